@@ -1,0 +1,21 @@
+"""The table of commands."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Callable
+
+from lbt_synth.cli.design_commands import design, show, verify
+from lbt_synth.cli.loop_commands import robustness, sigma, simulate
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.paper_command import paper
+
+COMMANDS: dict[str, Callable[[Namespace], Report]] = {
+    "design": design,
+    "paper": paper,
+    "robustness": robustness,
+    "show": show,
+    "sigma": sigma,
+    "simulate": simulate,
+    "verify": verify,
+}

@@ -1,0 +1,172 @@
+"""Commands that make and inspect gain files: design, show, verify."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.certify import Certificate
+from lbt_synth.cli.output import Report, TableText
+from lbt_synth.config import Config, load_config
+from lbt_synth.design import (
+    Design,
+    FilterDesign,
+    IntegratorDesign,
+    hinf,
+    integrator,
+    kalman,
+    optimal_integrator,
+)
+from lbt_synth.errors import ProblemError
+from lbt_synth.gainfile import load_gain, save_gain
+from lbt_synth.loop import close_loop, loop_margins
+
+_ROUTES = {"kalman": ("riccati", "sdp"), "hinf": ("lmi", "riccati"), "integrator": ()}
+
+
+def design(arguments: Namespace) -> Report:
+    """Design a controller and write its gain file."""
+    _refuse_foreign_options(arguments)
+    config = load_config(arguments.config)
+    made = _synthesise(config, arguments)
+    path = save_gain(arguments.output, made)
+    report = _description(made)
+    report.data["file"] = str(path)
+    report.notes.append(f"written: {path}")
+    return report
+
+
+def _refuse_foreign_options(arguments: Namespace) -> None:
+    """Refuse an option that the chosen method would silently ignore."""
+    method = arguments.method
+    routes = _ROUTES[method]
+    if arguments.route is not None and arguments.route not in routes:
+        expected = " or ".join(routes) if routes else "no --route"
+        raise ProblemError(f"--method {method} takes {expected}; got --route {arguments.route}.")
+    for option, owner in (("gamma", "hinf"), ("gamma_ratio", "hinf"), ("gain", "integrator")):
+        if getattr(arguments, option) is not None and method != owner:
+            raise ProblemError(
+                f"--{option.replace('_', '-')} goes with --method {owner}; got --method {method}."
+            )
+
+
+def _synthesise(config: Config, arguments: Namespace) -> Design:
+    if arguments.method == "kalman":
+        return kalman(config.plant, method=arguments.route or "riccati")
+    if arguments.method == "integrator":
+        if arguments.gain is not None:
+            return integrator(config.hardware, gain=arguments.gain)
+        return optimal_integrator(config.hardware, config.truth)
+    ratio = arguments.gamma_ratio
+    if arguments.gamma is None and ratio is None:
+        ratio = config.settings.design.gamma_ratio
+    return hinf(
+        config.plant, gamma=arguments.gamma, gamma_ratio=ratio, method=arguments.route or "lmi"
+    )
+
+
+def show(arguments: Namespace) -> Report:
+    """Show a gain file."""
+    loaded = load_gain(arguments.gain)
+    report = _description(loaded)
+    report.data["file"] = arguments.gain
+    if arguments.matrices:
+        matrices = {name: getattr(loaded.controller, name) for name in "ABCD"}
+        if isinstance(loaded, FilterDesign):
+            matrices |= {
+                "gain_predictor": loaded.gain_predictor,
+                "gain_filter": loaded.gain_filter,
+            }
+        report.data["matrices"] = matrices
+        with np.printoptions(precision=8, linewidth=160, suppress=False):
+            report.notes += [f"{name} =\n{value}" for name, value in matrices.items()]
+    return report
+
+
+def verify(arguments: Namespace) -> Report:
+    """Compute the certificate of a gain file anew."""
+    loaded = load_gain(arguments.gain)
+    certificate = loaded.recertified()
+    return Report(
+        data={
+            "file": arguments.gain,
+            "method": loaded.method,
+            "passed": certificate.passed,
+            "checks": _check_data(certificate),
+        },
+        tables=[_check_table(certificate)],
+        notes=[f"{arguments.gain}: {'verified' if certificate.passed else 'NOT VERIFIED'}"],
+        passed=certificate.passed,
+    )
+
+
+def _description(made: Design) -> Report:
+    """Tables of a design: what it is, its loop, its certificate."""
+    facts: list[tuple[str, Any, str]] = [
+        ("method", made.method, ""),
+        ("route", f"{made.solver.route} ({made.solver.status})", ""),
+        ("states of the controller", made.controller.n_states, ""),
+    ]
+    data: dict[str, Any] = {
+        "method": made.method,
+        "solver": asdict(made.solver),
+        "n_states": made.controller.n_states,
+        "poles": [complex(p) for p in made.poles],
+        "checks": _check_data(made.certificate),
+    }
+    unit = "nm" if made.hardware is not None else ""
+    if isinstance(made, FilterDesign):
+        facts += [
+            ("estimation error, rms", made.rms, unit),
+            ("estimation error, H-infinity norm", made.gamma, unit),
+        ]
+        data |= {
+            "rms": made.rms,
+            "gamma": made.gamma,
+            "gamma_requested": made.gamma_requested,
+            "gamma_least": made.gamma_least,
+        }
+        if made.gamma_requested is not None:
+            facts += [
+                ("bound asked for", made.gamma_requested, unit),
+                ("least bound", made.gamma_least, unit),
+            ]
+    if isinstance(made, IntegratorDesign):
+        facts.append(("gain", made.gain, ""))
+        data["gain"] = made.gain
+    tables = []
+    if made.hardware is not None:
+        margins = loop_margins(close_loop(made.hardware, made.controller))
+        data |= {
+            "frame_rate_hz": made.hardware.frame_rate_hz,
+            "delay_frames": made.hardware.delay_frames,
+            "margins": asdict(margins),
+        }
+        facts += [
+            ("frame rate", made.hardware.frame_rate_hz, "Hz"),
+            ("total delay", made.hardware.delay_frames, "frames"),
+            ("modulus margin", margins.modulus, ""),
+            ("stable sensor gains, from", margins.gain_low, ""),
+            ("stable sensor gains, to", margins.gain_high, ""),
+            ("phase margin", margins.phase_deg, "deg"),
+            ("delay margin", margins.delay_frames, "frames"),
+            ("highest crossover", margins.crossover_hz, "Hz"),
+        ]
+    tables.append(TableText(title="Design", headings=("quantity", "value", "unit"), rows=facts))
+    tables.append(_check_table(made.certificate))
+    return Report(data=data, tables=tables)
+
+
+def _check_table(certificate: Certificate) -> TableText:
+    return TableText(
+        title="Certificate",
+        headings=("check", "value", "limit", "passed", "method"),
+        rows=[(c.name, c.value, c.limit, c.passed, c.method) for c in certificate.checks],
+    )
+
+
+def _check_data(certificate: Certificate) -> list[dict[str, Any]]:
+    return [asdict(check) | {"passed": check.passed} for check in certificate.checks]

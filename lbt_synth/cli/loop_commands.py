@@ -1,0 +1,231 @@
+"""Commands that close the loop: sigma, simulate, robustness."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from lbt_synth.cli.output import Report, TableText, progress
+from lbt_synth.config import Config, load_config
+from lbt_synth.design import Design, FilterDesign
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import write_atomically
+from lbt_synth.gainfile import load_gain
+from lbt_synth.loop import close_loop, loop_margins, residual_budget, strehl
+from lbt_synth.models import Truth
+from lbt_synth.plotting import (
+    FIGURE_ENDINGS,
+    robustness_figure,
+    save_figure,
+    sigma_figure,
+    simulation_figure,
+)
+from lbt_synth.simulate import simulate as run_simulation
+from lbt_synth.sweep import METHODS, RobustnessRow, frequency_robustness
+from lbt_synth.tables import csv_bytes
+
+
+def sigma(arguments: Namespace) -> Report:
+    """Plot singular values of one or several designs, and print their margins."""
+    _require_figure(arguments.output)
+    designs = _named(arguments.gains)
+    figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
+    rows, data = [], {}
+    for name, design in designs.items():
+        entry: dict[str, object] = {"method": design.method}
+        if isinstance(design, FilterDesign):
+            entry |= {"gamma": design.gamma, "rms": design.rms}
+        if design.hardware is not None:
+            loop = close_loop(
+                design.hardware, design.controller, sensor_gain=arguments.sensor_gain
+            )
+            entry["stable"] = loop.is_stable
+            if loop.is_stable:
+                entry |= asdict(loop_margins(loop))
+        data[name] = entry
+        rows.append(
+            (
+                name,
+                entry.get("gamma"),
+                entry.get("stable"),
+                entry.get("modulus"),
+                entry.get("gain_low"),
+                entry.get("gain_high"),
+                entry.get("phase_deg"),
+                entry.get("delay_frames"),
+            )
+        )
+    path = save_figure(figure, arguments.output)
+    return Report(
+        data={"designs": data, "sensor_gain": arguments.sensor_gain, "file": str(path)},
+        tables=[
+            TableText(
+                title=f"Margins at sensor gain {arguments.sensor_gain:g}",
+                headings=(
+                    "design", "norm [nm]", "stable", "modulus", "gain from", "gain to",
+                    "phase [deg]", "delay [frames]",
+                ),
+                rows=rows,
+            )
+        ],
+        notes=[f"written: {path}"],
+    )  # fmt: skip
+
+
+def simulate(arguments: Namespace) -> Report:
+    """Close the loop in the time domain, beside the exact answer."""
+    if arguments.output is not None:
+        _require_figure(arguments.output)
+    config = load_config(arguments.config)
+    design = load_gain(arguments.gain)
+    truth = _truth(config, arguments)
+    settings = config.settings.simulation
+
+    def chosen(name: str) -> int:
+        given = getattr(arguments, name)
+        return int(getattr(settings, name) if given is None else given)
+
+    run = run_simulation(
+        design.controller,
+        truth,
+        hardware=config.hardware,
+        frames=chosen("frames"),
+        cases=chosen("cases"),
+        seed=chosen("seed"),
+    )
+    loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
+    budget = residual_budget(loop, truth)
+    strehls = run.strehl(config.imaging)
+    exact = strehl(budget, config.imaging)
+    command_rms = np.sqrt(np.sum(np.mean(run.commands**2, axis=(0, 1))))
+    scatter = float(np.std(strehls, ddof=1)) if len(strehls) > 1 else float("nan")
+    rows = [
+        ("Strehl ratio", 100 * float(np.mean(strehls)), 100 * exact, "%"),
+        ("residual", float(np.sqrt(np.mean(run.rms_nm**2))), budget.rms_nm, "nm rms"),
+        ("  turbulence", None, budget.turbulence_nm, "nm rms"),
+        ("  vibration", None, budget.vibration_nm, "nm rms"),
+        ("  noise", None, budget.noise_nm, "nm rms"),
+        ("commands", float(command_rms), None, "rms"),
+    ]
+    report = Report(
+        data={
+            "strehl": strehls,
+            "strehl_exact": exact,
+            "residual_nm": run.rms_nm,
+            "residual_exact_nm": budget.rms_nm,
+            "turbulence_nm": budget.turbulence_nm,
+            "vibration_nm": budget.vibration_nm,
+            "noise_nm": budget.noise_nm,
+            "command_rms": command_rms,
+            "frames": run.residual_nm.shape[1],
+            "cases": len(strehls),
+            "seed": run.seed,
+            "sensor_gain": config.settings.model.sensor_gain * truth.sensor_gain,
+        },
+        tables=[
+            TableText(
+                title=f"{design.method} in the loop: {len(strehls)} runs of "
+                f"{run.residual_nm.shape[1]} frames",
+                headings=("quantity", "simulated", "exact", "unit"),
+                rows=rows,
+            )
+        ],
+        notes=[f"scatter of the Strehl ratio between runs: {100 * scatter:.2f} points"],
+    )
+    if arguments.output is not None:
+        path = save_figure(simulation_figure(run, title=f"{design.method} filter"), arguments.output)
+        report.data["file"] = str(path)
+        report.notes.append(f"written: {path}")
+    return report
+
+
+def robustness(arguments: Namespace) -> Report:
+    """Strehl ratio over an error of the vibration frequency."""
+    for output in arguments.output:
+        if Path(output).suffix.lower() not in (".csv", *FIGURE_ENDINGS):
+            raise ProblemError(
+                f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
+            )
+    config = load_config(arguments.config)
+    settings = config.settings
+    ratio = arguments.gamma_ratio
+    errors = settings.robustness.errors_hz
+    rows = list(
+        progress(
+            frequency_robustness(
+                config.plant,
+                _truth(config, arguments),
+                config.imaging,
+                errors_hz=errors,
+                gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
+                hold=settings.robustness.hold,
+            ),
+            total=len(errors) * len(METHODS),
+            what="designs",
+            quiet=arguments.json,
+        )
+    )
+    report = Report(
+        data={"rows": [asdict(row) for row in rows]},
+        tables=[
+            TableText(
+                title="Robustness to the vibration frequency",
+                headings=(
+                    "error [Hz]", "method", "Strehl [%]", "residual [nm]", "vibration [nm]",
+                    "turbulence [nm]", "noise [nm]", "stable",
+                ),
+                rows=[
+                    (
+                        f"{row.error_hz:+.2f}", row.method, f"{100 * row.strehl:.2f}",
+                        f"{row.residual_nm:.1f}", f"{row.vibration_nm:.1f}",
+                        f"{row.turbulence_nm:.1f}", f"{row.noise_nm:.1f}", row.stable,
+                    )
+                    for row in rows
+                ],
+            )
+        ],
+    )  # fmt: skip
+    report.data["files"] = []
+    for output in arguments.output:
+        if Path(output).suffix.lower() == ".csv":
+            path = write_atomically(output, _robustness_csv(rows))
+        else:
+            path = save_figure(robustness_figure(rows), output)
+        report.data["files"].append(str(path))
+        report.notes.append(f"written: {path}")
+    return report
+
+
+def _robustness_csv(rows: list[RobustnessRow]) -> bytes:
+    records = [asdict(row) for row in rows]
+    cells = [
+        ["" if isinstance(v, float) and np.isnan(v) else v for v in record.values()]
+        for record in records
+    ]
+    return csv_bytes(list(records[0]), cells)
+
+
+def _truth(config: Config, arguments: Namespace) -> Truth:
+    if arguments.sensor_gain is None:
+        return config.truth
+    return replace(
+        config.truth, sensor_gain=arguments.sensor_gain / config.settings.model.sensor_gain
+    )
+
+
+def _require_figure(output: str) -> None:
+    """Refuse a wrong ending before any work is done."""
+    if Path(output).suffix.lower() not in FIGURE_ENDINGS:
+        raise ProblemError(f"a figure must end in {', '.join(FIGURE_ENDINGS)}; got {output!r}.")
+
+
+def _named(paths: list[str]) -> dict[str, Design]:
+    """Designs by the stems of their files, by the paths where stems repeat."""
+    stems = [Path(path).stem for path in paths]
+    names = stems if len(set(stems)) == len(stems) else paths
+    if len(set(names)) != len(names):
+        raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
+    return {name: load_gain(path) for name, path in zip(names, paths, strict=True)}

@@ -1,0 +1,142 @@
+"""Entry point of ``lbt-synth``: parser, dispatch, exit codes.
+
+Exit status: 0 done, 1 a design or a verification failed, 2 wrong usage or bad input.
+Nothing heavy is imported before a command runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import lbt_synth
+from lbt_synth.errors import LbtSynthError, SynthesisError
+
+DONE, FAILED, WRONG = 0, 1, 2
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="lbt-synth",
+        description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
+        epilog="Exit status: 0 done, 1 a design or verification failed, 2 wrong usage or bad input.",
+    )
+    parser.add_argument("--version", action="version", version=f"lbt-synth {lbt_synth.__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, text: str, **extra: Any) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text + ".", **extra)
+        sub.add_argument("--json", action="store_true", help="print one JSON object instead")
+        return sub
+
+    config_help = "configuration file (YAML)"
+    gain_help = "gain file (.fits, .npz or .json)"
+
+    design = command("design", "Design a controller and write its gain file")
+    design.add_argument("config", help=config_help)
+    design.add_argument("--method", choices=("kalman", "hinf", "integrator"), required=True)
+    design.add_argument(
+        "--route",
+        choices=("riccati", "sdp", "lmi"),
+        help="kalman: riccati (default) or sdp; hinf: lmi (default) or riccati",
+    )
+    bound = design.add_mutually_exclusive_group()
+    bound.add_argument("--gamma", type=float, help="bound of the H-infinity norm [nm]")
+    bound.add_argument(
+        "--gamma-ratio",
+        type=float,
+        help="the same as a multiple of the least one (default: the configuration's, else 1.2)",
+    )
+    design.add_argument(
+        "--gain", type=float, help="integrator gain (default: the best for the truth)"
+    )
+    design.add_argument("-o", "--output", required=True, help=gain_help)
+
+    show = command("show", "Show a gain file: design, loop, margins, certificate")
+    show.add_argument("gain", help=gain_help)
+    show.add_argument("--matrices", action="store_true", help="print the gains and the controller")
+
+    verify = command("verify", "Compute the certificate of a gain file anew")
+    verify.add_argument("gain", help=gain_help)
+
+    sigma = command("sigma", "Plot singular values of one or several designs")
+    sigma.add_argument("gains", nargs="+", metavar="gain", help=gain_help)
+    sigma.add_argument("--sensor-gain", type=float, default=1.0, help="real sensor gain")
+    sigma.add_argument("-o", "--output", required=True, help="figure (.png, .pdf or .svg)")
+
+    simulate = command("simulate", "Close the loop in the time domain, beside the exact answer")
+    simulate.add_argument("config", help=config_help)
+    simulate.add_argument("gain", help=gain_help)
+    simulate.add_argument("--frames", type=int, help="frames to keep")
+    simulate.add_argument("--cases", type=int, help="independent runs")
+    simulate.add_argument("--seed", type=int, help="seed of the random series")
+    simulate.add_argument("--sensor-gain", type=float, help="real sensor gain")
+    simulate.add_argument("-o", "--output", help="figure (.png, .pdf or .svg)")
+
+    robustness = command("robustness", "Strehl ratio over an error of the vibration frequency")
+    robustness.add_argument("config", help=config_help)
+    robustness.add_argument("--gamma-ratio", type=float, help="H-infinity bound of each row")
+    robustness.add_argument("--sensor-gain", type=float, help="real sensor gain")
+    robustness.add_argument(
+        "-o", "--output", action="append", default=[], help="table (.csv) or figure; repeatable"
+    )
+
+    paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")
+    paper.add_argument("-o", "--output", required=True, help="directory to write into")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; those of the process by default.
+
+    Returns
+    -------
+    int
+        0 done, 1 a design or a verification failed, 2 wrong usage or bad input.
+    """
+    arguments = build_parser().parse_args(argv)
+    commands = importlib.import_module("lbt_synth.cli.commands")
+    try:
+        report = commands.COMMANDS[arguments.command](arguments)
+    except SynthesisError as error:
+        return _refuse(error, FAILED, as_json=arguments.json)
+    except LbtSynthError as error:
+        return _refuse(error, WRONG, as_json=arguments.json)
+    except KeyboardInterrupt:
+        print("lbt-synth: interrupted", file=sys.stderr)
+        return 130
+    report.print(as_json=arguments.json)
+    return DONE if report.passed else FAILED
+
+
+def _refuse(error: LbtSynthError, status: int, *, as_json: bool) -> int:
+    if as_json:
+        print(json.dumps({"error": type(error).__name__, "message": str(error)}))
+    print(f"lbt-synth: error: {error}", file=sys.stderr)
+    return status
+
+
+def entry_point() -> None:
+    """Console script."""
+    try:
+        status = main()
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output went away, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 141
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    entry_point()

@@ -1,0 +1,112 @@
+"""What a command prints: aligned tables for people, one JSON object for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+_WIDE = 200
+
+
+@dataclass(kw_only=True)
+class TableText:
+    """A table: a title, headings with units, rows of cells."""
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+@dataclass(kw_only=True)
+class Report:
+    """Result of a command.
+
+    Attributes
+    ----------
+    data : dict
+        What ``--json`` prints; nan and inf become null.
+    tables : list of TableText
+        What people see.
+    notes : list of str
+        Lines below the tables.
+    passed : bool
+        False makes the exit status 1.
+    """
+
+    data: dict[str, Any]
+    tables: list[TableText] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    passed: bool = True
+
+    def print(self, *, as_json: bool) -> None:
+        """Print to standard output."""
+        if as_json:
+            print(json.dumps(plain(self.data), allow_nan=False))
+            return
+        console = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE)
+        for text in self.tables:
+            console.print(_table(text))
+        for note in self.notes:
+            console.print(note, markup=False, soft_wrap=True)
+
+
+def _table(text: TableText) -> Table:
+    table = Table(title=text.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD)
+    for i, heading in enumerate(text.headings):
+        table.add_column(heading, justify="left" if i == 0 else "right")
+    for row in text.rows:
+        table.add_row(*(cell(value) for value in row))
+    return table
+
+
+def cell(value: Any) -> str:
+    """Text of one cell; six significant digits at most."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        number = float(value)
+        if math.isnan(number):
+            return "-"
+        return f"{number:.6g}"
+    return str(value)
+
+
+def plain(value: Any) -> Any:
+    """Value made of what JSON knows."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.integer | np.bool_):
+        return value.item()
+    return value
+
+
+def progress(items: Iterable[Any], *, total: int, what: str, quiet: bool) -> Iterator[Any]:
+    """Pass items on with a bar on standard error, when that is a terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(
+        *columns, console=console, disable=quiet or not console.is_terminal, transient=True
+    ) as bar:
+        yield from bar.track(items, total=total, description=what)

@@ -1,0 +1,5 @@
+"""Configuration files: YAML with units in the keys, checked against a schema."""
+
+from lbt_synth.config.load import Config, load_config
+
+__all__ = ["Config", "load_config"]

@@ -1,0 +1,190 @@
+"""Schema of a configuration file. Keys carry their units; unknown keys are refused."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+Damping = Annotated[float, Field(gt=0, lt=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class TelescopeSection(_Section):
+    """The pupil."""
+
+    diameter_m: Positive
+    obstruction: Annotated[float, Field(ge=0, lt=1)] = 0.0
+
+
+class AtmosphereSection(_Section):
+    """The turbulence; ``outer_scale_m: null`` is Kolmogorov."""
+
+    seeing_arcsec: Positive
+    outer_scale_m: Positive | None
+    wind_speed_m_s: Positive
+    seeing_wavelength_um: Positive = 0.5
+
+
+class PyramidSection(_Section):
+    """Pyramid sensor, from which the noise is computed."""
+
+    wavelength_um: Positive
+    modulation_lambda_over_d: Positive
+    subapertures_across: Annotated[int, Field(ge=1)]
+    photons: Positive
+    read_noise_electrons: Annotated[float, Field(ge=0)]
+
+
+class SensorSection(_Section):
+    """Measurement noise: given, or from a pyramid."""
+
+    noise_nm: Positive | None = None
+    noise_mas: Positive | None = None
+    pyramid: PyramidSection | None = None
+    matrix: list[list[float]] | None = None
+
+    @model_validator(mode="after")
+    def _one_noise(self) -> SensorSection:
+        given = [v is not None for v in (self.noise_nm, self.noise_mas, self.pyramid)]
+        if sum(given) != 1:
+            raise ValueError("expected exactly one of noise_nm, noise_mas, pyramid")
+        return self
+
+
+class MirrorSection(_Section):
+    """Deformable mirror; ``modes`` counts all its modes and is for the record."""
+
+    modes: Annotated[int, Field(ge=1)] | None = None
+    influence_matrix: list[list[float]] | None = None
+
+
+class LoopSection(_Section):
+    """Timing."""
+
+    frame_rate_hz: Positive
+    delay_frames: Annotated[float, Field(ge=1)] = 2.0
+
+
+class _Line(_Section):
+    axis: Literal["tip", "tilt", "both"] | None = None
+    direction_deg: float | None = None
+    frequency_hz: Positive
+    rms_nm: Positive | None = None
+    rms_mas: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_size_one_direction(self) -> _Line:
+        if (self.rms_nm is None) == (self.rms_mas is None):
+            raise ValueError("expected exactly one of rms_nm, rms_mas")
+        if (self.axis is None) == (self.direction_deg is None):
+            raise ValueError("expected exactly one of axis, direction_deg")
+        return self
+
+
+class VibrationSection(_Line):
+    """A vibration of the model."""
+
+    damping: Damping
+
+
+class TrueVibrationSection(_Line):
+    """A vibration of the truth: a sinusoid, or a resonance with its damping."""
+
+    kind: Literal["sinusoid", "resonance"]
+    damping: Damping | None = None
+
+    @model_validator(mode="after")
+    def _damping_of_a_resonance(self) -> TrueVibrationSection:
+        if (self.kind == "resonance") != (self.damping is not None):
+            raise ValueError("damping goes with kind: resonance, and only with it")
+        return self
+
+
+class Ar1Section(_Section):
+    """AR1 turbulence, from the atmosphere."""
+
+    kind: Literal["ar1"]
+
+
+class Ar2Section(_Section):
+    """AR2 turbulence, fitted to the atmosphere's spectrum above the noise."""
+
+    kind: Literal["ar2"]
+
+
+class ArSection(_Section):
+    """Auto-regressive turbulence by its coefficients."""
+
+    kind: Literal["ar"]
+    coefficients: Annotated[list[float], Field(min_length=1)]
+    driving_rms_nm: Positive
+
+
+TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discriminator="kind")]
+
+
+class ModelSection(_Section):
+    """What the design believes; leave ``vibrations`` out for a plant without any."""
+
+    turbulence: TurbulenceSection
+    vibrations: Annotated[list[VibrationSection], Field(min_length=1)] | None = None
+    sensor_gain: Positive = 1.0
+
+
+class TruthSection(_Section):
+    """What the loop really meets."""
+
+    turbulence: Literal["frozen_flow", "model", "none"] = "frozen_flow"
+    vibrations: list[TrueVibrationSection] = []
+    sensor_gain: Positive = 1.0
+
+
+class ImagingSection(_Section):
+    """The camera."""
+
+    wavelength_um: Positive = 2.2
+    other_modes_strehl: Fraction = 1.0
+
+
+class DesignSection(_Section):
+    """Defaults of the synthesis."""
+
+    gamma_ratio: Annotated[float, Field(ge=1)] = 1.2
+
+
+class SimulationSection(_Section):
+    """Time-domain runs."""
+
+    frames: Annotated[int, Field(ge=2)] = 8000
+    cases: Annotated[int, Field(ge=1)] = 4
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class RobustnessSection(_Section):
+    """The frequency-error study."""
+
+    errors_hz: Annotated[list[float], Field(min_length=1)] = [x / 2 for x in range(-7, 8)]
+    hold: Literal["driving", "rms"] = "driving"
+
+
+class FileSection(_Section):
+    """A whole configuration file."""
+
+    version: Literal[1]
+    telescope: TelescopeSection
+    atmosphere: AtmosphereSection
+    sensor: SensorSection
+    mirror: MirrorSection = MirrorSection()
+    loop: LoopSection
+    model: ModelSection
+    truth: TruthSection = TruthSection()
+    imaging: ImagingSection = ImagingSection()
+    design: DesignSection = DesignSection()
+    simulation: SimulationSection = SimulationSection()
+    robustness: RobustnessSection = RobustnessSection()

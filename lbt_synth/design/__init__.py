@@ -1,0 +1,18 @@
+"""Designs: Kalman, H-infinity and integrator, each certified before it is returned."""
+
+from lbt_synth.design.hinf import hinf
+from lbt_synth.design.integrator import integrator, integrator_gain_limit, optimal_integrator
+from lbt_synth.design.kalman import kalman
+from lbt_synth.design.result import Design, FilterDesign, IntegratorDesign, SolverReport
+
+__all__ = [
+    "Design",
+    "FilterDesign",
+    "IntegratorDesign",
+    "SolverReport",
+    "hinf",
+    "integrator",
+    "integrator_gain_limit",
+    "kalman",
+    "optimal_integrator",
+]

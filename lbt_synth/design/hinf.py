@@ -1,0 +1,190 @@
+"""The H-infinity filter: least energy gain from disturbances to the estimation error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.design.kalman import error_scale
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.errors import InfeasibleError, ProblemError
+from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.norms import hinf_norm
+from lbt_synth.riccati import FilterRiccati, gamma_riccati, kalman_riccati, least_gamma
+from lbt_synth.validation import FloatArray, choice, number
+
+# A level this close to the least one counts as the least one itself.
+_AT_LEAST = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Gains:
+    gain_predictor: FloatArray
+    gain_filter: FloatArray
+    status: str
+    iterations: int
+
+
+def hinf(
+    problem: EstimationProblem,
+    *,
+    gamma: float | None = None,
+    gamma_ratio: float | None = None,
+    method: str = "lmi",
+) -> FilterDesign:
+    """Design an H-infinity filter of an estimation problem.
+
+    With neither ``gamma`` nor ``gamma_ratio`` the least gamma is found, and the
+    filter at it is returned. At the least gamma the error is all-pass and every
+    other property suffers: ratios from 1.05 to 1.5 are for use.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; a plant gives a controller.
+    gamma : float, optional
+        Bound on the H-infinity norm from w to the estimation error.
+    gamma_ratio : float, optional
+        The same bound as a multiple, at least 1, of the least gamma.
+    method : {"lmi", "riccati"}, optional
+        Linear matrix inequality, or the gamma-Riccati equation. For a given
+        bound both give the central filter.
+
+    Returns
+    -------
+    FilterDesign
+        Certified design. ``gamma`` is the norm achieved, ``gamma_requested`` the
+        bound, ``gamma_least`` the least bound.
+
+    Raises
+    ------
+    ProblemError
+        If both bounds are given, or a value is out of its range.
+    InfeasibleError
+        If the bound is below the least gamma; the message names the least.
+    DetectabilityError
+        If no stable filter exists.
+    NumericalError
+        If the solver fails.
+    CertificateError
+        If the design does not pass its checks.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> design = lbt.hinf(walk, gamma_ratio=1.2, method="riccati")
+    >>> design.gamma <= design.gamma_requested
+    True
+    """
+    choice(method, "method", ("lmi", "riccati"))
+    if gamma is not None and gamma_ratio is not None:
+        raise ProblemError(
+            "give gamma or gamma_ratio, not both; "
+            f"got gamma={gamma!r} and gamma_ratio={gamma_ratio!r}."
+        )
+    if gamma is not None:
+        gamma = number(gamma, "gamma", above=0)
+    if gamma_ratio is not None:
+        gamma_ratio = number(
+            gamma_ratio, "gamma_ratio", at_least=1, hint="No filter is better than the least gamma."
+        )
+    start = kalman_riccati(problem)
+    synthesis = _LmiRoute(problem, start) if method == "lmi" else _RiccatiRoute(problem, start)
+    least, gains = synthesis.least()
+    requested = least
+    if gamma_ratio is not None:
+        requested = least * gamma_ratio
+    if gamma is not None:
+        requested = gamma
+    if requested < least * (1 - _AT_LEAST):
+        raise InfeasibleError(
+            f"gamma must be at least {least:.9g}, the least of this problem; got {requested:.9g}. "
+            "Try gamma_ratio=1.2.",
+            gamma=requested,
+            gamma_least=least,
+        )
+    if requested > least * (1 + _AT_LEAST):
+        gains = synthesis.at(requested)
+    return filter_design(
+        problem,
+        gains.gain_predictor,
+        gains.gain_filter,
+        method="hinf",
+        solver=SolverReport(route=method, status=gains.status, iterations=gains.iterations),
+        gamma_requested=max(requested, least),
+        gamma_least=least,
+    )
+
+
+class _RiccatiRoute:
+    """Levels by the gamma-Riccati equation."""
+
+    def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
+        self.problem, self.start = problem, start
+
+    def least(self) -> tuple[float, _Gains]:
+        lower, upper = _kalman_bracket(self.problem, self.start)
+        _, least, solution = least_gamma(self.problem, lower=lower, upper=upper)
+        return least, self._gains(solution)
+
+    def at(self, gamma: float) -> _Gains:
+        solution = gamma_riccati(self.problem, gamma)
+        if solution is None:
+            raise InfeasibleError(
+                f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
+                "Try a larger gamma.",
+                gamma=gamma,
+            )
+        return self._gains(solution)
+
+    @staticmethod
+    def _gains(solution: FilterRiccati) -> _Gains:
+        return _Gains(
+            gain_predictor=solution.gain_predictor,
+            gain_filter=solution.gain_filter,
+            status=solution.method,
+            iterations=solution.iterations,
+        )
+
+
+class _LmiRoute:
+    """Levels by linear matrix inequalities, in the Kalman filter's coordinates."""
+
+    def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
+        self.problem, self.start = problem, start
+        self.scale = _kalman_bracket(problem, start)[1]
+
+    def least(self) -> tuple[float, _Gains]:
+        from lbt_synth.lmi import least_gamma_lmi
+
+        solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
+        return solution.gamma, _Gains(
+            gain_predictor=solution.gain_predictor,
+            gain_filter=solution.gain_filter,
+            status=solution.status,
+            iterations=solution.iterations,
+        )
+
+    def at(self, gamma: float) -> _Gains:
+        from lbt_synth.lmi import hinf_lmi
+
+        solution = hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
+        return _Gains(
+            gain_predictor=solution.gain_predictor,
+            gain_filter=solution.gain_filter,
+            status=solution.status,
+            iterations=solution.iterations,
+        )
+
+
+def _kalman_bracket(problem: EstimationProblem, start: FilterRiccati) -> tuple[float, float]:
+    """Bounds of the least gamma: the Kalman error's deviation, and its norm."""
+    if not np.any(problem.L @ start.P @ problem.L.T > 0):
+        raise ProblemError(
+            "z = L x must have an estimation error; got one that is known exactly. "
+            "Drive it with noise (B), or choose another L."
+        )
+    upper = hinf_norm(problem.error_system(start.gain_predictor)).upper
+    return error_scale(problem, start.P), upper

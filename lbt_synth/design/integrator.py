@@ -1,0 +1,155 @@
+"""The classical integrator, its limit, and its best gain (paper, section III-C, erratum 4)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from lbt_synth.certify import certify_loop
+from lbt_synth.design.result import IntegratorDesign, SolverReport, loop_certificate
+from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.loop import close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.truth import Truth
+from lbt_synth.statespace import Controller
+from lbt_synth.validation import number
+
+_TRIALS = 32
+
+
+def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
+    """Integrator ``u(k) = u(k-1) + gain R y(k)``, R the generalised inverse of D N.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop.
+    gain : float
+        Gain, above 0 and below :func:`integrator_gain_limit`.
+
+    Returns
+    -------
+    IntegratorDesign
+        Certified design.
+
+    Raises
+    ------
+    ProblemError
+        If the gain is not a positive number.
+    CertificateError
+        If the loop is not stable at unit sensor gain.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> bool(max(abs(lbt.integrator(path, gain=0.25).poles)) < 1)
+    True
+    """
+    value = number(gain, "gain", above=0)
+    controller = _controller(hardware, value)
+    return IntegratorDesign(
+        method="integrator",
+        controller=controller,
+        certificate=loop_certificate(certify_loop(hardware, controller)).require(),
+        solver=SolverReport(route="closed form", status="given", iterations=0),
+        loop_hardware=hardware,
+        gain=value,
+    )
+
+
+def integrator_gain_limit(delay_frames: float) -> float:
+    """Gain at which an integrator loop becomes unstable.
+
+    ``2 sin(pi / (2 (2 d - 1)))`` for a whole delay of d frames; for a fractional
+    one the limit is found numerically.
+
+    Parameters
+    ----------
+    delay_frames : float
+        Total delay [frames], at least 1.
+
+    Returns
+    -------
+    float
+        The limit.
+
+    Raises
+    ------
+    ProblemError
+        If the delay is below 1 or not a number.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> [round(lbt.integrator_gain_limit(d), 3) for d in (2, 3, 4)]
+    [1.0, 0.618, 0.445]
+    """
+    hardware = LoopHardware(frame_rate_hz=1.0, delay_frames=delay_frames, modes=1)
+    d = hardware.delay_frames
+    if d == round(d):
+        return float(2 * np.sin(np.pi / (2 * (2 * d - 1))))
+    start = 0.5 / d  # stable: well below the limit of the next whole delay
+    return start * stable_sensor_gains(hardware, _controller(hardware, start))[1]
+
+
+def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign:
+    """Integrator whose gain leaves the least residual for a given truth.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop.
+    truth : Truth
+        Disturbances, noise and sensor gain.
+
+    Returns
+    -------
+    IntegratorDesign
+        Certified design; the gain is within 1e-6 of the best.
+
+    Raises
+    ------
+    ProblemError
+        If nothing disturbs the loop.
+    CertificateError
+        If the loop is not stable at unit sensor gain (a real sensor gain well
+        below 1 allows gains that a unit one does not).
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> slow = lbt.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
+    >>> design = lbt.optimal_integrator(path, lbt.Truth(turbulence=slow, noise_nm=20.0))
+    >>> 0.2 < design.gain < 0.6
+    True
+    """
+    limit = integrator_gain_limit(hardware.delay_frames) / max(1.0, truth.sensor_gain)
+
+    def variance(log_gain: float) -> float:
+        controller = _controller(hardware, float(np.exp(log_gain)))
+        loop = close_loop(hardware, controller, sensor_gain=truth.sensor_gain)
+        try:
+            return residual_budget(loop, truth).rms_nm ** 2
+        except UnstableLoopError:
+            return np.inf
+
+    if truth.turbulence is None and not truth.vibrations and truth.noise_nm == 0:
+        raise ProblemError("the truth must disturb the loop; got no turbulence, vibration or noise.")
+    trials = np.log(np.geomspace(1e-4, 0.999, _TRIALS) * limit)
+    values = [variance(trial) for trial in trials]
+    best = int(np.argmin(values))
+    bracket = trials[max(best - 1, 0)], trials[min(best + 1, _TRIALS - 1)]
+    found = minimize_scalar(
+        variance, bounds=bracket, method="bounded", options={"xatol": 1e-7}
+    )
+    return integrator(hardware, gain=float(np.exp(found.x)))
+
+
+def _controller(hardware: LoopHardware, gain: float) -> Controller:
+    reconstructor = np.linalg.pinv(hardware.sensor @ hardware.influence)
+    m, q = reconstructor.shape
+    return Controller(
+        A=np.eye(m), B=gain * reconstructor, C=np.eye(m), D=np.zeros((m, q)), dt_s=hardware.dt_s
+    )

@@ -1,0 +1,76 @@
+"""The Kalman filter: least variance of the estimation error."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.riccati import kalman_riccati
+from lbt_synth.validation import choice
+
+
+def kalman(problem: EstimationProblem, *, method: str = "riccati") -> FilterDesign:
+    """Design the steady-state Kalman filter of an estimation problem.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; a plant gives a controller.
+    method : {"riccati", "sdp"}, optional
+        The Riccati equation, or a semidefinite programme (independent of it but
+        for the coordinates it is solved in).
+
+    Returns
+    -------
+    FilterDesign
+        Certified design; ``rms`` is the least standard deviation.
+
+    Raises
+    ------
+    DetectabilityError
+        If no stable filter exists; the message names the mode.
+    NumericalError
+        If the solver fails.
+    CertificateError
+        If the design does not pass its checks.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> design = lbt.kalman(walk)
+    >>> round(float(design.gain_predictor[0, 0]), 9), design.certificate.passed
+    (0.618033989, True)
+    """
+    choice(method, "method", ("riccati", "sdp"))
+    solution = kalman_riccati(problem)
+    if method == "riccati":
+        return filter_design(
+            problem,
+            solution.gain_predictor,
+            solution.gain_filter,
+            method="kalman",
+            solver=SolverReport(
+                route="riccati", status=solution.method, iterations=solution.iterations
+            ),
+        )
+    from lbt_synth.lmi import kalman_sdp
+
+    scale = error_scale(problem, solution.P)
+    programme = kalman_sdp(problem, coordinates=solution.P, scale=scale)
+    return filter_design(
+        problem,
+        programme.gain_predictor,
+        programme.gain_filter,
+        method="kalman",
+        solver=SolverReport(
+            route="sdp", status=programme.status, iterations=programme.iterations
+        ),
+    )
+
+
+def error_scale(problem: EstimationProblem, P: np.ndarray) -> float:
+    """Standard deviation of the estimation error in its worst direction; 1 if there is none."""
+    worst = float(np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[-1])
+    return float(np.sqrt(worst)) if worst > 0 else 1.0

@@ -1,0 +1,234 @@
+"""What a design is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.certify import Certificate, Check, certify_filter, certify_loop
+from lbt_synth.loop import close_loop
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.plant import FullStatePlant, TipTiltPlant
+from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.statespace import Controller
+from lbt_synth.validation import ComplexArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolverReport:
+    """How a design was computed; no evidence of its quality.
+
+    Attributes
+    ----------
+    route : str
+        "riccati", "sdp", "lmi" or "closed form".
+    status : str
+        What the method said of itself.
+    iterations : int
+        Iterations it took.
+    """
+
+    route: str
+    status: str
+    iterations: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Design:
+    """A certified controller.
+
+    Attributes
+    ----------
+    method : str
+        "kalman", "hinf" or "integrator".
+    controller : Controller
+        From y(k) to u(k), the known input included (new-state form).
+    certificate : Certificate
+        Checks that were passed.
+    solver : SolverReport
+        How it was computed.
+    """
+
+    method: str
+    controller: Controller
+    certificate: Certificate
+    solver: SolverReport
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the design is for; None for a bare estimation problem."""
+        return None
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles that the design places, (n,)."""
+        return np.linalg.eigvals(self.controller.A).astype(np.complex128)
+
+    def to_control(self) -> Any:
+        """Return the controller as a ``control.StateSpace`` in the textbook form.
+
+        Returns
+        -------
+        control.StateSpace
+            ``u(k) = C x(k) + D y(k)``, the same input-output map.
+        """
+        return self.controller.to_statespace().to_control()
+
+    def recertified(self) -> Certificate:
+        """Compute the certificate anew from the matrices."""
+        return self.certificate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FilterDesign(Design):
+    """A Kalman or H-infinity filter, and the controller made of it.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+        The problem (a plant, for a telescope).
+    gain_predictor : (n, q) ndarray
+        ``A P C' (C P C' + R)^-1``: of ``x(k+1|k) = A x(k|k-1) + gain (y(k) - C x(k|k-1))``.
+    gain_filter : (n, q) ndarray
+        ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
+    gamma_requested : float or None
+        Bound that the H-infinity design was asked for.
+    gamma_least : float or None
+        Least bound of its problem.
+    """
+
+    problem: EstimationProblem
+    gain_predictor: FloatArray
+    gain_filter: FloatArray
+    gamma_requested: float | None = None
+    gamma_least: float | None = None
+
+    @property
+    def gamma(self) -> float:
+        """Achieved H-infinity norm of the estimation error, recomputed."""
+        return self.certificate.gamma
+
+    @property
+    def rms(self) -> float:
+        """Standard deviation of the estimation error over all outputs, recomputed."""
+        return self.certificate.rms
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the design is for; None for a bare estimation problem."""
+        if isinstance(self.problem, TipTiltPlant | FullStatePlant):
+            return self.problem.hardware
+        return None
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles of the estimation error, (n,)."""
+        return self.problem.error_system(self.gain_predictor).poles
+
+    def recertified(self) -> Certificate:
+        """Compute the certificate anew from the matrices.
+
+        Returns
+        -------
+        Certificate
+            Passed or not.
+        """
+        return certify_design(
+            self.problem,
+            self.gain_predictor,
+            method=self.method,
+            gamma=self.gamma_requested,
+            controller=self.controller,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IntegratorDesign(Design):
+    """The classical controller ``u(k) = u(k-1) + gain R y(k)``.
+
+    Attributes
+    ----------
+    loop_hardware : LoopHardware
+        The loop.
+    gain : float
+        Integrator gain, per unit of sensor gain.
+    """
+
+    loop_hardware: LoopHardware
+    gain: float
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the design is for."""
+        return self.loop_hardware
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles of the closed loop."""
+        return close_loop(self.loop_hardware, self.controller).system.poles
+
+    def recertified(self) -> Certificate:
+        """Compute the certificate anew from the matrices.
+
+        Returns
+        -------
+        Certificate
+            Passed or not.
+        """
+        return loop_certificate(certify_loop(self.loop_hardware, self.controller))
+
+
+def loop_certificate(check: Check) -> Certificate:
+    """Certificate of a controller that estimates nothing."""
+    return Certificate(checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0))
+
+
+def certify_design(
+    problem: EstimationProblem,
+    gain_predictor: FloatArray,
+    *,
+    method: str,
+    gamma: float | None,
+    controller: Controller,
+) -> Certificate:
+    """Certificate of a filter, and of its closed loop where the problem is a plant."""
+    certificate = certify_filter(
+        problem, gain_predictor, gamma=gamma, least_variance=method == "kalman"
+    )
+    if not isinstance(problem, TipTiltPlant | FullStatePlant):
+        return certificate
+    return Certificate(
+        checks=(*certificate.checks, certify_loop(problem.hardware, controller)),
+        gamma=certificate.gamma,
+        rms_per_output=certificate.rms_per_output,
+    )
+
+
+def filter_design(
+    problem: EstimationProblem,
+    gain_predictor: FloatArray,
+    gain_filter: FloatArray,
+    *,
+    method: str,
+    solver: SolverReport,
+    gamma_requested: float | None = None,
+    gamma_least: float | None = None,
+) -> FilterDesign:
+    """Certify a gain and make the design; raise CertificateError if it fails."""
+    controller = problem.controller(gain_predictor)
+    certificate = certify_design(
+        problem, gain_predictor, method=method, gamma=gamma_requested, controller=controller
+    )
+    return FilterDesign(
+        method=method,
+        controller=controller,
+        certificate=certificate.require(),
+        solver=solver,
+        problem=problem,
+        gain_predictor=gain_predictor,
+        gain_filter=gain_filter,
+        gamma_requested=gamma_requested,
+        gamma_least=gamma_least,
+    )

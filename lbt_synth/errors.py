@@ -1,0 +1,166 @@
+"""Exceptions of the package.
+
+Every message says what was expected, what came, and what to try; the data
+behind the message is on the exception, so that a script need not parse text.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class LbtSynthError(Exception):
+    """Base class of every error that this package raises on purpose."""
+
+
+# --------------------------------------------------------------------------
+# The input is wrong.
+# --------------------------------------------------------------------------
+class ProblemError(LbtSynthError, ValueError):
+    """The input of a computation is wrong."""
+
+
+class DimensionError(ProblemError):
+    """Sizes of matrices or vectors clash."""
+
+
+class NonFiniteError(ProblemError):
+    """An input holds NaN or an infinite value."""
+
+
+class DefinitenessError(ProblemError):
+    """A matrix is not symmetric, or not (semi)definite, where it has to be."""
+
+
+class DetectabilityError(ProblemError):
+    """A mode that does not decay cannot be seen, or is not driven, as it must be.
+
+    Attributes
+    ----------
+    eigenvalue : complex or None
+        The offending eigenvalue of the state matrix.
+    """
+
+    def __init__(self, message: str, *, eigenvalue: complex | None = None) -> None:
+        super().__init__(message)
+        self.eigenvalue = eigenvalue
+
+
+class ConfigError(ProblemError):
+    """A configuration file is refused.
+
+    Attributes
+    ----------
+    path : str
+        Path of the offending key, for example ``model.vibrations[0].damping``.
+    """
+
+    def __init__(self, message: str, *, path: str = "") -> None:
+        super().__init__(message)
+        self.path = path
+
+
+# --------------------------------------------------------------------------
+# The input is right, the computation cannot succeed.
+# --------------------------------------------------------------------------
+class SynthesisError(LbtSynthError):
+    """A design could not be computed or could not be certified."""
+
+
+class InfeasibleError(SynthesisError):
+    """No design meets the demand.
+
+    Attributes
+    ----------
+    gamma : float or None
+        The level that was asked for.
+    gamma_least : float or None
+        The least level that can be met.
+    """
+
+    def __init__(
+        self, message: str, *, gamma: float | None = None, gamma_least: float | None = None
+    ) -> None:
+        super().__init__(message)
+        self.gamma = gamma
+        self.gamma_least = gamma_least
+
+
+class NumericalError(SynthesisError):
+    """A numerical method did not reach its accuracy.
+
+    Attributes
+    ----------
+    status : str
+        What the method said of itself.
+    residual : float or None
+        The residual that was reached.
+    """
+
+    def __init__(self, message: str, *, status: str = "", residual: float | None = None) -> None:
+        super().__init__(message)
+        self.status = status
+        self.residual = residual
+
+
+class CertificateError(SynthesisError):
+    """A design failed a check of its certificate, so it is not returned.
+
+    Attributes
+    ----------
+    failed : tuple of str
+        Names of the checks that failed.
+    """
+
+    def __init__(self, message: str, *, failed: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.failed = failed
+
+
+class UnstableLoopError(SynthesisError):
+    """A closed loop is unstable or marginally stable, so it has no residual.
+
+    Attributes
+    ----------
+    spectral_radius : float
+        Largest modulus of the closed loop's poles.
+    """
+
+    def __init__(self, message: str, *, spectral_radius: float) -> None:
+        super().__init__(message)
+        self.spectral_radius = spectral_radius
+
+
+# --------------------------------------------------------------------------
+# Files.
+# --------------------------------------------------------------------------
+class GainFileError(LbtSynthError):
+    """A gain file cannot be read: it is missing, damaged or foreign.
+
+    Attributes
+    ----------
+    path : pathlib.Path or None
+        The file.
+    """
+
+    def __init__(self, message: str, *, path: Path | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class OutputError(LbtSynthError):
+    """A result cannot be written.
+
+    Attributes
+    ----------
+    path : pathlib.Path or None
+        The file.
+    """
+
+    def __init__(self, message: str, *, path: Path | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class SchemaVersionError(GainFileError):
+    """A gain file was written with a layout that this version does not know."""

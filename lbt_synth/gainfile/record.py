@@ -1,0 +1,171 @@
+"""A design as named arrays and plain metadata, and back."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+import lbt_synth
+from lbt_synth.certify import Certificate, Check
+from lbt_synth.design import Design, FilterDesign, IntegratorDesign, SolverReport
+from lbt_synth.models import (
+    ARModel,
+    EstimationProblem,
+    FullStatePlant,
+    LoopHardware,
+    TipTiltPlant,
+    Vibration,
+)
+from lbt_synth.statespace import Controller
+from lbt_synth.validation import FloatArray, frozen
+
+CONVENTION = (
+    "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
+    "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1). "
+    "GAIN_PREDICTOR: x(k+1|k) = A x(k|k-1) + G (y - C x(k|k-1)); "
+    "GAIN_FILTER: x(k|k) = x(k|k-1) + G (y - C x(k|k-1)); A, B, C, D, L of the plant in PLANT_*."
+)
+Arrays = dict[str, FloatArray]
+Meta = dict[str, Any]
+
+_PROBLEMS: dict[str, type[EstimationProblem]] = {
+    "problem": EstimationProblem,
+    "plant": TipTiltPlant,
+    "full plant": FullStatePlant,
+}
+
+
+def to_record(design: Design) -> tuple[Arrays, Meta]:
+    """Return the arrays and the metadata of a design."""
+    arrays: Arrays = {name: getattr(design.controller, name) for name in "ABCD"}
+    meta: Meta = {
+        "library_version": lbt_synth.__version__,
+        "method": design.method,
+        "convention": CONVENTION,
+        "dt_s": design.controller.dt_s,
+        "solver": {
+            "route": design.solver.route,
+            "status": design.solver.status,
+            "iterations": design.solver.iterations,
+        },
+        "certificate": _pack_certificate(design.certificate),
+        "units": {"commands": "1", "measurements": "1", "phase": "1"},
+    }
+    if design.hardware is not None:
+        arrays |= {"SENSOR": design.hardware.sensor, "INFLUENCE": design.hardware.influence}
+        meta["frame_rate_hz"] = design.hardware.frame_rate_hz
+        meta["delay_frames"] = design.hardware.delay_frames
+        meta["units"] = {
+            "commands": "nm rms wavefront where INFLUENCE is the identity",
+            "measurements": "nm rms wavefront where SENSOR is the identity",
+            "phase": "nm rms wavefront",
+        }
+    if isinstance(design, IntegratorDesign):
+        meta["integrator_gain"] = design.gain
+    if isinstance(design, FilterDesign):
+        arrays |= {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
+        meta["gamma_requested"] = design.gamma_requested
+        meta["gamma_least"] = design.gamma_least
+        _pack_problem(design.problem, arrays, meta)
+    return arrays, meta
+
+
+def from_record(arrays: Arrays, meta: Meta) -> Design:
+    """Rebuild a design; missing keys raise KeyError, wrong sizes a ProblemError."""
+    common: dict[str, Any] = {
+        "method": meta["method"],
+        "controller": Controller(**{name: arrays[name] for name in "ABCD"}, dt_s=meta["dt_s"]),
+        "certificate": _unpack_certificate(meta["certificate"]),
+        "solver": SolverReport(**meta["solver"]),
+    }
+    if meta["method"] == "integrator":
+        return IntegratorDesign(
+            **common, loop_hardware=_unpack_hardware(arrays, meta), gain=meta["integrator_gain"]
+        )
+    problem = _unpack_problem(arrays, meta)
+    rows_cols = (problem.A.shape[0], problem.C.shape[0])
+    for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
+        if arrays[name].shape != rows_cols:
+            raise ValueError(f"{name} must be {rows_cols} to match the plant")
+    return FilterDesign(
+        **common,
+        problem=problem,
+        gain_predictor=arrays["GAIN_PREDICTOR"],
+        gain_filter=arrays["GAIN_FILTER"],
+        gamma_requested=meta["gamma_requested"],
+        gamma_least=meta["gamma_least"],
+    )
+
+
+def _pack_problem(problem: EstimationProblem, arrays: Arrays, meta: Meta) -> None:
+    for name in "ABCDL":
+        arrays[f"PLANT_{name}"] = getattr(problem, name)
+    meta["problem"] = next(key for key, kind in _PROBLEMS.items() if type(problem) is kind)
+    if isinstance(problem, FullStatePlant):
+        arrays |= {"KNOWN_B": problem.B_known, "KNOWN_D": problem.D_known}
+    if isinstance(problem, TipTiltPlant):
+        meta["turbulence"] = [
+            {
+                "coefficients": model.coefficients.tolist(),
+                "driving_rms_nm": model.driving_rms_nm,
+            }
+            for model in problem.turbulence
+        ]
+        meta["vibrations"] = [
+            {
+                "frequency_hz": line.frequency_hz,
+                "damping": line.damping,
+                "rms_nm": line.rms_nm,
+                "direction": list(line.direction),
+            }
+            for line in problem.vibrations
+        ]
+
+
+def _unpack_problem(arrays: Arrays, meta: Meta) -> EstimationProblem:
+    fields: dict[str, Any] = {name: arrays[f"PLANT_{name}"] for name in "ABCDL"}
+    fields["dt_s"] = meta["dt_s"]
+    kind = _PROBLEMS[meta["problem"]]
+    if kind is not EstimationProblem:
+        fields["hardware"] = _unpack_hardware(arrays, meta)
+    if kind is FullStatePlant:
+        fields |= {"B_known": arrays["KNOWN_B"], "D_known": arrays["KNOWN_D"]}
+    if kind is TipTiltPlant:
+        fields["turbulence"] = tuple(
+            ARModel(**model, frame_rate_hz=meta["frame_rate_hz"]) for model in meta["turbulence"]
+        )
+        fields["vibrations"] = tuple(
+            Vibration(**{**line, "direction": tuple(line["direction"])})
+            for line in meta["vibrations"]
+        )
+    return kind(**fields)
+
+
+def _unpack_hardware(arrays: Arrays, meta: Meta) -> LoopHardware:
+    return LoopHardware(
+        frame_rate_hz=meta["frame_rate_hz"],
+        delay_frames=meta["delay_frames"],
+        sensor_matrix=arrays["SENSOR"],
+        influence_matrix=arrays["INFLUENCE"],
+    )
+
+
+def _pack_certificate(certificate: Certificate) -> Meta:
+    return {
+        "gamma": None if math.isnan(certificate.gamma) else certificate.gamma,
+        "rms_per_output": certificate.rms_per_output.tolist(),
+        "checks": [
+            {"name": c.name, "value": c.value, "limit": c.limit, "method": c.method}
+            for c in certificate.checks
+        ],
+    }
+
+
+def _unpack_certificate(meta: Meta) -> Certificate:
+    return Certificate(
+        checks=tuple(Check(**check) for check in meta["checks"]),
+        gamma=np.nan if meta["gamma"] is None else float(meta["gamma"]),
+        rms_per_output=frozen(np.array(meta["rms_per_output"], dtype=np.float64)),
+    )

@@ -1,0 +1,88 @@
+"""Coordinates in which the semidefinite programmes are well conditioned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.riccati import decorrelated, filter_gains
+from lbt_synth.validation import FloatArray, frozen
+
+_RANK_TOLERANCE = 1e-13
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BalancedProblem:
+    """A problem in coordinates where a given error covariance is the identity.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+        Decorrelated (``B D' = 0``), of unit measurement noise and scaled z.
+    basis : (n, r) ndarray
+        ``x = basis xbar``; directions without error are dropped.
+    sensor_scale : (q, q) ndarray
+        ``ybar = sensor_scale y``.
+    output_scale : float
+        ``zbar = z / output_scale``.
+    injection : (n, q) ndarray
+        What the decorrelation added to the gain.
+    """
+
+    problem: EstimationProblem
+    basis: FloatArray
+    sensor_scale: FloatArray
+    output_scale: float
+    injection: FloatArray
+
+    def gains(self, information: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predictor and filter gain, in the original coordinates, of an information matrix."""
+        predictor, filtering = filter_gains(self.problem, information)
+        back = self.basis @ predictor @ self.sensor_scale
+        return frozen(back + self.injection), frozen(self.basis @ filtering @ self.sensor_scale)
+
+    def covariance(self, balanced: FloatArray) -> FloatArray:
+        """Covariance in the original coordinates."""
+        return frozen(self.basis @ balanced @ self.basis.T)
+
+
+def balanced(
+    problem: EstimationProblem, covariance: FloatArray, output_scale: float
+) -> BalancedProblem:
+    """Change to coordinates in which ``covariance`` is the identity.
+
+    The coordinates decide how well the solver sees, not what it finds.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    covariance : (n, n) ndarray
+        Positive semidefinite; the Kalman filter's is the natural choice.
+    output_scale : float
+        Size of the estimation error.
+    """
+    A_s, B_s, injection = decorrelated(problem)
+    spread = np.sqrt(np.diag(covariance))
+    spread = np.where(spread > 0, spread, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
+    kept = values > _RANK_TOLERANCE * values[-1]
+    root = np.sqrt(values[kept])
+    basis = spread[:, None] * vectors[:, kept] * root
+    inverse = (vectors[:, kept] / root).T / spread
+    sensor_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
+    return BalancedProblem(
+        problem=EstimationProblem(
+            A=inverse @ A_s @ basis,
+            B=inverse @ B_s,
+            C=sensor_scale @ problem.C @ basis,
+            D=sensor_scale @ problem.D,
+            L=problem.L @ basis / output_scale,
+        ),
+        basis=frozen(basis),
+        sensor_scale=frozen(sensor_scale),
+        output_scale=output_scale,
+        injection=injection,
+    )

@@ -1,0 +1,71 @@
+"""One call to the conic solver, and its answer as plain arrays."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import cvxpy as cp
+
+from lbt_synth.errors import NumericalError
+from lbt_synth.validation import FloatArray
+
+# Tolerances of Clarabel; reached on well-scaled problems of some tens of states.
+_SETTINGS = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9, "max_iter": 200}
+USABLE = ("optimal", "optimal_inaccurate")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LmiSolution:
+    """A solved semidefinite programme, back in the problem's own coordinates.
+
+    Attributes
+    ----------
+    gamma : float
+        Level of the programme (infinite for the Kalman filter).
+    P : (n, n) ndarray
+        Covariance, or ``gamma^2`` times the inverse of the storage matrix.
+    gain_predictor, gain_filter : (n, q) ndarray
+        Gains in closed form from P.
+    status : str
+        The solver's word; no evidence, so the design is certified without it.
+    iterations : int
+        Iterations of the solver.
+    """
+
+    gamma: float
+    P: FloatArray
+    gain_predictor: FloatArray
+    gain_filter: FloatArray
+    status: str
+    iterations: int
+
+
+def symmetrised(expression: Any) -> Any:
+    """Return (M + M') / 2, so that rounding does not trouble the modelling layer."""
+    return (expression + expression.T) / 2
+
+
+def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
+    """Solve with Clarabel; return the status and the iteration count.
+
+    Raises
+    ------
+    NumericalError
+        If the solver gave up.
+    """
+    programme = cp.Problem(objective, constraints)
+    try:
+        with warnings.catch_warnings():
+            # an inaccurate solution is judged by the certificate, not by a warning
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate")
+            programme.solve(solver=cp.CLARABEL, **_SETTINGS)
+    except cp.error.SolverError as error:
+        raise NumericalError(
+            f"the semidefinite programme was not solved: {error} "
+            'Try method="riccati", or scale the states to similar sizes.',
+            status="solver error",
+        ) from error
+    iterations = programme.solver_stats.num_iters if programme.solver_stats else 0
+    return str(programme.status), int(iterations or 0)

@@ -1,0 +1,214 @@
+"""Residual of a closed loop without noise of sampling: the exact answer.
+
+White noise and auto-regressive disturbances by a Lyapunov equation, spectra by
+quadrature on panels that crowd at the closed loop's resonances, sinusoids by
+the frequency response.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.loop.closed_loop import ClosedLoop
+from lbt_synth.lyapunov import stationary_covariance
+from lbt_synth.models.ar import ARModel
+from lbt_synth.models.truth import SinusoidalVibration, Spectrum, Truth
+from lbt_synth.models.vibration import Vibration
+from lbt_synth.validation import ComplexArray, FloatArray, frozen
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualBudget:
+    """Stationary residual of a loop, by origin.
+
+    Attributes
+    ----------
+    turbulence_nm2, noise_nm2, random_vibration_nm2 : (n, n) ndarray
+        Covariances over the modes [nm^2].
+    line_amplitudes_nm : (s, n) complex ndarray
+        Complex amplitude that each sinusoid leaves on each mode [nm].
+    """
+
+    turbulence_nm2: FloatArray
+    noise_nm2: FloatArray
+    random_vibration_nm2: FloatArray
+    line_amplitudes_nm: ComplexArray
+
+    @property
+    def gaussian_nm2(self) -> FloatArray:
+        """Covariance of all that is Gaussian [nm^2]."""
+        return frozen(self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2)
+
+    @property
+    def vibration_nm2(self) -> FloatArray:
+        """Covariance of all vibrations, the sinusoids by their mean power [nm^2]."""
+        a = self.line_amplitudes_nm
+        return frozen(self.random_vibration_nm2 + np.real(a.T @ a.conj()) / 2)
+
+    @property
+    def total_nm2(self) -> FloatArray:
+        """Covariance of the residual [nm^2]."""
+        return frozen(self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2)
+
+    @property
+    def rms_nm(self) -> float:
+        """Residual over all modes [nm rms]."""
+        return _rms(self.total_nm2)
+
+    @property
+    def turbulence_nm(self) -> float:
+        """Residual turbulence over all modes [nm rms]."""
+        return _rms(self.turbulence_nm2)
+
+    @property
+    def vibration_nm(self) -> float:
+        """Residual vibration over all modes [nm rms]."""
+        return _rms(self.vibration_nm2)
+
+    @property
+    def noise_nm(self) -> float:
+        """Propagated noise over all modes [nm rms]."""
+        return _rms(self.noise_nm2)
+
+
+def _rms(covariance: FloatArray) -> float:
+    return float(np.sqrt(np.trace(covariance)))
+
+
+def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
+    """Exact stationary residual of a loop under a truth.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The loop; its sensor gain must be the truth's.
+    truth : Truth
+        Disturbances.
+
+    Returns
+    -------
+    ResidualBudget
+        Covariances by origin.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is unstable or marginally stable.
+    ProblemError
+        If a vibration does not fit the loop, or the sensor gains differ.
+
+    Examples
+    --------
+    Noise through an integrator of gain g and delay 1 has the variance g / (2 - g):
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
+    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> budget = lbt.residual_budget(lbt.close_loop(path, lazy),
+    ...                              lbt.Truth(turbulence=None, noise_nm=3.0))
+    >>> round(budget.noise_nm ** 2, 9)
+    3.0
+    """
+    loop.require_stable()
+    if loop.sensor_gain != truth.sensor_gain:
+        raise ProblemError(
+            f"the loop must be closed with the truth's sensor gain {truth.sensor_gain:.6g}; "
+            f"got {loop.sensor_gain:.6g}."
+        )
+    n = loop.hardware.modes
+    modes = np.eye(n)
+    turbulence = np.zeros((n, n))
+    if isinstance(truth.turbulence, ARModel):
+        for mode in modes:
+            turbulence += _ar_covariance(loop, truth.turbulence, mode)
+    elif truth.turbulence is not None:
+        turbulence = _spectrum_covariance(loop, truth.turbulence)
+
+    random_vibration = np.zeros((n, n))
+    lines = []
+    for vibration in truth.vibrations:
+        direction = _checked_direction(vibration, loop)
+        if isinstance(vibration, Vibration):
+            model = vibration.ar_model(loop.hardware.frame_rate_hz)
+            random_vibration += _ar_covariance(loop, model, direction)
+        else:
+            response = loop.sensitivity([vibration.frequency_hz])[0]
+            lines.append(vibration.amplitude_nm * response @ direction)
+    return ResidualBudget(
+        turbulence_nm2=frozen(turbulence),
+        noise_nm2=frozen(_noise_covariance(loop, truth.noise_nm)),
+        random_vibration_nm2=frozen(random_vibration),
+        line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
+    )
+
+
+def _checked_direction(
+    vibration: Vibration | SinusoidalVibration, loop: ClosedLoop
+) -> FloatArray:
+    if len(vibration.direction) != loop.hardware.modes:
+        raise DimensionError(
+            f"the direction of a vibration must have {loop.hardware.modes} components, one a mode; "
+            f"got {len(vibration.direction)} at {vibration.frequency_hz:.6g} Hz."
+        )
+    if not vibration.frequency_hz < loop.hardware.frame_rate_hz / 2:
+        raise ProblemError(
+            f"a vibration must lie below the Nyquist frequency "
+            f"{loop.hardware.frame_rate_hz / 2:.6g} Hz; got {vibration.frequency_hz:.6g} Hz."
+        )
+    return np.array(vibration.direction)
+
+
+def _noise_covariance(loop: ClosedLoop, noise_nm: float) -> FloatArray:
+    n, s = loop.hardware.modes, loop.system
+    B, D = s.B[:, n:] * noise_nm, s.D[:n, n:] * noise_nm
+    states = stationary_covariance(s.A, B @ B.T)
+    return np.asarray(s.C[:n] @ states @ s.C[:n].T + D @ D.T)
+
+
+def _ar_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray) -> FloatArray:
+    """Covariance of the residual that an AR process along one direction leaves."""
+    if not np.isclose(model.frame_rate_hz, loop.hardware.frame_rate_hz, rtol=1e-9):
+        raise ProblemError(
+            f"a disturbance must be sampled at the loop's {loop.hardware.frame_rate_hz:.6g} Hz; "
+            f"got {model.frame_rate_hz:.6g} Hz."
+        )
+    n, s, order = loop.hardware.modes, loop.system, model.order
+    # the newest sample of the process, x(k), acts on frame k
+    entry = np.zeros((s.n_states, order))
+    entry[:, 0] = s.B[:, :n] @ direction
+    A = np.block([[s.A, entry], [np.zeros((order, s.n_states)), model.companion]])
+    drive = np.zeros(len(A))
+    drive[s.n_states] = model.driving_rms_nm
+    C = np.hstack([s.C[:n], np.zeros((n, order))])
+    C[:, s.n_states] = s.D[:n, :n] @ direction
+    return np.asarray(C @ stationary_covariance(A, np.outer(drive, drive)) @ C.T)
+
+
+def _spectrum_covariance(loop: ClosedLoop, spectrum: Spectrum) -> FloatArray:
+    frequency, weight = resonance_quadrature(loop)
+    response = loop.sensitivity(frequency)
+    density = spectrum.psd(frequency) * weight
+    return np.real(np.einsum("f,fij,fkj->ik", density, response, response.conj()))
+
+
+def resonance_quadrature(loop: ClosedLoop) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Legendre nodes [Hz] and weights [Hz] on (0, Nyquist).
+
+    The panels are geometric, with more of them around the frequency of each
+    pole, down to a fraction of its width.
+    """
+    nyquist = loop.hardware.frame_rate_hz / 2
+    edges = [np.geomspace(1e-6, 1, 64), np.array([0.0])]
+    offsets = np.concatenate([[0.0], np.geomspace(0.25, 64, 9)])
+    for pole in loop.system.poles:
+        centre, width = abs(np.angle(pole)) / np.pi, max(1 - abs(pole), 1e-9) / np.pi
+        if 1e-6 < width < 0.1:
+            edges += [centre + offsets * width, centre - offsets * width]
+    grid = np.unique(np.clip(np.concatenate(edges), 0, 1))
+    grid = grid[np.concatenate([[True], np.diff(grid) > 1e-12])] * nyquist
+    x, w = np.polynomial.legendre.leggauss(6)
+    half, middle = np.diff(grid)[:, None] / 2, (grid[1:] + grid[:-1])[:, None] / 2
+    return frozen((middle + half * x).ravel()), frozen((half * w).ravel())

@@ -1,0 +1,190 @@
+"""The loop closed around a controller, as one linear system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.validation import ComplexArray, FloatArray, number
+
+# A loop whose slowest pole is closer to the unit circle than this is called marginal.
+STABILITY_MARGIN = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ClosedLoop:
+    """Closed loop from ``[phi_tot (n), noise (q)]`` to ``[phi_res (n), u (m), y (q)]``.
+
+    Made by :func:`close_loop`.
+
+    Attributes
+    ----------
+    system : StateSpace
+        The loop.
+    hardware : LoopHardware
+        Sensor, mirror and delay.
+    controller : Controller
+        The controller.
+    sensor_gain : float
+        Real sensor gain relative to the sensor matrix.
+    """
+
+    system: StateSpace
+    hardware: LoopHardware
+    controller: Controller
+    sensor_gain: float
+
+    @property
+    def spectral_radius(self) -> float:
+        """Largest modulus of the closed loop's poles."""
+        return self.system.spectral_radius
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether every pole lies inside the unit circle, by more than 1e-9."""
+        return self.spectral_radius < 1 - STABILITY_MARGIN
+
+    def require_stable(self) -> None:
+        """Raise if the loop is unstable or marginally stable.
+
+        Raises
+        ------
+        UnstableLoopError
+            With the spectral radius.
+        """
+        radius = self.spectral_radius
+        if not radius < 1 - STABILITY_MARGIN:
+            word = "marginally stable" if radius < 1 + STABILITY_MARGIN else "unstable"
+            raise UnstableLoopError(
+                f"the closed loop must be stable; got a {word} one (spectral radius "
+                f"{radius:.12g} at sensor gain {self.sensor_gain:.6g}). Lower the gain, or design "
+                "for this sensor gain and delay.",
+                spectral_radius=radius,
+            )
+
+    def sensitivity(self, frequency_hz: Any) -> ComplexArray:
+        """Transfer from the total phase to the residual, (f, n, n) (the rejection)."""
+        n = self.hardware.modes
+        return self.system.frequency_response(frequency_hz)[:, :n, :n]
+
+    def noise_transfer(self, frequency_hz: Any) -> ComplexArray:
+        """Transfer from the measurement noise to the residual, (f, n, q)."""
+        n = self.hardware.modes
+        return self.system.frequency_response(frequency_hz)[:, :n, n:]
+
+    def output_sensitivity(self) -> StateSpace:
+        """System from measurement noise to measurement, ``(I + loop)^-1``."""
+        n, m = self.hardware.modes, self.hardware.n_commands
+        s = self.system
+        return StateSpace(A=s.A, B=s.B[:, n:], C=s.C[n + m :], D=s.D[n + m :, n:], dt_s=s.dt_s)
+
+
+def close_loop(
+    hardware: LoopHardware, controller: Controller, *, sensor_gain: float = 1.0
+) -> ClosedLoop:
+    """Close the loop of :class:`LoopHardware` around a controller.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Sensor, mirror and delay.
+    controller : Controller
+        From y(k) to u(k).
+    sensor_gain : float, optional
+        Real sensor gain relative to the sensor matrix.
+
+    Returns
+    -------
+    ClosedLoop
+        The loop, stable or not.
+
+    Raises
+    ------
+    ProblemError
+        If the controller has other sizes or another sampling period than the loop.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> lbt.close_loop(path, lazy).is_stable
+    True
+    """
+    gain = number(sensor_gain, "sensor_gain", above=0)
+    A0, A1, inputs, outputs0, outputs1, direct = _loop_matrices(hardware, controller)
+    return ClosedLoop(
+        system=StateSpace(
+            A=A0 + gain * A1, B=inputs, C=outputs0 + gain * outputs1, D=direct, dt_s=hardware.dt_s
+        ),
+        hardware=hardware,
+        controller=controller,
+        sensor_gain=gain,
+    )
+
+
+def spectral_radii(
+    hardware: LoopHardware, controller: Controller, sensor_gains: FloatArray
+) -> FloatArray:
+    """Spectral radius of the closed loop for many sensor gains at once, (g,)."""
+    A0, A1, *_ = _loop_matrices(hardware, controller)
+    loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
+    return np.asarray(np.max(np.abs(np.linalg.eigvals(loops)), axis=1))
+
+
+def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:
+    """Parts of the loop, each affine in the sensor gain g: ``A = A0 + g A1``, ``C = C0 + g C1``.
+
+    State: controller, past commands u(k-1) ... u(k-I), last residual phi_res(k-1).
+    """
+    k = controller.to_statespace()
+    n, m, q = hardware.modes, hardware.n_commands, hardware.n_measurements
+    if (k.C.shape[0], k.B.shape[1]) != (m, q):
+        raise DimensionError(
+            f"the controller must map {q} measurements to {m} commands; got "
+            f"{k.B.shape[1]} to {k.C.shape[0]}."
+        )
+    if not np.isclose(k.dt_s, hardware.dt_s, rtol=1e-9):
+        raise ProblemError(
+            f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
+            f"designed for {1 / k.dt_s:.6g} Hz. Design it for this frame rate."
+        )
+    taps = hardware.mirror_taps
+    past = len(taps) - 1
+    states = k.n_states + past * m + n
+    x = slice(0, k.n_states)
+    u = slice(k.n_states, k.n_states + past * m)
+    r = slice(states - n, states)
+    mirror = hardware.influence
+
+    measured = np.zeros((q, states))  # y = g measured x + noise
+    measured[:, r] = hardware.sensor
+    command0 = np.zeros((m, states))  # u = (command0 + g command1) x + D noise
+    command0[:, x] = k.C
+    command1 = k.D @ measured
+    residual0 = -taps[0] * mirror @ command0  # phi_res = (...) x + phi_tot - tap D noise
+    for i in range(past):
+        residual0[:, u.start + i * m : u.start + (i + 1) * m] -= taps[i + 1] * mirror
+    residual1 = -taps[0] * mirror @ command1
+
+    A0, A1 = np.zeros((states, states)), np.zeros((states, states))
+    B = np.zeros((states, n + q))
+    A0[x, x], A1[x], B[x, n:] = k.A, k.B @ measured, k.B
+    if past:
+        first = slice(u.start, u.start + m)
+        A0[first], A1[first], B[first, n:] = command0, command1, k.D
+        A0[u.start + m : u.stop, u.start : u.stop - m] = np.eye((past - 1) * m)
+    A0[r], A1[r] = residual0, residual1
+    B[r, :n], B[r, n:] = np.eye(n), -taps[0] * mirror @ k.D
+    C0 = np.vstack([residual0, command0, np.zeros((q, states))])
+    C1 = np.vstack([residual1, command1, measured])
+    D = np.zeros((n + m + q, n + q))
+    D[:n, :n], D[:n, n:] = np.eye(n), B[r, n:]
+    D[n : n + m, n:] = k.D
+    D[n + m :, n:] = np.eye(q)
+    return A0, A1, B, C0, C1, D

@@ -1,0 +1,177 @@
+"""Stability margins of a loop, and the sensor gains for which it is stable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from lbt_synth.loop.budget import resonance_quadrature
+from lbt_synth.loop.closed_loop import ClosedLoop, spectral_radii
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.norms import hinf_norm
+from lbt_synth.statespace import Controller
+from lbt_synth.validation import number
+
+_STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
+_WIDEST = 1e4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopMargins:
+    """Margins of a stable loop; each measurement is broken in turn, the others closed.
+
+    Attributes
+    ----------
+    modulus : float
+        Least distance of the loop from instability, ``1 / ||(I + loop)^-1||_inf``.
+    gain_low, gain_high : float
+        Interval of factors on the loop gain that keep it stable (0 or inf at open ends).
+    phase_deg : float
+        Least phase lag that destabilises [deg]; inf without a crossover.
+    delay_s, delay_frames : float
+        Least further delay that destabilises [s], [frames]; inf without a crossover.
+    crossover_hz : float
+        Highest frequency at which a loop's gain crosses one [Hz]; 0 without any.
+    """
+
+    modulus: float
+    gain_low: float
+    gain_high: float
+    phase_deg: float
+    delay_s: float
+    delay_frames: float
+    crossover_hz: float
+
+
+def loop_margins(loop: ClosedLoop) -> LoopMargins:
+    """Gain, phase, delay and modulus margin of a stable loop.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The loop.
+
+    Returns
+    -------
+    LoopMargins
+        The margins at the loop's sensor gain.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is not stable.
+
+    Examples
+    --------
+    An integrator of gain 0.5 in a two-frame loop is stable up to a gain of 1:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> margins = lbt.loop_margins(lbt.close_loop(path, lazy))
+    >>> margins.gain_low, round(margins.gain_high, 6)
+    (0.0, 2.0)
+    """
+    loop.require_stable()
+    low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
+    phases, delays, crossovers = [np.inf], [np.inf], [0.0]
+    for index in range(loop.hardware.n_measurements):
+        for frequency, lag in _crossings(loop, index):
+            phases.append(np.degrees(lag))
+            delays.append(lag / (2 * np.pi * frequency))
+            crossovers.append(frequency)
+    delay = float(min(delays))
+    return LoopMargins(
+        modulus=1 / float(hinf_norm(loop.output_sensitivity())),
+        gain_low=low / loop.sensor_gain,
+        gain_high=high / loop.sensor_gain,
+        phase_deg=float(min(phases)),
+        delay_s=delay,
+        delay_frames=delay * loop.hardware.frame_rate_hz,
+        crossover_hz=float(max(crossovers)),
+    )
+
+
+def stable_sensor_gains(
+    hardware: LoopHardware, controller: Controller, *, nominal: float = 1.0
+) -> tuple[float, float]:
+    """Interval of sensor gains around a nominal one for which the loop is stable.
+
+    The spectral radius is followed in steps of 1 % from the nominal gain, and
+    each end is refined by bisection.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Sensor, mirror and delay.
+    controller : Controller
+        The controller.
+    nominal : float, optional
+        Gain inside the interval.
+
+    Returns
+    -------
+    low, high : float
+        Ends of the interval; 0 and inf when it reaches beyond a factor of 1e4.
+        Both are ``nan`` when the loop is not stable at the nominal gain.
+
+    Raises
+    ------
+    ProblemError
+        If the nominal gain is not positive, or the sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=3, modes=1)
+    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> low, high = lbt.stable_sensor_gains(path, lazy)
+    >>> low, round(high, 6)                             # 0.618034 / 0.5
+    (0.0, 1.236068)
+    """
+    centre = number(nominal, "nominal", above=0)
+
+    def excess(gain: float) -> float:
+        return float(spectral_radii(hardware, controller, np.array([gain]))[0]) - 1
+
+    if not excess(centre) < 0:
+        return float("nan"), float("nan")
+    ends = []
+    for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
+        count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
+        gains = centre * ratio ** np.arange(count + 1)
+        outside = np.nonzero(spectral_radii(hardware, controller, gains) >= 1)[0]
+        if outside.size == 0:
+            ends.append(open_end)
+            continue
+        inner, outer = gains[outside[0] - 1], gains[outside[0]]
+        for _ in range(60):
+            middle = (inner + outer) / 2
+            inner, outer = (middle, outer) if excess(middle) < 0 else (inner, middle)
+        ends.append(float(inner))
+    return ends[0], ends[1]
+
+
+def _crossings(loop: ClosedLoop, index: int) -> list[tuple[float, float]]:
+    """Frequencies [Hz] where one broken loop has unit gain, with its distance from -1 [rad].
+
+    With measurement i broken and the rest closed, ``1 + l_i = 1 / S_ii``.
+    """
+    system = loop.output_sensitivity()
+
+    def broken(frequency: float | np.ndarray) -> np.ndarray:
+        response = system.frequency_response(np.atleast_1d(frequency))[:, index, index]
+        return np.asarray(1 / response - 1)
+
+    nodes, _ = resonance_quadrature(loop)
+    excess = np.abs(broken(nodes)) - 1
+    found = []
+    for i in np.nonzero(excess[1:] * excess[:-1] < 0)[0]:
+        frequency = brentq(
+            lambda f: float(np.abs(broken(f)[0]) - 1), nodes[i], nodes[i + 1], xtol=1e-12
+        )
+        phase = float(np.angle(broken(frequency)[0]))
+        found.append((float(frequency), float(np.mod(phase + np.pi, 2 * np.pi))))
+    return found

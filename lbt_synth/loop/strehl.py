@@ -1,0 +1,245 @@
+"""Strehl ratio of a jittering image, by the exact integral over the optical transfer function.
+
+A long exposure multiplies the transfer function by the characteristic function
+of the jitter. For an image that moves by Gaussian jitter of covariance S and by
+sinusoids of complex amplitude a::
+
+    SR = int OTF(f) exp(-2 pi^2 f'S f) prod J0(2 pi |f.a|) df / int OTF(f) df
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.special import j0
+
+from lbt_synth.errors import DimensionError
+from lbt_synth.loop.budget import ResidualBudget
+from lbt_synth.models.atmosphere import ARCSEC_RAD
+from lbt_synth.models.units import nm_per_mas
+from lbt_synth.validation import ComplexArray, FloatArray, number, real_array, semidefinite
+
+_DIRECTIONS = 64
+_SERIES_CHUNK = 4_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imaging:
+    """The camera behind the loop.
+
+    Parameters
+    ----------
+    diameter_m : float
+        Telescope diameter [m].
+    obstruction : float, optional
+        Diameter of the central obstruction as a fraction of the telescope's.
+    wavelength_um : float, optional
+        Imaging wavelength [um].
+    other_modes : float, optional
+        Strehl ratio, in (0, 1], that all other modes leave.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.Imaging(diameter_m=8.22, obstruction=0.11).wavelength_um
+    2.2
+    """
+
+    diameter_m: float
+    obstruction: float = 0.0
+    wavelength_um: float = 2.2
+    other_modes: float = 1.0
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "diameter_m", number(self.diameter_m, "diameter_m", above=0))
+        set_(self, "obstruction", number(self.obstruction, "obstruction", at_least=0, below=1))
+        set_(self, "wavelength_um", number(self.wavelength_um, "wavelength_um", above=0))
+        set_(self, "other_modes", number(self.other_modes, "other_modes", above=0, at_most=1))
+
+    @property
+    def cycles_per_nm(self) -> float:
+        """Highest spatial frequency D/lambda, in cycles per nm of tilt wavefront."""
+        cycles_per_rad = self.diameter_m / (self.wavelength_um * 1e-6)
+        return cycles_per_rad * ARCSEC_RAD * 1e-3 / nm_per_mas(self.diameter_m)
+
+
+def strehl(budget: ResidualBudget, imaging: Imaging) -> float:
+    """Strehl ratio, in [0, 1], of a loop's exact residual on one or two axes.
+
+    Parameters
+    ----------
+    budget : ResidualBudget
+        Residual of tip and tilt.
+    imaging : Imaging
+        The camera.
+
+    Returns
+    -------
+    float
+        Long-exposure Strehl ratio, the other modes included.
+
+    Raises
+    ------
+    DimensionError
+        If the loop has more than two modes.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> quiet = lbt.Controller(A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[0.0] * 2] * 2,
+    ...                        dt_s=1 / 800)
+    >>> still = lbt.residual_budget(lbt.close_loop(path, quiet), lbt.Truth(turbulence=None))
+    >>> round(lbt.strehl(still, lbt.Imaging(diameter_m=8.22, other_modes=0.84)), 12)
+    0.84
+    """
+    return jitter_strehl(
+        budget.gaussian_nm2, imaging=imaging, line_amplitudes_nm=budget.line_amplitudes_nm
+    )
+
+
+def jitter_strehl(
+    covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any = ()
+) -> float:
+    """Strehl ratio of Gaussian and sinusoidal jitter.
+
+    Parameters
+    ----------
+    covariance_nm2 : (2, 2) or (1, 1) array_like
+        Covariance of the Gaussian jitter on the two axes [nm^2 rms wavefront].
+    imaging : Imaging
+        The camera.
+    line_amplitudes_nm : (s, 2) or (s, 1) complex array_like, optional
+        Amplitude and phase of each sinusoid on each axis [nm]; the sinusoids
+        must have different frequencies.
+
+    Returns
+    -------
+    float
+        Strehl ratio in [0, 1], the other modes included.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite, the covariance is indefinite, or sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> camera = lbt.Imaging(diameter_m=8.22)
+    >>> round(lbt.jitter_strehl([[300**2, 0], [0, 300**2]], imaging=camera), 3)
+    0.372
+    """
+    covariance = semidefinite(covariance_nm2, "covariance_nm2")
+    size = covariance.shape[0]
+    _require_axes(size)
+    lines = np.asarray(line_amplitudes_nm, dtype=np.complex128).reshape(-1, size)
+    real_array(np.abs(lines), "line_amplitudes_nm")
+    fx, fy, weight = _weighted_otf(imaging.obstruction)
+    axes = np.stack([fx, fy])[:size] * imaging.cycles_per_nm
+    exponent = np.einsum("if,ij,jf->f", axes, covariance, axes)
+    factor = np.exp(-2 * np.pi**2 * exponent)
+    for amplitude in lines:
+        factor = factor * j0(2 * np.pi * np.abs(amplitude @ axes))
+    return float(imaging.other_modes * np.sum(weight * factor))
+
+
+def strehl_of_series(residual_nm: Any, imaging: Imaging) -> float:
+    """Long-exposure Strehl ratio of a residual series, whatever its distribution.
+
+    Parameters
+    ----------
+    residual_nm : (frames, 2) or (frames, 1) array_like
+        Residual of the axes, frame by frame [nm rms wavefront].
+    imaging : Imaging
+        The camera.
+
+    Returns
+    -------
+    float
+        Strehl ratio in [0, 1] about the mean position, the other modes included.
+
+    Raises
+    ------
+    ProblemError
+        If the series is not finite or has another shape.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> camera = lbt.Imaging(diameter_m=8.22, other_modes=0.9)
+    >>> round(lbt.strehl_of_series([[5.0, 1.0]] * 10, camera), 12)
+    0.9
+    """
+    series = real_array(residual_nm, "residual_nm")
+    if series.ndim != 2 or series.shape[0] == 0:
+        raise DimensionError(f"residual_nm must be (frames, axes); got shape {series.shape}.")
+    _require_axes(series.shape[1])
+    series = series - series.mean(axis=0)
+    fx, fy, weight = _weighted_otf(imaging.obstruction)
+    axes = np.stack([fx, fy])[: series.shape[1]] * imaging.cycles_per_nm
+    characteristic: ComplexArray = np.zeros(weight.size, dtype=np.complex128)
+    step = max(1, _SERIES_CHUNK // weight.size)
+    for start in range(0, len(series), step):
+        characteristic += np.exp(2j * np.pi * (series[start : start + step] @ axes)).sum(axis=0)
+    return float(imaging.other_modes * np.sum(weight * np.real(characteristic)) / len(series))
+
+
+def _require_axes(size: int) -> None:
+    if size not in (1, 2):
+        raise DimensionError(f"a Strehl ratio of jitter takes 1 or 2 axes; got {size} modes.")
+
+
+@lru_cache(maxsize=16)
+def _weighted_otf(obstruction: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Nodes (fx, fy) in units of D/lambda over half the plane, and OTF weights of sum 1."""
+    eps = obstruction
+    kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
+    edges = np.array(sorted(kinks))
+    x, w = np.polynomial.legendre.leggauss(12)
+    half, middle = np.diff(edges)[:, None] / 2, (edges[1:] + edges[:-1])[:, None] / 2
+    radius, weight = (middle + half * x).ravel(), (half * w).ravel()
+    weight = weight * radius * annular_otf(radius, eps)
+    angle = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
+    weights = np.repeat(weight / (weight.sum() * _DIRECTIONS), _DIRECTIONS)
+    return fx, fy, weights
+
+
+def annular_otf(radius: FloatArray, obstruction: Sequence[float] | float) -> FloatArray:
+    """Diffraction-limited transfer function of an annular pupil, at radius f lambda / D.
+
+    Autocorrelation of the annulus: overlap of the discs, less twice that of disc
+    and obstruction, plus that of the obstructions.
+    """
+    rho = np.asarray(radius, dtype=np.float64)
+    eps = float(np.asarray(obstruction))
+    overlap = _lens(rho, 0.5, 0.5)
+    if eps > 0:
+        overlap = overlap - 2 * _lens(rho, 0.5, eps / 2) + _lens(rho, eps / 2, eps / 2)
+    return np.asarray(overlap / (np.pi / 4 * (1 - eps**2)))
+
+
+def _lens(distance: FloatArray, large: float, small: float) -> FloatArray:
+    """Area common to two discs of radii large >= small at a distance."""
+    d = np.clip(distance, max(large - small, 1e-300), large + small)
+    cos_large = np.clip((d**2 + large**2 - small**2) / (2 * d * large), -1, 1)
+    cos_small = np.clip((d**2 + small**2 - large**2) / (2 * d * small), -1, 1)
+    kite = (-d + small + large) * (d + small - large) * (d - small + large) * (d + small + large)
+    area = (
+        large**2 * np.arccos(cos_large)
+        + small**2 * np.arccos(cos_small)
+        - np.sqrt(np.maximum(kite, 0)) / 2
+    )
+    inside = distance <= large - small
+    return np.asarray(np.where(inside, np.pi * small**2, area))

@@ -1,0 +1,42 @@
+"""Stationary covariances: the discrete Lyapunov (Stein) equation."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
+
+from lbt_synth.validation import FloatArray
+
+
+def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Solve ``X = A X A' + Q`` for a stable A, with one step of iterative refinement.
+
+    Parameters
+    ----------
+    A : (n, n) ndarray
+        State matrix, spectral radius below 1 (not checked here).
+    Q : (n, n) ndarray
+        Symmetric covariance of the driving noise.
+
+    Returns
+    -------
+    (n, n) ndarray
+        The covariance of ``x(k+1) = A x(k) + v(k)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.lyapunov import stationary_covariance
+    >>> float(stationary_covariance(np.array([[0.6]]), np.array([[64.0]]))[0, 0])
+    100.0
+    """
+    X = solve_discrete_lyapunov(A, Q)
+    X = X + solve_discrete_lyapunov(A, A @ X @ A.T - X + Q)
+    return np.asarray((X + X.T) / 2)
+
+
+def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:
+    """Relative residual of ``X = A X A' + Q`` in the 1-norm."""
+    AXA = A @ X @ A.T
+    scale = np.linalg.norm(X, 1) + np.linalg.norm(AXA, 1) + np.linalg.norm(Q, 1)
+    return float(np.linalg.norm(AXA - X + Q, 1) / scale) if scale > 0 else 0.0

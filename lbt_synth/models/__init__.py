@@ -1,0 +1,34 @@
+"""Models of turbulence, vibration, sensor, mirror, and the plant made of them."""
+
+from lbt_synth.models.ar import ARModel
+from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.plant import FullStatePlant, TipTiltPlant, retuned_plant, tip_tilt_plant
+from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.models.sensor import illuminated_subapertures, pyramid_tilt_noise_nm
+from lbt_synth.models.truth import SinusoidalVibration, Spectrum, TabulatedSpectrum, Truth
+from lbt_synth.models.turbulence import ar1_turbulence, ar2_turbulence, le_roux_pole
+from lbt_synth.models.units import nm_per_mas
+from lbt_synth.models.vibration import Vibration
+
+__all__ = [
+    "ARModel",
+    "Atmosphere",
+    "EstimationProblem",
+    "FullStatePlant",
+    "LoopHardware",
+    "SinusoidalVibration",
+    "Spectrum",
+    "TabulatedSpectrum",
+    "TipTiltPlant",
+    "Truth",
+    "Vibration",
+    "ar1_turbulence",
+    "ar2_turbulence",
+    "illuminated_subapertures",
+    "le_roux_pole",
+    "nm_per_mas",
+    "pyramid_tilt_noise_nm",
+    "retuned_plant",
+    "tip_tilt_plant",
+]

@@ -1,0 +1,132 @@
+"""Auto-regressive processes of any order, with their spectrum and variance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.lyapunov import stationary_covariance
+from lbt_synth.validation import FloatArray, frozen, number, real_array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ARModel:
+    """Stationary process ``x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)``.
+
+    Parameters
+    ----------
+    coefficients : (order,) array_like
+        a1, a2, ...
+    driving_rms_nm : float
+        Standard deviation of the white noise v [nm].
+    frame_rate_hz : float
+        Sampling frequency [Hz].
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or the process is not stationary.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> ar1 = lbt.ARModel(coefficients=[0.6], driving_rms_nm=8.0, frame_rate_hz=1000)
+    >>> round(ar1.rms_nm, 6)
+    10.0
+    """
+
+    coefficients: FloatArray
+    driving_rms_nm: float
+    frame_rate_hz: float
+
+    def __post_init__(self) -> None:
+        a = np.atleast_1d(real_array(self.coefficients, "coefficients"))
+        if a.ndim != 1 or a.size == 0:
+            raise DimensionError(
+                f"coefficients must be a list of at least one number; got shape {a.shape}."
+            )
+        object.__setattr__(self, "coefficients", frozen(a))
+        object.__setattr__(
+            self, "driving_rms_nm", number(self.driving_rms_nm, "driving_rms_nm", above=0)
+        )
+        object.__setattr__(
+            self, "frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0)
+        )
+        radius = float(np.max(np.abs(np.linalg.eigvals(self.companion))))
+        if not radius < 1:
+            raise ProblemError(
+                "an AR model must be stationary, all poles inside the unit circle; got a pole of "
+                f"modulus {radius:.9g}. Check the signs: x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)."
+            )
+
+    @property
+    def order(self) -> int:
+        """Number of coefficients."""
+        return int(self.coefficients.size)
+
+    @property
+    def companion(self) -> FloatArray:
+        """State matrix (order, order) of the state [x(k), x(k-1), ...]."""
+        A = np.eye(self.order, k=-1)
+        A[0] = self.coefficients
+        return A
+
+    @property
+    def rms_nm(self) -> float:
+        """Stationary standard deviation [nm]."""
+        drive = np.zeros((self.order, self.order))
+        drive[0, 0] = self.driving_rms_nm**2
+        variance = stationary_covariance(self.companion, drive)[0, 0]
+        return float(np.sqrt(variance))
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """One-sided power spectrum [nm^2/Hz] at frequencies up to Nyquist.
+
+        Parameters
+        ----------
+        frequency_hz : array_like
+            Frequencies [Hz].
+
+        Returns
+        -------
+        ndarray
+            ``2 s^2 / (f_s |1 - a1 z^-1 - a2 z^-2 - ...|^2)``.
+
+        Raises
+        ------
+        ProblemError
+            If a frequency is not finite.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> white = lbt.ARModel(coefficients=[0.0], driving_rms_nm=3.0, frame_rate_hz=900)
+        >>> float(white.psd(100.0) * 450)
+        9.0
+        """
+        frequency = real_array(frequency_hz, "frequency_hz")
+        delay = np.exp(-2j * np.pi * frequency / self.frame_rate_hz)
+        lags = np.arange(1, self.order + 1)
+        response = 1 - np.sum(self.coefficients * delay[..., None] ** lags, axis=-1)
+        density = 2 * self.driving_rms_nm**2 / self.frame_rate_hz / np.abs(response) ** 2
+        return np.asarray(density)
+
+
+def resonance_coefficients(
+    frequency_hz: float, damping: float, frame_rate_hz: float
+) -> tuple[float, float]:
+    """Coefficients a1, a2 of a damped oscillator sampled at the frame rate.
+
+    ``a1 = 2 exp(-k w T) cos(w T sqrt(1 - k^2))``, ``a2 = -exp(-2 k w T)``.
+    """
+    wt = 2 * np.pi * frequency_hz / frame_rate_hz
+    decay = np.exp(-damping * wt)
+    return float(2 * decay * np.cos(wt * np.sqrt(1 - damping**2))), float(-(decay**2))
+
+
+def resonance_variance_ratio(a1: float, a2: float) -> float:
+    """Variance of an AR2 process over the variance of its driving noise."""
+    return (1 - a2) / ((1 + a2) * ((1 - a2) ** 2 - a1**2))

@@ -1,0 +1,190 @@
+"""Tip/tilt of a von Karman turbulence layer that the wind carries along.
+
+Sources: R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976), doi:10.1364/JOSA.66.000207
+(Zernike filter functions); J.-M. Conan, G. Rousset, P.-Y. Madec, J. Opt. Soc.
+Am. A 12, 1559 (1995), doi:10.1364/JOSAA.12.001559 (temporal spectra under
+Taylor's hypothesis).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.special import jv
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.validation import FloatArray, number, real_array
+
+ARCSEC_RAD = np.pi / 180 / 3600
+_VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Atmosphere:
+    """One frozen layer of von Karman turbulence in front of a telescope.
+
+    Parameters
+    ----------
+    seeing_arcsec : float
+        Seeing (full width at half maximum) at ``seeing_wavelength_um`` [arcsec].
+    outer_scale_m : float or None
+        Outer scale L0 [m]; None for Kolmogorov turbulence, L0 infinite.
+    wind_speed_m_s : float
+        Speed of the layer [m/s].
+    diameter_m : float
+        Telescope diameter D [m].
+    obstruction : float, optional
+        Diameter of the central obstruction as a fraction of D.
+    seeing_wavelength_um : float, optional
+        Wavelength of the seeing [um].
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    The Large Binocular Telescope of Agapito et al. 2008, Table I:
+
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
+    ...                      diameter_m=8.22)
+    >>> round(air.tilt_rms_nm, 1)
+    591.7
+    """
+
+    seeing_arcsec: float
+    outer_scale_m: float | None
+    wind_speed_m_s: float
+    diameter_m: float
+    obstruction: float = 0.0
+    seeing_wavelength_um: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("seeing_arcsec", "wind_speed_m_s", "diameter_m", "seeing_wavelength_um"):
+            object.__setattr__(self, name, number(getattr(self, name), name, above=0))
+        if self.outer_scale_m is not None:
+            object.__setattr__(
+                self, "outer_scale_m", number(self.outer_scale_m, "outer_scale_m", above=0)
+            )
+        object.__setattr__(
+            self, "obstruction", number(self.obstruction, "obstruction", at_least=0, below=1)
+        )
+
+    @property
+    def fried_parameter_m(self) -> float:
+        """Fried parameter r0 = 0.976 lambda / seeing at the seeing's wavelength [m]."""
+        return 0.976 * self.seeing_wavelength_um * 1e-6 / (self.seeing_arcsec * ARCSEC_RAD)
+
+    @property
+    def tilt_rms_nm(self) -> float:
+        """Standard deviation of tip, and of tilt [nm rms wavefront]."""
+        return float(np.sqrt(_tilt_variance(self)))
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """One-sided temporal power spectrum of one axis [nm^2/Hz].
+
+        The mean over wind directions: the two axes have the same spectrum and
+        are taken as independent. Its integral over frequency is
+        ``tilt_rms_nm**2``.
+
+        Parameters
+        ----------
+        frequency_hz : array_like
+            Frequencies [Hz], at least 0.
+
+        Returns
+        -------
+        ndarray
+            Spectrum at each frequency [nm^2/Hz].
+
+        Raises
+        ------
+        ProblemError
+            If a frequency is negative or not finite.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
+        ...                      diameter_m=8.22)
+        >>> slow, fast = air.psd([0.1, 100.0])
+        >>> bool(slow > 1e9 * fast)
+        True
+        """
+        frequency = real_array(frequency_hz, "frequency_hz")
+        if np.any(frequency < 0):
+            raise ProblemError(f"frequency_hz must be at least 0; got {frequency.min()}.")
+        log_f, log_psd, low = _tilt_psd_table(self)
+        with np.errstate(divide="ignore"):
+            x = np.log(frequency)
+        values = np.exp(np.interp(x, log_f, log_psd))
+        # beyond the table: the power law f^(-17/3) of tilt
+        tail = x > log_f[-1]
+        values = np.where(
+            tail, np.exp(log_psd[-1] - 17 / 3 * (np.where(tail, x, log_f[-1]) - log_f[-1])), values
+        )
+        return np.asarray(np.where(x < log_f[0], low, values))
+
+
+def _nm_per_radian(air: Atmosphere) -> float:
+    return air.seeing_wavelength_um * 1e3 / (2 * np.pi)
+
+
+def _filtered_spectrum(air: Atmosphere, f: FloatArray) -> FloatArray:
+    """Spatial phase spectrum times the tilt filter, mean over directions [nm^2 m^2].
+
+    The filter is Noll's for a disc, and for an annulus the transform of the
+    annular tilt of unit rms.
+    """
+    inner = 0.0 if air.outer_scale_m is None else air.outer_scale_m**-2
+    eps = air.obstruction
+    argument = np.pi * air.diameter_m * f
+    amplitude = 2 * (jv(2, argument) - eps**3 * jv(2, eps * argument)) / argument
+    tilt_filter = 2 * amplitude**2 / ((1 - eps**2) ** 2 * (1 + eps**2))
+    phase = _VON_KARMAN * air.fried_parameter_m ** (-5 / 3) * (f**2 + inner) ** (-11 / 6)
+    return np.asarray(phase * tilt_filter * _nm_per_radian(air) ** 2)
+
+
+def _panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Legendre nodes and weights on consecutive panels, flattened."""
+    x, w = np.polynomial.legendre.leggauss(order)
+    half = np.diff(edges)[:, None] / 2
+    mid = (edges[:-1] + edges[1:])[:, None] / 2
+    return (mid + half * x).ravel(), (half * w).ravel()
+
+
+def _spatial_panels(diameter_m: float) -> tuple[FloatArray, FloatArray]:
+    """Nodes over spatial frequency [1/m]: octaves below 1/D, steps of 1/(2D) above."""
+    low = np.geomspace(1e-9, 0.25, 90)
+    high = np.arange(0.5, 40.5, 0.5)
+    return _panels(np.concatenate([low, high]) / diameter_m, 8)
+
+
+@lru_cache(maxsize=32)
+def _tilt_variance(air: Atmosphere) -> float:
+    f, w = _spatial_panels(air.diameter_m)
+    return float(np.sum(2 * np.pi * f * w * _filtered_spectrum(air, f)))
+
+
+@lru_cache(maxsize=32)
+def _tilt_psd_table(air: Atmosphere) -> tuple[FloatArray, FloatArray, float]:
+    """Logarithms of frequency and spectrum on a grid, and the value at zero frequency.
+
+    ``S(f) = (4 / V) int_0^inf Phi(f/V, f_y) df_y`` (one-sided).
+    """
+    scale = air.wind_speed_m_s / air.diameter_m
+    frequency = np.concatenate(
+        [np.geomspace(1e-4, 0.3, 120, endpoint=False), np.linspace(0.3, 12, 480, endpoint=False),
+         np.linspace(12, 120, 400)]
+    ) * scale  # fmt: skip
+    fy, wy = _spatial_panels(air.diameter_m)
+    psd = np.empty(frequency.size)
+    for i, f in enumerate(frequency):
+        radius = np.hypot(f / air.wind_speed_m_s, fy)
+        psd[i] = 4 / air.wind_speed_m_s * np.sum(wy * _filtered_spectrum(air, radius))
+    return np.log(frequency), np.log(psd), float(psd[0])

@@ -1,0 +1,130 @@
+"""The path from command to measurement: mirror, delay, sensor (Agapito et al. 2008, eqs. 1-2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.validation import FloatArray, frozen, matrix, number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopHardware:
+    """Sensor, mirror and delay around which a controller closes the loop.
+
+    In frames k of ``1 / frame_rate_hz``, with d the total delay::
+
+        y(k)       = sensor_matrix phi_res(k-1) + noise(k)
+        phi_res(k) = phi_tot(k) - phi_cor(k)
+        phi_cor(k) = influence_matrix u(k-d+1)
+
+    A fractional delay ``d = j + 1 + f`` holds the command of two frames within
+    one exposure: ``phi_cor(k) = influence_matrix ((1-f) u(k-j) + f u(k-j-1))``.
+
+    Parameters
+    ----------
+    frame_rate_hz : float
+        Frame rate [Hz].
+    delay_frames : float, optional
+        Total delay d [frames], at least 1.
+    sensor_matrix : (q, n) array_like, optional
+        Sensor response to the n modes; the identity by default.
+    influence_matrix : (n, m) array_like, optional
+        Mirror response to the m commands; the identity by default.
+    modes : int, optional
+        Number of modes n when neither matrix is given.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite, out of range, or the sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.25)
+    >>> [float(tap) for tap in path.mirror_taps]       # of u(k), u(k-1), u(k-2)
+    [0.0, 0.75, 0.25]
+    """
+
+    frame_rate_hz: float
+    delay_frames: float = 2.0
+    sensor_matrix: FloatArray | None = None
+    influence_matrix: FloatArray | None = None
+    modes: int = 2
+
+    def __post_init__(self) -> None:
+        sensor, influence, n = self.sensor_matrix, self.influence_matrix, self.modes
+        if sensor is not None:
+            sensor = matrix(sensor, "sensor_matrix")
+            n = sensor.shape[1]
+        if influence is not None:
+            rows = None if sensor is None else (n, f"to match sensor_matrix {sensor.shape}")
+            influence = matrix(influence, "influence_matrix", rows=rows)
+            n = influence.shape[0]
+        if n < 1 or (influence is not None and influence.shape[1] < 1):
+            raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
+        object.__setattr__(self, "modes", n)
+        object.__setattr__(self, "sensor_matrix", frozen(np.eye(n)) if sensor is None else sensor)
+        object.__setattr__(
+            self, "influence_matrix", frozen(np.eye(n)) if influence is None else influence
+        )
+        object.__setattr__(
+            self, "frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0)
+        )
+        object.__setattr__(
+            self,
+            "delay_frames",
+            number(
+                self.delay_frames,
+                "delay_frames",
+                at_least=1,
+                at_most=100,
+                hint="One frame is the exposure itself: no loop is faster.",
+            ),
+        )
+
+    @property
+    def sensor(self) -> FloatArray:
+        """Sensor matrix (q, n)."""
+        assert self.sensor_matrix is not None  # set by __post_init__
+        return self.sensor_matrix
+
+    @property
+    def influence(self) -> FloatArray:
+        """Influence matrix N (n, m)."""
+        assert self.influence_matrix is not None  # set by __post_init__
+        return self.influence_matrix
+
+    @property
+    def projector(self) -> FloatArray:
+        """Generalised inverse of the influence matrix, (m, n)."""
+        return frozen(np.linalg.pinv(self.influence))
+
+    @property
+    def n_commands(self) -> int:
+        """Number of commands m."""
+        return int(self.influence.shape[1])
+
+    @property
+    def n_measurements(self) -> int:
+        """Number of measurements q."""
+        return int(self.sensor.shape[0])
+
+    @property
+    def dt_s(self) -> float:
+        """Frame period [s]."""
+        return 1 / self.frame_rate_hz
+
+    @property
+    def mirror_taps(self) -> FloatArray:
+        """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``."""
+        whole = int(np.floor(self.delay_frames - 1))
+        fraction = self.delay_frames - 1 - whole
+        taps = np.zeros(whole + (2 if fraction > 0 else 1))
+        taps[whole] = 1 - fraction
+        if fraction > 0:
+            taps[whole + 1] = fraction
+        return frozen(taps)

@@ -1,0 +1,398 @@
+"""State-space model of tip/tilt for filter design (Agapito et al. 2008, eqs. 5-8).
+
+The paper's state, for n modes, p vibrations and m commands::
+
+    x(k) = [vib(k) (p), vib(k-1) (p), tur(k) (n), tot(k-1) (n), u(k-2) (m)]
+
+with the errata corrected: the vibration row holds ``A1, -A2``, the estimated
+signal is ``z = L x`` with ``L = [E 0 I 0 0]`` predicted one frame ahead, and
+E (n, p) embeds the vibrations into the modes. Turbulence of order r has r
+such blocks, a longer delay has a chain of past totals. The reduced form drops
+the known input u, whose estimation error is zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.ar import ARModel
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.models.vibration import Vibration
+from lbt_synth.statespace import Controller
+from lbt_synth.validation import FloatArray, definite, frozen, number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FullStatePlant(EstimationProblem):
+    """The plant with its past commands as states (the paper's full form).
+
+    ``x(k+1) = A x(k) + B_known u(k-1) + B w(k)``,
+    ``y(k) = C x(k) + D_known u(k-1) + D w(k)``; ``D_known`` is zero from a
+    delay of two frames up. ``L`` is the paper's F.
+
+    Parameters
+    ----------
+    B_known : (n, m) array_like
+        Known input to state.
+    D_known : (q, m) array_like
+        Known input to measurement.
+    hardware : LoopHardware
+        The loop.
+    """
+
+    B_known: FloatArray
+    D_known: FloatArray
+    hardware: LoopHardware
+
+    def controller(self, gain_predictor: FloatArray) -> Controller:
+        """Controller from y(k) to u(k), the known input included.
+
+        ``u(k) = N^+ L x_hat(k+1 | k)``; the past command u(k-1) is therefore
+        ``N^+ L x_hat(k | k-1)`` and needs no state of its own.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain over the full state.
+
+        Returns
+        -------
+        Controller
+            In new-state form.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+        """
+        gain = self._checked_gain(gain_predictor)
+        to_command = self.hardware.projector @ self.L
+        A = self.A - gain @ self.C + (self.B_known - gain @ self.D_known) @ to_command
+        D = np.zeros((to_command.shape[0], gain.shape[1]))
+        return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s)
+
+    def generalised(self) -> tuple[FloatArray, FloatArray]:
+        """Matrices of the H-infinity filter's generalised plant (eq. 8, errata 2 and 7).
+
+        Returns
+        -------
+        plant : (n + l + q, n + p + l) ndarray
+            Maps ``[x(k), w(k), z_hat(k)]`` to ``[x(k+1), z_hat(k) - z(k), y(k)]``.
+        known : (n + l + q, m) ndarray
+            The columns of the known input u(k-1).
+        """
+        n, p = self.B.shape
+        l, q = self.L.shape[0], self.C.shape[0]
+        plant = np.block(
+            [
+                [self.A, self.B, np.zeros((n, l))],
+                [-self.L, np.zeros((l, p)), np.eye(l)],
+                [self.C, self.D, np.zeros((q, l))],
+            ]
+        )
+        known = np.vstack([self.B_known, np.zeros((l, self.B_known.shape[1])), self.D_known])
+        return plant, known
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TipTiltPlant(EstimationProblem):
+    """Turbulence, vibrations, delay and noise as an estimation problem (reduced form).
+
+    Made by :func:`tip_tilt_plant`. The measurement of this problem is
+    ``ybar(k) = y(k) + sensor_matrix N u(k-d)``: the known input is taken out.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop, with the sensor gain that the design assumes in its sensor matrix.
+    turbulence : tuple of ARModel
+        One model a mode.
+    vibrations : tuple of Vibration
+        The vibrations, possibly none.
+    """
+
+    hardware: LoopHardware
+    turbulence: tuple[ARModel, ...]
+    vibrations: tuple[Vibration, ...]
+
+    def full(self) -> FullStatePlant:
+        """Return the same plant with the past commands as states.
+
+        Returns
+        -------
+        FullStatePlant
+            For the paper's case, delay 2 and AR1, of order 2p + 2n + m.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
+        >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+        >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
+        ...                            noise_nm=15.5)
+        >>> plant.full().A.shape            # 2 p + 2 n + m = 2 + 4 + 2
+        (8, 8)
+        """
+        hw = self.hardware
+        taps = hw.mirror_taps
+        n, m = self.A.shape[0], hw.n_commands
+        past = len(taps) - 1  # states u(k-2), u(k-3), ... ; u(k-1) is the input
+        A = np.zeros((n + past * m, n + past * m))
+        A[:n, :n] = self.A
+        B_known = np.zeros((n + past * m, m))
+        if past:
+            B_known[n : n + m] = np.eye(m)
+            A[n + m :, n:-m] = np.eye((past - 1) * m)
+        response = -hw.sensor @ hw.influence
+        C = np.hstack([self.C, *(tap * response for tap in taps[1:])])
+        pad = np.zeros((past * m, self.B.shape[1]))
+        return FullStatePlant(
+            A=A,
+            B=np.vstack([self.B, pad]),
+            C=C,
+            D=self.D,
+            L=np.hstack([self.L, np.zeros((self.L.shape[0], past * m))]),
+            B_known=frozen(B_known),
+            D_known=frozen(taps[0] * response),
+            hardware=hw,
+            dt_s=self.dt_s,
+        )
+
+    def controller(self, gain_predictor: FloatArray) -> Controller:
+        """Controller from y(k) to u(k), the known input included.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain over the reduced state.
+
+        Returns
+        -------
+        Controller
+            In new-state form: the reduced estimator, and the past commands.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+        """
+        gain = self._checked_gain(gain_predictor)
+        full = self.full()
+        padded = np.zeros((full.A.shape[0], gain.shape[1]))
+        padded[: gain.shape[0]] = gain
+        return full.controller(padded)
+
+
+def tip_tilt_plant(
+    *,
+    frame_rate_hz: float,
+    turbulence: ARModel | Sequence[ARModel],
+    noise_nm: Any,
+    vibrations: Sequence[Vibration] | None = None,
+    delay_frames: float = 2.0,
+    sensor_matrix: Any = None,
+    influence_matrix: Any = None,
+    sensor_gain: float = 1.0,
+    modes: int = 2,
+) -> TipTiltPlant:
+    """Assemble the plant of a tip/tilt loop from its parts.
+
+    Parameters
+    ----------
+    frame_rate_hz : float
+        Frame rate [Hz].
+    turbulence : ARModel or sequence of ARModel
+        Turbulence of each mode; one model serves all modes.
+    noise_nm : float or (q, q) array_like
+        Standard deviation of the measurement noise per frame, or its covariance [nm^2].
+    vibrations : sequence of Vibration, optional
+        The vibrations; None for a plant without any.
+    delay_frames : float, optional
+        Total delay of the loop [frames], at least 1, fractions allowed. For a
+        fractional delay the estimated signal is interpolated between two frames.
+    sensor_matrix : (q, n) array_like, optional
+        Sensor response; the identity by default.
+    influence_matrix : (n, m) array_like, optional
+        Mirror response; the identity by default.
+    sensor_gain : float, optional
+        Sensor (optical) gain that the design assumes; multiplies the sensor matrix.
+    modes : int, optional
+        Number of modes n when no matrix gives it.
+
+    Returns
+    -------
+    TipTiltPlant
+        The reduced estimation problem, with ``w = [v_vib, v_tur, noise]``.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite, out of range, or sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
+    ...                            noise_nm=15.5, modes=1)
+    >>> plant.A.shape
+    (4, 4)
+    """
+    gain = number(sensor_gain, "sensor_gain", above=0)
+    hardware = LoopHardware(
+        frame_rate_hz=frame_rate_hz,
+        delay_frames=delay_frames,
+        sensor_matrix=sensor_matrix,
+        influence_matrix=influence_matrix,
+        modes=modes,
+    )
+    if gain != 1:
+        hardware = LoopHardware(
+            frame_rate_hz=hardware.frame_rate_hz,
+            delay_frames=hardware.delay_frames,
+            sensor_matrix=gain * hardware.sensor,
+            influence_matrix=hardware.influence,
+        )
+    models = _per_mode(turbulence, hardware)
+    lines = _checked_vibrations(vibrations, hardware)
+    noise_factor = _noise_factor(noise_nm, hardware.n_measurements)
+
+    n, p, order = hardware.modes, len(lines), max(model.order for model in models)
+    ceil_delay = max(int(np.ceil(hardware.delay_frames)), 2)
+    chain = ceil_delay - 1
+    ar2 = [line.ar_model(hardware.frame_rate_hz) for line in lines]
+    embedding = np.array([line.direction for line in lines]).reshape(p, n).T
+    coefficients = np.zeros((n, order))
+    for row, model in zip(coefficients, models, strict=True):
+        row[: model.order] = model.coefficients
+
+    vib, tur, tot = 0, 2 * p, 2 * p + order * n  # where each part of the state begins
+    size = tot + chain * n
+    A = np.zeros((size, size))
+    A[vib : vib + p, vib : vib + p] = np.diag([m.coefficients[0] for m in ar2])
+    A[vib : vib + p, vib + p : vib + 2 * p] = np.diag([m.coefficients[1] for m in ar2])
+    A[vib + p : vib + 2 * p, vib : vib + p] = np.eye(p)
+    for lag in range(order):
+        A[tur : tur + n, tur + lag * n : tur + (lag + 1) * n] = np.diag(coefficients[:, lag])
+    A[tur + n : tot, tur : tot - n] = np.eye((order - 1) * n)
+    A[tot : tot + n, vib : vib + p] = embedding
+    A[tot : tot + n, tur : tur + n] = np.eye(n)
+    A[tot + n :, tot : size - n] = np.eye((chain - 1) * n)
+
+    q = hardware.n_measurements
+    B = np.zeros((size, p + n + q))
+    B[vib : vib + p, :p] = np.diag([m.driving_rms_nm for m in ar2])
+    B[tur : tur + n, p : p + n] = np.diag([m.driving_rms_nm for m in models])
+    C = np.zeros((q, size))
+    C[:, size - n :] = hardware.sensor
+    D = np.hstack([np.zeros((q, p + n)), noise_factor])
+
+    late = ceil_delay - hardware.delay_frames  # weight of the frame before
+    L = np.zeros((n, size))
+    L[:, vib : vib + p] = (1 - late) * embedding
+    L[:, tur : tur + n] = (1 - late) * np.eye(n)
+    L[:, tot : tot + n] += late * np.eye(n)
+    return TipTiltPlant(
+        A=A, B=B, C=C, D=D, L=L, dt_s=hardware.dt_s,
+        hardware=hardware, turbulence=models, vibrations=lines,
+    )  # fmt: skip
+
+
+def _per_mode(
+    turbulence: ARModel | Sequence[ARModel], hardware: LoopHardware
+) -> tuple[ARModel, ...]:
+    n = hardware.modes
+    models = (turbulence,) * n if isinstance(turbulence, ARModel) else tuple(turbulence)
+    if len(models) != n:
+        raise DimensionError(
+            f"turbulence must be one ARModel, or one a mode ({n}); got {len(models)}."
+        )
+    for model in models:
+        if not np.isclose(model.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
+            raise ProblemError(
+                f"the turbulence model must be sampled at the frame rate "
+                f"{hardware.frame_rate_hz:.6g} Hz; got {model.frame_rate_hz:.6g} Hz."
+            )
+    return models
+
+
+def _checked_vibrations(
+    vibrations: Sequence[Vibration] | None, hardware: LoopHardware
+) -> tuple[Vibration, ...]:
+    if vibrations is None:
+        return ()
+    lines = tuple(vibrations)
+    if not lines:
+        raise ProblemError(
+            "vibrations is empty; expected at least one Vibration, or None (leave it out) "
+            "for a plant without vibrations."
+        )
+    for line in lines:
+        if len(line.direction) != hardware.modes:
+            raise DimensionError(
+                f"the direction of a vibration must have {hardware.modes} components, one a mode; "
+                f"got {len(line.direction)} at {line.frequency_hz:.6g} Hz."
+            )
+    return lines
+
+
+def _noise_factor(noise_nm: Any, q: int) -> FloatArray:
+    if np.ndim(noise_nm) == 0:
+        return frozen(number(noise_nm, "noise_nm", above=0) * np.eye(q))
+    covariance = definite(noise_nm, "noise_nm", size=(q, "to match the measurements"))
+    return frozen(np.linalg.cholesky(covariance))
+
+
+def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") -> TipTiltPlant:
+    """Return a plant whose model has every vibration at another frequency.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant.
+    shift_hz : float
+        Added to the frequency of each vibration [Hz].
+    hold : {"rms", "driving"}, optional
+        What stays: the rms of each vibration, or that of its driving noise.
+
+    Returns
+    -------
+    TipTiltPlant
+        The plant with a frequency error.
+
+    Raises
+    ------
+    ProblemError
+        If a shifted frequency leaves (0, Nyquist), or there is no vibration.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
+    ...                            noise_nm=15.5)
+    >>> lbt.retuned_plant(plant, -3.5).vibrations[0].frequency_hz
+    16.5
+    """
+    shift = number(shift_hz, "shift_hz")
+    hw = plant.hardware
+    return tip_tilt_plant(
+        frame_rate_hz=hw.frame_rate_hz,
+        turbulence=plant.turbulence,
+        noise_nm=plant.R,
+        vibrations=[
+            line.retuned(line.frequency_hz + shift, frame_rate_hz=hw.frame_rate_hz, hold=hold)
+            for line in plant.vibrations
+        ],
+        delay_frames=hw.delay_frames,
+        sensor_matrix=hw.sensor,
+        influence_matrix=hw.influence,
+    )

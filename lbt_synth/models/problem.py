@@ -1,0 +1,173 @@
+"""The estimation problem that every filter of this package solves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lbt_synth.errors import DefinitenessError
+from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.validation import FloatArray, definite, frozen, matrix, number, square
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EstimationProblem:
+    """Estimate ``z = L x`` from past ``y``, where ``x+ = A x + B w`` and ``y = C x + D w``.
+
+    The filter is the strictly causal one-step predictor: the estimate of z(k)
+    uses y up to k-1. For the Kalman filter w is white noise of unit variance,
+    for the H-infinity filter any signal of unit energy; B and D carry the
+    weights. B D' need not be zero.
+
+    Parameters
+    ----------
+    A : (n, n) array_like
+        State matrix.
+    B : (n, p) array_like
+        Disturbance to state.
+    C : (q, n) array_like
+        State to measurement.
+    D : (q, p) array_like
+        Disturbance to measurement; ``D D'`` must be positive definite.
+    L : (l, n) array_like
+        State to the signal that is estimated.
+    dt_s : float, optional
+        Sampling period [s]; 1 when the samples have no physical rate.
+
+    Raises
+    ------
+    DimensionError
+        If sizes clash.
+    NonFiniteError
+        If an entry is NaN or infinite.
+    DefinitenessError
+        If ``D D'`` is singular: some combination of measurements is free of noise.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> walk = lbt.EstimationProblem(A=[[1.0]], B=[[1.0, 0.0]], C=[[1.0]], D=[[0.0, 1.0]],
+    ...                              L=[[1.0]])
+    >>> round(lbt.kalman(walk).rms ** 2, 6)      # the golden ratio
+    1.618034
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    L: FloatArray
+    dt_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        A = square(self.A, "A")
+        n = A.shape[0]
+        why = f"to match A {A.shape}"
+        B = matrix(self.B, "B", rows=(n, why))
+        C = matrix(self.C, "C", cols=(n, why))
+        D = matrix(
+            self.D,
+            "D",
+            rows=(C.shape[0], f"to match C {C.shape}"),
+            cols=(B.shape[1], f"to match B {B.shape}"),
+        )
+        L = matrix(self.L, "L", cols=(n, why))
+        try:
+            definite(D @ D.T, "D D'")
+        except DefinitenessError as error:
+            raise DefinitenessError(
+                f"{error} Every measurement needs noise of its own: add a column to D."
+            ) from error
+        for name, value in (("A", A), ("B", B), ("C", C), ("D", D), ("L", L)):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
+
+    @property
+    def Q(self) -> FloatArray:
+        """Covariance of the process noise, ``B B'`` (n, n)."""
+        return frozen(self.B @ self.B.T)
+
+    @property
+    def R(self) -> FloatArray:
+        """Covariance of the measurement noise, ``D D'`` (q, q)."""
+        return frozen(self.D @ self.D.T)
+
+    @property
+    def S(self) -> FloatArray:
+        """Cross-covariance of process and measurement noise, ``B D'`` (n, q)."""
+        return frozen(self.B @ self.D.T)
+
+    def error_system(self, gain_predictor: FloatArray) -> StateSpace:
+        """System from w to the estimation error ``z - z_hat`` of a predictor gain.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Gain of ``x_hat(k+1) = A x_hat(k) + gain (y(k) - C x_hat(k))``.
+
+        Returns
+        -------
+        StateSpace
+            ``(A - gain C, B - gain D, L, 0)``.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> p = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> float(p.error_system([[0.4]]).A[0, 0])
+        0.5
+        """
+        gain = self._checked_gain(gain_predictor)
+        return StateSpace(
+            A=self.A - gain @ self.C,
+            B=self.B - gain @ self.D,
+            C=self.L,
+            D=frozen([[0.0] * self.B.shape[1]] * self.L.shape[0]),
+            dt_s=self.dt_s,
+        )
+
+    def controller(self, gain_predictor: FloatArray) -> Controller:
+        """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain.
+
+        Returns
+        -------
+        Controller
+            The filter, in new-state form.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> p = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> float(p.controller([[0.4]]).start().step([1.0])[0])
+        0.4
+        """
+        gain = self._checked_gain(gain_predictor)
+        return Controller(
+            A=self.A - gain @ self.C,
+            B=gain,
+            C=self.L,
+            D=frozen([[0.0] * self.C.shape[0]] * self.L.shape[0]),
+            dt_s=self.dt_s,
+        )
+
+    def _checked_gain(self, gain_predictor: FloatArray) -> FloatArray:
+        return matrix(
+            gain_predictor,
+            "gain_predictor",
+            rows=(self.A.shape[0], f"to match A {self.A.shape}"),
+            cols=(self.C.shape[0], f"to match C {self.C.shape}"),
+        )

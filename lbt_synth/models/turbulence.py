@@ -1,0 +1,170 @@
+"""Auto-regressive models of the turbulence's tip and tilt.
+
+AR1: B. Le Roux et al., J. Opt. Soc. Am. A 21, 1261 (2004),
+doi:10.1364/JOSAA.21.001261. AR2: fitted here by the Whittle likelihood
+(P. Whittle, Ark. Mat. 2, 423 (1953), doi:10.1007/BF02590998) of the measured
+series, turbulence plus white noise: what lies below the noise does not count.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize
+
+from lbt_synth.errors import NumericalError
+from lbt_synth.models.ar import ARModel, resonance_coefficients, resonance_variance_ratio
+from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.validation import frozen, integer, number
+
+
+def le_roux_pole(
+    *, wind_speed_m_s: float, diameter_m: float, frame_rate_hz: float, radial_order: int = 1
+) -> float:
+    """Pole of the AR1 model, ``exp(-2 pi f_c / f_s)`` with ``f_c = 0.3 (n + 1) V / D``.
+
+    Parameters
+    ----------
+    wind_speed_m_s : float
+        Wind speed V [m/s].
+    diameter_m : float
+        Telescope diameter D [m].
+    frame_rate_hz : float
+        Sampling frequency f_s [Hz].
+    radial_order : int, optional
+        Radial order n of the Zernike mode; 1 for tip and tilt.
+
+    Returns
+    -------
+    float
+        The pole, in (0, 1).
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> round(lbt.le_roux_pole(wind_speed_m_s=20, diameter_m=8.22, frame_rate_hz=800), 5)
+    0.9886
+    """
+    order = integer(radial_order, "radial_order", at_least=1)
+    speed = number(wind_speed_m_s, "wind_speed_m_s", above=0)
+    diameter = number(diameter_m, "diameter_m", above=0)
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    return float(np.exp(-2 * np.pi * 0.3 * (order + 1) * speed / diameter / rate))
+
+
+def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
+    """AR1 model: Le Roux pole, stationary variance of the von Karman spectrum.
+
+    Parameters
+    ----------
+    atmosphere : Atmosphere
+        Turbulence and telescope.
+    frame_rate_hz : float
+        Sampling frequency [Hz].
+
+    Returns
+    -------
+    ARModel
+        Process of order 1 with ``rms_nm`` equal to ``atmosphere.tilt_rms_nm``.
+
+    Raises
+    ------
+    ProblemError
+        If the frame rate is not a positive number.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
+    ...                      diameter_m=8.22)
+    >>> model = lbt.ar1_turbulence(air, frame_rate_hz=800)
+    >>> round(float(model.coefficients[0]), 5), round(model.rms_nm, 1)
+    (0.9886, 591.6)
+    """
+    pole = le_roux_pole(
+        wind_speed_m_s=atmosphere.wind_speed_m_s,
+        diameter_m=atmosphere.diameter_m,
+        frame_rate_hz=frame_rate_hz,
+    )
+    driving = atmosphere.tilt_rms_nm * np.sqrt(1 - pole**2)
+    return ARModel(
+        coefficients=frozen([pole]), driving_rms_nm=float(driving), frame_rate_hz=frame_rate_hz
+    )
+
+
+def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: float) -> ARModel:
+    """AR2 model fitted to the von Karman frozen-flow spectrum.
+
+    Minimises the Whittle contrast ``int log(M + N) + (S + N) / (M + N) df`` over
+    the model spectrum M; S is the turbulence and N the white measurement noise.
+
+    Parameters
+    ----------
+    atmosphere : Atmosphere
+        Turbulence and telescope.
+    frame_rate_hz : float
+        Sampling frequency [Hz].
+    noise_nm : float
+        Measurement noise per frame [nm]; it sets down to which level the
+        spectrum has to be matched.
+
+    Returns
+    -------
+    ARModel
+        Process of order 2.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+    NumericalError
+        If the fit does not converge.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
+    ...                      diameter_m=8.22)
+    >>> model = lbt.ar2_turbulence(air, frame_rate_hz=800, noise_nm=15.5)
+    >>> [round(float(a), 4) for a in model.coefficients]
+    [1.9975, -0.9976]
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    noise = number(noise_nm, "noise_nm", above=0)
+    edges = np.geomspace(1e-4 * atmosphere.wind_speed_m_s / atmosphere.diameter_m, rate / 2, 300)
+    frequency = np.sqrt(edges[1:] * edges[:-1])
+    weight = np.diff(edges) / (rate / 2)
+    white = 2 * noise**2 / rate
+    target = atmosphere.psd(frequency) + white
+    delay = np.exp(-2j * np.pi * frequency / rate)
+
+    def unpack(p: np.ndarray) -> tuple[float, float, float]:
+        """Log frequency, log damping/(1 - damping), log rms -> a1, a2, driving variance."""
+        a1, a2 = resonance_coefficients(float(np.exp(p[0])), float(1 / (1 + np.exp(-p[1]))), rate)
+        return a1, a2, float(np.exp(2 * p[2])) / resonance_variance_ratio(a1, a2)
+
+    def contrast(p: np.ndarray) -> float:
+        a1, a2, drive = unpack(p)
+        model = 2 * drive / rate / np.abs(1 - a1 * delay - a2 * delay**2) ** 2 + white
+        return float(np.sum(weight * (np.log(model) + target / model)))
+
+    corner = 0.5 * atmosphere.wind_speed_m_s / atmosphere.diameter_m
+    start = np.array([np.log(corner), np.log(0.25), np.log(atmosphere.tilt_rms_nm)])
+    fit = minimize(
+        contrast, start, method="Nelder-Mead",
+        options={"xatol": 1e-9, "fatol": 1e-14, "maxiter": 4000, "maxfev": 4000},
+    )  # fmt: skip
+    if not fit.success:
+        raise NumericalError(
+            f"the AR2 fit to the turbulence spectrum did not converge: {fit.message} "
+            "Try the AR1 model, or check that the noise is not above the turbulence.",
+            status=str(fit.message),
+        )
+    a1, a2, drive = unpack(fit.x)
+    return ARModel(
+        coefficients=frozen([a1, a2]), driving_rms_nm=float(np.sqrt(drive)), frame_rate_hz=rate
+    )

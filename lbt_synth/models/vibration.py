@@ -1,0 +1,133 @@
+"""Structural vibrations as AR2 processes (Agapito et al. 2008, eq. 4, errata 1 and 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.models.ar import ARModel, resonance_coefficients, resonance_variance_ratio
+from lbt_synth.validation import choice, frozen, number, real_array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vibration:
+    """A narrow line: a damped resonance driven by white noise.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Natural frequency [Hz].
+    damping : float
+        Damping ratio, in (0, 1).
+    rms_nm : float
+        Standard deviation of the displacement along its direction [nm rms wavefront].
+    direction : tuple of float, optional
+        Direction over the modes, made a unit vector; ``(1, 0)`` shakes tip.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
+    >>> [round(float(a), 6) for a in line.ar_model(800).coefficients]
+    [1.972279, -0.996863]
+    """
+
+    frequency_hz: float
+    damping: float
+    rms_nm: float
+    direction: tuple[float, ...] = (1.0, 0.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frequency_hz", number(self.frequency_hz, "frequency_hz", above=0))
+        object.__setattr__(self, "damping", number(self.damping, "damping", above=0, below=1))
+        object.__setattr__(self, "rms_nm", number(self.rms_nm, "rms_nm", above=0))
+        vector = np.atleast_1d(real_array(self.direction, "direction"))
+        length = float(np.linalg.norm(vector))
+        if vector.ndim != 1 or length == 0:
+            raise ProblemError(
+                f"direction must be a vector over the modes, not zero; got {self.direction!r}."
+            )
+        object.__setattr__(self, "direction", tuple(float(v) for v in vector / length))
+
+    def ar_model(self, frame_rate_hz: float) -> ARModel:
+        """Return the AR2 process sampled at a frame rate.
+
+        Parameters
+        ----------
+        frame_rate_hz : float
+            Sampling frequency [Hz].
+
+        Returns
+        -------
+        ARModel
+            Process with this vibration's rms.
+
+        Raises
+        ------
+        ProblemError
+            If the line is not below the Nyquist frequency.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
+        >>> round(line.ar_model(800).rms_nm, 6)
+        100.0
+        """
+        rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+        if not self.frequency_hz < rate / 2:
+            raise ProblemError(
+                f"a vibration must lie below the Nyquist frequency {rate / 2:.6g} Hz; "
+                f"got {self.frequency_hz:.6g} Hz. Give the frequency it is aliased to."
+            )
+        a1, a2 = resonance_coefficients(self.frequency_hz, self.damping, rate)
+        driving = self.rms_nm / np.sqrt(resonance_variance_ratio(a1, a2))
+        return ARModel(
+            coefficients=frozen([a1, a2]), driving_rms_nm=float(driving), frame_rate_hz=rate
+        )
+
+    def retuned(
+        self, frequency_hz: float, *, frame_rate_hz: float, hold: str = "rms"
+    ) -> Vibration:
+        """Return this vibration at another frequency.
+
+        Parameters
+        ----------
+        frequency_hz : float
+            New frequency [Hz].
+        frame_rate_hz : float
+            Sampling frequency [Hz].
+        hold : {"rms", "driving"}, optional
+            What stays: the rms of the vibration, or that of its driving noise.
+
+        Returns
+        -------
+        Vibration
+            The vibration at its new frequency.
+
+        Raises
+        ------
+        ProblemError
+            If a value is out of its range.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
+        >>> round(line.retuned(18, frame_rate_hz=800, hold="driving").rms_nm, 2)
+        117.1
+        """
+        choice(hold, "hold", ("rms", "driving"))
+        moved = replace(self, frequency_hz=frequency_hz)
+        if hold == "rms":
+            return moved
+        drive = self.ar_model(frame_rate_hz).driving_rms_nm
+        ratio = drive / moved.ar_model(frame_rate_hz).driving_rms_nm
+        return replace(moved, rms_nm=self.rms_nm * ratio)

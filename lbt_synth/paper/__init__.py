@@ -1,0 +1,1 @@
+"""The tables and figures of Agapito et al. 2008, computed anew beside the published ones."""

@@ -1,0 +1,96 @@
+"""Look of the figures: told apart in grey and by the colour-blind."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.errors import OutputError
+from lbt_synth.files import write_atomically
+
+FIGURE_ENDINGS = (".png", ".pdf", ".svg")
+# Okabe and Ito's palette, in an order that also darkens and lightens in grey
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)))
+MARKERS = ("o", "s", "^", "D", "v", "P")
+
+_STYLE: dict[str, Any] = {
+    "font.size": 9,
+    "axes.labelsize": 9,
+    "axes.titlesize": 9,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8,
+    "legend.frameon": True,
+    "legend.framealpha": 0.9,
+    "legend.edgecolor": "none",
+    "lines.linewidth": 1.5,
+    "figure.dpi": 150,
+    "savefig.dpi": 200,
+    "svg.hashsalt": "lbt_synth",
+}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Matplotlib settings of this package, for the time of the block."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(_STYLE):
+        yield
+
+
+def looks() -> Iterator[dict[str, Any]]:
+    """Endless line styles, each with its own colour and dashes."""
+    for colour, line in cycle(zip(COLOURS, LINES, strict=True)):
+        yield {"color": colour, "linestyle": line}
+
+
+def new_figure(width_in: float, height_in: float) -> Any:
+    """Return an empty figure that belongs to no window."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def save_figure(figure: Any, path: str | os.PathLike[str]) -> Path:
+    """Write a figure, whole or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The figure.
+    path : path-like
+        File that ends in .png, .pdf or .svg.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        If the ending is another, or the file cannot be written.
+    """
+    target = Path(path)
+    ending = target.suffix.lower()
+    if ending not in FIGURE_ENDINGS:
+        raise OutputError(
+            f"a figure must end in {', '.join(FIGURE_ENDINGS)}; got {target.name!r}.", path=target
+        )
+    buffer = io.BytesIO()
+    # without a date, the same figure is the same file
+    undated: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+    with house_style():
+        figure.savefig(buffer, format=ending[1:], metadata=undated.get(ending))
+    return write_atomically(target, buffer.getvalue())

@@ -1,0 +1,90 @@
+"""Random series of a truth's disturbances, stationary from their first frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len
+from scipy.signal import lfilter
+
+from lbt_synth.errors import DimensionError
+from lbt_synth.lyapunov import stationary_covariance
+from lbt_synth.models.ar import ARModel
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.truth import Spectrum, Truth
+from lbt_synth.models.vibration import Vibration
+from lbt_synth.validation import FloatArray
+
+# A spectrum is drawn on this many times the wanted frames, so that the period is not seen.
+_PERIODS = 4
+
+
+def draw_disturbance(
+    truth: Truth, hardware: LoopHardware, *, frames: int, cases: int, rng: np.random.Generator
+) -> FloatArray:
+    """Draw the total phase, (cases, frames, n) [nm].
+
+    Each part has a stream of its own: a truth with one vibration more keeps the
+    turbulence that it had.
+    """
+    n = hardware.modes
+    turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
+    total = np.zeros((cases, frames, n))
+    if truth.turbulence is not None:
+        drawn = _draw(truth.turbulence, hardware, frames, cases * n, turbulence_rng)
+        total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
+    for vibration, line_rng in zip(truth.vibrations, line_rngs, strict=True):
+        if len(vibration.direction) != n:
+            raise DimensionError(
+                f"the direction of a vibration must have {n} components, one a mode; "
+                f"got {len(vibration.direction)} at {vibration.frequency_hz:.6g} Hz."
+            )
+        if isinstance(vibration, Vibration):
+            model = vibration.ar_model(hardware.frame_rate_hz)
+            motion = _draw_ar(model, frames, cases, line_rng)
+        else:
+            turns = vibration.frequency_hz / hardware.frame_rate_hz * np.arange(frames)
+            phase = line_rng.uniform(0, 2 * np.pi, (cases, 1))
+            motion = vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase)
+        total += motion[:, :, None] * np.array(vibration.direction)
+    return total
+
+
+def draw_noise(
+    truth: Truth, hardware: LoopHardware, *, frames: int, cases: int, rng: np.random.Generator
+) -> FloatArray:
+    """Draw the measurement noise, (cases, frames, q) [nm]."""
+    return truth.noise_nm * rng.standard_normal((cases, frames, hardware.n_measurements))
+
+
+def _draw(
+    spectrum: Spectrum, hardware: LoopHardware, frames: int, cases: int, rng: np.random.Generator
+) -> FloatArray:
+    if isinstance(spectrum, ARModel):
+        return _draw_ar(spectrum, frames, cases, rng)
+    rate = hardware.frame_rate_hz
+    length = next_fast_len(_PERIODS * frames, real=True)
+    frequency = np.arange(length // 2 + 1) * rate / length
+    # E|X_k|^2 = S(f_k) f_s length / 2, for a one-sided S; the mean is real
+    amplitude = np.sqrt(spectrum.psd(frequency) * rate * length / 4)
+    out = np.empty((cases, frames))
+    for case in range(cases):
+        white = rng.standard_normal((2, amplitude.size))
+        bins = amplitude * (white[0] + 1j * white[1])
+        bins[0] = amplitude[0] * np.sqrt(2) * white[0, 0]
+        out[case] = irfft(bins, n=length)[:frames]
+    return out
+
+
+def _draw_ar(model: ARModel, frames: int, cases: int, rng: np.random.Generator) -> FloatArray:
+    a, order = model.coefficients, model.order
+    drive = np.zeros((order, order))
+    drive[0, 0] = model.driving_rms_nm**2
+    covariance = stationary_covariance(model.companion, drive)
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    past = rng.standard_normal((cases, order)) @ root.T  # x(-1), x(-2), ...
+    # lfilter's delays: zi[i] = a[i+1] x(-1) + a[i+2] x(-2) + ...
+    delays = np.stack([past[:, : order - i] @ a[i:] for i in range(order)], axis=1)
+    white = model.driving_rms_nm * rng.standard_normal((cases, frames))
+    series, _ = lfilter([1.0], np.concatenate([[1.0], -a]), white, axis=1, zi=delays)
+    return np.asarray(series)

@@ -1,0 +1,304 @@
+"""Discrete-time linear systems, in the two output conventions of this field.
+
+:class:`StateSpace` is the textbook form ``y(k) = C x(k) + D u(k)``.
+:class:`Controller` is the form of real-time computers (and of SPECULA's
+state-space filter): the state is updated first and the output is read from
+the *new* state, ``u(k) = C x(k+1) + D y(k)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.validation import ComplexArray, FloatArray, frozen, matrix, number, real_array, square
+
+_CHUNK = 2_000_000  # complex numbers held at once by a frequency response
+
+
+def _system_matrices(
+    A: Any, B: Any, C: Any, D: Any
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Validate the four matrices of a system against each other."""
+    A = square(A, "A")
+    n = A.shape[0]
+    why = f"to match A {A.shape}"
+    B = matrix(B, "B", rows=(n, why))
+    C = matrix(C, "C", cols=(n, why))
+    D = matrix(
+        D,
+        "D",
+        rows=(C.shape[0], f"to match C {C.shape}"),
+        cols=(B.shape[1], f"to match B {B.shape}"),
+    )
+    return A, B, C, D
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StateSpace:
+    """Discrete-time system ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
+
+    Parameters
+    ----------
+    A : (n, n) array_like
+        State matrix.
+    B : (n, m) array_like
+        Input matrix.
+    C : (p, n) array_like
+        Output matrix.
+    D : (p, m) array_like
+        Feedthrough matrix.
+    dt_s : float, optional
+        Sampling period [s]; 1 when the samples have no physical rate.
+
+    Raises
+    ------
+    ProblemError
+        If a matrix is not finite or the sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lag = lbt.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> float(abs(lag.frequency_response([0.0])[0, 0, 0]))
+    2.0
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    dt_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in zip(
+            "ABCD", _system_matrices(self.A, self.B, self.C, self.D), strict=True
+        ):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
+
+    @classmethod
+    def of(cls, system: Any) -> StateSpace:
+        """Take a StateSpace, a discrete control.StateSpace, or a tuple (A, B, C, D).
+
+        Parameters
+        ----------
+        system : StateSpace, control.StateSpace or tuple
+            The system.
+
+        Returns
+        -------
+        StateSpace
+            The same system.
+
+        Raises
+        ------
+        ProblemError
+            If it is none of these, or a continuous-time system.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> lbt.StateSpace.of(([[0.5]], [[1.0]], [[1.0]], [[0.0]])).spectral_radius
+        0.5
+        """
+        if isinstance(system, StateSpace):
+            return system
+        if isinstance(system, tuple | list) and len(system) == 4:
+            A, B, C, D = system
+            return cls(A=A, B=B, C=C, D=D)
+        if all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt")):
+            if system.dt == 0:
+                raise ProblemError(
+                    "the system must be in discrete time; got a continuous one (dt = 0). "
+                    "Try control.sample_system(system, dt)."
+                )
+            unspecified = system.dt is None or system.dt is True
+            dt_s = 1.0 if unspecified else float(system.dt)
+            return cls(A=system.A, B=system.B, C=system.C, D=system.D, dt_s=dt_s)
+        raise ProblemError(
+            "a system must be a StateSpace, a control.StateSpace or a tuple (A, B, C, D); "
+            f"got {type(system).__name__}."
+        )
+
+    def to_control(self) -> Any:
+        """Return the system as a ``control.StateSpace`` with its sampling period.
+
+        Returns
+        -------
+        control.StateSpace
+            The same matrices.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> lag = lbt.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.01)
+        >>> lag.to_control().dt
+        0.01
+        """
+        import control
+
+        return control.StateSpace(self.A, self.B, self.C, self.D, self.dt_s, remove_useless_states=False)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Eigenvalues of A, (n,)."""
+        return np.linalg.eigvals(self.A).astype(np.complex128)
+
+    @property
+    def spectral_radius(self) -> float:
+        """Largest modulus of the poles."""
+        return float(np.max(np.abs(self.poles)))
+
+    def frequency_response(self, frequency_hz: Any) -> ComplexArray:
+        """Transfer matrix ``D + C (zI - A)^-1 B`` at ``z = exp(2 pi i f dt)``.
+
+        Parameters
+        ----------
+        frequency_hz : (f,) array_like
+            Frequencies [Hz].
+
+        Returns
+        -------
+        (f, p, m) complex ndarray
+            One matrix a frequency.
+
+        Raises
+        ------
+        ProblemError
+            If a frequency is not finite.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> delay = lbt.StateSpace(A=[[0.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.25)
+        >>> complex(delay.frequency_response([1.0])[0, 0, 0].round(12))
+        -1j
+        """
+        frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
+        z = np.exp(2j * np.pi * frequency * self.dt_s)
+        n, m = self.B.shape
+        out = np.empty((z.size, self.C.shape[0], m), dtype=np.complex128)
+        step = max(1, _CHUNK // (n * n))
+        identity = np.eye(n)
+        for start in range(0, z.size, step):
+            zs = z[start : start + step, None, None]
+            states = np.linalg.solve(zs * identity - self.A, np.broadcast_to(self.B, (len(zs), n, m)))
+            out[start : start + step] = self.C @ states + self.D
+        return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Controller:
+    """Controller in new-state form: ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
+
+    Parameters
+    ----------
+    A : (n, n) array_like
+        State matrix.
+    B : (n, q) array_like
+        Input matrix; y(k) has q measurements.
+    C : (m, n) array_like
+        Output matrix, applied to the state *after* its update.
+    D : (m, q) array_like
+        Feedthrough matrix.
+    dt_s : float, optional
+        Sampling period [s].
+
+    Raises
+    ------
+    ProblemError
+        If a matrix is not finite or the sizes clash.
+
+    Examples
+    --------
+    An integrator ``u(k) = u(k-1) + 0.5 y(k)``:
+
+    >>> import lbt_synth as lbt
+    >>> integrator = lbt.Controller(A=[[1.0]], B=[[0.5]], C=[[1.0]], D=[[0.0]])
+    >>> run = integrator.start()
+    >>> [float(run.step([1.0])[0]) for _ in range(3)]
+    [0.5, 1.0, 1.5]
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    dt_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in zip(
+            "ABCD", _system_matrices(self.A, self.B, self.C, self.D), strict=True
+        ):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    def to_statespace(self) -> StateSpace:
+        """Return the same input-output map in the textbook (current-state) form."""
+        return StateSpace(
+            A=self.A, B=self.B, C=self.C @ self.A, D=self.C @ self.B + self.D, dt_s=self.dt_s
+        )
+
+    def start(self) -> RunningController:
+        """Return a running copy with a zero state, to be stepped frame by frame."""
+        return RunningController(self)
+
+
+@dataclass(slots=True, eq=False)
+class RunningController:
+    """A controller with its state: ``step(y) -> u`` once a frame, and ``reset()``.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> run = lbt.Controller(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]]).start()
+    >>> _ = run.step([2.0]); run.reset(); float(run.step([3.0])[0])
+    3.0
+    """
+
+    controller: Controller
+    state: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the state to zero."""
+        self.state = np.zeros(self.controller.n_states)
+
+    def step(self, y: Any) -> FloatArray:
+        """Take the measurements y(k), (q,), and return the command u(k), (m,)."""
+        k = self.controller
+        measured = np.asarray(y, dtype=np.float64)
+        if measured.shape != (k.B.shape[1],):
+            raise DimensionError(
+                f"y must have shape ({k.B.shape[1]},) to match B {k.B.shape}; got {measured.shape}."
+            )
+        self.state = k.A @ self.state + k.B @ measured
+        return k.C @ self.state + k.D @ measured
+
+
+def block_diagonal(*blocks: FloatArray) -> FloatArray:
+    """Return the block-diagonal matrix; blocks may be empty in either direction."""
+    rows = sum(b.shape[0] for b in blocks)
+    cols = sum(b.shape[1] for b in blocks)
+    out = np.zeros((rows, cols))
+    i = j = 0
+    for b in blocks:
+        out[i : i + b.shape[0], j : j + b.shape[1]] = b
+        i, j = i + b.shape[0], j + b.shape[1]
+    return frozen(out)

@@ -1,0 +1,171 @@
+"""Checks of arguments: the one place where arrays and numbers are let in.
+
+Each function returns the value in its canonical form (read-only float64
+arrays, Python floats) or raises a :class:`~lbt_synth.errors.ProblemError`
+that names the argument.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from lbt_synth.errors import DefinitenessError, DimensionError, NonFiniteError, ProblemError
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+ComplexArray: TypeAlias = npt.NDArray[np.complex128]
+
+
+def frozen(array: npt.ArrayLike) -> FloatArray:
+    """Return a read-only float64 copy of an array."""
+    out = np.array(array, dtype=np.float64)
+    out.setflags(write=False)
+    return out
+
+
+def real_array(value: Any, name: str) -> FloatArray:
+    """Return a finite, read-only float64 array of any shape."""
+    try:
+        raw = np.asarray(value)
+    except ValueError as error:
+        raise DimensionError(
+            f"{name} must be a rectangular array of numbers; got rows of unequal length."
+        ) from error
+    if raw.dtype.kind == "c":
+        raise ProblemError(f"{name} must be real; got complex numbers.")
+    if raw.dtype.kind not in "fiub":
+        raise ProblemError(f"{name} must be an array of numbers; got {type(value).__name__}.")
+    out = frozen(raw)
+    if not np.all(np.isfinite(out)):
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(out))[0])
+        raise NonFiniteError(
+            f"{name} must be finite; got {out[where]} at index {where}. "
+            "Check the data that it was computed from."
+        )
+    return out
+
+
+def matrix(
+    value: Any,
+    name: str,
+    *,
+    rows: tuple[int, str] | None = None,
+    cols: tuple[int, str] | None = None,
+) -> FloatArray:
+    """Return a finite 2-D matrix; a scalar becomes (1, 1).
+
+    ``rows`` and ``cols`` are pairs ``(size, why)``; ``why`` ends the sentence
+    of the error, for example ``"to match A (4, 4)"``.
+    """
+    out = real_array(value, name)
+    if out.ndim == 0:
+        out = frozen(out.reshape(1, 1))
+    if out.ndim != 2:
+        raise DimensionError(f"{name} must be a matrix (2-D); got {out.ndim}-D, shape {out.shape}.")
+    for axis, demand, word in ((0, rows, "row"), (1, cols, "column")):
+        if demand is not None and out.shape[axis] != demand[0]:
+            size, why = demand
+            plural = "" if size == 1 else "s"
+            raise DimensionError(f"{name} must have {size} {word}{plural} {why}; got {out.shape}.")
+    return out
+
+
+def square(value: Any, name: str) -> FloatArray:
+    """Return a finite square matrix with at least one row."""
+    out = matrix(value, name)
+    if out.shape[0] != out.shape[1] or out.shape[0] == 0:
+        raise DimensionError(f"{name} must be square; got {out.shape}.")
+    return out
+
+
+def symmetric(value: Any, name: str, *, size: tuple[int, str] | None = None) -> FloatArray:
+    """Return a finite symmetric matrix; asymmetry beyond rounding is refused."""
+    out = matrix(value, name, rows=size, cols=size)
+    if out.shape[0] != out.shape[1]:
+        raise DimensionError(f"{name} must be square; got {out.shape}.")
+    scale = float(np.max(np.abs(out), initial=0.0))
+    skew = float(np.max(np.abs(out - out.T), initial=0.0))
+    if skew > 1e-10 * scale:
+        raise DefinitenessError(
+            f"{name} must be symmetric; got an asymmetry of {skew:.3g} beside entries of "
+            f"{scale:.3g}. Try {name} = ({name} + {name}.T) / 2 if it is rounding."
+        )
+    return frozen((out + out.T) / 2)
+
+
+def semidefinite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> FloatArray:
+    """Return a symmetric positive semidefinite matrix."""
+    out = symmetric(value, name, size=size)
+    least, scale = _extreme_eigenvalues(out)
+    if least < -1e-10 * scale:
+        raise DefinitenessError(
+            f"{name} must be positive semidefinite; got a least eigenvalue of {least:.6g}."
+        )
+    return out
+
+
+def definite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> FloatArray:
+    """Return a symmetric positive definite matrix."""
+    out = symmetric(value, name, size=size)
+    least, scale = _extreme_eigenvalues(out)
+    if not least > 1e-14 * scale:
+        raise DefinitenessError(
+            f"{name} must be positive definite; got a least eigenvalue of {least:.6g}."
+        )
+    return out
+
+
+def _extreme_eigenvalues(symmetric_matrix: FloatArray) -> tuple[float, float]:
+    values = np.linalg.eigvalsh(symmetric_matrix)
+    return float(values[0]), float(np.max(np.abs(values)))
+
+
+def number(
+    value: Any,
+    name: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+    hint: str = "",
+) -> float:
+    """Return a finite float within its bounds."""
+    if isinstance(value, bool | str | bytes) or value is None:
+        raise ProblemError(f"{name} must be a number; got {value!r}.")
+    try:
+        out = float(value)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"{name} must be a number; got {value!r}.") from error
+    if not math.isfinite(out):
+        raise NonFiniteError(f"{name} must be finite; got {out}.")
+    demands = (
+        (above, "above", above is not None and not out > above),
+        (at_least, "at least", at_least is not None and not out >= at_least),
+        (below, "below", below is not None and not out < below),
+        (at_most, "at most", at_most is not None and not out <= at_most),
+    )
+    for bound, word, broken in demands:
+        if broken:
+            raise ProblemError(f"{name} must be {word} {bound:.12g}; got {out:.12g}. {hint}".strip())
+    return out
+
+
+def integer(value: Any, name: str, *, at_least: int) -> int:
+    """Return an integer that is at least a bound."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise ProblemError(f"{name} must be an integer; got {value!r}.")
+    if value < at_least:
+        raise ProblemError(f"{name} must be at least {at_least}; got {value}.")
+    return int(value)
+
+
+def choice(value: Any, name: str, options: Sequence[str]) -> str:
+    """Return one of a list of words."""
+    if value not in options:
+        raise ProblemError(f"{name} must be one of {', '.join(options)}; got {value!r}.")
+    return cast(str, value)
