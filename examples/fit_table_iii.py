@@ -27,7 +27,9 @@ TARGET = np.array([row.hinf for row in TABLE_III])
 FREQUENCIES_HZ = np.array([row.model_hz for row in TABLE_III])
 
 
-def axis_plant(frequency_hz: float, damping: float, weights: tuple[float, float]) -> lbt.TipTiltPlant:
+def axis_plant(
+    frequency_hz: float, damping: float, weights: tuple[float, float]
+) -> lbt.TipTiltPlant:
     """One axis; ``weights`` are the driving noises of vibration and turbulence over the noise."""
     pole = turbulence_model().coefficients
     unit = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=1.0, direction=(1,))
@@ -38,9 +40,7 @@ def axis_plant(frequency_hz: float, damping: float, weights: tuple[float, float]
             coefficients=pole, driving_rms_nm=weights[1] * NOISE_NM, frame_rate_hz=800
         ),
         vibrations=[
-            lbt.Vibration(
-                frequency_hz=frequency_hz, damping=damping, rms_nm=rms_nm, direction=(1,)
-            )
+            lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=rms_nm, direction=(1,))
         ],
         noise_nm=NOISE_NM,
         modes=1,
@@ -67,7 +67,11 @@ def column(parameters: np.ndarray) -> np.ndarray:
             turbulence=PAPER_TRUTH.turbulence,
             noise_nm=NOISE_NM,
             sensor_gain=TRUTH_SENSOR_GAIN,
-            vibrations=(lbt.SinusoidalVibration(frequency_hz=20, rms_nm=PAPER_TRUTH.vibrations[0].rms_nm, direction=(1,)),),
+            vibrations=(
+                lbt.SinusoidalVibration(
+                    frequency_hz=20, rms_nm=PAPER_TRUTH.vibrations[0].rms_nm, direction=(1,)
+                ),
+            ),
         )
         budget = lbt.residual_budget(loop, shaken)
         tilt = budget.turbulence_nm2[0, 0] + budget.noise_nm2[0, 0]  # the axis without vibration
@@ -91,7 +95,7 @@ if __name__ == "__main__":
     for start in range(int(sys.argv[2]) if len(sys.argv) > 2 else 12):
         guess = centre + (0 if start == 0 else 1) * rng.normal(0, [0.6, 0.6, 0.3])
         for bump in np.arange(0, 1.2, 0.1):  # first feasible gamma
-            if loss(guess + [0, 0, bump]) < 100:
+            if loss(guess + np.array([0, 0, bump])) < 100:
                 guess = guess + np.array([0, 0, bump])
                 break
         fit = minimize(loss, guess, method="Nelder-Mead", options={"maxiter": 500, "xatol": 1e-4})

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.validation import ComplexArray, FloatArray, frozen, matrix, number, real_array, square
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    frozen,
+    matrix,
+    number,
+    real_array,
+    square,
+)
 
 _CHUNK = 2_000_000  # complex numbers held at once by a frequency response
 
@@ -141,7 +149,9 @@ class StateSpace:
         """
         import control
 
-        return control.StateSpace(self.A, self.B, self.C, self.D, self.dt_s, remove_useless_states=False)
+        return control.StateSpace(
+            self.A, self.B, self.C, self.D, self.dt_s, remove_useless_states=False
+        )
 
     @property
     def n_states(self) -> int:
@@ -191,7 +201,9 @@ class StateSpace:
         identity = np.eye(n)
         for start in range(0, z.size, step):
             zs = z[start : start + step, None, None]
-            states = np.linalg.solve(zs * identity - self.A, np.broadcast_to(self.B, (len(zs), n, m)))
+            states = np.linalg.solve(
+                zs * identity - self.A, np.broadcast_to(self.B, (len(zs), n, m))
+            )
             out[start : start + step] = self.C @ states + self.D
         return out
 

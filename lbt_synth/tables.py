@@ -9,13 +9,13 @@ from typing import Any
 
 
 def csv_bytes(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
-    """Return a CSV table as UTF-8, floats with all their digits.
+    r"""Return a CSV table as UTF-8, floats with all their digits.
 
     Examples
     --------
     >>> from lbt_synth.tables import csv_bytes
     >>> csv_bytes(["f_hz", "strehl"], [[20.0, 0.8]])
-    b'f_hz,strehl\\n20.0,0.8\\n'
+    b'f_hz,strehl\n20.0,0.8\n'
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")

@@ -151,7 +151,9 @@ def number(
     )
     for bound, word, broken in demands:
         if broken:
-            raise ProblemError(f"{name} must be {word} {bound:.12g}; got {out:.12g}. {hint}".strip())
+            raise ProblemError(
+                f"{name} must be {word} {bound:.12g}; got {out:.12g}. {hint}".strip()
+            )
     return out
 
 

@@ -39,9 +39,7 @@ def sigma(arguments: Namespace) -> Report:
         if isinstance(design, FilterDesign):
             entry |= {"gamma": design.gamma, "rms": design.rms}
         if design.hardware is not None:
-            loop = close_loop(
-                design.hardware, design.controller, sensor_gain=arguments.sensor_gain
-            )
+            loop = close_loop(design.hardware, design.controller, sensor_gain=arguments.sensor_gain)
             entry["stable"] = loop.is_stable
             if loop.is_stable:
                 entry |= asdict(loop_margins(loop))
@@ -108,7 +106,7 @@ def simulate(arguments: Namespace) -> Report:
         ("  turbulence", None, budget.turbulence_nm, "nm rms"),
         ("  vibration", None, budget.vibration_nm, "nm rms"),
         ("  noise", None, budget.noise_nm, "nm rms"),
-        ("commands", float(command_rms), None, "rms"),
+        ("commands", float(command_rms), None, "nm rms"),
     ]
     report = Report(
         data={
@@ -136,7 +134,9 @@ def simulate(arguments: Namespace) -> Report:
         notes=[f"scatter of the Strehl ratio between runs: {100 * scatter:.2f} points"],
     )
     if arguments.output is not None:
-        path = save_figure(simulation_figure(run, title=f"{design.method} filter"), arguments.output)
+        path = save_figure(
+            simulation_figure(run, title=f"{design.method} filter"), arguments.output
+        )
         report.data["file"] = str(path)
         report.notes.append(f"written: {path}")
     return report

@@ -25,7 +25,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="lbt-synth",
         description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
-        epilog="Exit status: 0 done, 1 a design or verification failed, 2 wrong usage or bad input.",
+        epilog="Exit status: 0 done, 1 a design or verification failed, 2 wrong usage or input.",
     )
     parser.add_argument("--version", action="version", version=f"lbt-synth {lbt_synth.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)

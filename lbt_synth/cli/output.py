@@ -14,8 +14,10 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 _WIDE = 200
+_WORDS = ("unit", "method", "origin")  # columns of words, set flush left
 
 
 @dataclass(kw_only=True)
@@ -61,11 +63,12 @@ class Report:
 
 
 def _table(text: TableText) -> Table:
-    table = Table(title=text.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD)
+    table = Table(title=Text(text.title, style="bold"), title_justify="left", box=SIMPLE_HEAD)
     for i, heading in enumerate(text.headings):
-        table.add_column(heading, justify="left" if i == 0 else "right")
+        words = heading in _WORDS
+        table.add_column(Text(heading), justify="left" if i == 0 or words else "right")
     for row in text.rows:
-        table.add_row(*(cell(value) for value in row))
+        table.add_row(*(Text(cell(value)) for value in row))
     return table
 
 

@@ -21,6 +21,7 @@ from lbt_synth.models import (
     Atmosphere,
     LoopHardware,
     SinusoidalVibration,
+    Spectrum,
     TipTiltPlant,
     Truth,
     Vibration,
@@ -226,9 +227,7 @@ def _plant(settings: FileSection, atmosphere: Atmosphere, noise_nm: float) -> Ti
     if model.turbulence.kind == "ar1":
         turbulence = ar1_turbulence(atmosphere, frame_rate_hz=loop.frame_rate_hz)
     elif model.turbulence.kind == "ar2":
-        turbulence = ar2_turbulence(
-            atmosphere, frame_rate_hz=loop.frame_rate_hz, noise_nm=noise_nm
-        )
+        turbulence = ar2_turbulence(atmosphere, frame_rate_hz=loop.frame_rate_hz, noise_nm=noise_nm)
     else:
         try:
             turbulence = ARModel(
@@ -283,14 +282,14 @@ def _truth(
                 lines.append(SinusoidalVibration(**size))
             else:
                 lines.append(Vibration(**size, damping=section.damping))
-    turbulence = {
+    spectra: dict[str, Spectrum | None] = {
         "frozen_flow": atmosphere,
         "model": plant.turbulence[0],
         "none": None,
-    }[settings.truth.turbulence]
+    }
     # the plant's sensor matrix holds the gain that the design assumes
     return Truth(
-        turbulence=turbulence,
+        turbulence=spectra[settings.truth.turbulence],
         vibrations=tuple(lines),
         noise_nm=noise_nm,
         sensor_gain=settings.truth.sensor_gain / settings.model.sensor_gain,

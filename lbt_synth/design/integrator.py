@@ -12,7 +12,7 @@ from lbt_synth.loop import close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.truth import Truth
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import number
+from lbt_synth.validation import frozen, number
 
 _TRIALS = 32
 
@@ -46,15 +46,18 @@ def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
     >>> bool(max(abs(lbt.integrator(path, gain=0.25).poles)) < 1)
     True
     """
-    value = number(gain, "gain", above=0)
-    controller = _controller(hardware, value)
+    return _certified(hardware, number(gain, "gain", above=0), status="given")
+
+
+def _certified(hardware: LoopHardware, gain: float, *, status: str) -> IntegratorDesign:
+    controller = _controller(hardware, gain)
     return IntegratorDesign(
         method="integrator",
         controller=controller,
         certificate=loop_certificate(certify_loop(hardware, controller)).require(),
-        solver=SolverReport(route="closed form", status="given", iterations=0),
+        solver=SolverReport(route="closed form", status=status, iterations=0),
         loop_hardware=hardware,
-        gain=value,
+        gain=gain,
     )
 
 
@@ -136,19 +139,19 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
             return np.inf
 
     if truth.turbulence is None and not truth.vibrations and truth.noise_nm == 0:
-        raise ProblemError("the truth must disturb the loop; got no turbulence, vibration or noise.")
+        raise ProblemError(
+            "the truth must disturb the loop; got no turbulence, vibration or noise."
+        )
     trials = np.log(np.geomspace(1e-4, 0.999, _TRIALS) * limit)
     values = [variance(trial) for trial in trials]
     best = int(np.argmin(values))
     bracket = trials[max(best - 1, 0)], trials[min(best + 1, _TRIALS - 1)]
-    found = minimize_scalar(
-        variance, bounds=bracket, method="bounded", options={"xatol": 1e-7}
-    )
-    return integrator(hardware, gain=float(np.exp(found.x)))
+    found = minimize_scalar(variance, bounds=bracket, method="bounded", options={"xatol": 1e-7})
+    return _certified(hardware, float(np.exp(found.x)), status="least residual of the truth")
 
 
 def _controller(hardware: LoopHardware, gain: float) -> Controller:
-    reconstructor = np.linalg.pinv(hardware.sensor @ hardware.influence)
+    reconstructor = frozen(np.linalg.pinv(hardware.sensor @ hardware.influence))
     m, q = reconstructor.shape
     return Controller(
         A=np.eye(m), B=gain * reconstructor, C=np.eye(m), D=np.zeros((m, q)), dt_s=hardware.dt_s

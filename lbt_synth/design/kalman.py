@@ -64,13 +64,11 @@ def kalman(problem: EstimationProblem, *, method: str = "riccati") -> FilterDesi
         programme.gain_predictor,
         programme.gain_filter,
         method="kalman",
-        solver=SolverReport(
-            route="sdp", status=programme.status, iterations=programme.iterations
-        ),
+        solver=SolverReport(route="sdp", status=programme.status, iterations=programme.iterations),
     )
 
 
 def error_scale(problem: EstimationProblem, P: np.ndarray) -> float:
-    """Standard deviation of the estimation error in its worst direction; 1 if there is none."""
+    """Return the estimation error's deviation in its worst direction; 1 if there is none."""
     worst = float(np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[-1])
     return float(np.sqrt(worst)) if worst > 0 else 1.0

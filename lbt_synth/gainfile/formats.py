@@ -59,7 +59,8 @@ def write_npz(arrays: Mapping[str, FloatArray], text: str, header: Mapping[str, 
     """Write a NumPy archive; the text is an array of bytes, so nothing is pickled."""
     del header
     buffer = io.BytesIO()
-    np.savez(buffer, **dict(arrays), **{_TEXT: np.frombuffer(text.encode(), dtype=np.uint8)})
+    everything: dict[str, Any] = {**arrays, _TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
+    np.savez(buffer, **everything)
     return buffer.getvalue()
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.gains import decorrelated, filter_gains
 from lbt_synth.models.problem import EstimationProblem
-from lbt_synth.riccati import decorrelated, filter_gains
 from lbt_synth.validation import FloatArray, frozen
 
 _RANK_TOLERANCE = 1e-13

@@ -97,9 +97,7 @@ def hinf_lmi(
     frame = balanced(problem, coordinates, scale)
     level = (gamma / scale) ** 2
     P = cp.Variable(frame.problem.A.shape, symmetric=True)
-    status, iterations = solve(
-        cp.Maximize(cp.trace(P)), _inequalities(frame.problem, P, level)
-    )
+    status, iterations = solve(cp.Maximize(cp.trace(P)), _inequalities(frame.problem, P, level))
     if "infeasible" in status:
         raise InfeasibleError(
             f"no H-infinity filter reaches gamma = {gamma:.9g}: the LMI is infeasible. "
@@ -121,9 +119,7 @@ def _inequalities(problem: EstimationProblem, P: Any, gamma_squared: Any) -> lis
     basis = null_space(np.hstack([C, D]))
     Nx, Nw = basis[:n], basis[n:]
     step, seen = A @ Nx + B @ Nw, L @ Nx
-    dissipation = (
-        Nx.T @ P @ Nx + gamma_squared * (Nw.T @ Nw) - step.T @ P @ step - seen.T @ seen
-    )
+    dissipation = Nx.T @ P @ Nx + gamma_squared * (Nw.T @ Nw) - step.T @ P @ step - seen.T @ seen
     return [symmetrised(dissipation) >> 0, P - L.T @ L >> 0]
 
 
@@ -135,7 +131,7 @@ def _unpacked(
     predictor, filtering = frame.gains(information)
     return LmiSolution(
         gamma=float(np.sqrt(gamma_squared) * frame.output_scale),
-        P=frame.covariance(gamma_squared * np.linalg.inv(storage)),
+        P=frame.covariance(np.asarray(gamma_squared * np.linalg.inv(storage), dtype=np.float64)),
         gain_predictor=predictor,
         gain_filter=filtering,
         status=status,

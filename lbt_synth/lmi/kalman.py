@@ -12,9 +12,7 @@ from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.validation import FloatArray
 
 
-def kalman_sdp(
-    problem: EstimationProblem, *, coordinates: FloatArray, scale: float
-) -> LmiSolution:
+def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: float) -> LmiSolution:
     """Maximise tr P subject to ``[[APA' + Q - P, APC'], [CPA', R + CPC']] >= 0``.
 
     The stabilising solution of the filter Riccati equation is the greatest P
@@ -47,9 +45,7 @@ def kalman_sdp(
     block = cp.bmat(
         [[A @ P @ A.T + B @ B.T - P, A @ P @ C.T], [C @ P @ A.T, np.eye(q) + C @ P @ C.T]]
     )
-    status, iterations = solve(
-        cp.Maximize(cp.trace(P)), [symmetrised(block) >> 0, P >> 0]
-    )
+    status, iterations = solve(cp.Maximize(cp.trace(P)), [symmetrised(block) >> 0, P >> 0])
     if status not in USABLE or P.value is None:
         raise NumericalError(
             f"the semidefinite programme of the Kalman filter ended as {status!r}; expected "

@@ -17,6 +17,7 @@ from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.truth import SinusoidalVibration, Spectrum, Truth
 from lbt_synth.models.vibration import Vibration
+from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
 
 
@@ -145,9 +146,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     )
 
 
-def _checked_direction(
-    vibration: Vibration | SinusoidalVibration, loop: ClosedLoop
-) -> FloatArray:
+def _checked_direction(vibration: Vibration | SinusoidalVibration, loop: ClosedLoop) -> FloatArray:
     if len(vibration.direction) != loop.hardware.modes:
         raise DimensionError(
             f"the direction of a vibration must have {loop.hardware.modes} components, one a mode; "
@@ -209,6 +208,5 @@ def resonance_quadrature(loop: ClosedLoop) -> tuple[FloatArray, FloatArray]:
             edges += [centre + offsets * width, centre - offsets * width]
     grid = np.unique(np.clip(np.concatenate(edges), 0, 1))
     grid = grid[np.concatenate([[True], np.diff(grid) > 1e-12])] * nyquist
-    x, w = np.polynomial.legendre.leggauss(6)
-    half, middle = np.diff(grid)[:, None] / 2, (grid[1:] + grid[:-1])[:, None] / 2
-    return frozen((middle + half * x).ravel()), frozen((half * w).ravel())
+    nodes, weights = gauss_panels(grid, 6)
+    return frozen(nodes), frozen(weights)

@@ -141,7 +141,7 @@ def stable_sensor_gains(
     ends = []
     for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
         count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
-        gains = centre * ratio ** np.arange(count + 1)
+        gains = np.asarray(centre * ratio ** np.arange(count + 1), dtype=np.float64)
         outside = np.nonzero(spectral_radii(hardware, controller, gains) >= 1)[0]
         if outside.size == 0:
             ends.append(open_end)

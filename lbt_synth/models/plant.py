@@ -51,7 +51,7 @@ class FullStatePlant(EstimationProblem):
     hardware: LoopHardware
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
-        """Controller from y(k) to u(k), the known input included.
+        """Return the controller from y(k) to u(k), the known input included.
 
         ``u(k) = N^+ L x_hat(k+1 | k)``; the past command u(k-1) is therefore
         ``N^+ L x_hat(k | k-1)`` and needs no state of its own.
@@ -88,15 +88,15 @@ class FullStatePlant(EstimationProblem):
             The columns of the known input u(k-1).
         """
         n, p = self.B.shape
-        l, q = self.L.shape[0], self.C.shape[0]
+        outputs, q = self.L.shape[0], self.C.shape[0]
         plant = np.block(
             [
-                [self.A, self.B, np.zeros((n, l))],
-                [-self.L, np.zeros((l, p)), np.eye(l)],
-                [self.C, self.D, np.zeros((q, l))],
+                [self.A, self.B, np.zeros((n, outputs))],
+                [-self.L, np.zeros((outputs, p)), np.eye(outputs)],
+                [self.C, self.D, np.zeros((q, outputs))],
             ]
         )
-        known = np.vstack([self.B_known, np.zeros((l, self.B_known.shape[1])), self.D_known])
+        known = np.vstack([self.B_known, np.zeros((outputs, self.B_known.shape[1])), self.D_known])
         return plant, known
 
 
@@ -165,7 +165,7 @@ class TipTiltPlant(EstimationProblem):
         )
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
-        """Controller from y(k) to u(k), the known input included.
+        """Return the controller from y(k) to u(k), the known input included.
 
         Parameters
         ----------

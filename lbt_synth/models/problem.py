@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from lbt_synth.errors import DefinitenessError
 from lbt_synth.statespace import Controller, StateSpace
 from lbt_synth.validation import FloatArray, definite, frozen, matrix, number, square
@@ -126,8 +128,32 @@ class EstimationProblem:
             A=self.A - gain @ self.C,
             B=self.B - gain @ self.D,
             C=self.L,
-            D=frozen([[0.0] * self.B.shape[1]] * self.L.shape[0]),
+            D=np.zeros((self.L.shape[0], self.B.shape[1])),
             dt_s=self.dt_s,
+        )
+
+    def with_unit_weights(self) -> EstimationProblem:
+        """Return the problem with each disturbance scaled to unit size.
+
+        The columns of ``[B; D]`` are divided by their norms: the paper's own
+        generalised plant, whose disturbances act with identity weights.
+
+        Returns
+        -------
+        EstimationProblem
+            The same states, measurements and signals.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> p = lbt.EstimationProblem(A=0.9, B=[[5.0, 0.0]], C=1.0, D=[[0.0, 2.0]], L=1.0)
+        >>> p.with_unit_weights().B.tolist()
+        [[1.0, 0.0]]
+        """
+        size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
+        size = np.where(size > 0, size, 1.0)
+        return EstimationProblem(
+            A=self.A, B=self.B / size, C=self.C, D=self.D / size, L=self.L, dt_s=self.dt_s
         )
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
@@ -160,7 +186,7 @@ class EstimationProblem:
             A=self.A - gain @ self.C,
             B=gain,
             C=self.L,
-            D=frozen([[0.0] * self.C.shape[0]] * self.L.shape[0]),
+            D=np.zeros((self.L.shape[0], self.C.shape[0])),
             dt_s=self.dt_s,
         )
 

@@ -9,7 +9,7 @@ from lbt_synth.validation import number
 
 
 def illuminated_subapertures(across: float, obstruction: float = 0.0) -> float:
-    """Number of subapertures of a square grid inside an annular pupil.
+    """Count the subapertures of a square grid inside an annular pupil.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def pyramid_tilt_noise_nm(
     wavelength_um: float,
     diameter_m: float,
 ) -> float:
-    """Standard deviation of the tip (or tilt) measurement, per frame [nm rms wavefront].
+    """Compute the noise of the tip (or tilt) measurement, per frame [nm rms wavefront].
 
     Slope variance of a quad cell in one subaperture,
     ``(N + 4 s^2) / N^2`` for N photons and read noise s, propagated to the tilt

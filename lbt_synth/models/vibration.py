@@ -93,9 +93,7 @@ class Vibration:
             coefficients=frozen([a1, a2]), driving_rms_nm=float(driving), frame_rate_hz=rate
         )
 
-    def retuned(
-        self, frequency_hz: float, *, frame_rate_hz: float, hold: str = "rms"
-    ) -> Vibration:
+    def retuned(self, frequency_hz: float, *, frame_rate_hz: float, hold: str = "rms") -> Vibration:
         """Return this vibration at another frequency.
 
         Parameters
@@ -122,7 +120,7 @@ class Vibration:
         >>> import lbt_synth as lbt
         >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
         >>> round(line.retuned(18, frame_rate_hz=800, hold="driving").rms_nm, 2)
-        117.1
+        117.01
         """
         choice(hold, "hold", ("rms", "driving"))
         moved = replace(self, frequency_hz=frequency_hz)

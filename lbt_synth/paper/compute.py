@@ -89,19 +89,19 @@ def table_ii() -> list[Comparison]:
 
 def table_iii() -> Iterator[RobustnessRow]:
     """Rows of Table III, two a frequency: Kalman, then H-infinity."""
-    errors = [row.model_hz - given.VIBRATION_HZ for row in TABLE_III]
-    for error in errors:
-        common = {"truth": given.PAPER_TRUTH, "imaging": given.imaging()}
-        yield from frequency_robustness(
-            given.kalman_plant(), **common, errors_hz=[error], methods=["kalman"]
-        )
-        yield from frequency_robustness(
-            given.hinf_plant(),
-            **common,
-            errors_hz=[error],
-            methods=["hinf"],
-            gamma=given.HINF_GAMMA * given.NOISE_NM,
-        )
+    for row in TABLE_III:
+        for plant, method, gamma in (
+            (given.kalman_plant(), "kalman", None),
+            (given.hinf_plant(), "hinf", given.HINF_GAMMA * given.NOISE_NM),
+        ):
+            yield from frequency_robustness(
+                plant,
+                given.PAPER_TRUTH,
+                given.imaging(),
+                errors_hz=[row.model_hz - given.VIBRATION_HZ],
+                methods=[method],
+                gamma=gamma,
+            )
 
 
 def compared(rows: list[RobustnessRow]) -> list[Comparison]:

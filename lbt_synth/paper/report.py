@@ -6,11 +6,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from lbt_synth.design import FilterDesign, kalman
+from lbt_synth.design import FilterDesign
 from lbt_synth.files import write_atomically
 from lbt_synth.gainfile import save_gain
 from lbt_synth.paper.compute import Comparison, compared, paper_filters, table_ii
-from lbt_synth.paper.parameters import PARAMETERS, VIBRATION_HZ, hinf_plant
+from lbt_synth.paper.parameters import PARAMETERS, VIBRATION_HZ
 from lbt_synth.paper.published import TABLE_III
 from lbt_synth.plotting import robustness_figure, save_figure, sigma_figure
 from lbt_synth.sweep import RobustnessRow
@@ -84,11 +84,10 @@ def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) ->
         method: [(row.model_hz - VIBRATION_HZ, getattr(row, method)) for row in TABLE_III]
         for method in ("kalman", "hinf")
     }
-    # the paper's sigma plot has one model for both filters; so has this one
-    same_model = {"Kalman": kalman(hinf_plant()), r"H$_\infty$": hinf_design}
+    filters = {"Kalman": kalman_design, r"H$_\infty$": hinf_design}
     for name, figure in (
         ("robustness", robustness_figure(rows, published)),
-        ("sigma", sigma_figure(same_model)),
+        ("sigma", sigma_figure(filters, unit_weights=True)),
     ):
         files += [save_figure(figure, folder / f"{name}{ending}") for ending in (".png", ".pdf")]
     files += [

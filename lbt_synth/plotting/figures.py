@@ -33,7 +33,9 @@ def frequency_grid(
     return grid[(grid > 0) & (grid <= nyquist)]
 
 
-def sigma_figure(designs: Mapping[str, Design], *, sensor_gain: float = 1.0) -> Any:
+def sigma_figure(
+    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, unit_weights: bool = False
+) -> Any:
     """Largest singular values of the estimation error, the rejection and the noise transfer.
 
     Parameters
@@ -43,6 +45,9 @@ def sigma_figure(designs: Mapping[str, Design], *, sensor_gain: float = 1.0) -> 
         only the first panel, integrators only the others.
     sensor_gain : float, optional
         Real sensor gain of the closed loops.
+    unit_weights : bool, optional
+        Draw the estimation error against disturbances of unit size, as the paper
+        does, instead of the weighted ones of each design.
 
     Returns
     -------
@@ -75,20 +80,23 @@ def sigma_figure(designs: Mapping[str, Design], *, sensor_gain: float = 1.0) -> 
     with house_style():
         panels = bool(estimators) + 2 * bool(loops)
         figure = new_figure(6.3, 2.4 * panels + 0.4)
-        axes = list(np.atleast_1d(figure.subplots(panels, 1)))
+        axes = list(np.atleast_1d(figure.subplots(panels, 1, sharex=True)))
         remaining = iter(axes)
         if estimators:
             axis = next(remaining)
             for name, design in estimators.items():
-                system = design.problem.error_system(design.gain_predictor)
+                problem = design.problem
+                problem = problem.with_unit_weights() if unit_weights else problem
+                system = problem.error_system(design.gain_predictor)
                 grid = frequency_grid(1 / system.dt_s, lines_hz)
                 axis.loglog(grid, largest_singular_values(system, grid), label=name, **styles[name])
-            unit = "nm" if loops else "-"
+            unit = "nm" if loops and not unit_weights else "-"
             axis.set_ylabel(rf"$\bar\sigma$ disturbances $\to$ error [{unit}]")
         if loops:
             _loop_panels(next(remaining), next(remaining), loops, styles, lines_hz)
         for axis in axes:
             _mark(axis, lines_hz)
+            _plain_ticks(axis)
             axis.legend(loc="best")
         axes[-1].set_xlabel("frequency [Hz]")
     return figure
@@ -153,7 +161,8 @@ def _loop_panels(
 
 
 def robustness_figure(
-    rows: Sequence[RobustnessRow], published: Mapping[str, Sequence[tuple[float, float]]] | None = None
+    rows: Sequence[RobustnessRow],
+    published: Mapping[str, Sequence[tuple[float, float]]] | None = None,
 ) -> Any:
     """Strehl ratio over the error of the model's vibration frequency.
 
@@ -260,7 +269,10 @@ def simulation_figure(run: Simulation, *, title: str = "") -> Any:
         for i, style in zip(range(n), looks(), strict=False):
             series.plot(time, run.residual_nm[0, :, i], label=names[i], linewidth=0.6,
                         color=style["color"])  # fmt: skip
-            for data, word, line in ((run.total_nm, "open loop", ":"), (run.residual_nm, "residual", "-")):
+            for data, word, line in (
+                (run.total_nm, "open loop", ":"),
+                (run.residual_nm, "residual", "-"),
+            ):
                 f, s = welch(data[:, :, i], fs=run.frame_rate_hz, nperseg=length, axis=1)
                 mean = np.maximum(s.mean(axis=0)[1:], 1e-12)
                 spectrum.loglog(f[1:], mean, linestyle=line, color=style["color"],
@@ -284,6 +296,17 @@ def _vibration_frequencies(designs: Any) -> list[float]:
         for line in design.problem.vibrations
     }
     return sorted(found)
+
+
+def _plain_ticks(axis: Any) -> None:
+    """Label a logarithmic axis of few decades with plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+    low, high = axis.get_ylim()
+    if high / low < 30:
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high / low > 3 else "all"))
+        axis.yaxis.set_major_formatter(ScalarFormatter())
+        axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _mark(axis: Any, lines_hz: Sequence[float]) -> None:

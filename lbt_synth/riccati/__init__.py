@@ -3,8 +3,6 @@
 from lbt_synth.riccati.dare import DareSolution, solve_dare
 from lbt_synth.riccati.filtering import (
     FilterRiccati,
-    decorrelated,
-    filter_gains,
     gamma_riccati,
     kalman_riccati,
     least_gamma,
@@ -14,8 +12,6 @@ from lbt_synth.riccati.filtering import (
 __all__ = [
     "DareSolution",
     "FilterRiccati",
-    "decorrelated",
-    "filter_gains",
     "gamma_riccati",
     "kalman_riccati",
     "least_gamma",

@@ -172,11 +172,15 @@ def _residual(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the gain, the residual matrix and its relative size."""
     cross = B.T @ X @ A + S.T
-    gain = np.linalg.solve(R + B.T @ X @ B, cross)
+    gain = np.asarray(np.linalg.solve(R + B.T @ X @ B, cross), dtype=np.float64)
     AXA = A.T @ X @ A
     residual = AXA - X + Q - cross.T @ gain
     scale = sum(float(np.linalg.norm(t, 1)) for t in (X, AXA, Q))
-    return gain, (residual + residual.T) / 2, float(np.linalg.norm(residual, 1)) / max(scale, 1e-300)
+    return (
+        gain,
+        (residual + residual.T) / 2,
+        float(np.linalg.norm(residual, 1)) / max(scale, 1e-300),
+    )
 
 
 def _refined(

@@ -20,7 +20,7 @@ _BLOCK = 16
 
 
 def filter_series(system: StateSpace, inputs: Any) -> FloatArray:
-    """Outputs of a discrete-time system from a zero state.
+    """Compute the outputs of a discrete-time system from a zero state.
 
     Parameters
     ----------

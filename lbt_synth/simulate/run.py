@@ -62,7 +62,7 @@ class Simulation:
     @property
     def rms_nm(self) -> FloatArray:
         """Residual of each case over all modes [nm rms], (cases,)."""
-        return np.sqrt(np.sum(np.mean(self.residual_nm**2, axis=1), axis=1))
+        return np.asarray(np.sqrt(np.sum(np.mean(self.residual_nm**2, axis=1), axis=1)))
 
     def strehl(self, imaging: Imaging) -> FloatArray:
         """Long-exposure Strehl ratio of each case, (cases,)."""
@@ -142,8 +142,8 @@ def simulate(
             "controller must be a Controller, or an object with step(y) and reset(); "
             f"got {type(controller).__name__}."
         )
-    settle = default if settle_frames is None else integer(
-        settle_frames, "settle_frames", at_least=0
+    settle = (
+        default if settle_frames is None else integer(settle_frames, "settle_frames", at_least=0)
     )
     disturbance_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     size = {"frames": settle + frames, "cases": cases}

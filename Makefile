@@ -1,0 +1,56 @@
+# Everything works from a fresh clone: the first command makes the environment.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+UV     := $(shell command -v uv 2>/dev/null)
+OUT    ?= out
+# small matrices: more threads than processes only get in each other's way
+export OPENBLAS_NUM_THREADS ?= 1
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: demo test test-all study bench docs lint clean
+
+$(VENV)/.ready: pyproject.toml
+ifdef UV
+	$(UV) venv --quiet --allow-existing --python $(PYTHON) $(VENV)
+	$(UV) pip install --quiet --python $(BIN)/python -e . --group dev
+else
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(BIN)/python -m pip install --quiet -e . --group dev
+endif
+	@touch $@
+
+demo: $(VENV)/.ready     ## design both filters for the LBT, close the loop, write out/
+	@mkdir -p $(OUT)
+	$(BIN)/lbt-synth design examples/lbt.yaml --method kalman -o $(OUT)/kalman.fits
+	$(BIN)/lbt-synth design examples/lbt.yaml --method hinf --gamma-ratio 1.2 -o $(OUT)/hinf.fits
+	$(BIN)/lbt-synth sigma $(OUT)/kalman.fits $(OUT)/hinf.fits -o $(OUT)/sigma.png
+	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/kalman.fits -o $(OUT)/kalman_loop.png
+	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/hinf.fits -o $(OUT)/hinf_loop.png
+	$(BIN)/lbt-synth robustness examples/lbt.yaml -o $(OUT)/robustness.csv -o $(OUT)/robustness.png
+	$(BIN)/lbt-synth paper -o $(OUT)/paper
+
+lint: $(VENV)/.ready     ## style, types, import layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint               ## the whole default check
+	$(BIN)/pytest -n 2 -m "not study" --doctest-modules lbt_synth tests
+
+test-all:                ## the check on each supported Python that is found
+	PYTHON=$(PYTHON) .ci/each-python $(MAKE) test
+
+study: $(VENV)/.ready    ## the long numerical studies
+	$(BIN)/pytest -m study tests
+
+bench: $(VENV)/.ready    ## speed against peers, as ratios within one run
+	$(BIN)/python benchmarks/run.py
+
+docs: $(VENV)/.ready     ## the documentation, warnings are errors
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+
+clean:
+	rm -rf $(OUT) $(VENV) docs/_build docs/api/generated .pytest_cache .mypy_cache .ruff_cache
