@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from lbt_synth.errors import NumericalError
 from lbt_synth.validation import FloatArray
 
 
@@ -34,3 +37,74 @@ def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]
     half = np.diff(edges)[:, None] / 2
     middle = (edges[:-1] + edges[1:])[:, None] / 2
     return (middle + half * x).ravel(), (half * w).ravel()
+
+
+def adaptive_integral(
+    integrand: Callable[[FloatArray], FloatArray],
+    edges: FloatArray,
+    *,
+    tolerance: float = 1e-7,
+    order: int = 6,
+) -> FloatArray:
+    """Integrate a matrix-valued function, halving panels until the integral stands still.
+
+    Parameters
+    ----------
+    integrand : callable
+        From (f,) points to (f, n, n) values with diagonals of at least 0.
+    edges : (panels + 1,) ndarray
+        Increasing ends of the first panels.
+    tolerance : float, optional
+        A panel is halved while that changes the trace by more than this part of the whole.
+    order : int, optional
+        Nodes a panel.
+
+    Returns
+    -------
+    (n, n) ndarray
+        The integral.
+
+    Raises
+    ------
+    NumericalError
+        If some panel still changes after 40 halvings.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.quadrature import adaptive_integral
+    >>> peak = lambda x: (1e-4 / (1e-8 + (x - 0.3) ** 2))[:, None, None]
+    >>> round(float(adaptive_integral(peak, np.array([0.0, 1.0]))[0, 0]), 5)   # close to pi
+    3.14112
+    """
+
+    def panels(low: FloatArray, high: FloatArray) -> FloatArray:
+        x, w = np.polynomial.legendre.leggauss(order)
+        half, middle = (high - low)[:, None] / 2, (high + low)[:, None] / 2
+        values = integrand((middle + half * x).ravel())
+        values = values.reshape(low.size, order, *values.shape[1:])
+        return np.asarray(np.einsum("po,poij->pij", half * w, values))
+
+    low, high = edges[:-1], edges[1:]
+    coarse = panels(low, high)
+    done = np.zeros(coarse.shape[1:])
+    for _ in range(40):
+        middle = (low + high) / 2
+        left, right = panels(low, middle), panels(middle, high)
+        fine = left + right
+        total = np.trace(done) + np.trace(fine.sum(axis=0))
+        change = np.abs(np.trace(fine - coarse, axis1=1, axis2=2))
+        open_ = change > tolerance * total
+        done = done + fine[~open_].sum(axis=0)
+        if not open_.any():
+            return done
+        low, high = (
+            np.concatenate([low[open_], middle[open_]]),
+            np.concatenate([middle[open_], high[open_]]),
+        )
+        coarse = np.concatenate([left[open_], right[open_]])
+    raise NumericalError(
+        "the integral of a spectrum did not settle: it changes still after 40 halvings. "
+        "Check that the spectrum is finite and not a set of delta functions.",
+        status="quadrature",
+    )

@@ -1,7 +1,7 @@
 """Residual of a closed loop without noise of sampling: the exact answer.
 
 White noise and auto-regressive disturbances by a Lyapunov equation, spectra by
-quadrature on panels that crowd at the closed loop's resonances, sinusoids by
+adaptive quadrature on panels that crowd at the closed loop's resonances, sinusoids by
 the frequency response.
 """
 
@@ -17,7 +17,7 @@ from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.truth import SinusoidalVibration, Spectrum, Truth
 from lbt_synth.models.vibration import Vibration
-from lbt_synth.quadrature import gauss_panels
+from lbt_synth.quadrature import adaptive_integral
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
 
 
@@ -187,26 +187,28 @@ def _ar_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray) -> F
 
 
 def _spectrum_covariance(loop: ClosedLoop, spectrum: Spectrum) -> FloatArray:
-    frequency, weight = resonance_quadrature(loop)
-    response = loop.sensitivity(frequency)
-    density = spectrum.psd(frequency) * weight
-    return np.real(np.einsum("f,fij,fkj->ik", density, response, response.conj()))
+    """Integrate the residual's spectrum over (0, Nyquist), adaptively."""
+    breaks = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
 
+    def density(frequency: FloatArray) -> FloatArray:
+        response = loop.sensitivity(frequency)
+        power = np.real(np.einsum("fij,fkj->fik", response, response.conj()))
+        return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
 
-def resonance_quadrature(loop: ClosedLoop) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Legendre nodes [Hz] and weights [Hz] on (0, Nyquist).
-
-    The panels are geometric, with more of them around the frequency of each
-    pole, down to a fraction of its width.
-    """
     nyquist = loop.hardware.frame_rate_hz / 2
-    edges = [np.geomspace(1e-6, 1, 64), np.array([0.0])]
-    offsets = np.concatenate([[0.0], np.geomspace(0.25, 64, 9)])
+    inside = breaks[(breaks > 0) & (breaks < nyquist)]
+    edges = np.unique(np.concatenate([resonance_edges(loop), inside]))
+    return adaptive_integral(density, edges)
+
+
+def resonance_edges(loop: ClosedLoop) -> FloatArray:
+    """Panels of (0, Nyquist) [Hz]: geometric, and more of them around each pole."""
+    nyquist = loop.hardware.frame_rate_hz / 2
+    edges = [np.geomspace(1e-6, 1, 40), np.array([0.0])]
+    offsets = np.array([0.0, 1.0, 4.0, 16.0])
     for pole in loop.system.poles:
         centre, width = abs(np.angle(pole)) / np.pi, max(1 - abs(pole), 1e-9) / np.pi
         if 1e-6 < width < 0.1:
             edges += [centre + offsets * width, centre - offsets * width]
     grid = np.unique(np.clip(np.concatenate(edges), 0, 1))
-    grid = grid[np.concatenate([[True], np.diff(grid) > 1e-12])] * nyquist
-    nodes, weights = gauss_panels(grid, 6)
-    return frozen(nodes), frozen(weights)
+    return frozen(grid[np.concatenate([[True], np.diff(grid) > 1e-12])] * nyquist)

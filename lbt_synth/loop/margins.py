@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from lbt_synth.loop.budget import resonance_quadrature
+from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, spectral_radii
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.norms import hinf_norm
+from lbt_synth.quadrature import gauss_panels
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import number
 
@@ -165,7 +166,7 @@ def _crossings(loop: ClosedLoop, index: int) -> list[tuple[float, float]]:
         response = system.frequency_response(np.atleast_1d(frequency))[:, index, index]
         return np.asarray(1 / response - 1)
 
-    nodes, _ = resonance_quadrature(loop)
+    nodes, _ = gauss_panels(resonance_edges(loop), 12)
     excess = np.abs(broken(nodes)) - 1
     found = []
     for i in np.nonzero(excess[1:] * excess[:-1] < 0)[0]:

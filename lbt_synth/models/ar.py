@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.validation import FloatArray, frozen, number, real_array
 
 
@@ -77,10 +76,7 @@ class ARModel:
     @property
     def rms_nm(self) -> float:
         """Stationary standard deviation [nm]."""
-        drive = np.zeros((self.order, self.order))
-        drive[0, 0] = self.driving_rms_nm**2
-        variance = stationary_covariance(self.companion, drive)[0, 0]
-        return float(np.sqrt(variance))
+        return self.driving_rms_nm * float(np.sqrt(variance_ratio(self.coefficients)))
 
     def psd(self, frequency_hz: Any) -> FloatArray:
         """One-sided power spectrum [nm^2/Hz] at frequencies up to Nyquist.
@@ -127,6 +123,18 @@ def resonance_coefficients(
     return float(2 * decay * np.cos(wt * np.sqrt(1 - damping**2))), float(-(decay**2))
 
 
-def resonance_variance_ratio(a1: float, a2: float) -> float:
-    """Variance of an AR2 process over the variance of its driving noise."""
-    return (1 - a2) / ((1 + a2) * ((1 - a2) ** 2 - a1**2))
+def variance_ratio(coefficients: FloatArray) -> float:
+    """Variance of a stationary AR process over that of its driving noise.
+
+    By Levinson's recursion stepped down: with the reflection coefficients r the
+    ratio is ``1 / prod(1 - r^2)``. Loses fewer digits than a Lyapunov equation
+    when the poles crowd at the unit circle.
+    """
+    a = np.array(coefficients, dtype=np.float64)
+    ratio = 1.0
+    while a.size:
+        r, rest = a[-1], a[:-1]
+        shrink = (1 - r) * (1 + r)
+        ratio /= shrink
+        a = (rest + r * rest[::-1]) / shrink
+    return float(ratio)

@@ -63,6 +63,11 @@ class TabulatedSpectrum:
         object.__setattr__(self, "frequency_hz", f)
         object.__setattr__(self, "density_nm2_hz", s)
 
+    @property
+    def breakpoints_hz(self) -> FloatArray:
+        """Frequencies where the spectrum has kinks [Hz]."""
+        return self.frequency_hz
+
     def psd(self, frequency_hz: Any) -> FloatArray:
         """Return the spectrum at frequencies [Hz] by linear interpolation [nm^2/Hz]."""
         x = real_array(frequency_hz, "frequency_hz")

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.models.ar import ARModel, resonance_coefficients, resonance_variance_ratio
+from lbt_synth.models.ar import ARModel, resonance_coefficients, variance_ratio
 from lbt_synth.models.atmosphere import Atmosphere
 from lbt_synth.validation import frozen, integer, number
 
@@ -145,7 +145,7 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     def unpack(p: np.ndarray) -> tuple[float, float, float]:
         """Log frequency, log damping/(1 - damping), log rms -> a1, a2, driving variance."""
         a1, a2 = resonance_coefficients(float(np.exp(p[0])), float(1 / (1 + np.exp(-p[1]))), rate)
-        return a1, a2, float(np.exp(2 * p[2])) / resonance_variance_ratio(a1, a2)
+        return a1, a2, float(np.exp(2 * p[2])) / variance_ratio(frozen([a1, a2]))
 
     def contrast(p: np.ndarray) -> float:
         a1, a2, drive = unpack(p)

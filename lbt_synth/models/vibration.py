@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.ar import ARModel, resonance_coefficients, resonance_variance_ratio
+from lbt_synth.models.ar import ARModel, resonance_coefficients, variance_ratio
 from lbt_synth.validation import choice, frozen, number, real_array
 
 
@@ -88,7 +88,7 @@ class Vibration:
                 f"got {self.frequency_hz:.6g} Hz. Give the frequency it is aliased to."
             )
         a1, a2 = resonance_coefficients(self.frequency_hz, self.damping, rate)
-        driving = self.rms_nm / np.sqrt(resonance_variance_ratio(a1, a2))
+        driving = self.rms_nm / np.sqrt(variance_ratio(frozen([a1, a2])))
         return ARModel(
             coefficients=frozen([a1, a2]), driving_rms_nm=float(driving), frame_rate_hz=rate
         )

@@ -1,0 +1,211 @@
+"""Kalman and H-infinity designs: published numbers, two routes, certificates, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import control
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import lbt_axis_plant, random_problem
+
+import lbt_synth as lbt
+
+KALMAN_NM, LEAST_GAMMA_NM = 135.958, 155.5373
+
+
+def test_the_numbers_of_the_lbt(axis_plant):
+    assert lbt.kalman(axis_plant).rms == pytest.approx(KALMAN_NM, rel=1e-5)
+    least = {m: lbt.hinf(axis_plant, method=m).gamma for m in ("lmi", "riccati")}
+    assert least["riccati"] == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
+    assert least["lmi"] == pytest.approx(least["riccati"], rel=1e-6)
+
+
+@pytest.mark.parametrize("modes", [1, 2])
+def test_kalman_by_sdp_agrees_with_the_riccati_equation(modes):
+    plant = lbt_axis_plant(modes=modes)
+    riccati, sdp = (lbt.kalman(plant, method=m) for m in ("riccati", "sdp"))
+    for name in ("gain_predictor", "gain_filter"):
+        one, other = getattr(riccati, name), getattr(sdp, name)
+        assert np.linalg.norm(one - other) / np.linalg.norm(one) < 1e-6
+    assert sdp.rms == pytest.approx(riccati.rms, rel=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [1.02, 1.2, 2.0])
+def test_hinf_by_lmi_is_the_central_filter_of_the_riccati_equation(axis_plant, ratio):
+    gamma = ratio * LEAST_GAMMA_NM
+    lmi, riccati = (lbt.hinf(axis_plant, gamma=gamma, method=m) for m in ("lmi", "riccati"))
+    difference = np.linalg.norm(lmi.gain_predictor - riccati.gain_predictor)
+    assert difference / np.linalg.norm(riccati.gain_predictor) < 1e-6
+    assert lmi.gamma <= gamma
+    assert lmi.gamma_requested == gamma
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 4), q=st.integers(1, 2), l=st.integers(1, 2))
+def test_both_routes_agree_on_problems_without_a_telescope(seed, n, q, l):
+    problem = random_problem(np.random.default_rng(seed), n, q, l=l)
+    kalman, sdp = lbt.kalman(problem), lbt.kalman(problem, method="sdp")
+    assert sdp.rms == pytest.approx(kalman.rms, rel=1e-5)
+    riccati, lmi = lbt.hinf(problem, method="riccati"), lbt.hinf(problem)
+    assert lmi.gamma == pytest.approx(riccati.gamma, rel=1e-5)
+    # each filter is the best by its own measure
+    assert kalman.rms <= riccati.rms * (1 + 1e-9)
+    assert riccati.gamma <= kalman.gamma * (1 + 1e-9)
+
+
+def test_kalman_against_a_long_recursion(axis_plant):
+    """The textbook time-varying filter, run until it stands still."""
+    p = axis_plant
+    P = np.zeros((4, 4))
+    for _ in range(20_000):
+        gain = p.A @ P @ p.C.T / (p.C @ P @ p.C.T + p.R)
+        P = p.A @ P @ p.A.T + p.Q - gain @ (p.C @ P @ p.A.T)
+    design = lbt.kalman(p)
+    assert np.allclose(design.gain_predictor, gain, rtol=1e-8)
+    assert np.allclose(p.A @ design.gain_filter, design.gain_predictor, rtol=1e-10)
+
+
+def test_kalman_gains_with_correlated_noise():
+    problem = random_problem(np.random.default_rng(8), 3, 2)
+    P = scipy.linalg.solve_discrete_are(
+        problem.A.T, problem.C.T, problem.Q, problem.R, s=problem.S
+    )
+    innovation = problem.C @ P @ problem.C.T + problem.R
+    predictor = (problem.A @ P @ problem.C.T + problem.S) @ np.linalg.inv(innovation)
+    design = lbt.kalman(problem)
+    assert np.allclose(design.gain_predictor, predictor, rtol=1e-8)
+    assert np.allclose(design.gain_filter, P @ problem.C.T @ np.linalg.inv(innovation), rtol=1e-8)
+
+
+def test_scalar_hinf_against_a_search():
+    """Of all gains of a scalar predictor, none beats the least gamma."""
+    problem = lbt.EstimationProblem(A=0.95, B=[[2.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    least = lbt.hinf(problem, method="riccati").gamma
+    gains = np.linspace(0.05, 1.9, 1_000_001)
+    norms = np.hypot(2.0, gains) / (1 - np.abs(0.95 - gains))
+    assert least == pytest.approx(norms.min(), rel=1e-5)
+    assert least <= norms.min() * (1 + 1e-9)
+
+
+def test_at_the_least_gamma_the_error_is_all_pass(axis_plant):
+    design = lbt.hinf(axis_plant, method="riccati")
+    error = axis_plant.error_system(design.gain_predictor)
+    sigma = lbt.largest_singular_values(error, np.linspace(0.1, 400, 200))
+    assert np.ptp(sigma) / sigma.mean() < 1e-4
+
+
+def test_hinf_costs_sensor_gain_robustness(axis_plant):
+    """FIELD_NOTES, section 3: Kalman [.075, 1.9], 1.05 gamma_min [.70, 1.6]."""
+    low, high = lbt.stable_sensor_gains(axis_plant.hardware, lbt.kalman(axis_plant).controller)
+    assert (low, high) == pytest.approx((0.075, 1.9), abs=0.03)
+    design = lbt.hinf(axis_plant, gamma_ratio=1.05)
+    low, high = lbt.stable_sensor_gains(axis_plant.hardware, design.controller)
+    assert (low, high) == pytest.approx((0.70, 1.6), abs=0.05)
+
+
+def test_gamma_below_the_least_names_the_least(axis_plant):
+    for method in ("lmi", "riccati"):
+        with pytest.raises(lbt.InfeasibleError, match=r"at least 155\.537.*got 150") as caught:
+            lbt.hinf(axis_plant, gamma=150, method=method)
+        assert caught.value.gamma == 150
+        assert caught.value.gamma_least == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"gamma": 200, "gamma_ratio": 1.2}, "gamma or gamma_ratio, not both"),
+        ({"gamma": -1}, "gamma must be above 0"),
+        ({"gamma": np.nan}, "gamma must be finite"),
+        ({"gamma_ratio": 0.9}, "gamma_ratio must be at least 1; got 0.9"),
+        ({"method": "magic"}, "method must be one of lmi, riccati; got 'magic'"),
+    ],
+)
+def test_wrong_arguments_are_refused(axis_plant, arguments, text):
+    with pytest.raises(lbt.ProblemError, match=text):
+        lbt.hinf(axis_plant, **arguments)
+
+
+def test_nothing_to_estimate_is_refused():
+    known = lbt.EstimationProblem(A=0.5, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    with pytest.raises(lbt.ProblemError, match="must have an estimation error"):
+        lbt.hinf(known)
+    assert lbt.kalman(known).rms == 0
+
+
+def test_designs_are_frozen(axis_plant):
+    design = lbt.kalman(axis_plant)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        design.method = "other"
+    with pytest.raises(ValueError, match="read-only"):
+        design.gain_predictor[0, 0] = 0
+
+
+def test_a_wrong_solver_answer_does_not_leave_the_library(monkeypatch, axis_plant):
+    """Solvers are not believed: a gain that is off by 1e-3 fails its certificate."""
+    module = sys.modules["lbt_synth.design.kalman"]  # the package has the function of that name
+    right = module.kalman_riccati(axis_plant)
+    wrong = dataclasses.replace(right, gain_predictor=right.gain_predictor * 1.001)
+    monkeypatch.setattr(module, "kalman_riccati", lambda _: wrong)
+    with pytest.raises(lbt.CertificateError, match="least-variance gain") as caught:
+        lbt.kalman(axis_plant)
+    assert caught.value.failed == ("distance from the least-variance gain",)
+
+
+def test_an_unstable_optimal_filter_does_not_leave_the_library(monkeypatch, axis_plant):
+    module = sys.modules["lbt_synth.design.hinf"]
+
+    class Liar(module._RiccatiRoute):
+        def at(self, gamma):
+            return dataclasses.replace(super().at(gamma), gain_predictor=np.full((4, 1), 5.0))
+
+    monkeypatch.setattr(module, "_RiccatiRoute", Liar)
+    with pytest.raises(lbt.CertificateError, match="spectral radius of the filter"):
+        lbt.hinf(axis_plant, gamma_ratio=1.2, method="riccati")
+
+
+def test_certificate_checks_are_independent(axis_plant):
+    design = lbt.hinf(axis_plant, gamma_ratio=1.2)
+    names = [check.name for check in design.certificate.checks]
+    assert "spectral radius of the filter" in names
+    assert "norm of the estimation error" in names
+    assert "spectral radius of the closed loop" in names
+    assert design.recertified().passed
+    tighter = lbt.certify_filter(axis_plant, design.gain_predictor, gamma=0.99 * design.gamma)
+    assert not tighter.passed
+    with pytest.raises(lbt.CertificateError, match="norm of the estimation error"):
+        tighter.require()
+    assert not lbt.certify_filter(axis_plant, np.full((4, 1), 9.0)).passed
+
+
+def test_to_control_is_the_same_controller(axis_plant):
+    design = lbt.kalman(axis_plant)
+    system = design.to_control()
+    assert isinstance(system, control.StateSpace)
+    y = np.random.default_rng(0).standard_normal(200)
+    run = design.controller.start()
+    stepped = [run.step([value])[0] for value in y]
+    _, response = control.forced_response(system, U=y)
+    assert np.allclose(np.ravel(response), stepped, rtol=1e-9, atol=1e-12)
+
+
+def test_a_mirror_without_vibration_needs_no_special_case():
+    turbulence = lbt.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=800)
+    plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=turbulence, noise_nm=15)
+    assert lbt.kalman(plant).certificate.passed
+    assert lbt.hinf(plant, gamma_ratio=1.2).certificate.passed
+
+
+def test_units_do_not_matter():
+    """The same problem in metres and in nanometres."""
+    nano = lbt_axis_plant()
+    metre = lbt.EstimationProblem(A=nano.A, B=nano.B * 1e-9, C=nano.C, D=nano.D * 1e-9, L=nano.L)
+    for make in (lbt.kalman, lambda p: lbt.kalman(p, method="sdp"), lambda p: lbt.hinf(p, gamma_ratio=1.2)):
+        one, other = make(nano), make(metre)
+        assert np.allclose(one.gain_predictor, other.gain_predictor, rtol=1e-6)
+        assert other.rms == pytest.approx(one.rms * 1e-9, rel=1e-6)

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lbt_synth as lbt
+
+
+@pytest.mark.parametrize(("delay", "limit"), [(1, 2.0), (2, 1.0), (3, 0.618034), (4, 0.445042)])
+def test_limits_of_whole_delays(delay, limit):
+    assert lbt.integrator_gain_limit(delay) == pytest.approx(limit, abs=1e-6)
+
+
+@given(delay=st.floats(1, 4.5))
+def test_the_limit_is_where_the_loop_turns_unstable(delay):
+    limit = lbt.integrator_gain_limit(delay)
+    path = lbt.LoopHardware(frame_rate_hz=1, delay_frames=delay, modes=1)
+
+    def radius(gain):
+        controller = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0)
+        return lbt.close_loop(path, controller).spectral_radius
+
+    assert radius(limit * (1 - 1e-4)) < 1
+    assert radius(limit * (1 + 1e-4)) > 1
+
+
+def test_a_gain_beyond_the_limit_does_not_leave_the_library():
+    path = lbt.LoopHardware(frame_rate_hz=800)
+    with pytest.raises(lbt.CertificateError, match="spectral radius of the closed loop"):
+        lbt.integrator(path, gain=1.01)
+    with pytest.raises(lbt.CertificateError):  # marginal
+        lbt.integrator(path, gain=1.0)
+    with pytest.raises(lbt.ProblemError, match="gain must be above 0"):
+        lbt.integrator(path, gain=0.0)
+
+
+def test_the_best_gain_beats_a_fine_search(air):
+    path = lbt.LoopHardware(frame_rate_hz=800)
+    truth = lbt.Truth(turbulence=air, noise_nm=15.5, sensor_gain=0.6)
+    best = lbt.optimal_integrator(path, truth)
+
+    def residual(gain):
+        controller = lbt.integrator(path, gain=gain).controller
+        return lbt.residual_budget(lbt.close_loop(path, controller, sensor_gain=0.6), truth).rms_nm
+
+    least = min(residual(g) for g in np.linspace(0.02, 0.98, 97))
+    assert residual(best.gain) <= least * (1 + 1e-6)
+
+
+def test_reconstructor_inverts_any_sensor():
+    rng = np.random.default_rng(0)
+    path = lbt.LoopHardware(
+        frame_rate_hz=800, sensor_matrix=rng.standard_normal((5, 2)),
+        influence_matrix=rng.standard_normal((2, 2)),
+    )  # fmt: skip
+    design = lbt.integrator(path, gain=0.4)
+    plain = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
+    f = [0.5, 10, 100]
+    one = lbt.close_loop(path, design.controller).sensitivity(f)
+    other = lbt.close_loop(plain.hardware, plain.controller).sensitivity(f)
+    assert np.allclose(one, other, atol=1e-12)
+
+
+def test_an_undisturbed_loop_has_no_best_gain():
+    with pytest.raises(lbt.ProblemError, match="must disturb the loop"):
+        lbt.optimal_integrator(lbt.LoopHardware(frame_rate_hz=800), lbt.Truth(turbulence=None))

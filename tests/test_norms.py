@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+import slycot
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lbt_synth as lbt
+
+
+def random_system(seed, n, m, p, radius):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    A *= radius / max(abs(np.linalg.eigvals(A)))
+    return A, rng.standard_normal((n, m)), rng.standard_normal((p, n)), rng.standard_normal((p, m))
+
+
+@given(
+    seed=st.integers(0, 100_000), n=st.integers(1, 8), m=st.integers(1, 3), p=st.integers(1, 3),
+    radius=st.sampled_from([0.3, 0.9, 0.999, 1 - 1e-6]),
+)  # fmt: skip
+def test_against_slycot(seed, n, m, p, radius):
+    A, B, C, D = random_system(seed, n, m, p, radius)
+    expected, _ = slycot.ab13dd("D", "I", "N", "D", n, m, p, A, np.eye(n), B, C, D, 1e-12)
+    norm = lbt.hinf_norm((A, B, C, D))
+    assert float(norm) == pytest.approx(expected, rel=1e-8)
+    assert norm.lower <= expected * (1 + 1e-9)
+    assert norm.upper >= expected * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9])
+def test_poles_next_to_the_unit_circle(gap):
+    assert float(lbt.hinf_norm(([[1 - gap]], [[1.0]], [[1.0]], [[0.0]]))) == pytest.approx(
+        1 / gap, rel=1e-6
+    )
+
+
+def test_poles_at_zero_and_wide_systems():
+    delay = np.eye(3, k=-1)
+    norm = lbt.hinf_norm((delay, np.eye(3)[:, :1], np.eye(3)[2:], [[0.0]]))
+    assert float(norm) == pytest.approx(1, rel=1e-12)
+    wide = lbt.hinf_norm(([[0.5]], [[3.0, 4.0]], [[1.0]], [[0.0, 0.0]]))
+    assert float(wide) == pytest.approx(10, rel=1e-12)
+
+
+def test_a_narrow_peak_is_found_and_placed():
+    line = lbt.Vibration(frequency_hz=133.7, damping=1e-7, rms_nm=1).ar_model(800)
+    a1, a2 = line.coefficients
+    system = lbt.StateSpace(A=[[a1, a2], [1, 0]], B=[[1], [0]], C=[[1, 0]], D=[[0]], dt_s=1 / 800)
+    norm = lbt.hinf_norm(system)
+    assert norm.peak_frequency_hz == pytest.approx(133.7, rel=1e-6)
+    pole = np.exp(2j * np.pi * 133.7 / 800)
+    assert norm.value == pytest.approx(
+        abs(system.frequency_response([norm.peak_frequency_hz])[0, 0, 0]), rel=1e-12
+    )
+    assert norm.value == pytest.approx(1 / abs((1 - abs(line.coefficients[1]) ** 0.5) * (pole - 1 / pole)), rel=1e-3)
+
+
+def test_zero_and_static_systems():
+    assert float(lbt.hinf_norm(([[0.5]], [[0.0]], [[1.0]], [[0.0]]))) == 0
+    assert float(lbt.hinf_norm(([[0.5]], [[0.0]], [[1.0]], [[-3.0]]))) == pytest.approx(3)
+
+
+@given(seed=st.integers(0, 1000), scale=st.floats(1e-6, 1e6))
+def test_the_norm_is_homogeneous(seed, scale):
+    A, B, C, D = random_system(seed, 4, 2, 2, 0.95)
+    one = float(lbt.hinf_norm((A, B, C, D)))
+    assert float(lbt.hinf_norm((A, B * scale, C, D * scale))) == pytest.approx(one * scale, rel=1e-9)
+
+
+def test_takes_python_control_systems():
+    system = control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    assert float(lbt.hinf_norm(system)) == pytest.approx(2, rel=1e-9)
+    with pytest.raises(lbt.ProblemError, match="must be in discrete time"):
+        lbt.hinf_norm(control.ss([[-0.5]], [[1.0]], [[1.0]], [[0.0]]))
+    with pytest.raises(lbt.ProblemError, match="got str"):
+        lbt.hinf_norm("system")
+
+
+def test_unstable_systems_have_no_norm():
+    with pytest.raises(lbt.UnstableLoopError, match="got a pole of modulus 1.5") as caught:
+        lbt.hinf_norm(([[1.5]], [[1.0]], [[1.0]], [[0.0]]))
+    assert caught.value.spectral_radius == 1.5
+
+
+def test_round_trip_through_python_control():
+    A, B, C, D = random_system(4, 5, 2, 3, 0.9)
+    system = lbt.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
+    back = lbt.StateSpace.of(system.to_control())
+    for name in "ABCD":
+        assert np.array_equal(getattr(back, name), getattr(system, name))
+    assert back.dt_s == 0.002
+
+
+def test_frequency_response_against_python_control():
+    A, B, C, D = random_system(7, 5, 2, 3, 0.9)
+    system = lbt.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
+    f = np.linspace(0.0, 250, 40)
+    expected = np.moveaxis(system.to_control()(np.exp(2j * np.pi * f * 0.002)), 2, 0)
+    assert np.allclose(system.frequency_response(f), expected, rtol=1e-10)

@@ -1,0 +1,110 @@
+"""Strehl ratio against FFT optics and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import j0
+
+import lbt_synth as lbt
+from lbt_synth.loop.strehl import annular_otf
+
+CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
+
+
+def pupil_otf(obstruction, size=512):
+    """Autocorrelation of a sampled pupil; returns coordinates in D and the OTF."""
+    x = (np.arange(2 * size) - size + 0.5) / size
+    radius = np.hypot(*np.meshgrid(x, x))
+    pupil = ((radius < 0.5) & (radius >= obstruction / 2)).astype(float)
+    otf = np.fft.fftshift(np.real(np.fft.ifft2(np.abs(np.fft.fft2(pupil)) ** 2)))
+    shift = (np.arange(2 * size) - size) / size
+    return np.meshgrid(shift, shift), otf / otf.max()
+
+
+@pytest.mark.parametrize("obstruction", [0.0, 0.11, 0.4])
+def test_otf_is_the_autocorrelation_of_the_pupil(obstruction):
+    (x, y), otf = pupil_otf(obstruction)
+    radius = np.hypot(x, y)
+    inside = radius < 0.99
+    assert np.max(np.abs(annular_otf(radius[inside], obstruction) - otf[inside])) < 4e-3
+
+
+def test_integral_against_fft_optics():
+    (x, y), otf = pupil_otf(0.11)
+    sx, sy, amplitude = 150.0, 320.0, np.array([500.0, 200.0j])
+    k = CAMERA.cycles_per_nm
+    factor = np.exp(-2 * np.pi**2 * k**2 * (sx**2 * x**2 + sy**2 * y**2))
+    factor = factor * j0(2 * np.pi * k * np.abs(amplitude[0] * x + amplitude[1] * y))
+    expected = np.sum(otf * factor) / np.sum(otf)
+    ours = lbt.jitter_strehl(
+        np.diag([sx**2, sy**2]), imaging=CAMERA, line_amplitudes_nm=[amplitude]
+    )
+    assert ours == pytest.approx(expected, abs=5e-4)
+
+
+def test_known_value_and_marechal():
+    """FIELD_NOTES section 2: 300 nm an axis leaves .375, where Marechal says .230."""
+    exact = lbt.jitter_strehl(np.eye(2) * 300**2, imaging=CAMERA)
+    assert exact == pytest.approx(0.375, abs=1e-3)
+    small = lbt.jitter_strehl(np.eye(2) * 20**2, imaging=CAMERA)
+    assert small == pytest.approx(np.exp(-2 * (2 * np.pi * 20 / 2200) ** 2), abs=2e-4)
+
+
+@given(angle=st.floats(0, np.pi), sx=st.floats(0, 800), sy=st.floats(0, 800))
+def test_turning_the_jitter_changes_nothing(angle, sx, sy):
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    covariance = np.diag([sx**2, sy**2])
+    one = lbt.jitter_strehl(covariance, imaging=CAMERA)
+    other = lbt.jitter_strehl(turn @ covariance @ turn.T, imaging=CAMERA)
+    assert one == pytest.approx(other, abs=1e-6)
+
+
+@given(small=st.floats(0, 900), more=st.floats(1, 300))
+def test_more_jitter_is_less_strehl(small, more):
+    def at(rms):
+        return lbt.jitter_strehl(np.eye(2) * rms**2, imaging=CAMERA)
+
+    assert 0 < at(small + more) < at(small) <= 1
+
+
+def test_no_jitter_is_the_other_modes():
+    camera = lbt.Imaging(diameter_m=8.22, other_modes=0.84)
+    assert lbt.jitter_strehl(np.zeros((2, 2)), imaging=camera) == pytest.approx(0.84, rel=1e-12)
+
+
+def test_one_axis_is_the_second_one_still():
+    one = lbt.jitter_strehl([[200.0**2]], imaging=CAMERA, line_amplitudes_nm=[[300.0]])
+    two = lbt.jitter_strehl(
+        np.diag([200.0**2, 0]), imaging=CAMERA, line_amplitudes_nm=[[300.0, 0]]
+    )
+    assert one == pytest.approx(two, rel=1e-12)
+
+
+def test_series_of_an_exact_sinusoid():
+    time = np.arange(6000) / 6000
+    series = np.stack([700 * np.cos(2 * np.pi * 7 * time), 300 * np.sin(2 * np.pi * 7 * time)], 1)
+    exact = lbt.jitter_strehl(
+        np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]]
+    )
+    assert lbt.strehl_of_series(series, CAMERA) == pytest.approx(exact, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: lbt.jitter_strehl(np.eye(3), imaging=CAMERA),
+        lambda: lbt.jitter_strehl([[1, 0], [0, -1]], imaging=CAMERA),
+        lambda: lbt.jitter_strehl([[np.nan]], imaging=CAMERA),
+        lambda: lbt.jitter_strehl([[1.0]], imaging=CAMERA, line_amplitudes_nm=[[np.inf]]),
+        lambda: lbt.strehl_of_series(np.zeros((10, 3)), CAMERA),
+        lambda: lbt.strehl_of_series(np.zeros(10), CAMERA),
+        lambda: lbt.strehl_of_series([[np.nan, 1]], CAMERA),
+        lambda: lbt.Imaging(diameter_m=8, other_modes=1.2),
+    ],
+)
+def test_wrong_input_is_refused(call):
+    with pytest.raises(lbt.ProblemError):
+        call()
