@@ -69,9 +69,9 @@ from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare
-from .simulate import Simulation as Simulation
-from .simulate import filter_series as filter_series
-from .simulate import simulate as simulate
+from .simulation import Simulation as Simulation
+from .simulation import filter_series as filter_series
+from .simulation import simulate as simulate
 from .statespace import Controller as Controller
 from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace

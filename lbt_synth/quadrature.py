@@ -97,7 +97,7 @@ def adaptive_integral(
         open_ = change > tolerance * total
         done = done + fine[~open_].sum(axis=0)
         if not open_.any():
-            return done
+            return np.asarray(done)
         low, high = (
             np.concatenate([low[open_], middle[open_]]),
             np.concatenate([middle[open_], high[open_]]),

@@ -13,6 +13,7 @@ mpl.use("Agg")
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
 hypothesis.settings.load_profile("default")
 
+
 @pytest.fixture
 def axis_plant():
     return lbt_axis_plant()
@@ -20,9 +21,7 @@ def axis_plant():
 
 @pytest.fixture
 def air():
-    return lbt.Atmosphere(
-        seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
-    )
+    return lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
 
 
 @pytest.fixture

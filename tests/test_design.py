@@ -72,9 +72,7 @@ def test_kalman_against_a_long_recursion(axis_plant):
 
 def test_kalman_gains_with_correlated_noise():
     problem = random_problem(np.random.default_rng(8), 3, 2)
-    P = scipy.linalg.solve_discrete_are(
-        problem.A.T, problem.C.T, problem.Q, problem.R, s=problem.S
-    )
+    P = scipy.linalg.solve_discrete_are(problem.A.T, problem.C.T, problem.Q, problem.R, s=problem.S)
     innovation = problem.C @ P @ problem.C.T + problem.R
     predictor = (problem.A @ P @ problem.C.T + problem.S) @ np.linalg.inv(innovation)
     design = lbt.kalman(problem)
@@ -205,7 +203,11 @@ def test_units_do_not_matter():
     """The same problem in metres and in nanometres."""
     nano = lbt_axis_plant()
     metre = lbt.EstimationProblem(A=nano.A, B=nano.B * 1e-9, C=nano.C, D=nano.D * 1e-9, L=nano.L)
-    for make in (lbt.kalman, lambda p: lbt.kalman(p, method="sdp"), lambda p: lbt.hinf(p, gamma_ratio=1.2)):
+    for make in (
+        lbt.kalman,
+        lambda p: lbt.kalman(p, method="sdp"),
+        lambda p: lbt.hinf(p, gamma_ratio=1.2),
+    ):
         one, other = make(nano), make(metre)
         assert np.allclose(one.gain_predictor, other.gain_predictor, rtol=1e-6)
         assert other.rms == pytest.approx(one.rms * 1e-9, rel=1e-6)

@@ -31,7 +31,10 @@ def test_error_transfer_of_the_field_notes(gain):
     z = np.exp(2j * np.pi * f / 800)
     closed = plant.A - design.gain_predictor @ plant.C
     H = np.array(
-        [v * (plant.L @ np.linalg.solve(v * np.eye(4) - closed, design.gain_predictor))[0, 0] for v in z]
+        [
+            v * (plant.L @ np.linalg.solve(v * np.eye(4) - closed, design.gain_predictor))[0, 0]
+            for v in z
+        ]
     )
     h = H / z**2
     assert np.allclose(loop.sensitivity(f)[:, 0, 0], (1 - h) / (1 - (1 - gain) * h), rtol=1e-8)
@@ -121,7 +124,10 @@ def test_marginal_and_unstable_loops_have_no_residual():
     for gain, word in ((1.0, "marginally stable"), (1.5, "unstable")):
         controller = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=1 / 800)
         loop = lbt.close_loop(path, controller)
-        for ask in (lambda loop=loop: lbt.residual_budget(loop, truth), lambda loop=loop: lbt.loop_margins(loop)):
+        for ask in (
+            lambda loop=loop: lbt.residual_budget(loop, truth),
+            lambda loop=loop: lbt.loop_margins(loop),
+        ):
             with pytest.raises(lbt.UnstableLoopError, match=word) as caught:
                 ask()
             assert caught.value.spectral_radius >= 1 - 1e-6
@@ -134,7 +140,9 @@ def test_loops_refuse_what_does_not_fit():
     lazy = lbt.integrator(path, gain=0.3).controller
     with pytest.raises(lbt.DimensionError, match="map 1 measurements to 1 commands; got 2 to 2"):
         lbt.close_loop(lbt.LoopHardware(frame_rate_hz=800, modes=1), lazy)
-    with pytest.raises(lbt.ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"):
+    with pytest.raises(
+        lbt.ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"
+    ):
         lbt.close_loop(lbt.LoopHardware(frame_rate_hz=500), lazy)
     loop = lbt.close_loop(path, lazy)
     with pytest.raises(lbt.ProblemError, match="truth's sensor gain 0.5; got 1"):

@@ -55,7 +55,9 @@ def test_a_narrow_peak_is_found_and_placed():
     assert norm.value == pytest.approx(
         abs(system.frequency_response([norm.peak_frequency_hz])[0, 0, 0]), rel=1e-12
     )
-    assert norm.value == pytest.approx(1 / abs((1 - abs(line.coefficients[1]) ** 0.5) * (pole - 1 / pole)), rel=1e-3)
+    assert norm.value == pytest.approx(
+        1 / abs((1 - abs(line.coefficients[1]) ** 0.5) * (pole - 1 / pole)), rel=1e-3
+    )
 
 
 def test_zero_and_static_systems():
@@ -67,7 +69,9 @@ def test_zero_and_static_systems():
 def test_the_norm_is_homogeneous(seed, scale):
     A, B, C, D = random_system(seed, 4, 2, 2, 0.95)
     one = float(lbt.hinf_norm((A, B, C, D)))
-    assert float(lbt.hinf_norm((A, B * scale, C, D * scale))) == pytest.approx(one * scale, rel=1e-9)
+    assert float(lbt.hinf_norm((A, B * scale, C, D * scale))) == pytest.approx(
+        one * scale, rel=1e-9
+    )
 
 
 def test_takes_python_control_systems():

@@ -42,7 +42,9 @@ def test_full_form_is_the_papers():
     assert np.all(np.linalg.eigvals(minus_A2) < 0)
     assert np.array_equal(full.B_known, np.vstack([Z, Z, Z, Z, I]))
     assert np.array_equal(full.L, np.hstack([I, Z, I, Z, Z]))
-    assert np.allclose(full.C, np.hstack([sensor @ m for m in (Z, Z, Z, I, -influence)]), rtol=1e-15)
+    assert np.allclose(
+        full.C, np.hstack([sensor @ m for m in (Z, Z, Z, I, -influence)]), rtol=1e-15
+    )
     assert not np.any(full.D_known)
 
 
@@ -97,9 +99,7 @@ def test_more_commands_than_modes_use_the_generalised_inverse():
         frame_rate_hz=800, turbulence=slow(), noise_nm=2.0, influence_matrix=influence
     )
     design = lbt.kalman(plant)
-    simple = lbt.kalman(
-        lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow(), noise_nm=2.0)
-    )
+    simple = lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow(), noise_nm=2.0))
     truth = lbt.Truth(turbulence=slow(), noise_nm=2.0)
     one, other = (
         lbt.residual_budget(lbt.close_loop(d.hardware, d.controller), truth).rms_nm

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 import slycot
-from plants import random_problem
 from hypothesis import given
 from hypothesis import strategies as st
+from plants import random_problem
 
 import lbt_synth as lbt
 from lbt_synth.riccati import gamma_riccati, kalman_riccati, least_gamma

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.simulate import draw_disturbance
+from lbt_synth.simulation import draw_disturbance
 
 
 @given(
@@ -88,9 +88,9 @@ def test_simulation_agrees_with_the_exact_answer(config):
 def test_drawn_series_have_their_spectrum(air):
     path = lbt.LoopHardware(frame_rate_hz=400, modes=1)
     truth = lbt.Truth(turbulence=air)
-    series = draw_disturbance(
-        truth, path, frames=8192, cases=200, rng=np.random.default_rng(0)
-    )[..., 0]
+    series = draw_disturbance(truth, path, frames=8192, cases=200, rng=np.random.default_rng(0))[
+        ..., 0
+    ]
     variance = np.mean(series**2, axis=1)
     error = variance.std(ddof=1) / np.sqrt(len(variance))
     assert abs(variance.mean() - air.tilt_rms_nm**2) < 4 * error
@@ -146,7 +146,13 @@ def test_wrong_controllers_and_counts_are_refused(axis_plant):
     with pytest.raises(lbt.ProblemError, match=r"step\(y\) and reset\(\)"):
         lbt.simulate("controller", truth, hardware=hw, frames=10)
     controller = lbt.kalman(axis_plant).controller
-    for wrong in ({"frames": 0}, {"frames": 1.5}, {"cases": 0}, {"seed": -1}, {"settle_frames": -1}):
+    for wrong in (
+        {"frames": 0},
+        {"frames": 1.5},
+        {"cases": 0},
+        {"seed": -1},
+        {"settle_frames": -1},
+    ):
         with pytest.raises(lbt.ProblemError):
             lbt.simulate(controller, truth, hardware=hw, **({"frames": 10} | wrong))
     with pytest.raises(lbt.DimensionError, match="inputs must be"):
@@ -162,9 +168,7 @@ def test_wrong_controllers_and_counts_are_refused(axis_plant):
 def test_axis_of_the_field_notes_in_the_time_domain():
     """Truth is the model: the simulated residual is the Kalman filter's 135.958 nm."""
     plant = lbt_axis_plant()
-    truth = lbt.Truth(
-        turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5
-    )
+    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
     run = lbt.simulate(
         lbt.kalman(plant).controller, truth, hardware=plant.hardware, frames=4000, cases=50
     )

@@ -77,18 +77,14 @@ def test_no_jitter_is_the_other_modes():
 
 def test_one_axis_is_the_second_one_still():
     one = lbt.jitter_strehl([[200.0**2]], imaging=CAMERA, line_amplitudes_nm=[[300.0]])
-    two = lbt.jitter_strehl(
-        np.diag([200.0**2, 0]), imaging=CAMERA, line_amplitudes_nm=[[300.0, 0]]
-    )
+    two = lbt.jitter_strehl(np.diag([200.0**2, 0]), imaging=CAMERA, line_amplitudes_nm=[[300.0, 0]])
     assert one == pytest.approx(two, rel=1e-12)
 
 
 def test_series_of_an_exact_sinusoid():
     time = np.arange(6000) / 6000
     series = np.stack([700 * np.cos(2 * np.pi * 7 * time), 300 * np.sin(2 * np.pi * 7 * time)], 1)
-    exact = lbt.jitter_strehl(
-        np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]]
-    )
+    exact = lbt.jitter_strehl(np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]])
     assert lbt.strehl_of_series(series, CAMERA) == pytest.approx(exact, abs=1e-5)
 
 

@@ -23,7 +23,7 @@ from lbt_synth.plotting import (
     sigma_figure,
     simulation_figure,
 )
-from lbt_synth.simulate import simulate as run_simulation
+from lbt_synth.simulation import simulate as run_simulation
 from lbt_synth.sweep import METHODS, RobustnessRow, frequency_robustness
 from lbt_synth.tables import csv_bytes
 

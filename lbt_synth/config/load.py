@@ -132,7 +132,7 @@ def _describe(error: ValidationError) -> tuple[str, str]:
     more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = _fields_at(FileSection, location[:-1])
-        close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.4)
+        close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
         hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
         return f"unknown key {key}; {hint}{more}", key
     if first["type"] == "missing":

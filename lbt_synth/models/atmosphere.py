@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.special import jv
+from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.quadrature import gauss_panels
@@ -145,10 +145,22 @@ def _filtered_spectrum(air: Atmosphere, f: FloatArray) -> FloatArray:
     inner = 0.0 if air.outer_scale_m is None else air.outer_scale_m**-2
     eps = air.obstruction
     argument = np.pi * air.diameter_m * f
-    amplitude = 2 * (jv(2, argument) - eps**3 * jv(2, eps * argument)) / argument
+    edge = _bessel_j2(argument)
+    if eps > 0:
+        edge = edge - eps**3 * _bessel_j2(eps * argument)
+    amplitude = 2 * edge / argument
     tilt_filter = 2 * amplitude**2 / ((1 - eps**2) ** 2 * (1 + eps**2))
     phase = _VON_KARMAN * air.fried_parameter_m ** (-5 / 3) * (f**2 + inner) ** (-11 / 6)
     return np.asarray(phase * tilt_filter * _nm_per_radian(air) ** 2)
+
+
+def _bessel_j2(x: FloatArray) -> FloatArray:
+    """J_2, by its recurrence where that loses no digits (several times faster)."""
+    out = np.empty_like(x)
+    large = x > 1
+    out[large] = 2 * j1(x[large]) / x[large] - j0(x[large])
+    out[~large] = jv(2, x[~large])
+    return out
 
 
 def _spatial_panels(diameter_m: float) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.norms import largest_singular_values
 from lbt_synth.plotting.style import MARKERS, house_style, looks, new_figure
-from lbt_synth.simulate import Simulation
+from lbt_synth.simulation import Simulation
 from lbt_synth.sweep import RobustnessRow
 from lbt_synth.validation import FloatArray
 
@@ -299,12 +299,14 @@ def _vibration_frequencies(designs: Any) -> list[float]:
 
 
 def _plain_ticks(axis: Any) -> None:
-    """Label a logarithmic axis of few decades with plain numbers."""
+    """Label an axis of less than two decades with plain numbers."""
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
     low, high = axis.get_ylim()
-    if high / low < 30:
-        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high / low > 3 else "all"))
+    if high / low < 3:
+        axis.set_yscale("linear")
+    elif high / low < 30:
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
         axis.yaxis.set_major_formatter(ScalarFormatter())
         axis.yaxis.set_minor_formatter(NullFormatter())
 

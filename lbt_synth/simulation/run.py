@@ -11,8 +11,8 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, strehl_of_series
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.truth import Truth
-from lbt_synth.simulate.linear import filter_series
-from lbt_synth.simulate.series import draw_disturbance, draw_noise
+from lbt_synth.simulation.linear import filter_series
+from lbt_synth.simulation.series import draw_disturbance, draw_noise
 from lbt_synth.statespace import Controller, RunningController
 from lbt_synth.validation import FloatArray, frozen, integer
 

@@ -1,0 +1,7 @@
+"""The closed loop in the time domain."""
+
+from lbt_synth.simulation.linear import filter_series
+from lbt_synth.simulation.run import Simulation, simulate
+from lbt_synth.simulation.series import draw_disturbance, draw_noise
+
+__all__ = ["Simulation", "draw_disturbance", "draw_noise", "filter_series", "simulate"]

@@ -1,0 +1,249 @@
+"""Gain files: round trips, other people's loaders, damage of every kind."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from plants import lbt_axis_plant
+
+import lbt_synth as lbt
+from lbt_synth.gainfile import store
+
+ENDINGS = ("fits", "npz", "json")
+
+
+def every_design():
+    plant = lbt_axis_plant(modes=2, delay_frames=2.5)
+    bare = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0, dt_s=0.1)
+    return {
+        "kalman": lbt.kalman(plant),
+        "hinf": lbt.hinf(plant, gamma_ratio=1.3, method="riccati"),
+        "full": lbt.kalman(plant.full()),
+        "bare": lbt.kalman(bare),
+        "integrator": lbt.integrator(plant.hardware, gain=0.3),
+    }
+
+
+DESIGNS = every_design()
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("name", DESIGNS)
+def test_round_trip_keeps_every_bit(tmp_path, name, ending):
+    design = DESIGNS[name]
+    back = lbt.load_gain(lbt.save_gain(tmp_path / f"gain.{ending}", design))
+    assert type(back) is type(design)
+    for field in "ABCD":
+        assert np.array_equal(getattr(back.controller, field), getattr(design.controller, field))
+    assert back.controller.dt_s == design.controller.dt_s
+    assert back.solver == design.solver
+    assert back.certificate.checks == design.certificate.checks
+    assert back.recertified().passed
+    if isinstance(design, lbt.FilterDesign):
+        assert type(back.problem) is type(design.problem)
+        for field in ("gain_predictor", "gain_filter"):
+            assert np.array_equal(getattr(back, field), getattr(design, field))
+        for field in "ABCDL":
+            assert np.array_equal(getattr(back.problem, field), getattr(design.problem, field))
+        assert (back.gamma_requested, back.gamma_least) == (
+            design.gamma_requested,
+            design.gamma_least,
+        )
+        assert (back.rms, back.gamma) == (design.rms, design.gamma)
+    else:
+        assert back.gain == design.gain
+    if design.hardware is not None:
+        assert back.hardware.delay_frames == design.hardware.delay_frames
+        assert np.array_equal(back.hardware.sensor, design.hardware.sensor)
+
+
+def test_vibrations_survive(tmp_path):
+    back = lbt.load_gain(lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"]))
+    assert back.problem.vibrations == DESIGNS["kalman"].problem.vibrations
+
+
+def state_space_filter(path):
+    """Read a FITS file as SPECULA's state-space filter does, and return its step function.
+
+    HDUs by name, new state first: x <- A x + B u, y = C x + D u.
+    """
+    with fits.open(path) as hdus:
+        assert hdus[0].header.get("VERSION", 1) == 1
+        assert hdus[0].data is None
+        A, B, C, D = (hdus[name].data.copy() for name in "ABCD")
+        assert hdus[0].header["NFILTER"] == B.shape[1]
+        assert hdus[0].header["NSTATES"] == A.shape[0]
+    assert C.shape == (B.shape[1], A.shape[0])
+    assert D.shape == (B.shape[1], B.shape[1])
+    x = np.zeros(len(A))
+
+    def step(u):
+        nonlocal x
+        x = A @ x + B @ u
+        return C @ x + D @ u
+
+    return step
+
+
+@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
+def test_the_fits_file_drives_a_foreign_state_space_filter(tmp_path, name):
+    design = DESIGNS[name]
+    step = state_space_filter(lbt.save_gain(tmp_path / "g.fits", design))
+    run = design.controller.start()
+    for y in np.random.default_rng(0).standard_normal((100, 2)):
+        assert np.allclose(step(y), run.step(y), rtol=1e-13, atol=1e-13)
+
+
+def test_fits_headers_speak_to_people(tmp_path):
+    header = fits.getheader(lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"]))
+    assert header["METHOD"] == "kalman"
+    assert header["RATE_HZ"] == 800
+    assert header["DELAY"] == 2.5
+    assert header["NEWSTATE"] is True
+    assert header["RMS"] == pytest.approx(DESIGNS["kalman"].rms)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_truncated_files_are_refused(tmp_path, ending):
+    path = lbt.save_gain(tmp_path / f"g.{ending}", DESIGNS["hinf"])
+    content = path.read_bytes()
+    for length in (
+        0,
+        10,
+        len(content) // 3,
+        len(content) // 2,
+        len(content) - 3000,
+        len(content) - 40,
+    ):
+        path.write_bytes(content[:length])
+        with pytest.raises(lbt.GainFileError) as caught:
+            lbt.load_gain(path)
+        assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    ending=st.sampled_from(ENDINGS), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7)
+)
+def test_a_flipped_bit_is_found_or_harmless(tmp_path, ending, place, bit):
+    path = lbt.save_gain(tmp_path / f"g.{ending}", DESIGNS["kalman"])
+    content = bytearray(path.read_bytes())
+    content[int(place * len(content))] ^= 1 << bit
+    path.write_bytes(bytes(content))
+    try:
+        back = lbt.load_gain(path)
+    except lbt.GainFileError:
+        return
+    assert np.array_equal(back.controller.A, DESIGNS["kalman"].controller.A)
+    assert np.array_equal(back.gain_predictor, DESIGNS["kalman"].gain_predictor)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    picture = tmp_path / "image.fits"
+    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
+    other = tmp_path / "other.npz"
+    np.savez(other, a=np.ones(3))
+    notes = tmp_path / "notes.json"
+    notes.write_text('{"meta": {"schema": "recipes"}, "arrays": {}}')
+    prose = tmp_path / "prose.json"
+    prose.write_text("[1, 2]")
+    pickled = tmp_path / "pickled.npz"
+    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    for path in (picture, other, notes, prose, pickled):
+        with pytest.raises(lbt.GainFileError, match=f"{path.name} is "):
+            lbt.load_gain(path)
+
+
+def edited(tmp_path, change, *, resign=True):
+    path = lbt.save_gain(tmp_path / "g.json", DESIGNS["kalman"])
+    document = json.loads(path.read_text())
+    change(document)
+    if resign:
+        arrays = {k: np.array(v, dtype=float) for k, v in document["arrays"].items()}
+        document["meta"]["digest"] = store._digest(arrays, document["meta"])
+    path.write_text(json.dumps(document))
+    return path
+
+
+def test_an_edited_gain_does_not_match_its_digest(tmp_path):
+    def change(document):
+        document["arrays"]["GAIN_PREDICTOR"][0][0] *= 1.0001
+
+    with pytest.raises(lbt.GainFileError, match="does not match its digest"):
+        lbt.load_gain(edited(tmp_path, change, resign=False))
+
+
+def test_a_later_layout_is_refused_by_its_number(tmp_path):
+    with pytest.raises(lbt.SchemaVersionError, match="layout version 99; this lbt_synth reads 1"):
+        lbt.load_gain(edited(tmp_path, lambda d: d["meta"].update(schema_version=99)))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda d: d["arrays"].pop("A"), "A is missing"),
+        (lambda d: d["arrays"].update(B=[[1.0]]), "B must have"),
+        (lambda d: d["arrays"].update(GAIN_FILTER=[[1.0]]), "GAIN_FILTER must be"),
+        (lambda d: d["arrays"].update(A=[[float("nan")]]), "holds values that are not finite"),
+        (lambda d: d["meta"].pop("certificate"), "certificate is missing"),
+        (lambda d: d["meta"].update(problem="riddle"), "riddle"),
+        (lambda d: d["meta"].update(delay_frames=-1), "delay_frames must be"),
+    ],
+)
+def test_signed_nonsense_is_inconsistent(tmp_path, change, text):
+    with pytest.raises(lbt.GainFileError, match=text):
+        lbt.load_gain(edited(tmp_path, change))
+
+
+def test_a_file_that_was_tampered_with_is_not_verified(tmp_path):
+    """Even when it is signed anew: verification computes everything from the matrices."""
+
+    def change(document):
+        gain = document["arrays"]["GAIN_PREDICTOR"]
+        gain[0][0] *= 1.01
+
+    assert not lbt.load_gain(edited(tmp_path, change)).recertified().passed
+
+
+def test_endings_and_missing_files(tmp_path):
+    with pytest.raises(lbt.OutputError, match="must end in .fits, .npz, .json; got 'g.txt'"):
+        lbt.save_gain(tmp_path / "g.txt", DESIGNS["kalman"])
+    with pytest.raises(lbt.GainFileError, match="must end in"):
+        lbt.load_gain(tmp_path / "g.txt")
+    with pytest.raises(lbt.GainFileError, match="cannot read .*No such file"):
+        lbt.load_gain(tmp_path / "none.fits")
+    (tmp_path / "folder.fits").mkdir()
+    with pytest.raises(lbt.GainFileError, match="cannot read"):
+        lbt.load_gain(tmp_path / "folder.fits")
+
+
+def test_nothing_half_written_stays(tmp_path, monkeypatch):
+    path = lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"])
+    before = path.read_bytes()
+
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(lbt.OutputError, match="cannot write .*No space left on device"):
+        lbt.save_gain(path, DESIGNS["hinf"])
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["g.fits"]
+
+
+def test_directories_that_cannot_be_written(tmp_path):
+    with pytest.raises(lbt.OutputError, match="cannot write .*No such file or directory"):
+        lbt.save_gain(tmp_path / "nowhere" / "g.fits", DESIGNS["kalman"])
+    (tmp_path / "taken.fits").mkdir()
+    with pytest.raises(lbt.OutputError, match="is a directory"):
+        lbt.save_gain(tmp_path / "taken.fits", DESIGNS["kalman"])
+    file = tmp_path / "file"
+    file.write_text("")
+    with pytest.raises(lbt.OutputError, match="Not a directory"):
+        lbt.save_gain(file / "g.fits", DESIGNS["kalman"])

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.plotting import save_figure
+
+
+@pytest.fixture
+def designs(config):
+    return {
+        "Kalman": lbt.kalman(config.plant),
+        "H-infinity": lbt.hinf(config.plant, gamma_ratio=1.2, method="riccati"),
+        "integrator": lbt.integrator(config.hardware, gain=0.5),
+    }
+
+
+def legend(axis):
+    return [text.get_text() for text in axis.get_legend().get_texts()]
+
+
+def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
+    error, rejection, noise = lbt.sigma_figure(designs).axes
+    assert legend(error) == ["Kalman", "H-infinity", "vibration"]
+    assert legend(rejection) == ["Kalman", "H-infinity", "integrator", "vibration"]
+    assert "[nm]" in error.get_ylabel()
+    assert noise.get_xlabel() == "frequency [Hz]"
+    marks = [line for line in error.get_lines() if line.get_label() == "vibration"]
+    assert marks[0].get_xdata()[0] == 20
+    # the curve is the achieved norm at its highest point
+    curve = error.get_lines()[0].get_ydata()
+    assert curve.max() == pytest.approx(designs["Kalman"].gamma, rel=1e-3)
+
+
+def test_curves_are_told_apart_in_grey(designs):
+    lines = lbt.sigma_figure(designs).axes[1].get_lines()[:3]
+    assert len({str(line.get_linestyle()) for line in lines}) == 3
+    assert len({line.get_color() for line in lines}) == 3
+
+
+@pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
+def test_figures_are_files(tmp_path, designs, ending):
+    path = save_figure(lbt.sigma_figure(designs), tmp_path / f"f.{ending}")
+    magic = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}[ending]
+    assert path.read_bytes().startswith(magic)
+    assert path.stat().st_size < 400_000
+
+
+def test_other_endings_are_refused(tmp_path, designs):
+    with pytest.raises(lbt.OutputError, match=r"must end in .png, .pdf, .svg; got 'f.gif'"):
+        save_figure(lbt.sigma_figure(designs), tmp_path / "f.gif")
+
+
+def test_robustness_figure_draws_the_paper_beside(config):
+    rows = list(
+        lbt.frequency_robustness(config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1])
+    )
+    (axis,) = lbt.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
+    assert legend(axis) == ["Kalman", "Kalman, paper", r"H$_\infty$"]
+    assert "[%]" in axis.get_ylabel()
+    assert "[Hz]" in axis.get_xlabel()
+
+
+def test_simulation_figure(config):
+    run = lbt.simulate(
+        lbt.kalman(config.plant).controller, config.truth, hardware=config.hardware, frames=600
+    )
+    series, spectrum = lbt.simulation_figure(run, title="Kalman").axes
+    assert series.get_xlabel() == "time [s]"
+    assert "[nm$^2$/Hz]" in spectrum.get_ylabel()
+
+
+def test_empty_figures_are_refused():
+    for empty in (
+        lambda: lbt.sigma_figure({}),
+        lambda: lbt.loop_figure({}),
+        lambda: lbt.robustness_figure([]),
+    ):
+        with pytest.raises(lbt.ProblemError, match="at least one"):
+            empty()

@@ -1,0 +1,63 @@
+"""Every public name: importable, documented, with an example."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import pkgutil
+from pathlib import Path
+
+import pytest
+
+import lbt_synth as lbt
+
+NAMES = sorted(set(lbt.__all__))
+
+
+def test_the_stub_lists_what_is_there():
+    stub = ast.parse(Path(lbt.__file__).with_suffix(".pyi").read_text())
+    listed = {
+        alias.asname
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert listed == set(NAMES)
+    for name in NAMES:
+        assert getattr(lbt, name) is not None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_docstrings(name):
+    thing = getattr(lbt, name)
+    text = inspect.getdoc(thing)
+    assert text
+    if inspect.isfunction(thing):
+        for section in ("Parameters", "Examples"):
+            assert f"{section}\n---" in text, f"{name} has no {section}"
+        assert "Returns\n---" in text or "Yields\n---" in text
+        for parameter in inspect.signature(thing).parameters:
+            assert parameter in text, f"{name} does not document {parameter}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_public_fields_say_which_gain_they_are(name):
+    thing = getattr(lbt, name)
+    for field in getattr(thing, "__dataclass_fields__", {}):
+        assert field not in {"K", "k"}
+
+
+def test_readme_names_commands_that_exist():
+    text = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+    for command in ("make demo", "make test"):
+        assert command in text
+
+
+def test_no_public_name_is_shadowed_by_a_module():
+    """Importing every submodule first must not turn a function into its module."""
+    for info in pkgutil.walk_packages(lbt.__path__, "lbt_synth."):
+        if not info.name.endswith("__main__"):
+            importlib.import_module(info.name)
+    for name in NAMES:
+        assert not inspect.ismodule(getattr(lbt, name)), name
