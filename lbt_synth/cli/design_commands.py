@@ -110,11 +110,13 @@ def _description(made: Design) -> Report:
         ("route", f"{made.solver.route} ({made.solver.status})", ""),
         ("states of the controller", made.controller.n_states, ""),
     ]
+    alone = made.controller.to_statespace().spectral_radius
     data: dict[str, Any] = {
         "method": made.method,
         "solver": asdict(made.solver),
         "n_states": made.controller.n_states,
         "poles": [complex(p) for p in made.poles],
+        "controller_spectral_radius": alone,
         "checks": _check_data(made.certificate),
     }
     unit = "nm" if made.hardware is not None else ""
@@ -157,7 +159,13 @@ def _description(made: Design) -> Report:
         ]
     tables.append(TableText(title="Design", headings=("quantity", "value", "unit"), rows=facts))
     tables.append(_check_table(made.certificate))
-    return Report(data=data, tables=tables)
+    notes = []
+    if made.hardware is not None and alone > 1:
+        notes.append(
+            f"note: the controller alone has a pole of modulus {alone:.4g}; with the loop open its "
+            "commands grow. Reset it whenever the loop opens."
+        )
+    return Report(data=data, tables=tables, notes=notes)
 
 
 def _check_table(certificate: Certificate) -> TableText:
