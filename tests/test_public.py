@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import importlib
 import inspect
 import pkgutil
 from pathlib import Path
 
 import pytest
+from plants import ROOT
 
 import lbt_synth as lbt
 
@@ -48,8 +50,18 @@ def test_public_fields_say_which_gain_they_are(name):
         assert field not in {"K", "k"}
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md"])
+def test_examples_on_pages_run(page, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    results = doctest.testfile(
+        str(ROOT / page), module_relative=False, optionflags=doctest.ELLIPSIS
+    )
+    assert results.attempted > 5
+    assert results.failed == 0
+
+
 def test_readme_names_commands_that_exist():
-    text = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+    text = (ROOT / "README.md").read_text()
     for command in ("make demo", "make test"):
         assert command in text
 
