@@ -18,6 +18,7 @@ from .errors import ConfigError as ConfigError
 from .errors import DefinitenessError as DefinitenessError
 from .errors import DetectabilityError as DetectabilityError
 from .errors import DimensionError as DimensionError
+from .errors import FileError as FileError
 from .errors import GainFileError as GainFileError
 from .errors import InfeasibleError as InfeasibleError
 from .errors import LbtSynthError as LbtSynthError

@@ -134,8 +134,8 @@ class UnstableLoopError(SynthesisError):
 # --------------------------------------------------------------------------
 # Files.
 # --------------------------------------------------------------------------
-class GainFileError(LbtSynthError):
-    """A gain file cannot be read: it is missing, damaged or foreign.
+class FileError(LbtSynthError):
+    """A file cannot be read or written.
 
     Attributes
     ----------
@@ -148,19 +148,13 @@ class GainFileError(LbtSynthError):
         self.path = path
 
 
-class OutputError(LbtSynthError):
-    """A result cannot be written.
-
-    Attributes
-    ----------
-    path : pathlib.Path or None
-        The file.
-    """
-
-    def __init__(self, message: str, *, path: Path | None = None) -> None:
-        super().__init__(message)
-        self.path = path
+class GainFileError(FileError):
+    """A gain file cannot be read: it is missing, damaged or foreign."""
 
 
 class SchemaVersionError(GainFileError):
     """A gain file was written with a layout that this version does not know."""
+
+
+class OutputError(FileError):
+    """A result cannot be written."""

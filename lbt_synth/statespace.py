@@ -27,26 +27,35 @@ from lbt_synth.validation import (
 _CHUNK = 2_000_000  # complex numbers held at once by a frequency response
 
 
-def _system_matrices(
-    A: Any, B: Any, C: Any, D: Any
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Validate the four matrices of a system against each other."""
-    A = square(A, "A")
-    n = A.shape[0]
-    why = f"to match A {A.shape}"
-    B = matrix(B, "B", rows=(n, why))
-    C = matrix(C, "C", cols=(n, why))
-    D = matrix(
-        D,
-        "D",
-        rows=(C.shape[0], f"to match C {C.shape}"),
-        cols=(B.shape[1], f"to match B {B.shape}"),
-    )
-    return A, B, C, D
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _LinearSystem:
+    """Four matrices that fit each other, and a sampling period."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    dt_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        A = square(self.A, "A")
+        why = f"to match A {A.shape}"
+        B = matrix(self.B, "B", rows=(len(A), why))
+        C = matrix(self.C, "C", cols=(len(A), why))
+        rows, cols = (len(C), f"to match C {C.shape}"), (B.shape[1], f"to match B {B.shape}")
+        D = matrix(self.D, "D", rows=rows, cols=cols)
+        for name, value in (("A", A), ("B", B), ("C", C), ("D", D)):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StateSpace:
+class StateSpace(_LinearSystem):
     """Discrete-time system ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
 
     Parameters
@@ -74,19 +83,6 @@ class StateSpace:
     >>> float(abs(lag.frequency_response([0.0])[0, 0, 0]))
     2.0
     """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    dt_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name, value in zip(
-            "ABCD", _system_matrices(self.A, self.B, self.C, self.D), strict=True
-        ):
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:
@@ -154,11 +150,6 @@ class StateSpace:
         )
 
     @property
-    def n_states(self) -> int:
-        """Number of states."""
-        return int(self.A.shape[0])
-
-    @property
     def poles(self) -> ComplexArray:
         """Eigenvalues of A, (n,)."""
         return np.linalg.eigvals(self.A).astype(np.complex128)
@@ -209,7 +200,7 @@ class StateSpace:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Controller:
+class Controller(_LinearSystem):
     """Controller in new-state form: ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
 
     Parameters
@@ -240,24 +231,6 @@ class Controller:
     >>> [float(run.step([1.0])[0]) for _ in range(3)]
     [0.5, 1.0, 1.5]
     """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    dt_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name, value in zip(
-            "ABCD", _system_matrices(self.A, self.B, self.C, self.D), strict=True
-        ):
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
-
-    @property
-    def n_states(self) -> int:
-        """Number of states."""
-        return int(self.A.shape[0])
 
     def to_statespace(self) -> StateSpace:
         """Return the same input-output map in the textbook (current-state) form."""
