@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.certify import Certificate
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Report, TableText, working
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import (
     Design,
@@ -30,8 +30,8 @@ _ROUTES = {"kalman": ("riccati", "sdp"), "hinf": ("lmi", "riccati"), "integrator
 def design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
     _refuse_foreign_options(arguments)
-    config = load_config(arguments.config)
-    made = _synthesise(config, arguments)
+    with working(f"designing ({arguments.method})", quiet=arguments.json):
+        made = _synthesise(load_config(arguments.config), arguments)
     path = save_gain(arguments.output, made)
     report = _description(made)
     report.data["file"] = str(path)

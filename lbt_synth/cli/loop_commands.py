@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lbt_synth.cli.output import Report, TableText, progress
+from lbt_synth.cli.output import Report, TableText, progress, working
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import ProblemError
@@ -32,7 +32,8 @@ def sigma(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
     _require_figure(arguments.output)
     designs = _named(arguments.gains)
-    figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
+    with working("drawing", quiet=arguments.json):
+        figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
     rows, data = [], {}
     for name, design in designs.items():
         entry: dict[str, object] = {"method": design.method}
@@ -86,17 +87,18 @@ def simulate(arguments: Namespace) -> Report:
         given = getattr(arguments, name)
         return int(getattr(settings, name) if given is None else given)
 
-    run = run_simulation(
-        design.controller,
-        truth,
-        hardware=config.hardware,
-        frames=chosen("frames"),
-        cases=chosen("cases"),
-        seed=chosen("seed"),
-    )
+    with working("closing the loop", quiet=arguments.json):
+        run = run_simulation(
+            design.controller,
+            truth,
+            hardware=config.hardware,
+            frames=chosen("frames"),
+            cases=chosen("cases"),
+            seed=chosen("seed"),
+        )
+        strehls = run.strehl(config.imaging)
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
     budget = residual_budget(loop, truth)
-    strehls = run.strehl(config.imaging)
     exact = strehl(budget, config.imaging)
     command_rms = np.sqrt(np.sum(np.mean(run.commands**2, axis=(0, 1))))
     scatter = float(np.std(strehls, ddof=1)) if len(strehls) > 1 else float("nan")
