@@ -86,7 +86,7 @@ class Certificate:
         """
         failed = [check for check in self.checks if not check.passed]
         if failed:
-            listing = "; ".join(f"{c.name} {c.value:.6g}, limit {c.limit:.6g}" for c in failed)
+            listing = "; ".join(f"{c.name} {c.value:.12g}, limit {c.limit:.12g}" for c in failed)
             raise CertificateError(
                 f"the design failed its certificate and is not returned: {listing}. "
                 "Try the other method, or scale the states to similar sizes.",

@@ -10,6 +10,35 @@ from pathlib import Path
 from lbt_synth.errors import OutputError
 
 
+def require_writable(*paths: str | os.PathLike[str]) -> None:
+    """Refuse outputs that cannot be written, before any work is done.
+
+    Parameters
+    ----------
+    *paths : path-like
+        Files to be written.
+
+    Raises
+    ------
+    OutputError
+        If the directory of one does not exist, or its name is that of a directory.
+
+    Examples
+    --------
+    >>> from lbt_synth.files import require_writable
+    >>> require_writable("nowhere/at/all.png")
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.OutputError: cannot write nowhere/at/all.png: no directory nowhere/at.
+    """
+    for path in paths:
+        target = Path(path)
+        if not target.parent.is_dir():
+            raise OutputError(f"cannot write {target}: no directory {target.parent}.", path=target)
+        if target.is_dir():
+            raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+
+
 def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
     """Write a file through a temporary one in the same directory.
 
@@ -40,9 +69,9 @@ def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
     b'whole'
     """
     target = Path(path)
+    temporary = None
     if target.is_dir():
         raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
-    temporary = None
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
         with os.fdopen(handle, "wb") as stream:
@@ -53,13 +82,13 @@ def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
         os.umask(umask)
         Path(temporary).chmod(0o666 & ~umask)
         Path(temporary).replace(target)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
         if temporary is not None:
             with contextlib.suppress(OSError):
                 Path(temporary).unlink()
+        reason = getattr(error, "strerror", None) or error
         raise OutputError(
-            f"cannot write {target}: {error.strerror or error}. Choose a directory that exists "
-            "and can be written.",
+            f"cannot write {target}: {reason}. Choose a directory that exists and can be written.",
             path=target,
         ) from error
     return target

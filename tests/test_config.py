@@ -83,6 +83,11 @@ def test_the_example_is_the_papers_table_i(config):
         (("imaging", "other_modes_strehl"), 1.2, "imaging.other_modes_strehl", "less than or equal"),
         (("design", "gamma_ratio"), 0.9, "design.gamma_ratio", "greater than or equal to 1"),
         (("version",), 2, "version", "1"),
+        (("version",), True, "version", "valid integer"),
+        (("atmosphere", "seeing_arcsec"), 1e300, "", "far from any telescope"),
+        (("atmosphere", "seeing_arcsec"), 1e-320, "", "far from any telescope"),
+        (("sensor", "pyramid", "photons"), 1e300, "", "far from any telescope"),
+        (("mirror", "influence_matrix"), [[0, 0], [0, 0]], "", "got only zeros"),
         (("model", "turbulence"), {"kind": "ar", "coefficients": [1.2], "driving_rms_nm": 1.0},
          "model.turbulence.coefficients", "must be stationary"),
     ],
@@ -106,6 +111,11 @@ def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
         ("version: 1\nversion: 1\n", "duplicate key"),
         ("a: !!python/object:os.system x\n", "not valid YAML"),
         ("\x00", "not valid YAML"),
+        ("version: 2021-13-45\n", "not valid YAML"),
+        ("version: !!float abc\n", "not valid YAML"),
+        ("version: !!bool abc\n", "not valid YAML"),
+        ("version: " + "9" * 5000 + "\n", "not valid YAML"),
+        ("version: " + "[" * 3000 + "\n", "not valid YAML"),
     ],
 )
 def test_other_texts_are_refused(tmp_path, content, text):

@@ -211,3 +211,71 @@ def test_units_do_not_matter():
         one, other = make(nano), make(metre)
         assert np.allclose(one.gain_predictor, other.gain_predictor, rtol=1e-6)
         assert other.rms == pytest.approx(one.rms * 1e-9, rel=1e-6)
+
+
+@pytest.mark.parametrize("noise_nm", [1e-3, 2.5e-3, 1.0, 1e3])
+def test_least_gamma_over_six_decades_of_noise(noise_nm):
+    """Both routes, also where the measurement is all but exact."""
+    base = lbt_axis_plant()
+    plant = lbt.EstimationProblem(
+        A=base.A, B=base.B, C=base.C, D=base.D * noise_nm / 15.5, L=base.L
+    )
+    riccati, lmi = lbt.hinf(plant, method="riccati"), lbt.hinf(plant)
+    assert riccati.gamma == pytest.approx(riccati.gamma_least, rel=1e-6)
+    assert lmi.gamma == pytest.approx(riccati.gamma, rel=1e-6)
+    assert lbt.hinf(plant, method="riccati", gamma_ratio=1.2).certificate.passed
+
+
+def test_unstable_modes_that_no_noise_drives():
+    """The stabilising solution is not the least one: doubling must not stop at P = 0."""
+    alone = lbt.EstimationProblem(A=2.0, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    pair = lbt.EstimationProblem(
+        A=np.diag([2.0, 0.5]), B=[[0.0, 0], [1, 0]], C=[[1.0, 1]], D=[[0, 1.0]], L=[[1.0, 1]]
+    )
+    for problem, least in ((alone, 2.0), (pair, 2.828427)):
+        for method in ("riccati", "lmi"):
+            assert lbt.hinf(problem, method=method).gamma == pytest.approx(least, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [33, 5, 8, 13, 21])
+def test_many_sensors_of_one_state_at_the_least_gamma(seed):
+    rng = np.random.default_rng(seed)
+    C = rng.standard_normal((3, 1))
+    D = np.hstack([np.zeros((3, 1)), rng.standard_normal((3, 3))])
+    problem = lbt.EstimationProblem(A=1.2, B=[[1.0, 0, 0, 0]], C=C, D=D, L=1.0)
+    design = lbt.hinf(problem, method="riccati")
+    assert design.gamma == pytest.approx(design.gamma_least, rel=1e-8)
+
+
+def test_weakly_driven_modes_and_odd_units_are_not_refused():
+    weak = lbt.EstimationProblem(
+        A=np.diag([1.0, 0.5]), B=[[1e-6, 0, 0], [0, 1, 0]], C=[[1, 1]], D=[[0, 0, 1]], L=[[1, 1]]
+    )
+    assert lbt.kalman(weak).certificate.passed
+    c = 1e-11
+    units = lbt.EstimationProblem(
+        A=np.diag([1.0, 0.5]), B=[[1 / c, 0, 0], [0, 1, 0]], C=[[c, 1]], D=[[0, 0, 1]], L=[[c, 1]]
+    )
+    assert lbt.kalman(units).rms == pytest.approx(1.6689, abs=1e-4)
+
+
+def test_a_very_large_bound_is_the_kalman_filter(axis_plant):
+    kalman = lbt.kalman(axis_plant)
+    for method in ("lmi", "riccati"):
+        design = lbt.hinf(axis_plant, gamma_ratio=1e6, method=method)
+        assert design.rms == pytest.approx(kalman.rms, rel=1e-6)
+    with pytest.raises(lbt.ProblemError, match="at most"):
+        lbt.hinf(axis_plant, gamma=1e300)
+
+
+def test_a_least_gamma_that_is_not_the_least_does_not_leave_the_library(monkeypatch, axis_plant):
+    module = sys.modules["lbt_synth.design.hinf"]
+    honest = module.least_gamma
+
+    def lazy(problem, *, lower, upper, start):
+        low, high, best = honest(problem, lower=lower, upper=upper, start=start)
+        return low, 1.1 * high, best
+
+    monkeypatch.setattr(module, "least_gamma", lazy)
+    with pytest.raises(lbt.NumericalError, match="is not the least"):
+        lbt.hinf(axis_plant, method="riccati")

@@ -247,3 +247,42 @@ def test_directories_that_cannot_be_written(tmp_path):
     file.write_text("")
     with pytest.raises(lbt.OutputError, match="Not a directory"):
         lbt.save_gain(file / "g.fits", DESIGNS["kalman"])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"meta": {}, "arrays": []}',
+        '{"meta": null, "arrays": {}}',
+        "[" * 100_000,
+        '{"meta": {"schema": "lbt_synth gain file", "x": NaN}, "arrays": {}}',
+        '{"meta": {}, "arrays": {"A": [[1' + "0" * 400 + "]]}}",
+        '{"meta": {}, "arrays": {"\\ud800": [[1]]}}',
+        "\x00",
+    ],
+)
+def test_hostile_json(tmp_path, text):
+    path = tmp_path / "h.json"
+    path.write_text(text)
+    with pytest.raises(lbt.GainFileError):
+        lbt.load_gain(path)
+
+
+def test_hostile_archives(tmp_path):
+    content = lbt.save_gain(tmp_path / "g.npz", DESIGNS["bare"]).read_bytes()
+    path = tmp_path / "h.npz"
+    for place in range(0, len(content), 7):  # every kind of byte of the format, one at a time
+        damaged = bytearray(content)
+        damaged[place] ^= 0xFF
+        path.write_bytes(bytes(damaged))
+        try:
+            assert np.array_equal(lbt.load_gain(path).controller.A, DESIGNS["bare"].controller.A)
+        except lbt.GainFileError:
+            continue
+
+
+def test_impossible_names():
+    with pytest.raises(lbt.GainFileError, match="null"):
+        lbt.load_gain("x\0y.json")
+    with pytest.raises(lbt.OutputError, match="null"):
+        lbt.save_gain("x\0y.json", DESIGNS["bare"])

@@ -80,6 +80,36 @@ def test_quadrature_agrees_with_the_lyapunov_equation(gain, model):
     assert np.allclose(quadrature, exact, rtol=2e-4, atol=1e-9 * exact.max())
 
 
+@pytest.mark.parametrize("half_width", [0.3, 0.03, 0.003])
+def test_narrow_lines_of_a_table_are_not_missed(half_width):
+    """A triangle of unit area: its residual is the rejection at its place."""
+    table = lbt.TabulatedSpectrum(
+        frequency_hz=[37.3 - half_width, 37.3, 37.3 + half_width],
+        density_nm2_hz=[0, 100 / half_width, 0],
+    )
+    plant = lbt_axis_plant()
+    loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
+    budget = lbt.residual_budget(loop, lbt.Truth(turbulence=table))
+    gain = abs(loop.sensitivity([37.3])[0, 0, 0])
+    assert budget.turbulence_nm == pytest.approx(10 * gain, rel=1e-3)
+
+
+def test_a_measured_spectrum_against_brute_force():
+    rng = np.random.default_rng(0)
+    f = np.linspace(5, 100, 3393)
+    lines = sum(40 / (1 + ((f - c) / w) ** 2) for c, w in ((10, 0.1), (48.3, 0.03), (72.5, 0.05)))
+    table = lbt.TabulatedSpectrum(
+        frequency_hz=f, density_nm2_hz=lines * rng.uniform(0.2, 1, f.size)
+    )
+    plant = lbt_axis_plant()
+    loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
+    fine = np.linspace(5, 100, 3392 * 20 + 1)
+    power = np.abs(loop.sensitivity(fine)[:, 0, 0]) ** 2
+    expected = np.trapezoid(table.psd(fine) * power, fine)
+    budget = lbt.residual_budget(loop, lbt.Truth(turbulence=table))
+    assert budget.turbulence_nm**2 == pytest.approx(expected, rel=1e-5)
+
+
 def test_a_narrow_resonance_tends_to_the_sinusoid():
     plant = lbt_axis_plant(modes=2)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)

@@ -101,6 +101,41 @@ def test_drawn_series_have_their_spectrum(air):
     assert abs(step.mean() - expected) < 5 * step.std(ddof=1) / np.sqrt(len(step))
 
 
+@pytest.mark.parametrize("frames", [100, 1000])
+def test_power_is_drawn_whole_however_short_the_series(frames):
+    """A line between two bins, and a spectrum that rises towards zero, keep their variance."""
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    steep = lbt.Atmosphere(
+        seeing_arcsec=0.8, outer_scale_m=None, wind_speed_m_s=20, diameter_m=8.22
+    )
+    line = lbt.TabulatedSpectrum(
+        frequency_hz=[37.2, 37.23, 37.26], density_nm2_hz=[0, 100 / 0.03, 0]
+    )
+    for spectrum, rms in ((steep, steep.tilt_rms_nm), (line, 10.0)):
+        series = draw_disturbance(
+            lbt.Truth(turbulence=spectrum), path, frames=frames, cases=3000,
+            rng=np.random.default_rng(2),
+        )  # fmt: skip
+        assert np.sqrt(np.mean(series**2)) == pytest.approx(rms, rel=0.05)
+
+
+def test_white_noise_is_drawn_white():
+    flat = lbt.TabulatedSpectrum(frequency_hz=[0, 400], density_nm2_hz=[1.0, 1.0])
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    series = draw_disturbance(
+        lbt.Truth(turbulence=flat), path, frames=8, cases=60_000, rng=np.random.default_rng(3)
+    )
+    assert np.mean(series**2) == pytest.approx(400, rel=0.01)
+
+
+def test_runs_beyond_the_memory_are_refused(axis_plant):
+    controller = lbt.kalman(axis_plant).controller
+    truth = lbt.Truth(turbulence=None, noise_nm=1)
+    for size in ({"frames": 10**24}, {"frames": 10**6, "cases": 10**6}):
+        with pytest.raises(lbt.ProblemError, match="must fit into 8 GB"):
+            lbt.simulate(controller, truth, hardware=axis_plant.hardware, **size)
+
+
 def test_drawn_ar_series_are_stationary_from_the_first_frame():
     line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=100, direction=(1,))
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)

@@ -75,6 +75,25 @@ def test_no_jitter_is_the_other_modes():
     assert lbt.jitter_strehl(np.zeros((2, 2)), imaging=camera) == pytest.approx(0.84, rel=1e-12)
 
 
+def test_large_jitter_stays_between_zero_and_one():
+    """Asymptotes: a Gaussian blob, and a circle that the image runs round."""
+    camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
+    sigma = 10_000.0
+    wide = lbt.jitter_strehl(np.eye(2) * sigma**2, imaging=camera)
+    radius = np.linspace(0, 0.2, 20_001)
+    k = 2 * np.pi * camera.cycles_per_nm * sigma
+    inner = radius * annular_otf(radius, 0.11) * np.exp(-(k**2) * radius**2 / 2)
+    whole = np.linspace(0, 1, 20_001)
+    outer = whole * annular_otf(whole, 0.11)
+    assert wide == pytest.approx(np.trapezoid(inner, radius) / np.trapezoid(outer, whole), rel=1e-3)
+    circle = lbt.jitter_strehl(
+        np.zeros((2, 2)), imaging=camera, line_amplitudes_nm=[[10_000, 10_000j]]
+    )
+    assert abs(circle) < 1e-4
+    with pytest.raises(lbt.ProblemError, match="the jitter must stay below"):
+        lbt.jitter_strehl(np.eye(2) * 1e12, imaging=camera)
+
+
 def test_one_axis_is_the_second_one_still():
     one = lbt.jitter_strehl([[200.0**2]], imaging=CAMERA, line_amplitudes_nm=[[300.0]])
     two = lbt.jitter_strehl(np.diag([200.0**2, 0]), imaging=CAMERA, line_amplitudes_nm=[[300.0, 0]])

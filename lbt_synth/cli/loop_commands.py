@@ -12,7 +12,7 @@ from lbt_synth.cli.output import Report, TableText, progress, working
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import write_atomically
+from lbt_synth.files import require_writable, write_atomically
 from lbt_synth.gainfile import load_gain
 from lbt_synth.loop import close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
@@ -31,6 +31,7 @@ from lbt_synth.tables import csv_bytes
 def sigma(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
     _require_figure(arguments.output)
+    require_writable(arguments.output)
     designs = _named(arguments.gains)
     with working("drawing", quiet=arguments.json):
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
@@ -78,6 +79,7 @@ def simulate(arguments: Namespace) -> Report:
     """Close the loop in the time domain, beside the exact answer."""
     if arguments.output is not None:
         _require_figure(arguments.output)
+        require_writable(arguments.output)
     config = load_config(arguments.config)
     design = load_gain(arguments.gain)
     truth = _truth(config, arguments)
@@ -151,6 +153,7 @@ def robustness(arguments: Namespace) -> Report:
             raise ProblemError(
                 f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
             )
+    require_writable(*arguments.output)
     config = load_config(arguments.config)
     settings = config.settings
     ratio = arguments.gamma_ratio

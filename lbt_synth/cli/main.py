@@ -113,6 +113,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(error, FAILED, as_json=arguments.json)
     except LbtSynthError as error:
         return _refuse(error, WRONG, as_json=arguments.json)
+    except MemoryError:
+        print("lbt-synth: error: not enough memory; ask for less.", file=sys.stderr)
+        return WRONG
     except KeyboardInterrupt:
         print("lbt-synth: interrupted", file=sys.stderr)
         return 130

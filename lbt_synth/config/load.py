@@ -112,7 +112,7 @@ def _read_yaml(source: Path) -> dict[str, Any]:
         raise ConfigError(f"{source} is not a text file: {error.reason}.") from error
     try:
         raw = YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
+    except (YAMLError, ValueError, KeyError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or str(error).split("\n")[0]
@@ -187,6 +187,10 @@ def _build(settings: FileSection, source: Path) -> Config:
         raise ConfigError(f"{source}: {error}", path=error.path) from error
     except ProblemError as error:
         raise ConfigError(f"{source}: {error}") from error
+    except ArithmeticError as error:
+        raise ConfigError(
+            f"{source}: some value is far from any telescope: {error}. Check the units."
+        ) from error
     imaging = Imaging(
         diameter_m=settings.telescope.diameter_m,
         obstruction=settings.telescope.obstruction,

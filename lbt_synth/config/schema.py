@@ -176,7 +176,7 @@ class RobustnessSection(_Section):
 class FileSection(_Section):
     """A whole configuration file."""
 
-    version: Literal[1]
+    version: Annotated[int, Field(ge=1, le=1)]
     telescope: TelescopeSection
     atmosphere: AtmosphereSection
     sensor: SensorSection

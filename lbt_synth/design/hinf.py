@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.certify import NORM_TOLERANCE
 from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
-from lbt_synth.errors import InfeasibleError, ProblemError
+from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.norms import hinf_norm
 from lbt_synth.riccati import FilterRiccati, gamma_riccati, kalman_riccati, least_gamma
@@ -16,6 +17,8 @@ from lbt_synth.validation import FloatArray, choice, number
 
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9
+_GREATEST = 1e100
+_GREATEST_RATIO = 1e6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,10 +88,14 @@ def hinf(
             f"got gamma={gamma!r} and gamma_ratio={gamma_ratio!r}."
         )
     if gamma is not None:
-        gamma = number(gamma, "gamma", above=0)
+        gamma = number(gamma, "gamma", above=0, at_most=_GREATEST)
     if gamma_ratio is not None:
         gamma_ratio = number(
-            gamma_ratio, "gamma_ratio", at_least=1, hint="No filter is better than the least gamma."
+            gamma_ratio,
+            "gamma_ratio",
+            at_least=1,
+            at_most=_GREATEST_RATIO,
+            hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
         )
     start = kalman_riccati(problem)
     synthesis = _LmiRoute(problem, start) if method == "lmi" else _RiccatiRoute(problem, start)
@@ -107,7 +114,7 @@ def hinf(
         )
     if requested > least * (1 + _AT_LEAST):
         gains = synthesis.at(requested)
-    return filter_design(
+    design = filter_design(
         problem,
         gains.gain_predictor,
         gains.gain_filter,
@@ -116,6 +123,13 @@ def hinf(
         gamma_requested=max(requested, least),
         gamma_least=least,
     )
+    if design.gamma < least * (1 - NORM_TOLERANCE):
+        raise NumericalError(
+            f"the least gamma {least:.9g} that was found is not the least: a filter achieves "
+            f"{design.gamma:.9g}. Try the other method, or scale the states to similar sizes.",
+            status="contradiction",
+        )
+    return design
 
 
 class _RiccatiRoute:
@@ -126,11 +140,11 @@ class _RiccatiRoute:
 
     def least(self) -> tuple[float, _Gains]:
         lower, upper = _kalman_bracket(self.problem, self.start)
-        _, least, solution = least_gamma(self.problem, lower=lower, upper=upper)
+        _, least, solution = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
         return least, self._gains(solution)
 
     def at(self, gamma: float) -> _Gains:
-        solution = gamma_riccati(self.problem, gamma)
+        solution = gamma_riccati(self.problem, gamma, start=self.start)
         if solution is None:
             raise InfeasibleError(
                 f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "

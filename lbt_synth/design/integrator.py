@@ -109,15 +109,14 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     Returns
     -------
     IntegratorDesign
-        Certified design; the gain is within 1e-6 of the best.
+        Certified design. The gain is within 1e-6 of the best among those that are
+        stable at unit sensor gain as well; ``solver.status`` says when that limit,
+        not the truth, decided.
 
     Raises
     ------
     ProblemError
         If nothing disturbs the loop.
-    CertificateError
-        If the loop is not stable at unit sensor gain (a real sensor gain well
-        below 1 allows gains that a unit one does not).
 
     Examples
     --------
@@ -147,7 +146,9 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     best = int(np.argmin(values))
     bracket = trials[max(best - 1, 0)], trials[min(best + 1, _TRIALS - 1)]
     found = minimize_scalar(variance, bounds=bracket, method="bounded", options={"xatol": 1e-7})
-    return _certified(hardware, float(np.exp(found.x)), status="least residual of the truth")
+    limited = best == _TRIALS - 1
+    status = "limited by stability at unit sensor gain" if limited else "least residual"
+    return _certified(hardware, float(np.exp(found.x)), status=status)
 
 
 def _controller(hardware: LoopHardware, gain: float) -> Controller:

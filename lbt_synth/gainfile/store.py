@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design, FilterDesign
-from lbt_synth.errors import GainFileError, OutputError, ProblemError, SchemaVersionError
+from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files import write_atomically
 from lbt_synth.gainfile import formats
 from lbt_synth.gainfile.record import Arrays, Meta, from_record, to_record
@@ -110,17 +110,20 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
         content = source.read_bytes()
     except OSError as error:
         raise GainFileError(f"cannot read {source}: {error.strerror}.", path=source) from error
+    except ValueError as error:
+        raise GainFileError(f"cannot read {str(source)!r}: {error}.", path=source) from error
     try:
         arrays, text = read(content)
         meta = json.loads(text)
-    except (ValueError, KeyError, OSError, TypeError, IndexError) as error:
+        digest = _digest(arrays, meta) if isinstance(meta, dict) else ""
+    except Exception as error:  # foreign bytes: three decoders raise whatever they like
         raise GainFileError(
             f"{source} is no gain file, or it is damaged: {_reason(error)}. "
             "Write it again with lbt-synth design.",
             path=source,
         ) from error
     _check_schema(meta, source)
-    if meta.get("digest") != _digest(arrays, meta):
+    if meta.get("digest") != digest:
         raise GainFileError(
             f"{source} is damaged: its content does not match its digest. "
             "Write it again with lbt-synth design.",
@@ -133,7 +136,7 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
             )
     try:
         return from_record({name: frozen(array) for name, array in arrays.items()}, meta)
-    except (ProblemError, KeyError, TypeError, ValueError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise GainFileError(
             f"{source} is inconsistent: {_reason(error)}. Write it again with lbt-synth design.",
             path=source,

@@ -55,7 +55,7 @@ def least_gamma_lmi(
     P = cp.Variable(frame.problem.A.shape, symmetric=True)
     gamma_squared = cp.Variable(nonneg=True)
     status, iterations = solve(
-        cp.Minimize(gamma_squared), _inequalities(frame.problem, P, gamma_squared)
+        cp.Minimize(gamma_squared), _inequalities(frame.problem, P, gamma_squared, 1.0)
     )
     if status not in USABLE or P.value is None or gamma_squared.value is None:
         raise NumericalError(
@@ -63,7 +63,8 @@ def least_gamma_lmi(
             'Try method="riccati".',
             status=status,
         )
-    return _unpacked(frame, P.value, float(gamma_squared.value), status, iterations)
+    level = float(gamma_squared.value)
+    return _unpacked(frame, P.value / level, level, status, iterations)
 
 
 def hinf_lmi(
@@ -97,7 +98,9 @@ def hinf_lmi(
     frame = balanced(problem, coordinates, scale)
     level = (gamma / scale) ** 2
     P = cp.Variable(frame.problem.A.shape, symmetric=True)
-    status, iterations = solve(cp.Maximize(cp.trace(P)), _inequalities(frame.problem, P, level))
+    status, iterations = solve(
+        cp.Maximize(cp.trace(P)), _inequalities(frame.problem, P, 1.0, 1 / level)
+    )
     if "infeasible" in status:
         raise InfeasibleError(
             f"no H-infinity filter reaches gamma = {gamma:.9g}: the LMI is infeasible. "
@@ -113,25 +116,34 @@ def hinf_lmi(
     return _unpacked(frame, P.value, level, status, iterations)
 
 
-def _inequalities(problem: EstimationProblem, P: Any, gamma_squared: Any) -> list[Any]:
+def _inequalities(
+    problem: EstimationProblem, P: Any, input_weight: Any, output_weight: float
+) -> list[Any]:
+    """Return the two inequalities; dividing them by gamma^2 suits a large, given level."""
     A, B, C, D, L = problem.A, problem.B, problem.C, problem.D, problem.L
     n = A.shape[0]
     basis = null_space(np.hstack([C, D]))
     Nx, Nw = basis[:n], basis[n:]
     step, seen = A @ Nx + B @ Nw, L @ Nx
-    dissipation = Nx.T @ P @ Nx + gamma_squared * (Nw.T @ Nw) - step.T @ P @ step - seen.T @ seen
-    return [symmetrised(dissipation) >> 0, P - L.T @ L >> 0]
+    dissipation = (
+        Nx.T @ P @ Nx
+        + input_weight * (Nw.T @ Nw)
+        - step.T @ P @ step
+        - output_weight * (seen.T @ seen)
+    )
+    return [symmetrised(dissipation) >> 0, P - output_weight * (L.T @ L) >> 0]
 
 
 def _unpacked(
     frame: BalancedProblem, P: FloatArray, gamma_squared: float, status: str, iterations: int
 ) -> LmiSolution:
+    """Turn ``P / gamma^2`` into gains and a covariance in the problem's coordinates."""
     storage = (P + P.T) / 2
-    information = (storage - frame.problem.L.T @ frame.problem.L) / gamma_squared
+    information = storage - frame.problem.L.T @ frame.problem.L / gamma_squared
     predictor, filtering = frame.gains(information)
     return LmiSolution(
         gamma=float(np.sqrt(gamma_squared) * frame.output_scale),
-        P=frame.covariance(np.asarray(gamma_squared * np.linalg.inv(storage), dtype=np.float64)),
+        P=frame.covariance(np.asarray(np.linalg.inv(storage), dtype=np.float64)),
         gain_predictor=predictor,
         gain_filter=filtering,
         status=status,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.special import j0
 
-from lbt_synth.errors import DimensionError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.models.atmosphere import ARCSEC_RAD
 from lbt_synth.models.units import nm_per_mas
@@ -25,6 +25,7 @@ from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray, number, real_array, semidefinite
 
 _DIRECTIONS = 64
+_MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
 _SERIES_CHUNK = 20_000  # frames at once
 
 
@@ -144,7 +145,16 @@ def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: 
     _require_axes(size)
     lines = np.asarray(line_amplitudes_nm, dtype=np.complex128).reshape(-1, size)
     real_array(np.abs(lines), "line_amplitudes_nm")
-    fx, fy, weight = _weighted_otf(imaging.obstruction)
+    spread = np.sqrt(np.max(np.diag(covariance))) + np.sum(np.abs(lines))
+    turns = float(spread * imaging.cycles_per_nm)
+    if turns > _MOST_TURNS:
+        raise ProblemError(
+            f"the jitter must stay below {_MOST_TURNS / imaging.cycles_per_nm:.3g} nm; got "
+            f"{spread:.3g} nm. Check the units."
+        )
+    # beyond some 5 turns of phase over the pupil the nodes are made denser
+    fineness = max(0, int(np.ceil(np.log2(max(turns, 1e-9) / 5))))
+    fx, fy, weight = _weighted_otf(imaging.obstruction, fineness)
     axes = np.stack([fx, fy])[:size] * imaging.cycles_per_nm
     exponent = np.einsum("if,ij,jf->f", axes, covariance, axes)
     factor = np.exp(-2 * np.pi**2 * exponent)
@@ -204,16 +214,19 @@ def _require_axes(size: int) -> None:
 
 
 @lru_cache(maxsize=16)
-def _weighted_otf(obstruction: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Nodes (fx, fy) in units of D/lambda over half the plane, and OTF weights of sum 1."""
     eps = obstruction
     kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
     edges = np.array(sorted(kinks))
+    for _ in range(fineness):
+        edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
+    directions = _DIRECTIONS * 2**fineness
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    angle = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    angle = np.pi * np.arange(directions) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
-    weights = np.repeat(weight / (weight.sum() * _DIRECTIONS), _DIRECTIONS)
+    weights = np.repeat(weight / (weight.sum() * directions), directions)
     return fx, fy, weights
 
 

@@ -66,6 +66,9 @@ class LoopHardware:
             n = influence.shape[0]
         if n < 1 or (influence is not None and influence.shape[1] < 1):
             raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
+        for name, value in (("sensor_matrix", sensor), ("influence_matrix", influence)):
+            if value is not None and not np.any(value):
+                raise ProblemError(f"{name} must respond to something; got only zeros.")
         object.__setattr__(self, "modes", n)
         object.__setattr__(self, "sensor_matrix", frozen(np.eye(n)) if sensor is None else sensor)
         object.__setattr__(

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+from scipy.linalg import matrix_balance, solve_discrete_are
 
 from lbt_synth.errors import DetectabilityError, NumericalError
+from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.riccati.doubling import doubling
 from lbt_synth.validation import (
     ComplexArray,
@@ -127,14 +128,24 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
 
 
 def unstable_hidden_mode(
-    A: FloatArray, C: FloatArray, *, only_unit_circle: bool = False
+    A: FloatArray, C: FloatArray, *, drive: FloatArray, only_unit_circle: bool = False
 ) -> complex | None:
     """Eigenvalue of A that does not decay and that C does not see, or None.
 
     The Popov-Belevitch-Hautus test on the eigenvalues with modulus 1 or more
-    (or about 1, with ``only_unit_circle``).
+    (or about 1, with ``only_unit_circle``). ``drive`` (n, p) enters the states: with
+    it their units are chosen, on which the answer must not depend.
     """
     n = A.shape[0]
+    border = np.block(
+        [
+            [np.abs(A), np.linalg.norm(drive, axis=1)[:, None]],
+            [np.linalg.norm(C, axis=0)[None, :], np.zeros((1, 1))],
+        ]
+    )
+    _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
+    units = np.asarray(scaling[:n], dtype=np.float64)
+    A, C = A * units / units[:, None], C * units
     scale_A = max(float(np.linalg.norm(A, 2)), 1e-300)
     scale_C = max(float(np.linalg.norm(C, 2)), 1e-300)
     tol = 1e-10
@@ -151,14 +162,16 @@ def unstable_hidden_mode(
 def _require_stabilising(
     A: FloatArray, B: FloatArray, shifted: FloatArray, weight: FloatArray
 ) -> None:
-    hidden = unstable_hidden_mode(A.T, B.T)
+    values, vectors = np.linalg.eigh(weight)
+    root = (vectors * np.sqrt(np.maximum(values, 0))).T  # root' root = weight
+    hidden = unstable_hidden_mode(A.T, B.T, drive=root.T)
     if hidden is not None:
         raise DetectabilityError(
             f"(A, B) must be stabilisable; the mode of A at {hidden:.6g} does not decay and B "
             "does not reach it. Give it an input, or take it out of the model.",
             eigenvalue=hidden,
         )
-    hidden = unstable_hidden_mode(shifted, weight, only_unit_circle=True)
+    hidden = unstable_hidden_mode(shifted, root, drive=B, only_unit_circle=True)
     if hidden is not None:
         raise DetectabilityError(
             f"Q must see every mode on the unit circle; the mode of A at {hidden:.6g} has no "
@@ -199,8 +212,7 @@ def _refined(
         closed = A - B @ gain
         if not np.max(np.abs(np.linalg.eigvals(closed))) < 1:
             return None
-        step = solve_discrete_lyapunov(closed.T, residual)
-        refined = X + (step + step.T) / 2
+        refined = X + stationary_covariance(closed.T, residual)
         new_gain, new_residual, new_size = _residual(A, B, Q, R, S, refined)
         if not new_size < size:
             break

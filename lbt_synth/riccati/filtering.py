@@ -55,7 +55,7 @@ def require_detectable(problem: EstimationProblem) -> None:
     DetectabilityError
         The message names the mode.
     """
-    hidden = unstable_hidden_mode(problem.A, problem.C)
+    hidden = unstable_hidden_mode(problem.A, problem.C, drive=problem.B)
     if hidden is not None:
         raise DetectabilityError(
             f"(A, C) must be detectable; the mode of A at {hidden:.6g} does not decay and no "
@@ -63,7 +63,7 @@ def require_detectable(problem: EstimationProblem) -> None:
             eigenvalue=hidden,
         )
     A_s, B_s, _ = decorrelated(problem)
-    hidden = unstable_hidden_mode(A_s.T, B_s.T, only_unit_circle=True)
+    hidden = unstable_hidden_mode(A_s.T, B_s.T, drive=problem.C.T, only_unit_circle=True)
     if hidden is not None:
         raise DetectabilityError(
             f"every mode on the unit circle must be driven by noise; the mode of A at "
@@ -114,25 +114,46 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     )
 
 
-def gamma_riccati(problem: EstimationProblem, gamma: float) -> FilterRiccati | None:
+def gamma_riccati(
+    problem: EstimationProblem, gamma: float, *, start: FilterRiccati | None = None
+) -> FilterRiccati | None:
     """Solve ``P = A P (I + W P)^-1 A' + BB'``, ``W = C'R^-1 C - L'L / gamma^2``.
 
     A predictor with an error norm below gamma exists if and only if the
-    stabilising P is positive semidefinite and ``gamma^2 I - L P L' > 0``; with
-    ``Pt = P + P L'(gamma^2 I - L P L')^-1 L P`` the gain is
-    ``A Pt C'(R + C Pt C')^-1``. Correlated noise is taken out first.
+    stabilising P is positive semidefinite and ``gamma^2 I - L P L' > 0``; the gain
+    is ``A Pt C'(R + C Pt C')^-1`` with ``Pt = P + P L'(gamma^2 I - L P L')^-1 L P``.
+    Correlated noise is taken out first.
+
+    The equation is solved for the excess over the Kalman filter's P0. With the
+    filtered covariance M, F = I - gain_filter C and
+    ``N = I + M L'(gamma^2 I - L M L')^-1 L``::
+
+        P = P0 + X,   X = A1 X (I + G1 X)^-1 A1' + H1
+        A1 = A N F,   G1 = W N F,   H1 = A M L'(gamma^2 I - L M L')^-1 L M A'
+
+    H1 is positive semidefinite and holds no difference of large numbers, so the
+    doubling starts inside the stabilising solution's reach.
 
     Parameters
     ----------
     problem : EstimationProblem
-        The problem; detectability is not checked here.
+        The problem.
     gamma : float
         Level asked for.
+    start : FilterRiccati, optional
+        The Kalman filter's solution, if it is at hand.
 
     Returns
     -------
     FilterRiccati or None
         None where no such filter exists.
+
+    Raises
+    ------
+    DetectabilityError
+        If no stable filter exists at all.
+    NumericalError
+        If the equation has a solution that was not reached accurately.
 
     Examples
     --------
@@ -142,31 +163,49 @@ def gamma_riccati(problem: EstimationProblem, gamma: float) -> FilterRiccati | N
     >>> gamma_riccati(p, 1.0) is None, gamma_riccati(p, 2.5) is None
     (True, False)
     """
-    A, B, injection = decorrelated(problem)
-    C, L, R = problem.C, problem.L, problem.R
-    weight = C.T @ np.linalg.solve(R, C) - L.T @ L / gamma**2
-    weight, Q = (weight + weight.T) / 2, B @ B.T
-    P, steps, converged = doubling(A.T, weight, Q)
+    kalman_filter = kalman_riccati(problem) if start is None else start
+    A, _, injection = decorrelated(problem)
+    C, L = problem.C, problem.L
+    identity = np.eye(len(A))
+    P0, keep = kalman_filter.P, identity - kalman_filter.gain_filter @ C
+    filtered = keep @ P0
+    filtered = (filtered + filtered.T) / 2
+    seen = L @ filtered
+    room = gamma**2 * np.eye(L.shape[0]) - seen @ L.T
+    if np.linalg.eigvalsh(room)[0] <= 0:
+        return None
+    weighted = np.linalg.solve(problem.R, C).T  # C' R^-1
+    W = weighted @ C - L.T @ L / gamma**2
+    widened = (identity + seen.T @ np.linalg.solve(room, L)) @ keep
+    A1, G1 = A @ widened, W @ widened
+    H1 = A @ seen.T @ np.linalg.solve(room, seen @ A.T)
+    G1, H1 = (G1 + G1.T) / 2, (H1 + H1.T) / 2
+    X, steps, converged = doubling(A1.T, G1, H1)
     if not converged:
         return None
+    spectrum = np.linalg.eigvalsh(X)
+    P = P0 + X
     slack = gamma**2 * np.eye(L.shape[0]) - L @ P @ L.T
-    if np.linalg.eigvalsh(slack)[0] <= 0:
+    if spectrum[0] < -1e-9 * abs(spectrum[-1]) or np.linalg.eigvalsh(slack)[0] <= 0:
         return None
-    spectrum = np.linalg.eigvalsh(P)
-    if spectrum[0] < -1e-9 * spectrum[-1]:
+    transition = np.linalg.solve((identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
+    if not np.max(np.abs(np.linalg.eigvals(transition))) < 1:
         return None
-    transition = np.linalg.solve(np.eye(len(A)) + weight @ P, A.T).T  # A (I + P W)^-1
-    APA = transition @ P @ A.T
-    size = sum(float(np.linalg.norm(t, 1)) for t in (P, APA, Q))
-    residual = float(np.linalg.norm(APA - P + Q, 1)) / size
-    if residual > _RESIDUAL_LIMIT or not np.max(np.abs(np.linalg.eigvals(transition))) < 1:
-        return None
-    LP = L @ P
-    Pt = P + LP.T @ np.linalg.solve(slack, LP)
-    gain_filter = np.linalg.solve(R + C @ Pt @ C.T, C @ Pt).T
+    gain_filter = _measurement_update(problem, P, gamma)
     gain = A @ gain_filter + injection
     if not np.max(np.abs(np.linalg.eigvals(problem.A - gain @ C))) < 1:
         return None
+    AXA = transition @ X @ A1.T
+    size = sum(float(np.linalg.norm(t, 1)) for t in (P, X, AXA, H1))
+    residual = float(np.linalg.norm(AXA - X + H1, 1)) / max(size, 1e-300)
+    if residual > _RESIDUAL_LIMIT:
+        raise NumericalError(
+            f"the gamma-Riccati equation at gamma = {gamma:.9g} was solved only to a relative "
+            f"residual of {residual:.3g}; expected {_RESIDUAL_LIMIT:g}. Try method='lmi', or scale "
+            "the states to similar sizes.",
+            status="residual",
+            residual=residual,
+        )
     return FilterRiccati(
         P=frozen(P),
         gain_predictor=frozen(gain),
@@ -177,8 +216,22 @@ def gamma_riccati(problem: EstimationProblem, gamma: float) -> FilterRiccati | N
     )
 
 
+def _measurement_update(problem: EstimationProblem, P: FloatArray, gamma: float) -> FloatArray:
+    """Gain ``Pt C'(R + C Pt C')^-1`` without forming Pt, which may be unbounded.
+
+    The first block column of ``P [C' L'/gamma] Re^-1``, where Re is the indefinite
+    covariance of the two innovations, of y and of z / gamma.
+    """
+    q = problem.C.shape[0]
+    outputs = np.vstack([problem.C, problem.L / gamma])
+    covariance = outputs @ P @ outputs.T
+    covariance[:q, :q] += problem.R
+    covariance[q:, q:] -= np.eye(problem.L.shape[0])
+    return np.asarray(np.linalg.solve(covariance, outputs @ P)[:q].T, dtype=np.float64)
+
+
 def least_gamma(
-    problem: EstimationProblem, *, lower: float, upper: float
+    problem: EstimationProblem, *, lower: float, upper: float, start: FilterRiccati | None = None
 ) -> tuple[float, float, FilterRiccati]:
     """Bisect for the least gamma: bracket and the filter at its upper end.
 
@@ -191,6 +244,8 @@ def least_gamma(
         its worst direction, for P grows as gamma falls.
     upper : float
         A level that is met: the norm that the Kalman filter achieves.
+    start : FilterRiccati, optional
+        The Kalman filter's solution, if it is at hand.
 
     Returns
     -------
@@ -206,9 +261,10 @@ def least_gamma(
     NumericalError
         If the bisection does not close.
     """
+    start = kalman_riccati(problem) if start is None else start
     best = None
     for _ in range(60):  # the upper level is feasible in exact arithmetic
-        best = gamma_riccati(problem, upper)
+        best = gamma_riccati(problem, upper, start=start)
         if best is not None:
             break
         upper *= 1.0001 if upper < 1.01 * lower else 1.01
@@ -222,7 +278,7 @@ def least_gamma(
         if upper - lower <= _GAMMA_TOLERANCE * upper:
             return lower, upper, best
         middle = (lower + upper) / 2
-        trial = gamma_riccati(problem, middle)
+        trial = gamma_riccati(problem, middle, start=start)
         if trial is None:
             lower = middle
         else:

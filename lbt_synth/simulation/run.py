@@ -19,6 +19,7 @@ from lbt_synth.validation import FloatArray, frozen, integer
 _SETTLED = 1e-4
 _MOST_SETTLING = 200_000
 _DEFAULT_SETTLING = 1000
+_MOST_GIGABYTES = 8.0
 
 
 @runtime_checkable
@@ -145,6 +146,13 @@ def simulate(
     settle = (
         default if settle_frames is None else integer(settle_frames, "settle_frames", at_least=0)
     )
+    channels = 2 * (hardware.modes + hardware.n_measurements) + hardware.n_commands
+    gigabytes = 8e-9 * (settle + frames) * cases * channels
+    if gigabytes > _MOST_GIGABYTES:
+        raise ProblemError(
+            f"frames x cases must fit into {_MOST_GIGABYTES:g} GB; got {frames} x {cases}, which "
+            f"need {gigabytes:.3g} GB. Run fewer cases at once, with different seeds."
+        )
     disturbance_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     size = {"frames": settle + frames, "cases": cases}
     total = draw_disturbance(truth, hardware, rng=disturbance_rng, **size)

@@ -12,6 +12,7 @@ from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.truth import Spectrum, Truth
 from lbt_synth.models.vibration import Vibration
+from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray
 
 # A spectrum is drawn on this many times the wanted frames, so that the period is not seen.
@@ -63,16 +64,31 @@ def _draw(
         return _draw_ar(spectrum, frames, cases, rng)
     rate = hardware.frame_rate_hz
     length = next_fast_len(_PERIODS * frames, real=True)
-    frequency = np.arange(length // 2 + 1) * rate / length
-    # E|X_k|^2 = S(f_k) f_s length / 2, for a one-sided S; the mean is real
-    amplitude = np.sqrt(spectrum.psd(frequency) * rate * length / 4)
+    length += length % 2  # an even length has a bin at the Nyquist frequency
+    # E|X_k|^2 = power_k length^2 / 2; the two ends are real, of twice that variance
+    amplitude = length * np.sqrt(_bin_powers(spectrum, rate, length)) / 2
     out = np.empty((cases, frames))
     for case in range(cases):
         white = rng.standard_normal((2, amplitude.size))
         bins = amplitude * (white[0] + 1j * white[1])
-        bins[0] = amplitude[0] * np.sqrt(2) * white[0, 0]
+        bins[[0, -1]] = 2 * amplitude[[0, -1]] * white[0, [0, -1]]
         out[case] = irfft(bins, n=length)[:frames]
     return out
+
+
+def _bin_powers(spectrum: Spectrum, rate: float, length: int) -> FloatArray:
+    """Power of the spectrum in each Fourier bin [nm^2], integrated, not sampled."""
+    width = rate / length
+    ends = np.concatenate([[0.0], (np.arange(length // 2) + 0.5) * width, [rate / 2]])
+    inside = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
+    inside = inside[(inside > 0) & (inside < rate / 2)]
+    # what lies below the first bin's end may rise without bound towards zero
+    low = np.geomspace(1e-9, 1, 40) * ends[1]
+    edges = np.unique(np.concatenate([ends, inside, low]))
+    nodes, weights = gauss_panels(edges, 4)
+    panels = (spectrum.psd(nodes) * weights).reshape(-1, 4).sum(axis=1)
+    first = np.searchsorted(edges, ends[:-1])
+    return np.asarray(np.add.reduceat(panels, first))
 
 
 def _draw_ar(model: ARModel, frames: int, cases: int, rng: np.random.Generator) -> FloatArray:
