@@ -1,0 +1,45 @@
+"""Sphinx configuration. Build with ``make docs``; warnings are errors, no network is used."""
+
+import lbt_synth
+
+project = "lbt_synth"
+author = "The lbt_synth developers"
+copyright = author
+version = release = lbt_synth.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "numpydoc",
+]
+root_doc = "index"
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+
+myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_heading_anchors = 3
+
+autosummary_generate = True
+autosummary_imported_members = False
+autodoc_typehints = "none"  # the docstrings name the types and shapes
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False  # the templates list them
+numpydoc_class_members_toctree = False
+
+# MathJax is fetched by the reader's browser, not by the build.
+html_theme = "furo"
+html_title = f"lbt_synth {release}"
+html_static_path = []
+html_copy_source = False
+
+
+def _closed_literals(app, what, name, obj, options, lines):
+    """Write dots as one sign: a summary would end at them, within its literal."""
+    lines[:] = [line.replace(" + ... + ", " + … + ") for line in lines]
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", _closed_literals, priority=900)
