@@ -76,8 +76,13 @@ class Certificate:
         """Root of the summed variances of the estimation error."""
         return float(np.sqrt(np.sum(self.rms_per_output**2)))
 
-    def require(self) -> Certificate:
+    def require(self, hint: str = "") -> Certificate:
         """Return the certificate itself, or raise if a check failed.
+
+        Parameters
+        ----------
+        hint : str, optional
+            What to try; ends the message.
 
         Raises
         ------
@@ -88,8 +93,7 @@ class Certificate:
         if failed:
             listing = "; ".join(f"{c.name} {c.value:.12g}, limit {c.limit:.12g}" for c in failed)
             raise CertificateError(
-                f"the design failed its certificate and is not returned: {listing}. "
-                "Try the other method, or scale the states to similar sizes.",
+                f"the design failed its certificate and is not returned: {listing}. {hint}".strip(),
                 failed=tuple(check.name for check in failed),
             )
         return self

@@ -98,7 +98,7 @@ def test_at_the_least_gamma_the_error_is_all_pass(axis_plant):
 
 
 def test_hinf_costs_sensor_gain_robustness(axis_plant):
-    """FIELD_NOTES, section 3: Kalman [.075, 1.9], 1.05 gamma_min [.70, 1.6]."""
+    """Kalman [.075, 1.9], 1.05 gamma_min [.70, 1.6]."""
     low, high = lbt.stable_sensor_gains(axis_plant.hardware, lbt.kalman(axis_plant).controller)
     assert (low, high) == pytest.approx((0.075, 1.9), abs=0.03)
     design = lbt.hinf(axis_plant, gamma_ratio=1.05)

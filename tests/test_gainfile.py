@@ -286,3 +286,9 @@ def test_impossible_names():
         lbt.load_gain("x\0y.json")
     with pytest.raises(lbt.OutputError, match="null"):
         lbt.save_gain("x\0y.json", DESIGNS["bare"])
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_same_design_is_the_same_file(tmp_path, ending):
+    one = lbt.save_gain(tmp_path / f"a.{ending}", DESIGNS["kalman"]).read_bytes()
+    assert lbt.save_gain(tmp_path / f"b.{ending}", DESIGNS["kalman"]).read_bytes() == one

@@ -22,8 +22,8 @@ class Anonymous:
 
 
 @given(gain=st.floats(0.2, 1.5))
-def test_error_transfer_of_the_field_notes(gain):
-    """``E = (1-h)/(1-(1-g) h)``, noise ``-z^-1 H/(1-(1-g) h)``, h = z^-2 H."""
+def test_error_transfer_of_the_lbt(gain):
+    """Error ``E = (1-h)/(1-(1-g) h)``, noise ``-z^-1 H/(1-(1-g) h)``, h = z^-2 H."""
     plant = lbt_axis_plant()
     design = lbt.kalman(plant)
     loop = lbt.close_loop(plant.hardware, design.controller, sensor_gain=gain)

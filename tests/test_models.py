@@ -84,7 +84,7 @@ def test_ar1_is_stationary_with_the_von_karman_variance(air):
     assert model.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-12)
 
 
-def test_ar2_fit_of_the_field_notes(air):
+def test_ar2_fit_of_the_lbt(air):
     model = lbt.ar2_turbulence(air, frame_rate_hz=800, noise_nm=15.5)
     assert model.coefficients == pytest.approx([1.997477, -0.997555], abs=2e-5)
 
@@ -97,7 +97,7 @@ def test_ar2_fit_returns_the_model_that_made_the_spectrum(monkeypatch, air):
     assert found.driving_rms_nm == pytest.approx(0.8, rel=1e-3)
 
 
-def test_vibration_of_the_field_notes():
+def test_vibration_of_the_lbt():
     model = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=1.0).ar_model(800)
     assert model.coefficients == pytest.approx([1.972279, -0.996863], abs=5e-7)
     assert model.driving_rms_nm == pytest.approx(0.012381, abs=5e-7)

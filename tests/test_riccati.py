@@ -80,7 +80,7 @@ def test_similarity_and_scaling(seed):
 
 
 def test_an_ordinary_plant_that_scipy_refuses():
-    """AR2 turbulence and a lightly damped vibration (FIELD_NOTES, section 5)."""
+    """AR2 turbulence and a lightly damped vibration."""
     turbulence = lbt.ARModel(
         coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
     )

@@ -200,7 +200,7 @@ def test_wrong_controllers_and_counts_are_refused(axis_plant):
         lbt.simulate(controller, shaken, hardware=hw, frames=10)
 
 
-def test_axis_of_the_field_notes_in_the_time_domain():
+def test_axis_of_the_lbt_in_the_time_domain():
     """Truth is the model: the simulated residual is the Kalman filter's 135.958 nm."""
     plant = lbt_axis_plant()
     truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)

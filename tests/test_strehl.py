@@ -46,7 +46,7 @@ def test_integral_against_fft_optics():
 
 
 def test_known_value_and_marechal():
-    """FIELD_NOTES section 2: 300 nm an axis leaves .375, where Marechal says .230."""
+    """300 nm an axis leaves .375, where Marechal says .230."""
     exact = lbt.jitter_strehl(np.eye(2) * 300**2, imaging=CAMERA)
     assert exact == pytest.approx(0.375, abs=1e-3)
     small = lbt.jitter_strehl(np.eye(2) * 20**2, imaging=CAMERA)

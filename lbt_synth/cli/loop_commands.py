@@ -23,6 +23,7 @@ from lbt_synth.plotting import (
     sigma_figure,
     simulation_figure,
 )
+from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
 from lbt_synth.sweep import METHODS, RobustnessRow, frequency_robustness
 from lbt_synth.tables import csv_bytes
@@ -89,6 +90,10 @@ def simulate(arguments: Namespace) -> Report:
         given = getattr(arguments, name)
         return int(getattr(settings, name) if given is None else given)
 
+    loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
+    budget = residual_budget(loop, truth)
+    # the same settling for all controllers, so that one seed is one weather
+    settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
     with working("closing the loop", quiet=arguments.json):
         run = run_simulation(
             design.controller,
@@ -97,10 +102,9 @@ def simulate(arguments: Namespace) -> Report:
             frames=chosen("frames"),
             cases=chosen("cases"),
             seed=chosen("seed"),
+            settle_frames=settle,
         )
         strehls = run.strehl(config.imaging)
-    loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
-    budget = residual_budget(loop, truth)
     exact = strehl(budget, config.imaging)
     command_rms = np.sqrt(np.sum(np.mean(run.commands**2, axis=(0, 1))))
     scatter = float(np.std(strehls, ddof=1)) if len(strehls) > 1 else float("nan")
@@ -184,9 +188,9 @@ def robustness(arguments: Namespace) -> Report:
                 ),
                 rows=[
                     (
-                        f"{row.error_hz:+.2f}", row.method, f"{100 * row.strehl:.2f}",
-                        f"{row.residual_nm:.1f}", f"{row.vibration_nm:.1f}",
-                        f"{row.turbulence_nm:.1f}", f"{row.noise_nm:.1f}", row.stable,
+                        f"{row.error_hz:+.2f}", row.method, _fixed(100 * row.strehl, 2),
+                        _fixed(row.residual_nm, 1), _fixed(row.vibration_nm, 1),
+                        _fixed(row.turbulence_nm, 1), _fixed(row.noise_nm, 1), row.stable,
                     )
                     for row in rows
                 ],
@@ -202,6 +206,11 @@ def robustness(arguments: Namespace) -> Report:
         report.data["files"].append(str(path))
         report.notes.append(f"written: {path}")
     return report
+
+
+def _fixed(value: float, digits: int) -> str:
+    """Return a number with a fixed count of decimals, a dash where there is none."""
+    return "-" if np.isnan(value) else f"{value:.{digits}f}"
 
 
 def _robustness_csv(rows: list[RobustnessRow]) -> bytes:

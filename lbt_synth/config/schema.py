@@ -164,6 +164,7 @@ class SimulationSection(_Section):
     frames: Annotated[int, Field(ge=2)] = 8000
     cases: Annotated[int, Field(ge=1)] = 4
     seed: Annotated[int, Field(ge=0)] = 0
+    settle_frames: Annotated[int, Field(ge=0)] = 2000
 
 
 class RobustnessSection(_Section):

@@ -54,7 +54,9 @@ def _certified(hardware: LoopHardware, gain: float, *, status: str) -> Integrato
     return IntegratorDesign(
         method="integrator",
         controller=controller,
-        certificate=loop_certificate(certify_loop(hardware, controller)).require(),
+        certificate=loop_certificate(certify_loop(hardware, controller)).require(
+            f"Lower the gain {gain:.6g}."
+        ),
         solver=SolverReport(route="closed form", status=status, iterations=0),
         loop_hardware=hardware,
         gain=gain,

@@ -90,7 +90,7 @@ class FilterDesign(Design):
     problem : EstimationProblem
         The problem (a plant, for a telescope).
     gain_predictor : (n, q) ndarray
-        ``A P C' (C P C' + R)^-1``: of ``x(k+1|k) = A x(k|k-1) + gain (y(k) - C x(k|k-1))``.
+        ``(A P C' + S) (C P C' + R)^-1``: of ``x(k+1|k) = A x(k|k-1) + gain (y(k) - C x(k|k-1))``.
     gain_filter : (n, q) ndarray
         ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
     gamma_requested : float or None
@@ -224,7 +224,9 @@ def filter_design(
     return FilterDesign(
         method=method,
         controller=controller,
-        certificate=certificate.require(),
+        certificate=certificate.require(
+            "Try the other method, or scale the states to similar sizes."
+        ),
         solver=solver,
         problem=problem,
         gain_predictor=gain_predictor,

@@ -59,9 +59,9 @@ class ClosedLoop:
         """
         radius = self.spectral_radius
         if not radius < 1 - STABILITY_MARGIN:
-            word = "marginally stable" if radius < 1 + STABILITY_MARGIN else "unstable"
+            word = "a marginally stable" if radius < 1 + STABILITY_MARGIN else "an unstable"
             raise UnstableLoopError(
-                f"the closed loop must be stable; got a {word} one (spectral radius "
+                f"the closed loop must be stable; got {word} one (spectral radius "
                 f"{radius:.12g} at sensor gain {self.sensor_gain:.6g}). Lower the gain, or design "
                 "for this sensor gain and delay.",
                 spectral_radius=radius,

@@ -135,7 +135,7 @@ def simulate(
     if isinstance(controller, Controller):
         loop = close_loop(hardware, controller, sensor_gain=truth.sensor_gain)
         loop.require_stable()
-        default = _settling_frames(loop.spectral_radius)
+        default = settling_frames(loop.spectral_radius)
     elif isinstance(controller, SteppedController):
         loop, default = None, _DEFAULT_SETTLING
     else:
@@ -174,7 +174,8 @@ def simulate(
     )
 
 
-def _settling_frames(radius: float) -> int:
+def settling_frames(radius: float) -> int:
+    """Frames until the slowest mode of a loop of that spectral radius has decayed to 1e-4."""
     if radius <= 0:
         return 1
     return int(min(np.ceil(np.log(_SETTLED) / np.log(radius)), _MOST_SETTLING))
