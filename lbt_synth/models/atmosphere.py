@@ -119,7 +119,7 @@ class Atmosphere:
         """
         frequency = real_array(frequency_hz, "frequency_hz")
         if np.any(frequency < 0):
-            raise ProblemError(f"frequency_hz must be at least 0; got {frequency.min()}.")
+            raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency)}.")
         log_f, log_psd, low = _tilt_psd_table(self)
         with np.errstate(divide="ignore"):
             x = np.log(frequency)

@@ -59,7 +59,7 @@ class TabulatedSpectrum:
         if np.any(np.diff(f) <= 0) or f[0] < 0:
             raise ProblemError("frequency_hz must increase from at least 0; it does not.")
         if np.any(s < 0):
-            raise ProblemError(f"density_nm2_hz must be at least 0; got {s.min():.6g}.")
+            raise ProblemError(f"density_nm2_hz must be at least 0; got {np.min(s):.6g}.")
         object.__setattr__(self, "frequency_hz", f)
         object.__setattr__(self, "density_nm2_hz", s)
 
