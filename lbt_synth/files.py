@@ -88,7 +88,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
                 Path(temporary).unlink()
         reason = getattr(error, "strerror", None) or error
         raise OutputError(
-            f"cannot write {target}: {reason}. Choose a directory that exists and can be written.",
+            f"cannot write {target}: {reason}. Check the directory and its free space.",
             path=target,
         ) from error
     return target

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from plants import LBT_YAML
@@ -257,3 +258,29 @@ def test_the_console_script_survives_a_closed_pipe():
     script = f"{sys.executable} -m lbt_synth.cli.main design --help | head -1"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
+
+
+def test_a_controller_for_another_loop_gets_a_note(tmp_path, capsys, gains):
+    text = LBT_YAML.read_text().replace("delay_frames: 2.0", "delay_frames: 2.4")
+    (tmp_path / "other.yaml").write_text(text)
+    status, out, _ = run(
+        capsys, "simulate", tmp_path / "other.yaml", gains["kalman"], "--frames", 500, "--cases", 1
+    )
+    assert status == 0
+    assert "note: designed for a delay of 2 frames, run with 2.4." in out
+    assert "scatter" not in out  # one run has none
+    assert "1 run of 500 frames" in out
+
+
+def test_a_small_margin_gets_a_note(tmp_path, capsys):
+    _, out, _ = run(capsys, "design", CONFIG, "--method", "integrator", "-o", tmp_path / "i.fits")
+    assert "note: the modulus margin 0.0751 is small" in out
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the device is Linux's own")
+def test_output_that_cannot_be_written(gains):
+    script = f"{sys.executable} -m lbt_synth.cli.main verify {gains['kalman']} > /dev/full"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert "cannot write the output" in done.stderr

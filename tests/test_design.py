@@ -279,3 +279,9 @@ def test_a_least_gamma_that_is_not_the_least_does_not_leave_the_library(monkeypa
     monkeypatch.setattr(module, "least_gamma", lazy)
     with pytest.raises(lbt.NumericalError, match="is not the least"):
         lbt.hinf(axis_plant, method="riccati")
+
+
+def test_only_problems_are_designed_for():
+    for make in (lbt.kalman, lbt.hinf):
+        with pytest.raises(lbt.ProblemError, match="expected an EstimationProblem.*got ndarray"):
+            make(np.eye(2))

@@ -292,3 +292,25 @@ def test_impossible_names():
 def test_the_same_design_is_the_same_file(tmp_path, ending):
     one = lbt.save_gain(tmp_path / f"a.{ending}", DESIGNS["kalman"]).read_bytes()
     assert lbt.save_gain(tmp_path / f"b.{ending}", DESIGNS["kalman"]).read_bytes() == one
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"RATE_HZ =                800.0", b"RATE_HZ =                900.0"),
+        (b"VERSION =                    1", b"VERSION =                    2"),
+        (b"NEWSTATE=                    T", b"NEWSTATE=                    F"),
+    ],
+)
+def test_an_edited_header_card_is_found(tmp_path, old, new):
+    path = lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"])
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new))
+    with pytest.raises(lbt.GainFileError, match="a checksum is broken"):
+        lbt.load_gain(path)
+
+
+def test_only_designs_are_saved(tmp_path):
+    with pytest.raises(lbt.OutputError, match="holds a Design; got int"):
+        lbt.save_gain(tmp_path / "g.fits", 3)

@@ -78,3 +78,26 @@ def test_empty_figures_are_refused():
     ):
         with pytest.raises(lbt.ProblemError, match="at least one"):
             empty()
+
+
+def test_an_unstable_loop_is_named_and_not_drawn(designs):
+    _, rejection, noise = lbt.sigma_figure(designs, sensor_gain=0.4).axes
+    assert "sensor gain 0.4" in rejection.get_title(loc="right")
+    for axis in (rejection, noise):
+        assert "H-infinity: unstable" in legend(axis)
+        curves = {line.get_label(): len(line.get_xdata()) for line in axis.get_lines()}
+        assert curves["H-infinity: unstable"] == 0
+        assert curves["Kalman"] > 100
+
+
+def test_robustness_figure_of_an_unstable_method(config):
+    from dataclasses import replace
+
+    truth = replace(config.truth, sensor_gain=0.3)
+    rows = list(
+        lbt.frequency_robustness(
+            config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05
+        )
+    )
+    (axis,) = lbt.robustness_figure(rows).axes
+    assert legend(axis) == ["Kalman", r"H$_\infty$: unstable"]

@@ -25,6 +25,7 @@ from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain, save_gain
 from lbt_synth.loop import close_loop, loop_margins
 
+_SMALL_MODULUS = 0.3
 _ROUTES = {"kalman": ("riccati", "sdp"), "hinf": ("lmi", "riccati"), "integrator": ()}
 
 
@@ -162,6 +163,11 @@ def _description(made: Design) -> Report:
     tables.append(TableText(title="Design", headings=("quantity", "value", "unit"), rows=facts))
     tables.append(_check_table(made.certificate))
     notes = []
+    if made.hardware is not None and margins.modulus < _SMALL_MODULUS:
+        notes.append(
+            f"note: the modulus margin {margins.modulus:.3g} is small; a loop is usually asked for "
+            f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
+        )
     if made.hardware is not None and alone > 1:
         notes.append(
             f"note: the controller alone has a pole of modulus {alone:.4g}; with the loop open its "

@@ -60,13 +60,15 @@ def sigma(arguments: Namespace) -> Report:
             )
         )
     path = save_figure(figure, arguments.output)
+    physical = all(design.hardware is not None for design in designs.values())
+    norm = "norm [nm]" if physical else "norm"
     return Report(
         data={"designs": data, "sensor_gain": arguments.sensor_gain, "file": str(path)},
         tables=[
             TableText(
                 title=f"Margins at sensor gain {arguments.sensor_gain:g}",
                 headings=(
-                    "design", "norm [nm]", "stable", "modulus", "gain from", "gain to",
+                    "design", norm, "stable", "modulus", "gain from", "gain to",
                     "phase [deg]", "delay [frames]",
                 ),
                 rows=rows,
@@ -133,21 +135,47 @@ def simulate(arguments: Namespace) -> Report:
         },
         tables=[
             TableText(
-                title=f"{design.method} in the loop: {len(strehls)} runs of "
-                f"{run.residual_nm.shape[1]} frames",
+                title=f"{design.method} in the loop: {len(strehls)} "
+                f"run{'s' if len(strehls) > 1 else ''} of {run.residual_nm.shape[1]} frames",
                 headings=("quantity", "simulated", "exact", "unit"),
                 rows=rows,
             )
         ],
-        notes=[f"scatter of the Strehl ratio between runs: {100 * scatter:.2f} points"],
+        notes=_simulation_notes(config, design, scatter, settle),
     )
     if arguments.output is not None:
         path = save_figure(
-            simulation_figure(run, title=f"{design.method} filter"), arguments.output
+            simulation_figure(
+                run, title=f"{design.method}: first run above, mean spectrum of all runs below"
+            ),
+            arguments.output,
         )
         report.data["file"] = str(path)
         report.notes.append(f"written: {path}")
     return report
+
+
+def _simulation_notes(config: Config, design: Design, scatter: float, settle: int) -> list[str]:
+    notes = []
+    if not np.isnan(scatter):
+        notes.append(f"scatter of the Strehl ratio between runs: {100 * scatter:.2f} points")
+    usual = config.settings.simulation.settle_frames
+    if settle > usual:
+        notes.append(
+            f"note: this loop settles for {settle} frames, not {usual}; its random series are not "
+            "those of a faster loop with the same seed. Raise simulation.settle_frames."
+        )
+    own, here = design.hardware, config.hardware
+    if own is not None and own.delay_frames != here.delay_frames:
+        notes.append(
+            f"note: designed for a delay of {own.delay_frames:g} frames, run with "
+            f"{here.delay_frames:g}."
+        )
+    if own is not None and not (
+        np.array_equal(own.sensor, here.sensor) and np.array_equal(own.influence, here.influence)
+    ):
+        notes.append("note: designed for another sensor or influence matrix than it is run with.")
+    return notes
 
 
 def robustness(arguments: Namespace) -> Report:

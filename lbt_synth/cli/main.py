@@ -79,7 +79,9 @@ def build_parser() -> argparse.ArgumentParser:
     simulate.add_argument("--sensor-gain", type=float, help="real sensor gain")
     simulate.add_argument("-o", "--output", help="figure (.png, .pdf or .svg)")
 
-    robustness = command("robustness", "Strehl ratio over an error of the vibration frequency")
+    robustness = command(
+        "robustness", "Strehl ratio over an error of all vibration frequencies of the model"
+    )
     robustness.add_argument("config", help=config_help)
     robustness.add_argument("--gamma-ratio", type=float, help="H-infinity bound of each row")
     robustness.add_argument("--sensor-gain", type=float, help="real sensor gain")
@@ -138,6 +140,10 @@ def entry_point() -> None:
     except BrokenPipeError:  # the reader of our output went away, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 141
+    except OSError as error:  # a full disk behind a redirection
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print(f"lbt-synth: error: cannot write the output: {error.strerror}.", file=sys.stderr)
+        status = WRONG
     sys.exit(status)
 
 

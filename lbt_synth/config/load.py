@@ -139,6 +139,11 @@ def _describe(error: ValidationError) -> tuple[str, str]:
         return f"the key {key} is missing.{more}", key
     if first["type"] == "value_error":
         return f"{key}: {first['ctx']['error']}.{more}", key
+    if first["type"] == "too_short" and key.endswith("vibrations"):
+        return f"{key} is empty; leave the key out for a model without vibrations.{more}", key
+    if first["type"] == "union_tag_invalid":
+        expected, got = first["ctx"]["expected_tags"], first["ctx"]["tag"]
+        return f"{key}.kind must be one of {expected}; got {got!r}.{more}", key
     text = first["msg"][0].lower() + first["msg"][1:]
     return f"{key}: {text}; got {first['input']!r}.{more}", key
 

@@ -10,7 +10,7 @@ from lbt_synth.certify import NORM_TOLERANCE
 from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
-from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.models.problem import EstimationProblem, require_problem
 from lbt_synth.norms import hinf_norm
 from lbt_synth.riccati import FilterRiccati, gamma_riccati, kalman_riccati, least_gamma
 from lbt_synth.validation import FloatArray, choice, number
@@ -81,6 +81,7 @@ def hinf(
     >>> design.gamma <= design.gamma_requested
     True
     """
+    require_problem(problem)
     choice(method, "method", ("lmi", "riccati"))
     if gamma is not None and gamma_ratio is not None:
         raise ProblemError(

@@ -46,10 +46,10 @@ def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
     >>> bool(max(abs(lbt.integrator(path, gain=0.25).poles)) < 1)
     True
     """
-    return _certified(hardware, number(gain, "gain", above=0), status="given")
+    return _certified(hardware, number(gain, "gain", above=0), route="closed form", status="given")
 
 
-def _certified(hardware: LoopHardware, gain: float, *, status: str) -> IntegratorDesign:
+def _certified(hardware: LoopHardware, gain: float, *, route: str, status: str) -> IntegratorDesign:
     controller = _controller(hardware, gain)
     return IntegratorDesign(
         method="integrator",
@@ -57,7 +57,7 @@ def _certified(hardware: LoopHardware, gain: float, *, status: str) -> Integrato
         certificate=loop_certificate(certify_loop(hardware, controller)).require(
             f"Lower the gain {gain:.6g}."
         ),
-        solver=SolverReport(route="closed form", status=status, iterations=0),
+        solver=SolverReport(route=route, status=status, iterations=0),
         loop_hardware=hardware,
         gain=gain,
     )
@@ -150,7 +150,7 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     found = minimize_scalar(variance, bounds=bracket, method="bounded", options={"xatol": 1e-7})
     limited = best == _TRIALS - 1
     status = "limited by stability at unit sensor gain" if limited else "least residual"
-    return _certified(hardware, float(np.exp(found.x)), status=status)
+    return _certified(hardware, float(np.exp(found.x)), route="search", status=status)
 
 
 def _controller(hardware: LoopHardware, gain: float) -> Controller:

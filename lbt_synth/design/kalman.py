@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
-from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.models.problem import EstimationProblem, require_problem
 from lbt_synth.riccati import kalman_riccati
 from lbt_synth.validation import choice
 
@@ -43,6 +43,7 @@ def kalman(problem: EstimationProblem, *, method: str = "riccati") -> FilterDesi
     >>> round(float(design.gain_predictor[0, 0]), 9), design.certificate.passed
     (0.618033989, True)
     """
+    require_problem(problem)
     choice(method, "method", ("riccati", "sdp"))
     solution = kalman_riccati(problem)
     if method == "riccati":

@@ -63,6 +63,8 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
         raise OutputError(
             f"a gain file must end in {', '.join(_FORMATS)}; got {target.name!r}.", path=target
         )
+    if not isinstance(design, Design):
+        raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
     write, _ = _FORMATS[target.suffix.lower()]
     arrays, meta = to_record(design)
     meta = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **meta}

@@ -62,8 +62,8 @@ class ClosedLoop:
             word = "a marginally stable" if radius < 1 + STABILITY_MARGIN else "an unstable"
             raise UnstableLoopError(
                 f"the closed loop must be stable; got {word} one (spectral radius "
-                f"{radius:.12g} at sensor gain {self.sensor_gain:.6g}). Lower the gain, or design "
-                "for this sensor gain and delay.",
+                f"{radius:.12g} at sensor gain {self.sensor_gain:.6g}). Design for this sensor "
+                "gain and delay; lbt-synth show prints the gains that are stable.",
                 spectral_radius=radius,
             )
 

@@ -6,9 +6,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.errors import DefinitenessError
+from lbt_synth.errors import DefinitenessError, ProblemError
 from lbt_synth.statespace import Controller, StateSpace
 from lbt_synth.validation import FloatArray, definite, frozen, matrix, number, square
+
+
+def require_problem(problem: object) -> None:
+    """Refuse anything that is not an estimation problem.
+
+    Raises
+    ------
+    ProblemError
+        Saying what came instead.
+    """
+    if not isinstance(problem, EstimationProblem):
+        raise ProblemError(
+            "expected an EstimationProblem, such as a plant; got "
+            f"{type(problem).__name__}. Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

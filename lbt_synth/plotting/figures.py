@@ -52,7 +52,9 @@ def sigma_figure(
     Returns
     -------
     matplotlib.figure.Figure
-        One panel a transfer function, the vibration frequencies marked.
+        One panel a transfer function, the vibration frequencies marked. A loop that is
+        unstable at this sensor gain is named and not drawn. With several axes the
+        largest singular value is that of the worst one.
 
     Raises
     ------
@@ -90,10 +92,13 @@ def sigma_figure(
                 system = problem.error_system(design.gain_predictor)
                 grid = frequency_grid(1 / system.dt_s, lines_hz)
                 axis.loglog(grid, largest_singular_values(system, grid), label=name, **styles[name])
-            unit = "nm" if loops and not unit_weights else "-"
+            physical = all(design.hardware is not None for design in estimators.values())
+            unit = "nm" if physical and not unit_weights else "-"
             axis.set_ylabel(rf"$\bar\sigma$ disturbances $\to$ error [{unit}]")
         if loops:
-            _loop_panels(next(remaining), next(remaining), loops, styles, lines_hz)
+            rejection = next(remaining)
+            rejection.set_title(f"closed loops at sensor gain {sensor_gain:g}", loc="right")
+            _loop_panels(rejection, next(remaining), loops, styles, lines_hz)
         for axis in axes:
             _mark(axis, lines_hz)
             _plain_ticks(axis)
@@ -148,6 +153,10 @@ def _loop_panels(
     lines_hz: Sequence[float],
 ) -> None:
     for name, loop in loops.items():
+        if not loop.is_stable:  # it has no steady response: named in the legend, not drawn
+            for axis in (rejection, noise):
+                axis.plot([], [], label=f"{name}: unstable", **styles[name])
+            continue
         grid = frequency_grid(loop.hardware.frame_rate_hz, lines_hz)
         for axis, response in (
             (rejection, loop.sensitivity(grid)),
@@ -207,13 +216,13 @@ def robustness_figure(
                 [100 * r.strehl for r in own],
                 marker=marker,
                 markersize=4,
-                label=label,
+                label=label if any(r.stable for r in own) else None,
                 **style,
             )
             unstable = [r.error_hz for r in own if not r.stable]
             if unstable:
                 axis.plot(
-                    unstable, [0.0] * len(unstable), linestyle="none", marker="x",
+                    unstable, [0.0] * len(unstable), linestyle="none", marker="x", clip_on=False,
                     color=style["color"], label=f"{label}: unstable",
                 )  # fmt: skip
             if published is not None and method in published:
@@ -225,7 +234,7 @@ def robustness_figure(
                 )  # fmt: skip
         axis.set_xlabel("error of the vibration frequency in the model [Hz]")
         axis.set_ylabel("Strehl ratio [%]")
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.06 * axis.get_ylim()[1])
         axis.legend(loc="best")
     return figure
 
@@ -267,7 +276,7 @@ def simulation_figure(run: Simulation, *, title: str = "") -> Any:
         time = np.arange(frames) / run.frame_rate_hz
         length = min(frames, 2048)
         for i, style in zip(range(n), looks(), strict=False):
-            series.plot(time, run.residual_nm[0, :, i], label=names[i], linewidth=0.6,
+            series.plot(time, run.residual_nm[0, :, i], label=names[i], linewidth=0.6, alpha=0.8,
                         color=style["color"])  # fmt: skip
             for data, word, line in (
                 (run.total_nm, "open loop", ":"),
