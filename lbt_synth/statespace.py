@@ -17,7 +17,6 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
-    frozen,
     matrix,
     number,
     real_array,
@@ -275,15 +274,3 @@ class RunningController:
             )
         self.state = k.A @ self.state + k.B @ measured
         return k.C @ self.state + k.D @ measured
-
-
-def block_diagonal(*blocks: FloatArray) -> FloatArray:
-    """Return the block-diagonal matrix; blocks may be empty in either direction."""
-    rows = sum(b.shape[0] for b in blocks)
-    cols = sum(b.shape[1] for b in blocks)
-    out = np.zeros((rows, cols))
-    i = j = 0
-    for b in blocks:
-        out[i : i + b.shape[0], j : j + b.shape[1]] = b
-        i, j = i + b.shape[0], j + b.shape[1]
-    return frozen(out)
