@@ -33,10 +33,15 @@ def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]
     >>> round(float(w @ x**7), 9)                     # 3^8 / 8
     820.125
     """
+    nodes, weights = _panel_rule(edges[:-1], edges[1:], order)
+    return nodes.ravel(), weights.ravel()
+
+
+def _panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Nodes and weights (panels, order) of panels that need not touch."""
     x, w = np.polynomial.legendre.leggauss(order)
-    half = np.diff(edges)[:, None] / 2
-    middle = (edges[:-1] + edges[1:])[:, None] / 2
-    return (middle + half * x).ravel(), (half * w).ravel()
+    half, middle = (high - low)[:, None] / 2, (high + low)[:, None] / 2
+    return middle + half * x, half * w
 
 
 def adaptive_integral(
@@ -79,11 +84,10 @@ def adaptive_integral(
     """
 
     def panels(low: FloatArray, high: FloatArray) -> FloatArray:
-        x, w = np.polynomial.legendre.leggauss(order)
-        half, middle = (high - low)[:, None] / 2, (high + low)[:, None] / 2
-        values = integrand((middle + half * x).ravel())
+        nodes, weights = _panel_rule(low, high, order)
+        values = integrand(nodes.ravel())
         values = values.reshape(low.size, order, *values.shape[1:])
-        return np.asarray(np.einsum("po,poij->pij", half * w, values))
+        return np.asarray(np.einsum("po,poij->pij", weights, values))
 
     low, high = edges[:-1], edges[1:]
     coarse = panels(low, high)

@@ -27,7 +27,7 @@ _CHUNK = 2_000_000  # complex numbers held at once by a frequency response
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _LinearSystem:
+class LinearSystem:
     """Four matrices that fit each other, and a sampling period."""
 
     A: FloatArray
@@ -54,7 +54,7 @@ class _LinearSystem:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StateSpace(_LinearSystem):
+class StateSpace(LinearSystem):
     """Discrete-time system ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
 
     Parameters
@@ -199,7 +199,7 @@ class StateSpace(_LinearSystem):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Controller(_LinearSystem):
+class Controller(LinearSystem):
     """Controller in new-state form: ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
 
     Parameters

@@ -210,3 +210,12 @@ def test_axis_of_the_lbt_in_the_time_domain():
     variances = run.rms_nm**2
     error = variances.std(ddof=1) / np.sqrt(len(variances))
     assert abs(variances.mean() - 135.958**2) < 4 * error
+
+
+def test_a_line_above_nyquist_is_refused_as_in_the_exact_answer(axis_plant):
+    line = lbt.SinusoidalVibration(frequency_hz=600, rms_nm=1, direction=(1,))
+    truth = lbt.Truth(turbulence=None, vibrations=(line,))
+    with pytest.raises(lbt.ProblemError, match="below the Nyquist frequency 400 Hz; got 600 Hz"):
+        lbt.simulate(
+            lbt.kalman(axis_plant).controller, truth, hardware=axis_plant.hardware, frames=10
+        )

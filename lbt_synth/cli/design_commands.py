@@ -22,7 +22,7 @@ from lbt_synth.design import (
 )
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import require_writable
-from lbt_synth.gainfile import load_gain, save_gain
+from lbt_synth.gainfile import load_gain, require_gain_name, save_gain
 from lbt_synth.loop import close_loop, loop_margins
 
 _SMALL_MODULUS = 0.3
@@ -32,7 +32,7 @@ _ROUTES = {"kalman": ("riccati", "sdp"), "hinf": ("lmi", "riccati"), "integrator
 def design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
     _refuse_foreign_options(arguments)
-    require_writable(arguments.output)
+    require_writable(require_gain_name(arguments.output))
     with working(f"designing ({arguments.method})", quiet=arguments.json):
         made = _synthesise(load_config(arguments.config), arguments)
     path = save_gain(arguments.output, made)

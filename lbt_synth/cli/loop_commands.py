@@ -18,6 +18,7 @@ from lbt_synth.loop import close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
 from lbt_synth.plotting import (
     FIGURE_ENDINGS,
+    require_figure_name,
     robustness_figure,
     save_figure,
     sigma_figure,
@@ -32,7 +33,6 @@ from lbt_synth.tables import csv_bytes
 def sigma(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
     _require_figure(arguments.output)
-    require_writable(arguments.output)
     designs = _named(arguments.gains)
     with working("drawing", quiet=arguments.json):
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
@@ -82,7 +82,6 @@ def simulate(arguments: Namespace) -> Report:
     """Close the loop in the time domain, beside the exact answer."""
     if arguments.output is not None:
         _require_figure(arguments.output)
-        require_writable(arguments.output)
     config = load_config(arguments.config)
     design = load_gain(arguments.gain)
     truth = _truth(config, arguments)
@@ -259,9 +258,8 @@ def _truth(config: Config, arguments: Namespace) -> Truth:
 
 
 def _require_figure(output: str) -> None:
-    """Refuse a wrong ending before any work is done."""
-    if Path(output).suffix.lower() not in FIGURE_ENDINGS:
-        raise ProblemError(f"a figure must end in {', '.join(FIGURE_ENDINGS)}; got {output!r}.")
+    """Refuse an output that cannot become a figure, before any work is done."""
+    require_writable(require_figure_name(output))
 
 
 def _named(paths: list[str]) -> dict[str, Design]:

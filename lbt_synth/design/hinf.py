@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -21,12 +21,20 @@ _GREATEST = 1e100
 _GREATEST_RATIO = 1e6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Gains:
-    gain_predictor: FloatArray
-    gain_filter: FloatArray
-    status: str
-    iterations: int
+class _Gains(Protocol):
+    """What both routes return."""
+
+    @property
+    def gain_predictor(self) -> FloatArray: ...
+
+    @property
+    def gain_filter(self) -> FloatArray: ...
+
+    @property
+    def status(self) -> str: ...
+
+    @property
+    def iterations(self) -> int: ...
 
 
 def hinf(
@@ -142,7 +150,7 @@ class _RiccatiRoute:
     def least(self) -> tuple[float, _Gains]:
         lower, upper = _kalman_bracket(self.problem, self.start)
         _, least, solution = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
-        return least, self._gains(solution)
+        return least, solution
 
     def at(self, gamma: float) -> _Gains:
         solution = gamma_riccati(self.problem, gamma, start=self.start)
@@ -152,16 +160,7 @@ class _RiccatiRoute:
                 "Try a larger gamma.",
                 gamma=gamma,
             )
-        return self._gains(solution)
-
-    @staticmethod
-    def _gains(solution: FilterRiccati) -> _Gains:
-        return _Gains(
-            gain_predictor=solution.gain_predictor,
-            gain_filter=solution.gain_filter,
-            status=solution.method,
-            iterations=solution.iterations,
-        )
+        return solution
 
 
 class _LmiRoute:
@@ -175,23 +174,12 @@ class _LmiRoute:
         from lbt_synth.lmi import least_gamma_lmi
 
         solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
-        return solution.gamma, _Gains(
-            gain_predictor=solution.gain_predictor,
-            gain_filter=solution.gain_filter,
-            status=solution.status,
-            iterations=solution.iterations,
-        )
+        return solution.gamma, solution
 
     def at(self, gamma: float) -> _Gains:
         from lbt_synth.lmi import hinf_lmi
 
-        solution = hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
-        return _Gains(
-            gain_predictor=solution.gain_predictor,
-            gain_filter=solution.gain_filter,
-            status=solution.status,
-            iterations=solution.iterations,
-        )
+        return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 
 
 def _kalman_bracket(problem: EstimationProblem, start: FilterRiccati) -> tuple[float, float]:

@@ -53,7 +53,7 @@ def kalman(problem: EstimationProblem, *, method: str = "riccati") -> FilterDesi
             solution.gain_filter,
             method="kalman",
             solver=SolverReport(
-                route="riccati", status=solution.method, iterations=solution.iterations
+                route="riccati", status=solution.status, iterations=solution.iterations
             ),
         )
     from lbt_synth.lmi import kalman_sdp

@@ -26,6 +26,22 @@ _FORMATS = {
 }
 
 
+def require_gain_name(path: str | os.PathLike[str]) -> Path:
+    """Refuse a file name that is not that of a gain file.
+
+    Raises
+    ------
+    OutputError
+        If it ends in another way than .fits, .npz or .json.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in _FORMATS:
+        raise OutputError(
+            f"a gain file must end in {', '.join(_FORMATS)}; got {target.name!r}.", path=target
+        )
+    return target
+
+
 def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     """Write a design to a gain file, whole or not at all.
 
@@ -58,11 +74,7 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     ...     lbt.load_gain(file).method
     'integrator'
     """
-    target = Path(path)
-    if target.suffix.lower() not in _FORMATS:
-        raise OutputError(
-            f"a gain file must end in {', '.join(_FORMATS)}; got {target.name!r}.", path=target
-        )
+    target = require_gain_name(path)
     if not isinstance(design, Design):
         raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
     write, _ = _FORMATS[target.suffix.lower()]

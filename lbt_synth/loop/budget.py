@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.ar import ARModel
-from lbt_synth.models.truth import SinusoidalVibration, Spectrum, Truth
+from lbt_synth.models.truth import Spectrum, Truth, breakpoints_below, fitted_direction
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.quadrature import adaptive_integral
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
@@ -131,7 +131,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     random_vibration = np.zeros((n, n))
     lines = []
     for vibration in truth.vibrations:
-        direction = _checked_direction(vibration, loop)
+        direction = fitted_direction(vibration, loop.hardware)
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(loop.hardware.frame_rate_hz)
             random_vibration += _ar_covariance(loop, model, direction)
@@ -144,20 +144,6 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
         random_vibration_nm2=frozen(random_vibration),
         line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
     )
-
-
-def _checked_direction(vibration: Vibration | SinusoidalVibration, loop: ClosedLoop) -> FloatArray:
-    if len(vibration.direction) != loop.hardware.modes:
-        raise DimensionError(
-            f"the direction of a vibration must have {loop.hardware.modes} components, one a mode; "
-            f"got {len(vibration.direction)} at {vibration.frequency_hz:.6g} Hz."
-        )
-    if not vibration.frequency_hz < loop.hardware.frame_rate_hz / 2:
-        raise ProblemError(
-            f"a vibration must lie below the Nyquist frequency "
-            f"{loop.hardware.frame_rate_hz / 2:.6g} Hz; got {vibration.frequency_hz:.6g} Hz."
-        )
-    return np.array(vibration.direction)
 
 
 def _noise_covariance(loop: ClosedLoop, noise_nm: float) -> FloatArray:
@@ -188,7 +174,6 @@ def _ar_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray) -> F
 
 def _spectrum_covariance(loop: ClosedLoop, spectrum: Spectrum) -> FloatArray:
     """Integrate the residual's spectrum over (0, Nyquist), adaptively."""
-    breaks = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
 
     def density(frequency: FloatArray) -> FloatArray:
         response = loop.sensitivity(frequency)
@@ -196,9 +181,8 @@ def _spectrum_covariance(loop: ClosedLoop, spectrum: Spectrum) -> FloatArray:
         return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
 
     nyquist = loop.hardware.frame_rate_hz / 2
-    inside = breaks[(breaks > 0) & (breaks < nyquist)]
-    edges = np.unique(np.concatenate([resonance_edges(loop), inside]))
-    return adaptive_integral(density, edges)
+    edges = np.concatenate([resonance_edges(loop), breakpoints_below(spectrum, nyquist)])
+    return adaptive_integral(density, np.unique(edges))
 
 
 def resonance_edges(loop: ClosedLoop) -> FloatArray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import DefinitenessError, ProblemError
-from lbt_synth.statespace import Controller, StateSpace
-from lbt_synth.validation import FloatArray, definite, frozen, matrix, number, square
+from lbt_synth.statespace import Controller, LinearSystem, StateSpace
+from lbt_synth.validation import FloatArray, definite, frozen, matrix
 
 
 def require_problem(problem: object) -> None:
@@ -27,7 +27,7 @@ def require_problem(problem: object) -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EstimationProblem:
+class EstimationProblem(LinearSystem):
     """Estimate ``z = L x`` from past ``y``, where ``x+ = A x + B w`` and ``y = C x + D w``.
 
     The filter is the strictly causal one-step predictor: the estimate of z(k)
@@ -68,35 +68,18 @@ class EstimationProblem:
     1.618034
     """
 
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
     L: FloatArray
-    dt_s: float = 1.0
 
     def __post_init__(self) -> None:
-        A = square(self.A, "A")
-        n = A.shape[0]
-        why = f"to match A {A.shape}"
-        B = matrix(self.B, "B", rows=(n, why))
-        C = matrix(self.C, "C", cols=(n, why))
-        D = matrix(
-            self.D,
-            "D",
-            rows=(C.shape[0], f"to match C {C.shape}"),
-            cols=(B.shape[1], f"to match B {B.shape}"),
-        )
-        L = matrix(self.L, "L", cols=(n, why))
+        LinearSystem.__post_init__(self)
+        L = matrix(self.L, "L", cols=(self.n_states, f"to match A {self.A.shape}"))
+        object.__setattr__(self, "L", L)
         try:
-            definite(D @ D.T, "D D'")
+            definite(self.D @ self.D.T, "D D'")
         except DefinitenessError as error:
             raise DefinitenessError(
                 f"{error} Every measurement needs noise of its own: add a column to D."
             ) from error
-        for name, value in (("A", A), ("B", B), ("C", C), ("D", D), ("L", L)):
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
 
     @property
     def Q(self) -> FloatArray:

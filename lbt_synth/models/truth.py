@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, number, real_array
 
@@ -118,6 +119,38 @@ class SinusoidalVibration:
     def amplitude_nm(self) -> float:
         """Peak displacement [nm rms wavefront]."""
         return float(np.sqrt(2) * self.rms_nm)
+
+
+def breakpoints_below(spectrum: Spectrum, limit_hz: float) -> FloatArray:
+    """Frequencies in (0, limit) at which a spectrum says that it has kinks [Hz]."""
+    points = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
+    return points[(points > 0) & (points < limit_hz)]
+
+
+def fitted_direction(
+    vibration: Vibration | SinusoidalVibration, hardware: LoopHardware
+) -> FloatArray:
+    """Return the direction (n,) of a vibration that fits a loop.
+
+    Raises
+    ------
+    DimensionError
+        If it has another number of modes.
+    ProblemError
+        If it does not lie below the Nyquist frequency.
+    """
+    if len(vibration.direction) != hardware.modes:
+        raise DimensionError(
+            f"the direction of a vibration must have {hardware.modes} components, one a mode; "
+            f"got {len(vibration.direction)} at {vibration.frequency_hz:.6g} Hz."
+        )
+    nyquist = hardware.frame_rate_hz / 2
+    if not vibration.frequency_hz < nyquist:
+        raise ProblemError(
+            f"a vibration must lie below the Nyquist frequency {nyquist:.6g} Hz; "
+            f"got {vibration.frequency_hz:.6g} Hz."
+        )
+    return np.array(vibration.direction)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,11 +6,12 @@ from lbt_synth.plotting.figures import (
     sigma_figure,
     simulation_figure,
 )
-from lbt_synth.plotting.style import FIGURE_ENDINGS, save_figure
+from lbt_synth.plotting.style import FIGURE_ENDINGS, require_figure_name, save_figure
 
 __all__ = [
     "FIGURE_ENDINGS",
     "loop_figure",
+    "require_figure_name",
     "robustness_figure",
     "save_figure",
     "sigma_figure",

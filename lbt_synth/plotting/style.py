@@ -62,6 +62,22 @@ def new_figure(width_in: float, height_in: float) -> Any:
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
+def require_figure_name(path: str | os.PathLike[str]) -> Path:
+    """Refuse a file name that is not that of a figure.
+
+    Raises
+    ------
+    OutputError
+        If it ends in another way than .png, .pdf or .svg.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in FIGURE_ENDINGS:
+        raise OutputError(
+            f"a figure must end in {', '.join(FIGURE_ENDINGS)}; got {target.name!r}.", path=target
+        )
+    return target
+
+
 def save_figure(figure: Any, path: str | os.PathLike[str]) -> Path:
     """Write a figure, whole or not at all.
 
@@ -82,12 +98,8 @@ def save_figure(figure: Any, path: str | os.PathLike[str]) -> Path:
     OutputError
         If the ending is another, or the file cannot be written.
     """
-    target = Path(path)
+    target = require_figure_name(path)
     ending = target.suffix.lower()
-    if ending not in FIGURE_ENDINGS:
-        raise OutputError(
-            f"a figure must end in {', '.join(FIGURE_ENDINGS)}; got {target.name!r}.", path=target
-        )
     buffer = io.BytesIO()
     # without a date, the same figure is the same file
     undated: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}

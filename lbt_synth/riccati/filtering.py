@@ -35,8 +35,8 @@ class FilterRiccati:
         Relative residual of the equation.
     iterations : int
         Doublings made.
-    method : str
-        Route that gave P.
+    status : str
+        Method that gave P.
     """
 
     P: FloatArray
@@ -44,7 +44,7 @@ class FilterRiccati:
     gain_filter: FloatArray
     residual: float
     iterations: int
-    method: str
+    status: str
 
 
 def require_detectable(problem: EstimationProblem) -> None:
@@ -110,7 +110,7 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
         gain_filter=frozen(gain_filter),
         residual=dare.residual,
         iterations=dare.iterations,
-        method=dare.method,
+        status=dare.method,
     )
 
 
@@ -212,7 +212,7 @@ def gamma_riccati(
         gain_filter=frozen(gain_filter),
         residual=residual,
         iterations=steps,
-        method="doubling",
+        status="doubling",
     )
 
 

@@ -6,11 +6,10 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len
 from scipy.signal import lfilter
 
-from lbt_synth.errors import DimensionError
 from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.truth import Spectrum, Truth
+from lbt_synth.models.truth import Spectrum, Truth, breakpoints_below, fitted_direction
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray
@@ -34,11 +33,7 @@ def draw_disturbance(
         drawn = _draw(truth.turbulence, hardware, frames, cases * n, turbulence_rng)
         total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
     for vibration, line_rng in zip(truth.vibrations, line_rngs, strict=True):
-        if len(vibration.direction) != n:
-            raise DimensionError(
-                f"the direction of a vibration must have {n} components, one a mode; "
-                f"got {len(vibration.direction)} at {vibration.frequency_hz:.6g} Hz."
-            )
+        direction = fitted_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(hardware.frame_rate_hz)
             motion = _draw_ar(model, frames, cases, line_rng)
@@ -46,7 +41,7 @@ def draw_disturbance(
             turns = vibration.frequency_hz / hardware.frame_rate_hz * np.arange(frames)
             phase = line_rng.uniform(0, 2 * np.pi, (cases, 1))
             motion = vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase)
-        total += motion[:, :, None] * np.array(vibration.direction)
+        total += motion[:, :, None] * direction
     return total
 
 
@@ -80,8 +75,7 @@ def _bin_powers(spectrum: Spectrum, rate: float, length: int) -> FloatArray:
     """Power of the spectrum in each Fourier bin [nm^2], integrated, not sampled."""
     width = rate / length
     ends = np.concatenate([[0.0], (np.arange(length // 2) + 0.5) * width, [rate / 2]])
-    inside = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
-    inside = inside[(inside > 0) & (inside < rate / 2)]
+    inside = breakpoints_below(spectrum, rate / 2)
     # what lies below the first bin's end may rise without bound towards zero
     low = np.geomspace(1e-9, 1, 40) * ends[1]
     edges = np.unique(np.concatenate([ends, inside, low]))
