@@ -1,6 +1,7 @@
 from .certify import Certificate as Certificate
 from .certify import Check as Check
 from .certify import certify_filter as certify_filter
+from .certify import certify_infeasible as certify_infeasible
 from .certify import certify_loop as certify_loop
 from .config import Config as Config
 from .config import load_config as load_config
@@ -68,6 +69,7 @@ from .plotting import loop_figure as loop_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
+from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare
 from .simulation import Simulation as Simulation
@@ -78,5 +80,7 @@ from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace
 from .sweep import RobustnessRow as RobustnessRow
 from .sweep import frequency_robustness as frequency_robustness
+from .witness import Witness as Witness
+from .witness import infeasible_level as infeasible_level
 
 __version__: str

@@ -6,19 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.errors import CertificateError
+from lbt_synth.errors import CertificateError, DimensionError
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.lyapunov import lyapunov_residual, stationary_covariance
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.norms import hinf_norm, largest_singular_values
+from lbt_synth.riccati import kalman_riccati
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.witness import Witness, infeasible_level
 
 GAIN_TOLERANCE = 1e-6
 NORM_TOLERANCE = 1e-6
 RESIDUAL_TOLERANCE = 1e-8
+INFEASIBLE_TOLERANCE = 1e-9
 _GRID = 513
 
 
@@ -199,6 +202,52 @@ def certify_filter(
         checks=tuple(checks),
         gamma=norm.value,
         rms_per_output=frozen(np.sqrt(np.maximum(variances, 0))),
+    )
+
+
+def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
+    """Check that a witness proves what is claimed of it: no filter below a level of gamma.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    level : float
+        Level that is claimed infeasible.
+    witness : Witness
+        Disturbances that no measurement shows.
+
+    Returns
+    -------
+    Check
+        Passed if the level does not exceed what the witness proves, but for 1e-9 of it.
+
+    Raises
+    ------
+    DimensionError
+        If the witness does not fit the problem.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> p = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> push = lbt.Witness(states=np.zeros((1, 1)), disturbances=np.array([[1.0], [0.0]]))
+    >>> lbt.certify_infeasible(p, 1.0, push).passed, lbt.certify_infeasible(p, 1.1, push).passed
+    (True, False)
+    """
+    x, w = witness.states, witness.disturbances
+    if x.shape[:1] != (problem.n_states,) or w.shape != (problem.B.shape[1], *x.shape[1:]):
+        raise DimensionError(
+            f"a witness must have {problem.n_states} rows of states, {problem.B.shape[1]} rows of "
+            f"disturbances and as many columns in both; got {x.shape} and {w.shape}."
+        )
+    proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
+    return Check(
+        name="level claimed infeasible, over the level proved",
+        value=level / max(proved, 1e-300),
+        limit=1 + INFEASIBLE_TOLERANCE,
+        method="disturbances that no measurement shows",
     )
 
 

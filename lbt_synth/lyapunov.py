@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 
+from lbt_synth.stacks import norms, transposed
 from lbt_synth.validation import FloatArray
 
 
@@ -45,3 +46,39 @@ def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:
     AXA = A @ X @ A.T
     scale = np.linalg.norm(X, 1) + np.linalg.norm(AXA, 1) + np.linalg.norm(Q, 1)
     return float(np.linalg.norm(AXA - X + Q, 1) / scale) if scale > 0 else 0.0
+
+
+def smith_sum(A: FloatArray, Q: FloatArray, *, max_steps: int = 60) -> FloatArray:
+    """Sum ``A^i Q A'^i`` over all i by squaring, for a stack of matrices.
+
+    R. A. Smith, SIAM J. Appl. Math. 16, 198 (1968), doi:10.1137/0116017. Not finite
+    where A is not stable. For corrections: it loses digits as A nears the unit circle.
+
+    Parameters
+    ----------
+    A, Q : (N, n, n) ndarray
+        State matrices, and symmetric matrices.
+    max_steps : int, optional
+        Greatest number of squarings.
+
+    Returns
+    -------
+    (N, n, n) ndarray
+        The sums, solutions of ``X = A X A' + Q``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.lyapunov import smith_sum
+    >>> round(float(smith_sum(np.array([[[0.6]]]), np.array([[[64.0]]]))[0, 0, 0]), 12)
+    100.0
+    """
+    X = Q
+    with np.errstate(all="ignore"):
+        for _ in range(max_steps):
+            X = X + A @ X @ transposed(A)
+            A = A @ A
+            size = norms(A)
+            if not np.any(size > 1e-9):  # what remains is of its square
+                return np.where((size <= 1)[:, None, None], X, np.nan)
+    return np.where((size <= 1e-9)[:, None, None], X, np.nan)

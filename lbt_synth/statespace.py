@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.linalg import schur
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import (
@@ -23,7 +24,7 @@ from lbt_synth.validation import (
     square,
 )
 
-_CHUNK = 2_000_000  # complex numbers held at once by a frequency response
+_CHUNK = 60_000  # complex numbers worked on at once by a frequency response: they fit a cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -174,7 +175,7 @@ class StateSpace(LinearSystem):
         Raises
         ------
         ProblemError
-            If a frequency is not finite.
+            If a frequency is not finite, or is that of a pole on the unit circle.
 
         Examples
         --------
@@ -185,17 +186,56 @@ class StateSpace(LinearSystem):
         """
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
-        n, m = self.B.shape
-        out = np.empty((z.size, self.C.shape[0], m), dtype=np.complex128)
-        step = max(1, _CHUNK // (n * n))
-        identity = np.eye(n)
-        for start in range(0, z.size, step):
-            zs = z[start : start + step, None, None]
-            states = np.linalg.solve(
-                zs * identity - self.A, np.broadcast_to(self.B, (len(zs), n, m))
+        # a few points are solved one by one, which is more accurate next to a pole
+        few = z.size <= self.n_states
+        response = pointwise_response(self, z) if few else _response(self, z)
+        undefined = ~np.isfinite(response).all(axis=(1, 2))
+        if undefined.any():
+            raise ProblemError(
+                f"the system has a pole at {frequency[undefined][0]:.9g} Hz, on the unit circle, "
+                "and no response there; leave that frequency out."
             )
-            out[start : start + step] = self.C @ states + self.D
+        return response
+
+
+def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
+    """Transfer matrices at points z, one linear system a point; inf at a pole."""
+    n, m = system.B.shape
+    pencil = z[:, None, None] * np.eye(n) - system.A
+    try:
+        states = np.linalg.solve(pencil, np.broadcast_to(system.B, (z.size, n, m)))
+    except np.linalg.LinAlgError:
+        out = np.full((z.size, len(system.C), m), np.inf, dtype=np.complex128)
+        for i in range(z.size if z.size > 1 else 0):
+            out[i] = pointwise_response(system, z[i : i + 1])[0]
         return out
+    return np.asarray(system.C @ states + system.D, dtype=np.complex128)
+
+
+def _response(system: StateSpace, z: ComplexArray) -> ComplexArray:
+    """Transfer matrices at points z, by one Schur form and a substitution a point.
+
+    ``A = U T U*`` is unitary, so nothing is lost when A is defective, as it is with
+    every delay. The smaller of inputs and outputs is carried through the substitution.
+    """
+    if len(system.C) > system.B.shape[1]:
+        dual = StateSpace(A=system.A.T, B=system.C.T, C=system.B.T, D=system.D.T)
+        return np.swapaxes(_response(dual, z), 1, 2)
+    T, U = schur(system.A.astype(np.complex128), output="complex")
+    rows, B = system.C @ U, U.conj().T @ system.B
+    p, n = rows.shape
+    out = np.empty((z.size, p, B.shape[1]), dtype=np.complex128)
+    step = max(1, _CHUNK // (n * p))
+    with np.errstate(all="ignore"):  # a pole among the points is the caller's to report
+        for start in range(0, z.size, step):
+            part = z[start : start + step]
+            left = np.empty((n, p * part.size), dtype=np.complex128)  # C U (zI - T)^-1
+            for i in range(n):
+                sums = rows[:, i, None] + (T[:i, i] @ left[:i]).reshape(p, part.size)
+                left[i] = (sums / (part - T[i, i])).ravel()
+            solved = left.reshape(n, p, part.size).transpose(2, 1, 0)
+            out[start : start + step] = solved @ B + system.D
+    return out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

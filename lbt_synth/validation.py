@@ -18,6 +18,8 @@ from lbt_synth.errors import DefinitenessError, DimensionError, NonFiniteError, 
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 
 def frozen(array: npt.ArrayLike) -> FloatArray:
@@ -55,18 +57,21 @@ def matrix(
     *,
     rows: tuple[int, str] | None = None,
     cols: tuple[int, str] | None = None,
+    stacked: bool = False,
 ) -> FloatArray:
     """Return a finite 2-D matrix; a scalar becomes (1, 1).
 
     ``rows`` and ``cols`` are pairs ``(size, why)``; ``why`` ends the sentence
-    of the error, for example ``"to match A (4, 4)"``.
+    of the error, for example ``"to match A (4, 4)"``. With ``stacked``, leading
+    dimensions are let in: a stack of matrices.
     """
     out = real_array(value, name)
     if out.ndim == 0:
         out = frozen(out.reshape(1, 1))
-    if out.ndim != 2:
-        raise DimensionError(f"{name} must be a matrix (2-D); got {out.ndim}-D, shape {out.shape}.")
-    for axis, demand, word in ((0, rows, "row"), (1, cols, "column")):
+    if out.ndim < 2 or (out.ndim > 2 and not stacked):
+        kind = "a matrix (2-D) or a stack of them" if stacked else "a matrix (2-D)"
+        raise DimensionError(f"{name} must be {kind}; got {out.ndim}-D, shape {out.shape}.")
+    for axis, demand, word in ((-2, rows, "row"), (-1, cols, "column")):
         if demand is not None and out.shape[axis] != demand[0]:
             size, why = demand
             plural = "" if size == 1 else "s"
@@ -74,27 +79,31 @@ def matrix(
     return out
 
 
-def square(value: Any, name: str) -> FloatArray:
+def square(value: Any, name: str, *, stacked: bool = False) -> FloatArray:
     """Return a finite square matrix with at least one row."""
-    out = matrix(value, name)
-    if out.shape[0] != out.shape[1] or out.shape[0] == 0:
+    out = matrix(value, name, stacked=stacked)
+    if out.shape[-2] != out.shape[-1] or out.shape[-1] == 0:
         raise DimensionError(f"{name} must be square; got {out.shape}.")
     return out
 
 
-def symmetric(value: Any, name: str, *, size: tuple[int, str] | None = None) -> FloatArray:
+def symmetric(
+    value: Any, name: str, *, size: tuple[int, str] | None = None, stacked: bool = False
+) -> FloatArray:
     """Return a finite symmetric matrix; asymmetry beyond rounding is refused."""
-    out = matrix(value, name, rows=size, cols=size)
-    if out.shape[0] != out.shape[1]:
+    out = matrix(value, name, rows=size, cols=size, stacked=stacked)
+    if out.shape[-2] != out.shape[-1]:
         raise DimensionError(f"{name} must be square; got {out.shape}.")
-    scale = float(np.max(np.abs(out), initial=0.0))
-    skew = float(np.max(np.abs(out - out.T), initial=0.0))
-    if skew > 1e-10 * scale:
+    turned = np.swapaxes(out, -1, -2)
+    scale = np.max(np.abs(out), axis=(-2, -1), initial=0.0)
+    skew = np.max(np.abs(out - turned), axis=(-2, -1), initial=0.0)
+    worst = np.unravel_index(np.argmax(skew - 1e-10 * scale), skew.shape)
+    if skew[worst] > 1e-10 * scale[worst]:
         raise DefinitenessError(
-            f"{name} must be symmetric; got an asymmetry of {skew:.3g} beside entries of "
-            f"{scale:.3g}. Try {name} = ({name} + {name}.T) / 2 if it is rounding."
+            f"{name} must be symmetric; got an asymmetry of {skew[worst]:.3g} beside entries of "
+            f"{scale[worst]:.3g}. Try {name} = ({name} + {name}.T) / 2 if it is rounding."
         )
-    return frozen((out + out.T) / 2)
+    return frozen((out + turned) / 2)
 
 
 def semidefinite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> FloatArray:

@@ -133,11 +133,13 @@ def _description(made: Design) -> Report:
             "gamma": made.gamma,
             "gamma_requested": made.gamma_requested,
             "gamma_least": made.gamma_least,
+            "gamma_infeasible": made.gamma_infeasible,
         }
         if made.gamma_requested is not None:
             facts += [
                 ("bound asked for", made.gamma_requested, unit),
-                ("least bound", made.gamma_least, unit),
+                ("least norm of any filter, not above", made.gamma_least, unit),
+                ("least norm of any filter, not below", made.gamma_infeasible, unit),
             ]
     if isinstance(made, IntegratorDesign):
         facts.append(("gain", made.gain, ""))

@@ -6,17 +6,24 @@ from typing import Protocol
 
 import numpy as np
 
-from lbt_synth.certify import NORM_TOLERANCE
 from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.models.problem import EstimationProblem, require_problem
 from lbt_synth.norms import hinf_norm
-from lbt_synth.riccati import FilterRiccati, gamma_riccati, kalman_riccati, least_gamma
+from lbt_synth.riccati import (
+    FilterRiccati,
+    gamma_riccati,
+    kalman_riccati,
+    least_gamma,
+    worst_invisible,
+)
 from lbt_synth.validation import FloatArray, choice, number
+from lbt_synth.witness import Witness, infeasible_level
 
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9
+_CONTRADICTION = 1e-9  # what rounding may take from a proof
 _GREATEST = 1e100
 _GREATEST_RATIO = 1e6
 
@@ -42,6 +49,7 @@ def hinf(
     *,
     gamma: float | None = None,
     gamma_ratio: float | None = None,
+    horizon: int = 1,
     method: str = "lmi",
 ) -> FilterDesign:
     """Design an H-infinity filter of an estimation problem.
@@ -58,6 +66,9 @@ def hinf(
         Bound on the H-infinity norm from w to the estimation error.
     gamma_ratio : float, optional
         The same bound as a multiple, at least 1, of the least gamma.
+    horizon : int, optional
+        Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
+        filter (a-posteriori), 2 and more predict further, as ``problem.ahead``.
     method : {"lmi", "riccati"}, optional
         Linear matrix inequality, or the gamma-Riccati equation. For a given
         bound both give the central filter.
@@ -66,7 +77,9 @@ def hinf(
     -------
     FilterDesign
         Certified design. ``gamma`` is the norm achieved, ``gamma_requested`` the
-        bound, ``gamma_least`` the least bound.
+        bound. ``gamma_least`` is the norm that a filter achieves,
+        ``gamma_infeasible`` a level that no filter reaches, proved by ``witness``:
+        the least gamma lies between the two.
 
     Raises
     ------
@@ -106,9 +119,11 @@ def hinf(
             at_most=_GREATEST_RATIO,
             hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
         )
+    problem = problem.ahead(horizon)
     start = kalman_riccati(problem)
     synthesis = _LmiRoute(problem, start) if method == "lmi" else _RiccatiRoute(problem, start)
-    least, gains = synthesis.least()
+    gains, witness = synthesis.least()
+    least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = least
     if gamma_ratio is not None:
         requested = least * gamma_ratio
@@ -131,13 +146,11 @@ def hinf(
         solver=SolverReport(route=method, status=gains.status, iterations=gains.iterations),
         gamma_requested=max(requested, least),
         gamma_least=least,
+        gamma_infeasible=infeasible,
+        witness=witness,
     )
-    if design.gamma < least * (1 - NORM_TOLERANCE):
-        raise NumericalError(
-            f"the least gamma {least:.9g} that was found is not the least: a filter achieves "
-            f"{design.gamma:.9g}. Try the other method, or scale the states to similar sizes.",
-            status="contradiction",
-        )
+    if design.gamma < infeasible * (1 - _CONTRADICTION):
+        raise _contradiction(infeasible, design.gamma)
     return design
 
 
@@ -147,10 +160,10 @@ class _RiccatiRoute:
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
         self.problem, self.start = problem, start
 
-    def least(self) -> tuple[float, _Gains]:
+    def least(self) -> tuple[_Gains, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)
-        _, least, solution = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
-        return least, solution
+        _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
+        return best, worst_invisible(self.problem, best.P, level, self.start.P)
 
     def at(self, gamma: float) -> _Gains:
         solution = gamma_riccati(self.problem, gamma, start=self.start)
@@ -170,16 +183,43 @@ class _LmiRoute:
         self.problem, self.start = problem, start
         self.scale = _kalman_bracket(problem, start)[1]
 
-    def least(self) -> tuple[float, _Gains]:
+    def least(self) -> tuple[_Gains, Witness]:
         from lbt_synth.lmi import least_gamma_lmi
 
         solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
-        return solution.gamma, solution
+        assert solution.witness is not None  # the least gamma has a dual solution
+        return solution, solution.witness
 
     def at(self, gamma: float) -> _Gains:
         from lbt_synth.lmi import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
+
+
+def _verified_bracket(
+    problem: EstimationProblem, start: FilterRiccati, gains: _Gains, witness: Witness
+) -> tuple[float, float]:
+    """Least gamma from both sides: the norm of a filter, and a level that a witness refutes."""
+    error = problem.error_system(gains.gain_predictor)
+    if not error.spectral_radius < 1:
+        raise NumericalError(
+            "the filter of the least gamma is not stable; expected a spectral radius below 1, got "
+            f"{error.spectral_radius:.9g}. Try the other method, or scale the states.",
+            status=gains.status,
+        )
+    least = hinf_norm(error).upper
+    infeasible = infeasible_level(problem, witness, start.P)
+    if infeasible > least * (1 + _CONTRADICTION):
+        raise _contradiction(infeasible, least)
+    return least, min(infeasible, least)
+
+
+def _contradiction(infeasible: float, achieved: float) -> NumericalError:
+    return NumericalError(
+        f"no filter should have a norm below {infeasible:.9g}, yet one achieves {achieved:.9g}. "
+        "Try the other method, or scale the states to similar sizes.",
+        status="contradiction",
+    )
 
 
 def _kalman_bracket(problem: EstimationProblem, start: FilterRiccati) -> tuple[float, float]:

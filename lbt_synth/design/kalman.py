@@ -10,13 +10,18 @@ from lbt_synth.riccati import kalman_riccati
 from lbt_synth.validation import choice
 
 
-def kalman(problem: EstimationProblem, *, method: str = "riccati") -> FilterDesign:
+def kalman(
+    problem: EstimationProblem, *, horizon: int = 1, method: str = "riccati"
+) -> FilterDesign:
     """Design the steady-state Kalman filter of an estimation problem.
 
     Parameters
     ----------
     problem : EstimationProblem
         The problem; a plant gives a controller.
+    horizon : int, optional
+        Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
+        filter, 2 and more predict further, as ``problem.ahead``.
     method : {"riccati", "sdp"}, optional
         The Riccati equation, or a semidefinite programme (independent of it but
         for the coordinates it is solved in).
@@ -45,6 +50,7 @@ def kalman(problem: EstimationProblem, *, method: str = "riccati") -> FilterDesi
     """
     require_problem(problem)
     choice(method, "method", ("riccati", "sdp"))
+    problem = problem.ahead(horizon)
     solution = kalman_riccati(problem)
     if method == "riccati":
         return filter_design(

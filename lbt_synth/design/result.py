@@ -7,13 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.certify import Certificate, Check, certify_filter, certify_loop
+from lbt_synth.certify import (
+    Certificate,
+    Check,
+    certify_filter,
+    certify_infeasible,
+    certify_loop,
+)
 from lbt_synth.loop import close_loop
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import FullStatePlant, TipTiltPlant
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.witness import Witness
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +103,11 @@ class FilterDesign(Design):
     gamma_requested : float or None
         Bound that the H-infinity design was asked for.
     gamma_least : float or None
-        Least bound of its problem.
+        Norm that a filter of the problem achieves, with the least gamma.
+    gamma_infeasible : float or None
+        Level that no filter reaches: the least gamma is not below it.
+    witness : Witness or None
+        The proof of that level: disturbances that no measurement shows.
     """
 
     problem: EstimationProblem
@@ -104,6 +115,8 @@ class FilterDesign(Design):
     gain_filter: FloatArray
     gamma_requested: float | None = None
     gamma_least: float | None = None
+    gamma_infeasible: float | None = None
+    witness: Witness | None = None
 
     @property
     def gamma(self) -> float:
@@ -121,6 +134,11 @@ class FilterDesign(Design):
         if isinstance(self.problem, TipTiltPlant | FullStatePlant):
             return self.problem.hardware
         return None
+
+    @property
+    def estimator(self) -> Controller:
+        """Estimator of z whatever the commands are, from [y(k), u(k-1)] for a plant."""
+        return self.problem.estimator(self.gain_predictor)
 
     @property
     def poles(self) -> ComplexArray:
@@ -141,6 +159,8 @@ class FilterDesign(Design):
             method=self.method,
             gamma=self.gamma_requested,
             controller=self.controller,
+            infeasible=self.gamma_infeasible,
+            witness=self.witness,
         )
 
 
@@ -192,15 +212,20 @@ def certify_design(
     method: str,
     gamma: float | None,
     controller: Controller,
+    infeasible: float | None = None,
+    witness: Witness | None = None,
 ) -> Certificate:
     """Certificate of a filter, and of its closed loop where the problem is a plant."""
     certificate = certify_filter(
         problem, gain_predictor, gamma=gamma, least_variance=method == "kalman"
     )
-    if not isinstance(problem, TipTiltPlant | FullStatePlant):
-        return certificate
+    checks = list(certificate.checks)
+    if infeasible is not None and witness is not None:
+        checks.append(certify_infeasible(problem, infeasible, witness))
+    if isinstance(problem, TipTiltPlant | FullStatePlant):
+        checks.append(certify_loop(problem.hardware, controller))
     return Certificate(
-        checks=(*certificate.checks, certify_loop(problem.hardware, controller)),
+        checks=tuple(checks),
         gamma=certificate.gamma,
         rms_per_output=certificate.rms_per_output,
     )
@@ -215,11 +240,19 @@ def filter_design(
     solver: SolverReport,
     gamma_requested: float | None = None,
     gamma_least: float | None = None,
+    gamma_infeasible: float | None = None,
+    witness: Witness | None = None,
 ) -> FilterDesign:
     """Certify a gain and make the design; raise CertificateError if it fails."""
     controller = problem.controller(gain_predictor)
     certificate = certify_design(
-        problem, gain_predictor, method=method, gamma=gamma_requested, controller=controller
+        problem,
+        gain_predictor,
+        method=method,
+        gamma=gamma_requested,
+        controller=controller,
+        infeasible=gamma_infeasible,
+        witness=witness,
     )
     return FilterDesign(
         method=method,
@@ -233,4 +266,6 @@ def filter_design(
         gain_filter=gain_filter,
         gamma_requested=gamma_requested,
         gamma_least=gamma_least,
+        gamma_infeasible=gamma_infeasible,
+        witness=witness,
     )

@@ -20,6 +20,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.witness import Witness
 
 CONVENTION = (
     "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
@@ -68,6 +69,12 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
         arrays |= {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
         meta["gamma_requested"] = design.gamma_requested
         meta["gamma_least"] = design.gamma_least
+        meta["gamma_infeasible"] = design.gamma_infeasible
+        if design.witness is not None:
+            arrays |= {
+                "WITNESS_X": design.witness.states,
+                "WITNESS_W": design.witness.disturbances,
+            }
         _pack_problem(design.problem, arrays, meta)
     return arrays, meta
 
@@ -96,6 +103,10 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
         gain_filter=arrays["GAIN_FILTER"],
         gamma_requested=meta["gamma_requested"],
         gamma_least=meta["gamma_least"],
+        gamma_infeasible=meta.get("gamma_infeasible"),  # files of 0.1 have none, nor a witness
+        witness=Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
+        if "WITNESS_X" in arrays
+        else None,
     )
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from lbt_synth.gains import decorrelated, filter_gains
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.validation import FloatArray, frozen
-
-_RANK_TOLERANCE = 1e-13
+from lbt_synth.witness import Witness, identity_coordinates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,6 +42,13 @@ class BalancedProblem:
         back = self.basis @ predictor @ self.sensor_scale
         return frozen(back + self.injection), frozen(self.basis @ filtering @ self.sensor_scale)
 
+    def witness(self, moments: FloatArray, basis: FloatArray) -> Witness:
+        """Witness of a dual point: moments over a basis of balanced states and disturbances."""
+        values, vectors = np.linalg.eigh((moments + moments.T) / 2)
+        pairs = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+        n = self.basis.shape[1]
+        return Witness(states=frozen(self.basis @ pairs[:n]), disturbances=frozen(pairs[n:]))
+
     def covariance(self, balanced: FloatArray) -> FloatArray:
         """Covariance in the original coordinates."""
         return frozen(self.basis @ balanced @ self.basis.T)
@@ -65,13 +71,7 @@ def balanced(
         Size of the estimation error.
     """
     A_s, B_s, injection = decorrelated(problem)
-    spread = np.sqrt(np.diag(covariance))
-    spread = np.where(spread > 0, spread, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
-    kept = values > _RANK_TOLERANCE * values[-1]
-    root = np.sqrt(values[kept])
-    basis = spread[:, None] * vectors[:, kept] * root
-    inverse = (vectors[:, kept] / root).T / spread
+    basis, inverse = identity_coordinates(covariance)
     sensor_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
     return BalancedProblem(
         problem=EstimationProblem(

@@ -25,6 +25,7 @@ from lbt_synth.lmi.coordinates import BalancedProblem, balanced
 from lbt_synth.lmi.solver import USABLE, LmiSolution, solve, symmetrised
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.validation import FloatArray
+from lbt_synth.witness import Witness
 
 
 def least_gamma_lmi(
@@ -44,7 +45,8 @@ def least_gamma_lmi(
     Returns
     -------
     LmiSolution
-        ``gamma`` may lie about 1e-8 below the truth: recompute the norm.
+        ``gamma`` may lie about 1e-8 below the truth: recompute the norm. Its witness is
+        the dual solution.
 
     Raises
     ------
@@ -54,9 +56,9 @@ def least_gamma_lmi(
     frame = balanced(problem, coordinates, scale)
     P = cp.Variable(frame.problem.A.shape, symmetric=True)
     gamma_squared = cp.Variable(nonneg=True)
-    status, iterations = solve(
-        cp.Minimize(gamma_squared), _inequalities(frame.problem, P, gamma_squared, 1.0)
-    )
+    basis = null_space(np.hstack([frame.problem.C, frame.problem.D]))
+    inequalities = _inequalities(frame.problem, basis, P, gamma_squared, 1.0)
+    status, iterations = solve(cp.Minimize(gamma_squared), inequalities)
     if status not in USABLE or P.value is None or gamma_squared.value is None:
         raise NumericalError(
             f"the least gamma's semidefinite programme ended as {status!r}; expected an optimum. "
@@ -64,7 +66,8 @@ def least_gamma_lmi(
             status=status,
         )
     level = float(gamma_squared.value)
-    return _unpacked(frame, P.value / level, level, status, iterations)
+    witness = frame.witness(inequalities[0].dual_value, basis)
+    return _unpacked(frame, P.value / level, level, status, iterations, witness)
 
 
 def hinf_lmi(
@@ -98,9 +101,9 @@ def hinf_lmi(
     frame = balanced(problem, coordinates, scale)
     level = (gamma / scale) ** 2
     P = cp.Variable(frame.problem.A.shape, symmetric=True)
-    status, iterations = solve(
-        cp.Maximize(cp.trace(P)), _inequalities(frame.problem, P, 1.0, 1 / level)
-    )
+    basis = null_space(np.hstack([frame.problem.C, frame.problem.D]))
+    inequalities = _inequalities(frame.problem, basis, P, 1.0, 1 / level)
+    status, iterations = solve(cp.Maximize(cp.trace(P)), inequalities)
     if "infeasible" in status:
         raise InfeasibleError(
             f"no H-infinity filter reaches gamma = {gamma:.9g}: the LMI is infeasible. "
@@ -117,12 +120,11 @@ def hinf_lmi(
 
 
 def _inequalities(
-    problem: EstimationProblem, P: Any, input_weight: Any, output_weight: float
+    problem: EstimationProblem, basis: FloatArray, P: Any, input_weight: Any, output_weight: float
 ) -> list[Any]:
     """Return the two inequalities; dividing them by gamma^2 suits a large, given level."""
-    A, B, C, D, L = problem.A, problem.B, problem.C, problem.D, problem.L
+    A, B, L = problem.A, problem.B, problem.L
     n = A.shape[0]
-    basis = null_space(np.hstack([C, D]))
     Nx, Nw = basis[:n], basis[n:]
     step, seen = A @ Nx + B @ Nw, L @ Nx
     dissipation = (
@@ -135,7 +137,12 @@ def _inequalities(
 
 
 def _unpacked(
-    frame: BalancedProblem, P: FloatArray, gamma_squared: float, status: str, iterations: int
+    frame: BalancedProblem,
+    P: FloatArray,
+    gamma_squared: float,
+    status: str,
+    iterations: int,
+    witness: Witness | None = None,
 ) -> LmiSolution:
     """Turn ``P / gamma^2`` into gains and a covariance in the problem's coordinates."""
     storage = (P + P.T) / 2
@@ -148,4 +155,5 @@ def _unpacked(
         gain_filter=filtering,
         status=status,
         iterations=iterations,
+        witness=witness,
     )

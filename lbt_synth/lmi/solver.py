@@ -10,6 +10,7 @@ import cvxpy as cp
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.validation import FloatArray
+from lbt_synth.witness import Witness
 
 # Tighter ones end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 _SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
@@ -32,6 +33,8 @@ class LmiSolution:
         The solver's word; no evidence, so the design is certified without it.
     iterations : int
         Iterations of the solver.
+    witness : Witness or None
+        The dual solution, as disturbances that no filter sees (of the least gamma only).
     """
 
     gamma: float
@@ -40,6 +43,7 @@ class LmiSolution:
     gain_filter: FloatArray
     status: str
     iterations: int
+    witness: Witness | None = None
 
 
 def symmetrised(expression: Any) -> Any:

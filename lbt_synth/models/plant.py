@@ -22,10 +22,10 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.models.problem import LONGEST_HORIZON, EstimationProblem
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import FloatArray, definite, frozen, number
+from lbt_synth.validation import FloatArray, definite, frozen, integer, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,6 +76,54 @@ class FullStatePlant(EstimationProblem):
         A = self.A - gain @ self.C + (self.B_known - gain @ self.D_known) @ to_command
         D = np.zeros((to_command.shape[0], gain.shape[1]))
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s)
+
+    def estimator(self, gain_predictor: FloatArray) -> Controller:
+        """Estimator of z from y(k) and the command u(k-1), whoever gave that command.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain over the full state.
+
+        Returns
+        -------
+        Controller
+            From ``[y(k), u(k-1)]`` to the estimate, in new-state form.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+        """
+        gain = self._checked_gain(gain_predictor)
+        B = np.hstack([gain, self.B_known - gain @ self.D_known])
+        D = np.zeros((self.L.shape[0], B.shape[1]))
+        return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
+
+    def ahead(self, frames: int) -> EstimationProblem:
+        """Refuse any horizon but one: the reduced plant has them all.
+
+        Parameters
+        ----------
+        frames : int
+            Frames from the newest measurement to the estimate.
+
+        Returns
+        -------
+        FullStatePlant
+            This plant, for 1.
+
+        Raises
+        ------
+        ProblemError
+            For any other horizon.
+        """
+        if frames != 1:
+            raise ProblemError(
+                f"a plant with its commands as states has a horizon of 1; got {frames!r}. "
+                "Try plant.ahead(frames).full() on the reduced plant."
+            )
+        return self
 
     def generalised(self) -> tuple[FloatArray, FloatArray]:
         """Matrices of the H-infinity filter's generalised plant (eq. 8, errata 2 and 7).
@@ -182,11 +230,87 @@ class TipTiltPlant(EstimationProblem):
         DimensionError
             If the gain does not fit.
         """
-        gain = self._checked_gain(gain_predictor)
         full = self.full()
+        return full.controller(self._padded(gain_predictor, full))
+
+    def estimator(self, gain_predictor: FloatArray) -> Controller:
+        """Estimator of z from y(k) and the command u(k-1), whoever gave that command.
+
+        The known input is taken out exactly: the estimation error does not depend on it.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain over the reduced state.
+
+        Returns
+        -------
+        Controller
+            From ``[y(k), u(k-1)]`` to the estimate, in new-state form.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+        """
+        full = self.full()
+        return full.estimator(self._padded(gain_predictor, full))
+
+    def ahead(self, frames: int) -> TipTiltPlant:
+        """Plant of the estimate of ``z(k + frames)`` from y up to k: a loop of another delay.
+
+        A prediction that reaches one frame further serves a loop that is one frame later.
+
+        Parameters
+        ----------
+        frames : int
+            Frames from the newest measurement to the estimate; 1 is this plant.
+
+        Returns
+        -------
+        TipTiltPlant
+            The plant with a delay of ``delay_frames + frames - 1``.
+
+        Raises
+        ------
+        ProblemError
+            If ``frames`` is no integer, or that delay is less than one frame.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+        >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
+        >>> [plant.ahead(frames).hardware.delay_frames for frames in (0, 1, 2)]
+        [1.0, 2.0, 3.0]
+        """
+        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
+        if steps == 1:
+            return self
+        hw = self.hardware
+        delay = hw.delay_frames + steps - 1
+        if not 1 <= delay <= LONGEST_HORIZON:
+            raise ProblemError(
+                f"horizon must leave the loop a delay of 1 to {LONGEST_HORIZON} frames; got "
+                f"{steps}, which makes {delay:g}. For an estimate without a loop, make an "
+                "EstimationProblem of the plant's matrices."
+            )
+        return tip_tilt_plant(
+            frame_rate_hz=hw.frame_rate_hz,
+            turbulence=self.turbulence,
+            noise_nm=self.R,
+            vibrations=self.vibrations or None,
+            delay_frames=delay,
+            sensor_matrix=hw.sensor,
+            influence_matrix=hw.influence,
+        )
+
+    def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
+        """Gain over the full state: the known input has an error of zero, and no gain."""
+        gain = self._checked_gain(gain_predictor)
         padded = np.zeros((full.A.shape[0], gain.shape[1]))
         padded[: gain.shape[0]] = gain
-        return full.controller(padded)
+        return padded
 
 
 def tip_tilt_plant(

@@ -8,7 +8,9 @@ import numpy as np
 
 from lbt_synth.errors import DefinitenessError, ProblemError
 from lbt_synth.statespace import Controller, LinearSystem, StateSpace
-from lbt_synth.validation import FloatArray, definite, frozen, matrix
+from lbt_synth.validation import FloatArray, definite, frozen, integer, matrix
+
+LONGEST_HORIZON = 1000  # frames of a horizon
 
 
 def require_problem(problem: object) -> None:
@@ -153,6 +155,85 @@ class EstimationProblem(LinearSystem):
         return EstimationProblem(
             A=self.A, B=self.B / size, C=self.C, D=self.D / size, L=self.L, dt_s=self.dt_s
         )
+
+    def ahead(self, frames: int) -> EstimationProblem:
+        """Problem whose one-step prediction is the estimate of ``z(k + frames)`` from y up to k.
+
+        1 is this problem. 0 is its filter (a-posteriori) form: the estimated signal gets
+        a state of its own, one frame late. Less than 0 smooths with a fixed lag.
+        For 2 and more the measurement gets states of its own, and the disturbances that
+        come in between count in the error, for which they are not delayed.
+
+        Parameters
+        ----------
+        frames : int
+            Frames from the newest measurement to the estimate.
+
+        Returns
+        -------
+        EstimationProblem
+            With some more states; the first ones are x(k + max(frames, 1) - 1).
+
+        Raises
+        ------
+        ProblemError
+            If ``frames`` is no integer, or is 2 or more while ``B D'`` is not zero: part of
+            the noise would act on the states before it is measured.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> [round(lbt.kalman(walk, horizon=h).rms ** 2, 6) for h in (-1, 0, 1, 2)]
+        [0.472136, 0.618034, 1.618034, 2.618034]
+        """
+        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
+        if steps > LONGEST_HORIZON:
+            raise ProblemError(f"horizon must be at most {LONGEST_HORIZON} frames; got {steps}.")
+        if steps == 1:
+            return self
+        n, p, q = self.n_states, self.B.shape[1], self.C.shape[0]
+        if steps > 1:
+            size = np.linalg.norm(self.B, 2) * np.linalg.norm(self.D, 2)
+            if np.linalg.norm(self.S, 2) > 1e-12 * size:
+                raise ProblemError(
+                    f"a prediction of {steps} frames needs process and measurement noise that are "
+                    "uncorrelated (B D' = 0); got B D' with a norm of "
+                    f"{np.linalg.norm(self.S, 2):.3g}. Try horizon=1, or separate the noises."
+                )
+            late, entry = (steps - 1) * q, self.C
+        else:
+            late, entry = (1 - steps) * len(self.L), self.L
+        width = len(entry)
+        A = np.zeros((n + late, n + late))
+        A[:n, :n], A[n : n + width, :n] = self.A, entry
+        A[n + width :, n:-width] = np.eye(late - width)
+        last = np.zeros((width, n + late))
+        last[:, -width:] = np.eye(width)
+        padding = np.zeros((max(q, len(self.L)), late))
+        return EstimationProblem(
+            A=A,
+            B=np.vstack([self.B, np.zeros((late, p))]),
+            C=last if steps > 1 else np.hstack([self.C, padding[:q]]),
+            D=self.D,
+            L=np.hstack([self.L, padding[: len(self.L)]]) if steps > 1 else last,
+            dt_s=self.dt_s,
+        )
+
+    def estimator(self, gain_predictor: FloatArray) -> Controller:
+        """Estimator of z from what is known: here from y(k), as :meth:`controller`.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain.
+
+        Returns
+        -------
+        Controller
+            In new-state form.
+        """
+        return self.controller(gain_predictor)
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.

@@ -11,7 +11,7 @@ from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.norms import largest_singular_values
+from lbt_synth.norms import largest_singular_values, spectral_norms
 from lbt_synth.plotting.style import MARKERS, house_style, looks, new_figure
 from lbt_synth.simulation import Simulation
 from lbt_synth.sweep import RobustnessRow
@@ -162,8 +162,7 @@ def _loop_panels(
             (rejection, loop.sensitivity(grid)),
             (noise, loop.noise_transfer(grid)),
         ):
-            sigma = np.linalg.svd(response, compute_uv=False)[:, 0]
-            axis.loglog(grid, sigma, label=name, **styles[name])
+            axis.loglog(grid, spectral_norms(response), label=name, **styles[name])
     rejection.axhline(1, color="0.4", linewidth=0.8)
     rejection.set_ylabel(r"$\bar\sigma$ phase $\to$ residual [-]")
     noise.set_ylabel(r"$\bar\sigma$ noise $\to$ residual [-]")

@@ -1,4 +1,4 @@
-"""The discrete algebraic Riccati equation of control, with its evidence."""
+"""The discrete algebraic Riccati equation, one or many at once, with its evidence."""
 
 from __future__ import annotations
 
@@ -6,70 +6,112 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import matrix_balance, solve_discrete_are
 
-from lbt_synth.errors import DetectabilityError, NumericalError
-from lbt_synth.lyapunov import stationary_covariance
-from lbt_synth.riccati.doubling import doubling
+from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError
+from lbt_synth.riccati.diagnosis import require_stabilising
+from lbt_synth.riccati.equation import Equations
+from lbt_synth.riccati.routes import ROUTES
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
-    definite,
+    IntArray,
     frozen,
     matrix,
-    semidefinite,
     square,
+    symmetric,
 )
 
-RESIDUAL_LIMIT = 1e-9
-_REFINEMENTS = 3
+RESIDUAL_LIMIT = 1e-9  # a solution beyond it is not returned
+_SATISFIED = 1e-12  # beyond it the next route is tried
+_DOUBTFUL = 1e-9  # a pole this close to the unit circle makes the conditions be checked
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attempt:
+    """What one route did.
+
+    Attributes
+    ----------
+    method : str
+        "doubling", "shifted doubling" or "schur".
+    tried, solved : int
+        Equations it was given, and those it solved.
+    """
+
+    method: str
+    tried: int
+    solved: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DareSolution:
-    """Stabilising solution of a discrete algebraic Riccati equation.
+    """Stabilising solution of a discrete algebraic Riccati equation, or of a stack of them.
 
     Attributes
     ----------
-    X : (n, n) ndarray
+    X : (..., n, n) ndarray
         The solution, symmetric.
-    gain_feedback : (m, n) ndarray
+    gain_feedback : (..., m, n) ndarray
         ``(R + B'XB)^-1 (B'XA + S')``; the closed loop is ``A - B gain_feedback``.
-    poles : (n,) complex ndarray
+    poles : (..., n) complex ndarray
         Poles of the closed loop.
-    residual : float
-        Relative residual of the equation in the 1-norm.
-    method : str
-        Route that gave X: "doubling" or "schur".
+    residuals : (...) ndarray
+        Relative residual of each equation: its norm (Frobenius) over those of X, A'XA and Q,
+        in units of the states that balance the equation.
+    negative : (...) int ndarray
+        Number of negative eigenvalues of ``R + B'XB``. Where it is zero, X is the least
+        cost of the control problem; elsewhere X is a saddle point.
     iterations : int
-        Doublings made (0 for "schur").
+        Most doublings made for an equation.
+    attempts : tuple of Attempt
+        Routes in the order they were tried.
     """
 
     X: FloatArray
     gain_feedback: FloatArray
     poles: ComplexArray
-    residual: float
-    method: str
+    residuals: FloatArray
+    negative: IntArray
     iterations: int
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def residual(self) -> float:
+        """Largest relative residual."""
+        return float(np.max(self.residuals, initial=0.0))
+
+    @property
+    def method(self) -> str:
+        """Routes that solved something, in the order they were tried."""
+        return ", ".join(attempt.method for attempt in self.attempts if attempt.solved)
 
 
 def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     """Solve ``X = A'XA + Q - (A'XB + S)(R + B'XB)^-1 (B'XA + S')`` for its stabilising X.
 
-    Structured doubling, then Newton refinement; scipy's Schur method if that
-    fails. For the filter equation pass ``(A', C', B B', D D', B D')``.
+    Structured doubling in balanced units; if that fails, doubling from some steps of
+    the Riccati recursion, which a singular R needs; if that fails, the ordered Schur
+    form of the extended pencil. Each answer is refined by Newton steps on a residual in
+    extended precision, and verified: a stable closed loop and a small residual make it
+    the stabilising solution, of which there is only one. For the filter equation pass
+    ``(A', C', B B', D D', B D')``.
+
+    Leading dimensions of the arguments are those of a stack of equations, broadcast
+    against each other and solved at once.
 
     Parameters
     ----------
-    A : (n, n) array_like
+    A : (..., n, n) array_like
         State matrix.
-    B : (n, m) array_like
+    B : (..., n, m) array_like
         Input matrix.
-    Q : (n, n) array_like
-        State weight, symmetric; ``[[Q, S], [S', R]]`` positive semidefinite.
-    R : (m, m) array_like
-        Input weight, symmetric positive definite.
-    S : (n, m) array_like, optional
+    Q : (..., n, n) array_like
+        State weight, symmetric.
+    R : (..., m, m) array_like
+        Input weight, symmetric. It may be singular. If it has negative eigenvalues the
+        equation is that of an H-infinity problem, and X must then be positive
+        semidefinite and leave ``R + B'XB`` the signs of R.
+    S : (..., n, m) array_like, optional
         Cross weight.
 
     Returns
@@ -82,7 +124,10 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     DimensionError, NonFiniteError, DefinitenessError
         If the input is wrong.
     DetectabilityError
-        If there is no stabilising solution; the message names the mode.
+        If there is no stabilising solution; the message names the mode, or the zero on
+        the unit circle.
+    InfeasibleError
+        If R is indefinite and the stabilising solution does not meet its conditions.
     NumericalError
         If no route reaches a relative residual of 1e-9 with a stable closed loop.
 
@@ -91,148 +136,144 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     >>> import lbt_synth as lbt
     >>> round(float(lbt.solve_dare(1, 1, 1, 1).X[0, 0]), 12)        # (1 + sqrt 5) / 2
     1.61803398875
+
+    Three equations at once:
+
+    >>> lbt.solve_dare(1, 1, [[[1]], [[2]], [[6]]], 1).X.ravel().round(6).tolist()
+    [1.618034, 2.732051, 7.162278]
     """
-    A = square(A, "A")
-    n = A.shape[0]
-    why = f"to match A {A.shape}"
-    B = matrix(B, "B", rows=(n, why))
-    m = B.shape[1]
-    Q = semidefinite(Q, "Q", size=(n, why))
-    R = definite(R, "R", size=(m, f"to match B {B.shape}"))
+    equations, lead = _stacked(A, B, Q, R, S)
+    units = equations.balancing_units()
+    balanced = equations.in_units(units)
+    X, gains, poles, residuals, steps, attempts = _attempted(balanced)
+    radius = np.abs(poles).max(axis=-1)
+
+    solved = (radius < 1) & (residuals <= RESIDUAL_LIMIT)
+    for i in np.flatnonzero(~solved | (radius > 1 - _DOUBTFUL)):
+        require_stabilising(balanced, int(i), _name(int(i), lead))
+    if not solved.all():
+        _refuse(int(np.flatnonzero(~solved)[0]), lead, residuals, radius, attempts)
+    weights = balanced.weights(X)
+    negative = np.sum(np.linalg.eigvalsh(weights) < 0, axis=-1)
+    _require_saddle(balanced.R, X, negative, lead)
+
+    column, row = units[:, None, :], units[:, :, None]
+    n, m = equations.B.shape[-2:]
+    return DareSolution(
+        X=frozen((X / column / row).reshape(*lead, n, n)),
+        gain_feedback=frozen((gains / column).reshape(*lead, m, n)),
+        poles=poles.reshape(*lead, n),
+        residuals=frozen(residuals.reshape(lead)),
+        negative=negative.reshape(lead),
+        iterations=int(steps.max(initial=0)),
+        attempts=attempts,
+    )
+
+
+def _stacked(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[int, ...]]:
+    """Check the arguments; return them as one stack, and its leading dimensions."""
+    A = square(A, "A", stacked=True)
+    n, why = A.shape[-1], f"to match A {A.shape}"
+    B = matrix(B, "B", rows=(n, why), stacked=True)
+    m, also = B.shape[-1], f"to match B {B.shape}"
+    if m == 0:
+        raise DimensionError(f"B must have at least one column; got {B.shape}.")
+    Q = symmetric(Q, "Q", size=(n, why), stacked=True)
+    R = symmetric(R, "R", size=(m, also), stacked=True)
     if S is None:
         S = np.zeros((n, m))
-    S = matrix(S, "S", rows=(n, why), cols=(m, f"to match B {B.shape}"))
-    if np.any(S):
-        semidefinite(np.block([[Q, S], [S.T, R]]), "[[Q, S], [S', R]]")
-
-    shifted = A - B @ np.linalg.solve(R, S.T)
-    weight = Q - S @ np.linalg.solve(R, S.T)
-    _require_stabilising(A, B, shifted, (weight + weight.T) / 2)
-
-    X, steps, converged = doubling(shifted, B @ np.linalg.solve(R, B.T), (weight + weight.T) / 2)
-    solution = None
-    if converged:
-        solution = _refined(A, B, Q, R, S, X, "doubling", steps)
-    if solution is None or solution.residual > RESIDUAL_LIMIT:
-        solution = _schur(A, B, Q, R, S) or solution
-    if solution is None or solution.residual > RESIDUAL_LIMIT:
-        residual = None if solution is None else solution.residual
-        raise NumericalError(
-            "the Riccati equation was not solved: doubling and Schur both failed to reach a "
-            f"relative residual of {RESIDUAL_LIMIT:g} with a stable closed loop; "
-            f"got {residual}. Try to scale the states to similar sizes.",
-            status="residual",
-            residual=residual,
-        )
-    return solution
-
-
-def unstable_hidden_mode(
-    A: FloatArray, C: FloatArray, *, drive: FloatArray, only_unit_circle: bool = False
-) -> complex | None:
-    """Eigenvalue of A that does not decay and that C does not see, or None.
-
-    The Popov-Belevitch-Hautus test on the eigenvalues with modulus 1 or more
-    (or about 1, with ``only_unit_circle``). ``drive`` (n, p) enters the states: with
-    it their units are chosen, on which the answer must not depend.
-    """
-    n = A.shape[0]
-    border = np.block(
-        [
-            [np.abs(A), np.linalg.norm(drive, axis=1)[:, None]],
-            [np.linalg.norm(C, axis=0)[None, :], np.zeros((1, 1))],
-        ]
-    )
-    _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
-    units = np.asarray(scaling[:n], dtype=np.float64)
-    A, C = A * units / units[:, None], C * units
-    scale_A = max(float(np.linalg.norm(A, 2)), 1e-300)
-    scale_C = max(float(np.linalg.norm(C, 2)), 1e-300)
-    tol = 1e-10
-    for value in np.linalg.eigvals(A):
-        size = abs(value)
-        if size < 1 - tol or (only_unit_circle and size > 1 + tol):
-            continue
-        pencil = np.vstack([(A - value * np.eye(n)) / scale_A, C / scale_C])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < tol:
-            return complex(value)
-    return None
-
-
-def _require_stabilising(
-    A: FloatArray, B: FloatArray, shifted: FloatArray, weight: FloatArray
-) -> None:
-    values, vectors = np.linalg.eigh(weight)
-    root = (vectors * np.sqrt(np.maximum(values, 0))).T  # root' root = weight
-    hidden = unstable_hidden_mode(A.T, B.T, drive=root.T)
-    if hidden is not None:
-        raise DetectabilityError(
-            f"(A, B) must be stabilisable; the mode of A at {hidden:.6g} does not decay and B "
-            "does not reach it. Give it an input, or take it out of the model.",
-            eigenvalue=hidden,
-        )
-    hidden = unstable_hidden_mode(shifted, root, drive=B, only_unit_circle=True)
-    if hidden is not None:
-        raise DetectabilityError(
-            f"Q must see every mode on the unit circle; the mode of A at {hidden:.6g} has no "
-            "weight, so there is no stabilising solution. Add a small weight on it.",
-            eigenvalue=hidden,
-        )
-
-
-def _residual(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray, X: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return the gain, the residual matrix and its relative size."""
-    cross = B.T @ X @ A + S.T
-    gain = np.asarray(np.linalg.solve(R + B.T @ X @ B, cross), dtype=np.float64)
-    AXA = A.T @ X @ A
-    residual = AXA - X + Q - cross.T @ gain
-    scale = sum(float(np.linalg.norm(t, 1)) for t in (X, AXA, Q))
-    return (
-        gain,
-        (residual + residual.T) / 2,
-        float(np.linalg.norm(residual, 1)) / max(scale, 1e-300),
-    )
-
-
-def _refined(
-    A: FloatArray,
-    B: FloatArray,
-    Q: FloatArray,
-    R: FloatArray,
-    S: FloatArray,
-    X: FloatArray,
-    method: str,
-    iterations: int,
-) -> DareSolution | None:
-    """Newton steps while they lower the residual; None if the closed loop is not stable."""
-    gain, residual, size = _residual(A, B, Q, R, S, X)
-    for _ in range(_REFINEMENTS):
-        closed = A - B @ gain
-        if not np.max(np.abs(np.linalg.eigvals(closed))) < 1:
-            return None
-        refined = X + stationary_covariance(closed.T, residual)
-        new_gain, new_residual, new_size = _residual(A, B, Q, R, S, refined)
-        if not new_size < size:
-            break
-        X, gain, residual, size = refined, new_gain, new_residual, new_size
-    poles = np.linalg.eigvals(A - B @ gain)
-    return DareSolution(
-        X=frozen(X),
-        gain_feedback=frozen(gain),
-        poles=poles.astype(np.complex128),
-        residual=size,
-        method=method,
-        iterations=iterations,
-    )
-
-
-def _schur(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
-) -> DareSolution | None:
+    S = matrix(S, "S", rows=(n, why), cols=(m, also), stacked=True)
+    parts = {"A": A, "B": B, "Q": Q, "R": R, "S": S}
     try:
-        X = solve_discrete_are(A, B, Q, R, s=S)
-    except (np.linalg.LinAlgError, ValueError):
-        return None
-    return _refined(A, B, Q, R, S, (X + X.T) / 2, "schur", 0)
+        lead = np.broadcast_shapes(*(part.shape[:-2] for part in parts.values()))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {part.shape}" for name, part in parts.items())
+        raise DimensionError(
+            f"the leading dimensions must be the same or 1, to be stacked; got {shapes}."
+        ) from error
+    stacks = {
+        name: np.broadcast_to(part, lead + part.shape[-2:]).reshape(-1, *part.shape[-2:])
+        for name, part in parts.items()
+    }
+    return Equations(**stacks), lead
+
+
+def _attempted(
+    equations: Equations,
+) -> tuple[FloatArray, FloatArray, ComplexArray, FloatArray, IntArray, tuple[Attempt, ...]]:
+    """Try the routes in order; keep the best answer to each equation."""
+    count, n, m = equations.B.shape
+    X = np.full((count, n, n), np.nan)
+    gains, residuals = np.full((count, m, n), np.nan), np.full(count, np.inf)
+    poles = np.full((count, n), np.inf, dtype=np.complex128)
+    steps = np.zeros(count, dtype=np.int64)
+    attempts: list[Attempt] = []
+    pending = np.arange(count)
+    for method, route in ROUTES:
+        if pending.size == 0:
+            break
+        part = equations.take(pending)
+        found, taken = route(part)
+        found, gain, size = part.refined(found)
+        closed = part.poles(gain)
+        size = np.where(np.abs(closed).max(axis=-1) < 1, size, np.inf)
+        better = size < residuals[pending]
+        chosen = pending[better]
+        X[chosen], gains[chosen], residuals[chosen] = found[better], gain[better], size[better]
+        poles[chosen], steps[chosen] = closed[better], taken[better]
+        satisfied = size <= _SATISFIED
+        attempts.append(
+            Attempt(method=method, tried=int(pending.size), solved=int(satisfied.sum()))
+        )
+        pending = pending[~satisfied]
+    return X, gains, poles, residuals, steps, tuple(attempts)
+
+
+def _name(index: int, lead: tuple[int, ...]) -> str:
+    """Begin of a message about one equation of many; empty for a single one."""
+    if not lead:
+        return ""
+    where = tuple(int(i) for i in np.unravel_index(index, lead))
+    return f"equation {where[0] if len(where) == 1 else where}: "
+
+
+def _refuse(
+    index: int,
+    lead: tuple[int, ...],
+    residuals: FloatArray,
+    radius: FloatArray,
+    attempts: tuple[Attempt, ...],
+) -> None:
+    residual = float(residuals[index])
+    stable = bool(np.isfinite(residual))
+    found = f"a residual of {residual:.3g}" if stable else "no stable closed loop"
+    raise NumericalError(
+        f"{_name(index, lead)}the Riccati equation was not solved: "
+        f"{', '.join(attempt.method for attempt in attempts)} gave {found}; expected a relative "
+        f"residual below {RESIDUAL_LIMIT:g} and a stable closed loop. There may be no stabilising "
+        "solution; look for modes near the unit circle that are barely driven or seen.",
+        status="residual",
+        residual=residual if stable else None,
+    )
+
+
+def _require_saddle(
+    R: FloatArray, X: FloatArray, negative: IntArray, lead: tuple[int, ...]
+) -> None:
+    """Existence conditions of the H-infinity problem, wherever R has negative eigenvalues."""
+    values = np.linalg.eigvalsh(R)
+    expected = np.sum(values < -1e-12 * np.abs(values).max(axis=-1, keepdims=True), axis=-1)
+    for i in np.flatnonzero(expected > 0):
+        spectrum = np.linalg.eigvalsh(X[i])
+        if negative[i] != expected[i]:
+            raise InfeasibleError(
+                f"{_name(int(i), lead)}R + B'XB must have as many negative eigenvalues as R, "
+                f"{expected[i]}; got {negative[i]}. The level that R holds cannot be met: "
+                "try a larger one."
+            )
+        if spectrum[0] < -1e-9 * max(abs(spectrum[-1]), abs(spectrum[0])):
+            raise InfeasibleError(
+                f"{_name(int(i), lead)}X must be positive semidefinite, as R is indefinite; got an "
+                f"eigenvalue of {spectrum[0]:.3g}. The level that R holds cannot be met: "
+                "try a larger one."
+            )

@@ -1,0 +1,138 @@
+"""Why a Riccati equation has no stabilising solution: the mode, and what it lacks."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import eigvals, matrix_balance
+
+from lbt_synth.errors import DefinitenessError, DetectabilityError
+from lbt_synth.riccati.equation import Equations
+from lbt_synth.validation import FloatArray
+
+_RANK = 1e-10
+_CIRCLE = 1e-6  # a double root on the circle is found this far from it
+
+
+def unstable_hidden_mode(
+    A: FloatArray, C: FloatArray, *, drive: FloatArray, only_unit_circle: bool = False
+) -> complex | None:
+    """Eigenvalue of A that does not decay and that C does not see, or None.
+
+    The Popov-Belevitch-Hautus test on the eigenvalues with modulus 1 or more
+    (or about 1, with ``only_unit_circle``). ``drive`` (n, p) enters the states: with
+    it their units are chosen, on which the answer must not depend.
+    """
+    n = A.shape[0]
+    border = np.block(
+        [
+            [np.abs(A), np.linalg.norm(drive, axis=1)[:, None]],
+            [np.linalg.norm(C, axis=0)[None, :], np.zeros((1, 1))],
+        ]
+    )
+    _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
+    units = np.asarray(scaling[:n], dtype=np.float64)
+    A, C = A * units / units[:, None], C * units
+    scale_A = max(float(np.linalg.norm(A, 2)), 1e-300)
+    scale_C = max(float(np.linalg.norm(C, 2)), 1e-300)
+    for value in np.linalg.eigvals(A):
+        size = abs(value)
+        if size < 1 - _RANK or (only_unit_circle and size > 1 + _RANK):
+            continue
+        pencil = np.vstack([(A - value * np.eye(n)) / scale_A, C / scale_C])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < _RANK:
+            return complex(value)
+    return None
+
+
+def require_stabilising(equations: Equations, index: int, name: str = "") -> None:
+    """Raise if an equation has no stabilising solution for a reason that can be named.
+
+    Parameters
+    ----------
+    equations : Equations
+        The stack.
+    index : int
+        Which of them.
+    name : str, optional
+        Begins the message, for an equation of many.
+
+    Raises
+    ------
+    DetectabilityError
+        If a mode cannot be stabilised, or a zero of the problem is on the unit circle.
+    DefinitenessError
+        If ``R + B'XB`` is singular whatever X.
+    """
+    A, B, Q, R, S = (getattr(equations, key)[index] for key in "ABQRS")
+    hidden = unstable_hidden_mode(A.T, B.T, drive=_root(Q))
+    if hidden is not None:
+        raise DetectabilityError(
+            f"{name}(A, B) must be stabilisable; the mode of A at {hidden:.6g} does not decay and "
+            "B does not reach it. Give it an input, or take it out of the model.",
+            eigenvalue=hidden,
+        )
+    inputs = np.vstack([part / max(np.abs(part).max(), 1e-300) for part in (B, R, S)])
+    if np.linalg.svd(inputs, compute_uv=False)[-1] < _RANK:
+        raise DefinitenessError(
+            f"{name}R must be positive definite, or B and S must act where it is not; got a "
+            "combination of inputs that has no weight and no effect. Leave it out."
+        )
+    if np.linalg.eigvalsh(R)[0] > 0:
+        feedback = np.linalg.solve(R, S.T)
+        weight = Q - S @ feedback
+        hidden = unstable_hidden_mode(
+            A - B @ feedback, _root((weight + weight.T) / 2).T, drive=B, only_unit_circle=True
+        )
+        if hidden is not None:
+            raise DetectabilityError(
+                f"{name}Q must see every mode on the unit circle; the mode of A at {hidden:.6g} "
+                "has no weight, so there is no stabilising solution. Add a small weight on it.",
+                eigenvalue=hidden,
+            )
+    zero = _unit_circle_zero(A, B, Q, R, S)
+    if zero is not None:
+        raise DetectabilityError(
+            f"{name}the equation has a zero on the unit circle, at {zero:.6g}: there its weights "
+            "leave an oscillation free of cost, so there is no stabilising solution. "
+            "Add a small weight.",
+            eigenvalue=zero,
+        )
+
+
+def _root(weight: FloatArray) -> FloatArray:
+    """Columns whose squares add up to the absolute value of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(weight)
+    return np.asarray(vectors * np.sqrt(np.abs(values)), dtype=np.float64)
+
+
+def _unit_circle_zero(
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
+) -> complex | None:
+    """Eigenvalue on the unit circle of the extended symplectic pencil, or None."""
+    n, m = B.shape
+    weight = max(np.abs(Q).max(), np.abs(R).max(), np.abs(S).max(), 1e-300)
+    zero = np.zeros
+    M = np.block(
+        [
+            [A, zero((n, n)), B],
+            [-Q / weight, np.eye(n), -S / weight],
+            [S.T / weight, zero((m, n)), R / weight],
+        ]
+    )
+    N = np.block(
+        [
+            [np.eye(n), zero((n, n + m))],
+            [zero((n, n)), A.T, zero((n, m))],
+            [zero((m, n)), -B.T, zero((m, m))],
+        ]
+    )
+    with np.errstate(all="ignore"):
+        values = eigvals(M, N)
+    size = float(np.linalg.norm(M, 2))
+    for value in values[np.isfinite(values)]:
+        if abs(abs(value) - 1) > _CIRCLE:
+            continue
+        on_circle = value / abs(value)
+        if np.linalg.svd(M - on_circle * N, compute_uv=False)[-1] < _RANK * size:
+            return complex(on_circle)
+    return None

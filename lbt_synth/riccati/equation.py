@@ -1,0 +1,143 @@
+"""A stack of Riccati equations: their units, gains, residuals and Newton steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.lyapunov import smith_sum
+from lbt_synth.stacks import norms, solve_stack, symmetrised, transposed
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+
+# Where the platform has it, the residual is formed with 64 bits of mantissa instead of 53:
+# the limit of accuracy is then the rounding of X itself, not that of the products.
+_Extended = np.longdouble
+_NEWTON_STEPS = 6
+_SETTLED = 1e-13  # a Newton step this small is the last one
+_SWEEPS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Equations:
+    """Equations ``X = A'XA + Q - (A'XB + S)(R + B'XB)^-1 (B'XA + S')``, stacked.
+
+    Attributes
+    ----------
+    A, Q : (N, n, n) ndarray
+        State matrices and weights.
+    B, S : (N, n, m) ndarray
+        Input matrices and cross weights.
+    R : (N, m, m) ndarray
+        Input weights, of any sign.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    Q: FloatArray
+    R: FloatArray
+    S: FloatArray
+
+    def take(self, which: IntArray) -> Equations:
+        """Return some of the equations."""
+        return Equations(
+            A=self.A[which], B=self.B[which], Q=self.Q[which], R=self.R[which], S=self.S[which]
+        )
+
+    def in_units(self, units: FloatArray) -> Equations:
+        """Change to states ``x_i / units_i``, (N, n); exact for powers of two."""
+        column, row = units[:, None, :], units[:, :, None]
+        return Equations(
+            A=self.A * column / row,
+            B=self.B / row,
+            Q=self.Q * column * row,
+            R=self.R,
+            S=self.S * row,
+        )
+
+    def balancing_units(self) -> FloatArray:
+        """Powers of two in which rows and columns of A, bordered by B and Q, are alike, (N, n)."""
+        off = np.abs(self.A) * (1 - np.eye(self.A.shape[-1]))
+        scale = np.maximum(np.abs(self.A).max(axis=(-2, -1)), 1e-300)[:, None]
+        entry, weight = np.linalg.norm(self.B, axis=-1), np.sqrt(np.abs(_diagonal(self.Q)))
+        entry = entry * scale / np.maximum(entry.max(axis=-1, keepdims=True), 1e-300)
+        weight = weight * scale / np.maximum(weight.max(axis=-1, keepdims=True), 1e-300)
+        exponent = np.zeros(entry.shape)
+        for _ in range(_SWEEPS):
+            units = np.exp2(exponent)
+            rows = (off * units[:, None, :]).sum(axis=-1) / units + entry / units
+            columns = (off / units[:, :, None]).sum(axis=-2) * units + weight * units
+            both = (rows > 0) & (columns > 0)
+            ratio = np.where(both, rows, 1.0) / np.where(both, columns, 1.0)
+            exponent = exponent + 0.25 * np.log2(ratio)  # half a step: all states move at once
+        return np.asarray(np.exp2(np.round(exponent)), dtype=np.float64)
+
+    def weights(self, X: FloatArray) -> FloatArray:
+        """``R + B'XB``, (N, m, m)."""
+        return symmetrised(self.R + transposed(self.B) @ X @ self.B)
+
+    def gains(self, X: FloatArray) -> FloatArray:
+        """``(R + B'XB)^-1 (B'XA + S')``, (N, m, n)."""
+        return solve_stack(self.weights(X), transposed(self.B) @ X @ self.A + transposed(self.S))
+
+    def poles(self, gains: FloatArray) -> ComplexArray:
+        """Poles of ``A - B gain``, (N, n); nan where the gain is not finite."""
+        closed = self.A - self.B @ gains
+        finite = np.isfinite(closed).all(axis=(-2, -1))
+        poles = np.full(closed.shape[:-1], np.nan, dtype=np.complex128)
+        poles[finite] = np.linalg.eigvals(closed[finite])
+        return poles
+
+    def residuals(self, X: FloatArray, gains: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residual matrices (N, n, n) and their sizes relative to X, A'XA and Q, (N,).
+
+        With K a gain near that of X, ``A'XA - X + Q - H'K - K'H + K'(R + B'XB)K`` with
+        ``H = B'XA + S'`` differs from the residual by the square of the gain's error,
+        and has no inverse in it, so that it can be summed in extended precision.
+        """
+        A, B, Q, R, S, Xe, K = (
+            stack.astype(_Extended) for stack in (self.A, self.B, self.Q, self.R, self.S, X, gains)
+        )
+        XA = Xe @ A
+        AXA = transposed(A) @ XA
+        cross = transposed(transposed(B) @ XA + transposed(S)) @ K
+        weight = R + transposed(B) @ Xe @ B
+        sums = AXA - Xe + Q - cross - transposed(cross) + transposed(K) @ weight @ K
+        residual = symmetrised(sums.astype(np.float64))
+        scale = norms(X) + norms(AXA.astype(np.float64)) + norms(self.Q)
+        return residual, norms(residual) / np.maximum(scale, 1e-300)
+
+    def refined(self, X: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Newton steps while they lower the residual: X, gains and relative residuals.
+
+        An equation whose closed loop is not stable is left as it came.
+        """
+        with np.errstate(all="ignore"):
+            gains = self.gains(X)
+            residual, size = self.residuals(X, gains)
+            X, gains, size = X.copy(), gains.copy(), size.copy()
+            active = np.flatnonzero(np.isfinite(size))
+            for _ in range(_NEWTON_STEPS):
+                if active.size == 0:
+                    break
+                part = self.take(active)
+                closed = transposed(part.A - part.B @ gains[active])
+                step = smith_sum(closed, residual[active])
+                trial = symmetrised(X[active] + step)
+                new_gains = part.gains(trial)
+                new_residual, new_size = part.residuals(trial, new_gains)
+                better = np.isfinite(new_size) & (new_size < size[active])
+                large = norms(step) > _SETTLED * norms(trial)
+                done = active[better]
+                X[done], gains[done], size[done] = (
+                    trial[better],
+                    new_gains[better],
+                    new_size[better],
+                )
+                residual[done] = new_residual[better]
+                active = active[better & large]
+        return X, gains, size
+
+
+def _diagonal(stack: FloatArray) -> FloatArray:
+    return np.asarray(np.diagonal(stack, axis1=-2, axis2=-1))
