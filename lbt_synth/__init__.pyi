@@ -9,10 +9,12 @@ from .design import Design as Design
 from .design import FilterDesign as FilterDesign
 from .design import IntegratorDesign as IntegratorDesign
 from .design import SolverReport as SolverReport
+from .design import central as central
 from .design import hinf as hinf
 from .design import integrator as integrator
 from .design import integrator_gain_limit as integrator_gain_limit
 from .design import kalman as kalman
+from .design import mixed as mixed
 from .design import optimal_integrator as optimal_integrator
 from .errors import CertificateError as CertificateError
 from .errors import ConfigError as ConfigError
@@ -30,6 +32,8 @@ from .errors import ProblemError as ProblemError
 from .errors import SchemaVersionError as SchemaVersionError
 from .errors import SynthesisError as SynthesisError
 from .errors import UnstableLoopError as UnstableLoopError
+from .front import TradeoffPoint as TradeoffPoint
+from .front import tradeoff as tradeoff
 from .gainfile import load_gain as load_gain
 from .gainfile import save_gain as save_gain
 from .loop import ClosedLoop as ClosedLoop
@@ -69,6 +73,7 @@ from .plotting import loop_figure as loop_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
+from .plotting import tradeoff_figure as tradeoff_figure
 from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare

@@ -6,6 +6,7 @@ from argparse import Namespace
 from collections.abc import Callable
 
 from lbt_synth.cli.design_commands import design, show, verify
+from lbt_synth.cli.front_command import tradeoff_command
 from lbt_synth.cli.loop_commands import robustness, sigma, simulate
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.paper_command import paper
@@ -17,5 +18,6 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "show": show,
     "sigma": sigma,
     "simulate": simulate,
+    "tradeoff": tradeoff_command,
     "verify": verify,
 }

@@ -18,6 +18,7 @@ from lbt_synth.design import (
     hinf,
     integrator,
     kalman,
+    mixed,
     optimal_integrator,
 )
 from lbt_synth.errors import ProblemError
@@ -26,7 +27,19 @@ from lbt_synth.gainfile import load_gain, require_gain_name, save_gain
 from lbt_synth.loop import close_loop, loop_margins
 
 _SMALL_MODULUS = 0.3
-_ROUTES = {"kalman": ("riccati", "sdp"), "hinf": ("lmi", "riccati"), "integrator": ()}
+_ROUTES = {
+    "kalman": ("riccati", "sdp"),
+    "hinf": ("lmi", "riccati"),
+    "mixed": (),
+    "integrator": (),
+}
+_OWNERS = {
+    "gamma": ("hinf", "mixed"),
+    "gamma_ratio": ("hinf", "mixed"),
+    "rms": ("mixed",),
+    "taps": ("mixed",),
+    "gain": ("integrator",),
+}
 
 
 def design(arguments: Namespace) -> Report:
@@ -49,25 +62,44 @@ def _refuse_foreign_options(arguments: Namespace) -> None:
     if arguments.route is not None and arguments.route not in routes:
         expected = " or ".join(routes) if routes else "no --route"
         raise ProblemError(f"--method {method} takes {expected}; got --route {arguments.route}.")
-    for option, owner in (("gamma", "hinf"), ("gamma_ratio", "hinf"), ("gain", "integrator")):
-        if getattr(arguments, option) is not None and method != owner:
+    for option, owners in _OWNERS.items():
+        if getattr(arguments, option) is not None and method not in owners:
             raise ProblemError(
-                f"--{option.replace('_', '-')} goes with --method {owner}; got --method {method}."
+                f"--{option.replace('_', '-')} goes with --method {' or '.join(owners)}; "
+                f"got --method {method}."
             )
+    if method == "integrator" and arguments.horizon != 1:
+        raise ProblemError(
+            "an integrator has no horizon; set loop.delay_frames in the configuration instead. "
+            f"Got --horizon {arguments.horizon}."
+        )
 
 
 def _synthesise(config: Config, arguments: Namespace) -> Design:
     if arguments.method == "kalman":
-        return kalman(config.plant, method=arguments.route or "riccati")
+        return kalman(config.plant, horizon=arguments.horizon, method=arguments.route or "riccati")
     if arguments.method == "integrator":
         if arguments.gain is not None:
             return integrator(config.hardware, gain=arguments.gain)
         return optimal_integrator(config.hardware, config.truth)
     ratio = arguments.gamma_ratio
-    if arguments.gamma is None and ratio is None:
+    if arguments.gamma is None and ratio is None and arguments.rms is None:
         ratio = config.settings.design.gamma_ratio
+    if arguments.method == "mixed":
+        return mixed(
+            config.plant,
+            gamma=arguments.gamma,
+            gamma_ratio=ratio,
+            rms=arguments.rms,
+            taps=16 if arguments.taps is None else arguments.taps,
+            horizon=arguments.horizon,
+        )
     return hinf(
-        config.plant, gamma=arguments.gamma, gamma_ratio=ratio, method=arguments.route or "lmi"
+        config.plant,
+        gamma=arguments.gamma,
+        gamma_ratio=ratio,
+        horizon=arguments.horizon,
+        method=arguments.route or "lmi",
     )
 
 
@@ -136,8 +168,9 @@ def _description(made: Design) -> Report:
             "gamma_infeasible": made.gamma_infeasible,
         }
         if made.gamma_requested is not None:
+            facts.append(("bound asked for", made.gamma_requested, unit))
+        if made.gamma_least is not None:
             facts += [
-                ("bound asked for", made.gamma_requested, unit),
                 ("least norm of any filter, not above", made.gamma_least, unit),
                 ("least norm of any filter, not below", made.gamma_infeasible, unit),
             ]

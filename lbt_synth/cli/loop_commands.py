@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.cli.output import Report, TableText, progress, working
+from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import require_writable, write_atomically
+from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
 from lbt_synth.loop import close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
 from lbt_synth.plotting import (
-    FIGURE_ENDINGS,
     require_figure_name,
     robustness_figure,
     save_figure,
@@ -26,8 +26,7 @@ from lbt_synth.plotting import (
 )
 from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
-from lbt_synth.sweep import METHODS, RobustnessRow, frequency_robustness
-from lbt_synth.tables import csv_bytes
+from lbt_synth.sweep import METHODS, frequency_robustness
 
 
 def sigma(arguments: Namespace) -> Report:
@@ -179,12 +178,7 @@ def _simulation_notes(config: Config, design: Design, scatter: float, settle: in
 
 def robustness(arguments: Namespace) -> Report:
     """Strehl ratio over an error of the vibration frequency."""
-    for output in arguments.output:
-        if Path(output).suffix.lower() not in (".csv", *FIGURE_ENDINGS):
-            raise ProblemError(
-                f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
-            )
-    require_writable(*arguments.output)
+    require_outputs(arguments.output)
     config = load_config(arguments.config)
     settings = config.settings
     ratio = arguments.gamma_ratio
@@ -224,29 +218,18 @@ def robustness(arguments: Namespace) -> Report:
             )
         ],
     )  # fmt: skip
-    report.data["files"] = []
-    for output in arguments.output:
-        if Path(output).suffix.lower() == ".csv":
-            path = write_atomically(output, _robustness_csv(rows))
-        else:
-            path = save_figure(robustness_figure(rows), output)
-        report.data["files"].append(str(path))
-        report.notes.append(f"written: {path}")
+    write_outputs(
+        report,
+        arguments.output,
+        records=[asdict(row) for row in rows],
+        figure=lambda: robustness_figure(rows),
+    )
     return report
 
 
 def _fixed(value: float, digits: int) -> str:
     """Return a number with a fixed count of decimals, a dash where there is none."""
     return "-" if np.isnan(value) else f"{value:.{digits}f}"
-
-
-def _robustness_csv(rows: list[RobustnessRow]) -> bytes:
-    records = [asdict(row) for row in rows]
-    cells = [
-        ["" if isinstance(v, float) and np.isnan(v) else v for v in record.values()]
-        for record in records
-    ]
-    return csv_bytes(list(records[0]), cells)
 
 
 def _truth(config: Config, arguments: Namespace) -> Truth:

@@ -40,7 +40,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     design = command("design", "Design a controller and write its gain file")
     design.add_argument("config", help=config_help)
-    design.add_argument("--method", choices=("kalman", "hinf", "integrator"), required=True)
+    design.add_argument(
+        "--method", choices=("kalman", "hinf", "mixed", "integrator"), required=True
+    )
     design.add_argument(
         "--route",
         choices=("riccati", "sdp", "lmi"),
@@ -52,6 +54,19 @@ def build_parser() -> argparse.ArgumentParser:
         "--gamma-ratio",
         type=float,
         help="the same as a multiple of the least one (default: the configuration's, else 1.2)",
+    )
+    bound.add_argument(
+        "--rms", type=float, help="mixed: bound of the estimation error [nm rms], for a least norm"
+    )
+    design.add_argument(
+        "--taps", type=int, help="mixed: past innovations that the filter weighs (default 16)"
+    )
+    design.add_argument(
+        "--horizon",
+        type=int,
+        default=1,
+        help="frames from the newest measurement to the estimate (default 1); another one is for "
+        "a loop that is later by as much",
     )
     design.add_argument(
         "--gain", type=float, help="integrator gain (default: the best for the truth)"
@@ -86,6 +101,18 @@ def build_parser() -> argparse.ArgumentParser:
     robustness.add_argument("--gamma-ratio", type=float, help="H-infinity bound of each row")
     robustness.add_argument("--sensor-gain", type=float, help="real sensor gain")
     robustness.add_argument(
+        "-o", "--output", action="append", default=[], help="table (.csv) or figure; repeatable"
+    )
+
+    tradeoff = command(
+        "tradeoff", "Filters from the least norm to the least variance, and their sensor gains"
+    )
+    tradeoff.add_argument("config", help=config_help)
+    tradeoff.add_argument("--points", type=int, default=9, help="levels of the norm (default 9)")
+    tradeoff.add_argument(
+        "--taps", type=int, default=16, help="taps of the mixed filters (default 16)"
+    )
+    tradeoff.add_argument(
         "-o", "--output", action="append", default=[], help="table (.csv) or figure; repeatable"
     )
 

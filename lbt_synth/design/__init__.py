@@ -1,8 +1,10 @@
 """Designs: Kalman, H-infinity and integrator, each certified before it is returned."""
 
+from lbt_synth.design.central import central
 from lbt_synth.design.hinf import hinf
 from lbt_synth.design.integrator import integrator, integrator_gain_limit, optimal_integrator
 from lbt_synth.design.kalman import kalman
+from lbt_synth.design.mixed import mixed
 from lbt_synth.design.result import Design, FilterDesign, IntegratorDesign, SolverReport
 
 __all__ = [
@@ -10,9 +12,11 @@ __all__ = [
     "FilterDesign",
     "IntegratorDesign",
     "SolverReport",
+    "central",
     "hinf",
     "integrator",
     "integrator_gain_limit",
     "kalman",
+    "mixed",
     "optimal_integrator",
 ]

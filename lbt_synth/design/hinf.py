@@ -28,14 +28,20 @@ _GREATEST = 1e100
 _GREATEST_RATIO = 1e6
 
 
-class _Gains(Protocol):
+class Gains(Protocol):
+    """The two gains of a filter, whatever holds them."""
+
+    @property
+    def gain_predictor(self) -> FloatArray:
+        """Gain of the time-and-measurement update."""
+
+    @property
+    def gain_filter(self) -> FloatArray:
+        """Gain of the measurement update alone."""
+
+
+class _Solved(Gains, Protocol):
     """What both routes return."""
-
-    @property
-    def gain_predictor(self) -> FloatArray: ...
-
-    @property
-    def gain_filter(self) -> FloatArray: ...
 
     @property
     def status(self) -> str: ...
@@ -160,12 +166,12 @@ class _RiccatiRoute:
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
         self.problem, self.start = problem, start
 
-    def least(self) -> tuple[_Gains, Witness]:
+    def least(self) -> tuple[_Solved, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)
         _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
         return best, worst_invisible(self.problem, best.P, level, self.start.P)
 
-    def at(self, gamma: float) -> _Gains:
+    def at(self, gamma: float) -> _Solved:
         solution = gamma_riccati(self.problem, gamma, start=self.start)
         if solution is None:
             raise InfeasibleError(
@@ -183,21 +189,21 @@ class _LmiRoute:
         self.problem, self.start = problem, start
         self.scale = _kalman_bracket(problem, start)[1]
 
-    def least(self) -> tuple[_Gains, Witness]:
+    def least(self) -> tuple[_Solved, Witness]:
         from lbt_synth.lmi import least_gamma_lmi
 
         solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
         assert solution.witness is not None  # the least gamma has a dual solution
         return solution, solution.witness
 
-    def at(self, gamma: float) -> _Gains:
+    def at(self, gamma: float) -> _Solved:
         from lbt_synth.lmi import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 
 
 def _verified_bracket(
-    problem: EstimationProblem, start: FilterRiccati, gains: _Gains, witness: Witness
+    problem: EstimationProblem, start: FilterRiccati, gains: _Solved, witness: Witness
 ) -> tuple[float, float]:
     """Least gamma from both sides: the norm of a filter, and a level that a witness refutes."""
     error = problem.error_system(gains.gain_predictor)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.errors import DefinitenessError, ProblemError
+from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
 from lbt_synth.statespace import Controller, LinearSystem, StateSpace
 from lbt_synth.validation import FloatArray, definite, frozen, integer, matrix
 
@@ -218,6 +218,52 @@ class EstimationProblem(LinearSystem):
             D=self.D,
             L=np.hstack([self.L, padding[: len(self.L)]]) if steps > 1 else last,
             dt_s=self.dt_s,
+        )
+
+    def with_memory(self, taps: FloatArray) -> EstimationProblem:
+        """Problem with the past innovations of a filter as states, for filters that weigh them.
+
+        The new states are zero in truth, so that z is the same signal; a filter that feeds its
+        innovations into them, with the gain 1, estimates ``L x + taps [nu(k); nu(k-1); ...]``.
+
+        Parameters
+        ----------
+        taps : (l, T q) array_like
+            Weights of the innovations, the newest first.
+
+        Returns
+        -------
+        EstimationProblem
+            Of the same kind, with T q more states.
+
+        Raises
+        ------
+        DimensionError
+            If the taps do not fit.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> walk.with_memory([[0.3, 0.1]]).n_states
+        3
+        """
+        weights = matrix(taps, "taps", rows=(len(self.L), f"to match L {self.L.shape}"))
+        q, size = self.C.shape[0], weights.shape[1]
+        if size == 0 or size % q:
+            raise DimensionError(
+                f"taps must have a multiple of {q} columns, one for each measurement of each past "
+                f"frame; got {weights.shape}."
+            )
+        A = np.zeros((self.n_states + size, self.n_states + size))
+        A[: self.n_states, : self.n_states] = self.A
+        A[self.n_states + q :, self.n_states : -q] = np.eye(size - q)
+        return replace(
+            self,
+            A=A,
+            B=np.vstack([self.B, np.zeros((size, self.B.shape[1]))]),
+            C=np.hstack([self.C, np.zeros((q, size))]),
+            L=np.hstack([self.L, weights]),
         )
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:

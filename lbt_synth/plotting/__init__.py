@@ -6,6 +6,7 @@ from lbt_synth.plotting.figures import (
     sigma_figure,
     simulation_figure,
 )
+from lbt_synth.plotting.front import tradeoff_figure
 from lbt_synth.plotting.style import FIGURE_ENDINGS, require_figure_name, save_figure
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "save_figure",
     "sigma_figure",
     "simulation_figure",
+    "tradeoff_figure",
 ]

@@ -12,7 +12,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.norms import largest_singular_values, spectral_norms
-from lbt_synth.plotting.style import MARKERS, house_style, looks, new_figure
+from lbt_synth.plotting.style import MARKERS, house_style, looks, new_figure, plain_ticks
 from lbt_synth.simulation import Simulation
 from lbt_synth.sweep import RobustnessRow
 from lbt_synth.validation import FloatArray
@@ -101,7 +101,7 @@ def sigma_figure(
             _loop_panels(rejection, next(remaining), loops, styles, lines_hz)
         for axis in axes:
             _mark(axis, lines_hz)
-            _plain_ticks(axis)
+            plain_ticks(axis)
             axis.legend(loc="best")
         axes[-1].set_xlabel("frequency [Hz]")
     return figure
@@ -304,19 +304,6 @@ def _vibration_frequencies(designs: Any) -> list[float]:
         for line in design.problem.vibrations
     }
     return sorted(found)
-
-
-def _plain_ticks(axis: Any) -> None:
-    """Label an axis of less than two decades with plain numbers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
-
-    low, high = axis.get_ylim()
-    if high / low < 3:
-        axis.set_yscale("linear")
-    elif high / low < 30:
-        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        axis.yaxis.set_major_formatter(ScalarFormatter())
-        axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _mark(axis: Any, lines_hz: Sequence[float]) -> None:

@@ -62,6 +62,19 @@ def new_figure(width_in: float, height_in: float) -> Any:
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
+def plain_ticks(axis: Any) -> None:
+    """Label an axis of less than two decades with plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+    low, high = axis.get_ylim()
+    if high / low < 3:
+        axis.set_yscale("linear")
+    elif high / low < 30:
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        axis.yaxis.set_major_formatter(ScalarFormatter())
+        axis.yaxis.set_minor_formatter(NullFormatter())
+
+
 def require_figure_name(path: str | os.PathLike[str]) -> Path:
     """Refuse a file name that is not that of a figure.
 

@@ -1,0 +1,56 @@
+"""Outputs that a study writes: tables (.csv) and figures, as many as were asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.cli.output import Report
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import require_writable, write_atomically
+from lbt_synth.plotting import FIGURE_ENDINGS, save_figure
+from lbt_synth.tables import csv_bytes
+
+
+def require_outputs(outputs: Sequence[str]) -> None:
+    """Refuse names that are neither of a table nor of a figure, and places that cannot be written.
+
+    Raises
+    ------
+    ProblemError, OutputError
+        Before any work is done.
+    """
+    for output in outputs:
+        if Path(output).suffix.lower() not in (".csv", *FIGURE_ENDINGS):
+            raise ProblemError(
+                f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
+            )
+    require_writable(*outputs)
+
+
+def write_outputs(
+    report: Report,
+    outputs: Sequence[str],
+    *,
+    records: Sequence[Mapping[str, Any]],
+    figure: Callable[[], Any],
+) -> None:
+    """Write each output, and note it in the report."""
+    report.data["files"] = []
+    for output in outputs:
+        if Path(output).suffix.lower() == ".csv":
+            path = write_atomically(output, _csv(records))
+        else:
+            path = save_figure(figure(), output)
+        report.data["files"].append(str(path))
+        report.notes.append(f"written: {path}")
+
+
+def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
+    cells = [
+        ["" if isinstance(v, float) and math.isnan(v) else v for v in record.values()]
+        for record in records
+    ]
+    return csv_bytes(list(records[0]), cells)

@@ -1,0 +1,124 @@
+"""The central H-infinity filters of a problem, by the norm that they achieve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import brentq
+
+from lbt_synth.design.hinf import Gains, hinf
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.errors import InfeasibleError
+from lbt_synth.lyapunov import stationary_covariance
+from lbt_synth.models.problem import EstimationProblem, require_problem
+from lbt_synth.norms import hinf_norm
+from lbt_synth.riccati import gamma_riccati, kalman_riccati
+from lbt_synth.validation import number
+
+_DECADES = 4.0  # of gamma, over which a member is searched
+_SAME = 1e-9
+_SLACK = 4e-7  # by which a member may miss its norm
+
+
+def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
+    """Design the central H-infinity filter that has a given norm.
+
+    The filter that :func:`hinf` makes for a bound stays below it; this one reaches it, and
+    has less variance.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; a plant gives a controller.
+    gamma : float
+        Norm to reach. From that of the Kalman filter up, the Kalman filter is returned.
+
+    Returns
+    -------
+    FilterDesign
+        Certified design.
+
+    Raises
+    ------
+    InfeasibleError
+        If the norm is below the least gamma.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> round(lbt.central(walk, gamma=1.5).gamma, 6)
+    1.5
+    """
+    require_problem(problem)
+    bound = number(gamma, "gamma", above=0)
+    least = hinf(problem, method="riccati")
+    assert least.gamma_least is not None  # of an H-infinity design
+    if bound < least.gamma_least * (1 - _SAME):
+        raise InfeasibleError(
+            f"gamma must be at least {least.gamma_least:.9g}, the least of this problem; got "
+            f"{bound:.9g}.",
+            gamma=bound,
+            gamma_least=least.gamma_least,
+        )
+    gains = CentralFamily(problem, least).member(lambda norm, _: norm - bound)
+    return filter_design(
+        problem,
+        gains.gain_predictor,
+        gains.gain_filter,
+        method="hinf",
+        solver=SolverReport(route="riccati", status="norm reached", iterations=0),
+        gamma_requested=bound * (1 + _SLACK),
+        gamma_least=least.gamma_least,
+        gamma_infeasible=least.gamma_infeasible,
+        witness=least.witness,
+    )
+
+
+class CentralFamily:
+    """The central filters of a problem, from that of the least gamma to the Kalman filter.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    least : FilterDesign
+        Its filter of the least gamma.
+    """
+
+    def __init__(self, problem: EstimationProblem, least: FilterDesign) -> None:
+        self.problem, self.least = problem, least
+        self.start = kalman_riccati(problem)
+
+    def member(self, measure: Callable[[float, float], float]) -> Gains:
+        """Gains of the member at which a rising measure of norm and deviation is zero.
+
+        An end of the family where the measure does not change its sign.
+
+        Parameters
+        ----------
+        measure : callable
+            Function of norm and standard deviation, negative towards the least gamma.
+        """
+        gains: dict[float, Gains] = {0.0: self.least}
+        found = {0.0: measure(self.least.gamma, self.least.rms)}
+
+        def value(decades: float) -> float:
+            level = self.least.gamma * 10**decades
+            solution = gamma_riccati(self.problem, level, start=self.start) if decades else None
+            if solution is not None:
+                error = self.problem.error_system(solution.gain_predictor)
+                covariance = stationary_covariance(error.A, error.B @ error.B.T)
+                variance = float(np.trace(error.C @ covariance @ error.C.T))
+                gains[decades] = solution
+                found[decades] = measure(float(hinf_norm(error)), float(np.sqrt(variance)))
+            return found.get(decades, found[0.0])
+
+        if found[0.0] >= 0:
+            return gains[0.0]
+        if value(_DECADES) <= 0:
+            return self.start
+        brentq(value, 0.0, _DECADES, xtol=1e-9)
+        # on the side of the lesser norm
+        return gains[max(decades for decades, size in found.items() if size <= 0)]

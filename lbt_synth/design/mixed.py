@@ -1,0 +1,224 @@
+"""The mixed filter: least variance under a bound on the norm, and the reverse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lbt_synth.design.central import CentralFamily
+from lbt_synth.design.hinf import Gains, hinf
+from lbt_synth.design.kalman import kalman
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
+from lbt_synth.models.problem import EstimationProblem, require_problem
+from lbt_synth.norms import hinf_norm, largest_singular_values
+from lbt_synth.statespace import StateSpace
+from lbt_synth.validation import FloatArray, frozen, integer, number
+from lbt_synth.witness import Witness
+
+if TYPE_CHECKING:
+    from lbt_synth.lmi import InnovationProgramme
+
+_ROUNDS = 20
+_FIRST_GRID = 48
+_FINE_GRID = 1024
+_EXCESS = 4e-7  # by which the norm may exceed its bound; the certificate allows 1e-6
+_ROOM = 2e-7  # by which the bound at the frequencies is drawn in
+_SAME = 1e-9
+_EDGE = 1e-5  # so close to the least gamma the filter of the least gamma is returned
+
+
+def mixed(
+    problem: EstimationProblem,
+    *,
+    gamma: float | None = None,
+    gamma_ratio: float | None = None,
+    rms: float | None = None,
+    taps: int = 16,
+    horizon: int = 1,
+) -> FilterDesign:
+    """Design the filter of least variance under a bound on its norm, or the reverse.
+
+    A base, the central H-infinity filter that just meets the bound, is completed with an
+    impulse response on its innovations. All stable filters are of this kind, and the
+    best impulse response is a convex programme: more taps come closer to the best of all
+    linear filters. The norm is bounded on frequencies that are added to until it holds
+    between them too.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; a plant gives a controller.
+    gamma : float, optional
+        Bound on the H-infinity norm; the variance is made least.
+    gamma_ratio : float, optional
+        The same bound as a multiple, at least 1, of the least gamma.
+    rms : float, optional
+        Bound on the standard deviation of the error; the norm is made least.
+    taps : int, optional
+        Length of the impulse response: states that the filter gets for each measurement.
+    horizon : int, optional
+        Frames from the newest measurement to the estimate, as ``problem.ahead``.
+
+    Returns
+    -------
+    FilterDesign
+        Certified design; its problem has the past innovations as further states. Within
+        1e-5 of the least gamma it is the filter of the least gamma itself.
+
+    Raises
+    ------
+    ProblemError
+        If not exactly one bound is given, or a value is out of its range.
+    InfeasibleError
+        If no filter meets the bound.
+    NumericalError
+        If the programme fails.
+    CertificateError
+        If the design does not pass its checks.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.EstimationProblem(A=[[1.9, -0.99], [1.0, 0.0]], B=[[1.0, 0.0], [0.0, 0.0]],
+    ...                              C=[[0.0, 1.0]], D=[[0.0, 3.0]], L=[[1.0, 0.0]])
+    >>> central = lbt.hinf(line, gamma_ratio=1.1, method="riccati")
+    >>> best = lbt.mixed(line, gamma=central.gamma)
+    >>> best.gamma <= central.gamma * (1 + 1e-6) and best.rms < central.rms
+    True
+    """
+    require_problem(problem)
+    if sum(bound is not None for bound in (gamma, gamma_ratio, rms)) != 1:
+        raise ProblemError(
+            "give one of gamma, gamma_ratio and rms; "
+            f"got gamma={gamma!r}, gamma_ratio={gamma_ratio!r}, rms={rms!r}."
+        )
+    length = integer(taps, "taps", at_least=1)
+    if length > 256:
+        raise ProblemError(f"taps must be at most 256; got {length}.")
+    problem = problem.ahead(horizon)
+    least, best = hinf(problem, method="riccati"), kalman(problem)
+    assert least.gamma_least is not None  # of an H-infinity design
+    if rms is not None:
+        bound = number(rms, "rms", above=0)
+        if bound < best.rms * (1 - _SAME):
+            raise InfeasibleError(
+                f"rms must be at least {best.rms:.9g}, that of the Kalman filter; got {bound:.9g}."
+            )
+        family = CentralFamily(problem, least)
+        base = family.member(lambda _, deviation: bound - deviation)
+        made = _completed(
+            problem, base, length, lambda p, grid: p.least_level((bound * (1 - _ROOM)) ** 2, grid)
+        )
+    else:
+        if gamma_ratio is not None:
+            gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
+        bound = number(gamma, "gamma", above=0)
+        if bound < least.gamma_least * (1 - _SAME):
+            raise InfeasibleError(
+                f"gamma must be at least {least.gamma_least:.9g}, the least of this problem; got "
+                f"{bound:.9g}. Try gamma_ratio=1.1.",
+                gamma=bound,
+                gamma_least=least.gamma_least,
+            )
+        family = CentralFamily(problem, least)
+        base = family.member(lambda norm, _: norm - bound)
+        if bound <= least.gamma_least * (1 + _EDGE):  # there is no room for anything else
+            return least
+        made = _completed(
+            problem, base, length, lambda p, grid: p.least_variance(bound * (1 - _ROOM), grid)
+        )
+    return _certified(problem, base, made, least, bound if rms is None else None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Completed:
+    """An impulse response on the innovations of a base."""
+
+    taps: FloatArray
+    status: str
+    rounds: int
+
+
+def _completed(
+    problem: EstimationProblem,
+    base: Gains,
+    length: int,
+    programme_of: Callable[[InnovationProgramme, FloatArray], tuple[FloatArray, float, str]],
+) -> _Completed:
+    """Solve on a set of frequencies, and add to it until the norm holds between them."""
+    from lbt_synth.lmi import InnovationProgramme
+
+    programme = InnovationProgramme.of(problem, base.gain_predictor, taps=length)
+    grid = _first_grid(programme.error)
+    excess = np.inf
+    for rounds in range(1, _ROUNDS + 1):
+        taps, level, status = programme_of(programme, grid)
+        error = problem.with_memory(taps).error_system(_with_memory(base.gain_predictor, length))
+        peak = hinf_norm(error)
+        excess = peak.value / level - 1
+        if excess <= _EXCESS:
+            return _Completed(taps=taps, status=status, rounds=rounds)
+        fine = np.linspace(0, 0.5 / error.dt_s, _FINE_GRID)
+        fine = np.unique(np.concatenate([fine, _near_poles(error)]))
+        sigma = largest_singular_values(error, fine)
+        inner = np.r_[True, sigma[1:] >= sigma[:-1]] & np.r_[sigma[:-1] >= sigma[1:], True]
+        high = fine[inner & (sigma > level * (1 + _EXCESS / 4))]
+        grid = np.unique(np.concatenate([grid, high, [peak.peak_frequency_hz]]))
+    raise NumericalError(
+        f"the mixed filter exceeds its bound by {excess:.3g} between the {len(grid)} frequencies "
+        f"of its programme; expected {_EXCESS:g}. Try another number of taps.",
+        status="frequencies",
+        residual=excess,
+    )
+
+
+def _certified(
+    problem: EstimationProblem,
+    base: Gains,
+    made: _Completed,
+    least: FilterDesign,
+    gamma: float | None,
+) -> FilterDesign:
+    extended = problem.with_memory(made.taps)
+    size, q = made.taps.shape[1], base.gain_predictor.shape[1]
+    gain = _with_memory(base.gain_predictor, size // q)
+    assert least.witness is not None
+    padding = np.zeros((size, least.witness.states.shape[1]))
+    innovation_gain = np.vstack([base.gain_filter, np.zeros((size, q))])
+    return filter_design(
+        extended,
+        gain,
+        innovation_gain,
+        method="mixed",
+        solver=SolverReport(route="youla", status=made.status, iterations=made.rounds),
+        gamma_requested=gamma,
+        gamma_least=least.gamma_least,
+        gamma_infeasible=least.gamma_infeasible,
+        witness=Witness(
+            states=frozen(np.vstack([least.witness.states, padding])),
+            disturbances=least.witness.disturbances,
+        ),
+    )
+
+
+def _with_memory(gain_predictor: FloatArray, length: int) -> FloatArray:
+    """Gain that feeds the innovations into the memory as well."""
+    q = gain_predictor.shape[1]
+    return frozen(np.vstack([gain_predictor, np.eye(q), np.zeros(((length - 1) * q, q))]))
+
+
+def _first_grid(error: StateSpace) -> FloatArray:
+    even = np.linspace(0, 0.5 / error.dt_s, _FIRST_GRID)
+    return np.unique(np.concatenate([even, _near_poles(error)]))
+
+
+def _near_poles(error: StateSpace) -> FloatArray:
+    """Frequencies at and around the poles of a system [Hz]."""
+    centres, widths = np.abs(np.angle(error.poles)), 1 - np.abs(error.poles)
+    offsets = np.array([0.0, 0.3, 1.0, 3.0])
+    angles = centres[:, None] + widths[:, None] * np.concatenate([-offsets[1:], offsets])
+    return np.asarray(np.clip(angles.ravel(), 0, np.pi) / (2 * np.pi * error.dt_s))
