@@ -104,3 +104,73 @@ def test_frequency_response_against_python_control():
     f = np.linspace(0.0, 250, 40)
     expected = np.moveaxis(system.to_control()(np.exp(2j * np.pi * f * 0.002)), 2, 0)
     assert np.allclose(system.frequency_response(f), expected, rtol=1e-10)
+
+
+def test_a_thousand_systems_against_slycot():
+    """AB13DD on 1,000 random stable systems, up to poles of modulus 1 - 1e-6."""
+    rng = np.random.default_rng(7)
+    worst = 0.0
+    for seed in range(1000):
+        n, m, p = rng.integers(1, 9), rng.integers(1, 4), rng.integers(1, 4)
+        radius = rng.choice([0.3, 0.9, 0.999, 1 - 1e-6])
+        A, B, C, D = random_system(seed, n, m, p, radius)
+        expected, _ = slycot.ab13dd("D", "I", "N", "D", n, m, p, A, np.eye(n), B, C, D, 1e-12)
+        worst = max(worst, abs(float(lbt.hinf_norm((A, B, C, D))) / expected - 1))
+    assert worst < 1e-8
+
+
+@pytest.mark.parametrize("n", [2, 5, 12])
+def test_frequency_responses_of_defective_matrices(n):
+    """A Jordan block at 0.9, turned at random: no basis of eigenvectors, a closed form."""
+    turn = np.linalg.qr(np.random.default_rng(n).standard_normal((n, n)))[0]
+    block = 0.9 * np.eye(n) + np.eye(n, k=1)
+    system = lbt.StateSpace(
+        A=turn @ block @ turn.T, B=turn[:, -1:], C=turn[:, :1].T, D=[[0.0]], dt_s=1.0
+    )
+    frequency = np.linspace(0.1, 0.5, 5000)
+    z = np.exp(2j * np.pi * frequency)
+    response = system.frequency_response(frequency)[:, 0, 0]
+    assert np.max(np.abs(response * (z - 0.9) ** n - 1)) < 1e-9
+
+
+@given(seed=st.integers(0, 100_000), n=st.integers(1, 9), m=st.integers(1, 4), p=st.integers(1, 4))
+def test_many_points_and_few_points_agree(seed, n, m, p):
+    A, B, C, D = random_system(seed, n, m, p, 0.95)
+    system = lbt.StateSpace(A=A, B=B, C=C, D=D)
+    frequency = np.linspace(0, 0.5, 101)
+    many = system.frequency_response(frequency)
+    few = np.concatenate([system.frequency_response(frequency[i : i + 1]) for i in range(101)])
+    assert np.allclose(many, few, rtol=1e-10, atol=1e-10 * np.abs(few).max())
+    sigma = np.linalg.svd(few, compute_uv=False)[:, 0]
+    assert np.allclose(lbt.largest_singular_values(system, frequency), sigma, rtol=1e-10)
+
+
+def test_a_pole_on_the_unit_circle_has_no_response():
+    integrator = lbt.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.1)
+    for frequency in ([0.0], np.linspace(0, 5, 50)):
+        with pytest.raises(lbt.ProblemError, match="pole at 0 Hz, on the unit circle"):
+            integrator.frequency_response(frequency)
+    assert np.isfinite(integrator.frequency_response(np.linspace(0.1, 5, 50))).all()
+
+
+def test_what_python_control_cannot_do():
+    """Poles at 1 - 1e-9 and at 0, D not square: here the exact values."""
+    near = lbt.hinf_norm(([[1 - 1e-9]], [[1e-9]], [[1.0]], [[0.0]]))
+    assert float(near) == pytest.approx(1, rel=1e-6)
+    delay = (
+        np.eye(3, k=1),
+        np.eye(3)[:, -1:],
+        np.vstack([np.eye(3)[:1], np.zeros(3)]),
+        [[0.0], [2.0]],
+    )
+    assert float(lbt.hinf_norm(delay)) == pytest.approx(np.sqrt(5), rel=1e-12)
+
+
+def test_the_bracket_is_narrow_and_holds():
+    A, B, C, D = random_system(3, 6, 2, 2, 0.99)
+    norm = lbt.hinf_norm((A, B, C, D))
+    assert norm.lower <= norm.value <= norm.upper <= norm.lower * (1 + 1e-10)
+    dense = lbt.largest_singular_values(
+        lbt.StateSpace(A=A, B=B, C=C, D=D), np.linspace(0, 0.5, 20_001)
+    )
+    assert dense.max() <= norm.upper

@@ -56,8 +56,9 @@ class DareSolution:
     poles : (..., n) complex ndarray
         Poles of the closed loop.
     residuals : (...) ndarray
-        Relative residual of each equation: its norm (Frobenius) over those of X, A'XA and Q,
-        in units of the states that balance the equation.
+        Relative residual of each equation: its norm (Frobenius) over ``||X|| (1 + ||closed
+        loop||^2) + ||A'XA|| + ||Q||``, in units of the states that balance the equation.
+        The first term is what rounding X can make of it.
     negative : (...) int ndarray
         Number of negative eigenvalues of ``R + B'XB``. Where it is zero, X is the least
         cost of the control problem; elsewhere X is a saddle point.
@@ -140,7 +141,7 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     Three equations at once:
 
     >>> lbt.solve_dare(1, 1, [[[1]], [[2]], [[6]]], 1).X.ravel().round(6).tolist()
-    [1.618034, 2.732051, 7.162278]
+    [1.618034, 2.732051, 6.872983]
     """
     equations, lead = _stacked(A, B, Q, R, S)
     units = equations.balancing_units()

@@ -76,10 +76,6 @@ class Equations:
         """``R + B'XB``, (N, m, m)."""
         return symmetrised(self.R + transposed(self.B) @ X @ self.B)
 
-    def gains(self, X: FloatArray) -> FloatArray:
-        """``(R + B'XB)^-1 (B'XA + S')``, (N, m, n)."""
-        return solve_stack(self.weights(X), transposed(self.B) @ X @ self.A + transposed(self.S))
-
     def poles(self, gains: FloatArray) -> ComplexArray:
         """Poles of ``A - B gain``, (N, n); nan where the gain is not finite."""
         closed = self.A - self.B @ gains
@@ -88,24 +84,32 @@ class Equations:
         poles[finite] = np.linalg.eigvals(closed[finite])
         return poles
 
-    def residuals(self, X: FloatArray, gains: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residual matrices (N, n, n) and their sizes relative to X, A'XA and Q, (N,).
+    def evaluated(self, X: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Gains ``(R + B'XB)^-1 (B'XA + S')``, residual matrices, and their relative sizes.
 
-        With K a gain near that of X, ``A'XA - X + Q - H'K - K'H + K'(R + B'XB)K`` with
-        ``H = B'XA + S'`` differs from the residual by the square of the gain's error,
-        and has no inverse in it, so that it can be summed in extended precision.
+        The size is over those of X (1 + ||A - BK||^2), A'XA and Q. With K a gain near that of X,
+        ``A'XA - X + Q - H'K - K'H + K'(R + B'XB)K`` with ``H = B'XA + S'`` differs from the
+        residual by the square of the gain's error, and has no inverse in it, so that it can
+        be summed in extended precision; the gain gets a step of iterative refinement first.
         """
-        A, B, Q, R, S, Xe, K = (
-            stack.astype(_Extended) for stack in (self.A, self.B, self.Q, self.R, self.S, X, gains)
+        A, B, Q, R, S, Xe = (
+            stack.astype(_Extended) for stack in (self.A, self.B, self.Q, self.R, self.S, X)
         )
         XA = Xe @ A
         AXA = transposed(A) @ XA
-        cross = transposed(transposed(B) @ XA + transposed(S)) @ K
+        H = transposed(B) @ XA + transposed(S)
         weight = R + transposed(B) @ Xe @ B
+        rounded = symmetrised(weight.astype(np.float64))
+        K = solve_stack(rounded, H.astype(np.float64)).astype(_Extended)
+        K = K + solve_stack(rounded, (H - weight @ K).astype(np.float64))
+        cross = transposed(H) @ K
         sums = AXA - Xe + Q - cross - transposed(cross) + transposed(K) @ weight @ K
         residual = symmetrised(sums.astype(np.float64))
-        scale = norms(X) + norms(AXA.astype(np.float64)) + norms(self.Q)
-        return residual, norms(residual) / np.maximum(scale, 1e-300)
+        gains = K.astype(np.float64)
+        # rounding X alone leaves a residual of eps ||X|| (1 + ||A - B K||^2)
+        size = norms(X) * (1 + norms(self.A - self.B @ gains) ** 2)
+        scale = size + norms(AXA.astype(np.float64)) + norms(self.Q)
+        return gains, residual, norms(residual) / np.maximum(scale, 1e-300)
 
     def refined(self, X: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Newton steps while they lower the residual: X, gains and relative residuals.
@@ -113,9 +117,8 @@ class Equations:
         An equation whose closed loop is not stable is left as it came.
         """
         with np.errstate(all="ignore"):
-            gains = self.gains(X)
-            residual, size = self.residuals(X, gains)
-            X, gains, size = X.copy(), gains.copy(), size.copy()
+            gains, residual, size = self.evaluated(X)
+            X = X.copy()
             active = np.flatnonzero(np.isfinite(size))
             for _ in range(_NEWTON_STEPS):
                 if active.size == 0:
@@ -124,17 +127,12 @@ class Equations:
                 closed = transposed(part.A - part.B @ gains[active])
                 step = smith_sum(closed, residual[active])
                 trial = symmetrised(X[active] + step)
-                new_gains = part.gains(trial)
-                new_residual, new_size = part.residuals(trial, new_gains)
+                new_gains, new_residual, new_size = part.evaluated(trial)
                 better = np.isfinite(new_size) & (new_size < size[active])
                 large = norms(step) > _SETTLED * norms(trial)
                 done = active[better]
-                X[done], gains[done], size[done] = (
-                    trial[better],
-                    new_gains[better],
-                    new_size[better],
-                )
-                residual[done] = new_residual[better]
+                X[done], gains[done] = trial[better], new_gains[better]
+                residual[done], size[done] = new_residual[better], new_size[better]
                 active = active[better & large]
         return X, gains, size
 

@@ -1,0 +1,215 @@
+"""Mixed filters and the trade-off: bounds that hold, and nothing better to be found."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import LBT_YAML, lbt_axis_plant, random_problem
+from scipy.optimize import minimize
+
+import lbt_synth as lbt
+from lbt_synth.lyapunov import stationary_covariance
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return lbt_axis_plant()
+
+
+@pytest.fixture(scope="module")
+def ends(plant):
+    return lbt.hinf(plant, method="riccati"), lbt.kalman(plant)
+
+
+@pytest.mark.parametrize("ratio", [1.01, 1.05, 1.1, 1.2])
+def test_less_variance_than_the_central_filter_of_the_same_norm(plant, ends, ratio):
+    bound = ratio * ends[0].gamma_least
+    best, central = lbt.mixed(plant, gamma=bound), lbt.central(plant, gamma=bound)
+    assert best.gamma == pytest.approx(bound, rel=1e-6)
+    assert central.gamma == pytest.approx(bound, rel=1e-6)
+    assert ends[1].rms < best.rms < central.rms
+    assert best.method == "mixed"
+    assert lbt.mixed(plant, gamma_ratio=ratio).rms == pytest.approx(best.rms, rel=1e-7)
+
+
+def test_the_ends_of_the_front(plant, ends):
+    least, kalman = ends
+    assert lbt.mixed(plant, gamma=2 * kalman.gamma).rms == pytest.approx(kalman.rms, rel=1e-9)
+    assert lbt.mixed(plant, gamma_ratio=1).gamma == pytest.approx(least.gamma, rel=1e-9)
+    assert lbt.central(plant, gamma=2 * kalman.gamma).rms == pytest.approx(kalman.rms, rel=1e-9)
+    assert lbt.mixed(plant, rms=2 * least.rms).gamma == pytest.approx(least.gamma, rel=1e-5)
+
+
+def test_the_reverse_finds_the_same_front(plant, ends):
+    bound = 1.08 * ends[0].gamma_least
+    there = lbt.mixed(plant, gamma=bound)
+    back = lbt.mixed(plant, rms=there.rms)
+    assert back.rms <= there.rms * (1 + 1e-6)
+    assert back.gamma == pytest.approx(bound, rel=1e-4)
+
+
+def test_more_taps_never_do_worse_and_converge(plant, ends):
+    bound = 1.05 * ends[0].gamma_least
+    found = [lbt.mixed(plant, gamma=bound, taps=taps).rms for taps in (1, 4, 16, 48)]
+    assert all(more <= fewer * (1 + 1e-7) for fewer, more in itertools.pairwise(found))
+    assert found[2] / found[3] - 1 < 2e-4
+
+
+def test_no_gain_of_the_plants_own_order_does_better(plant, ends):
+    """An independent search over all predictor gains, not convex: it ends above."""
+    bound = 1.05 * ends[0].gamma_least
+    best = lbt.mixed(plant, gamma=bound)
+    start = lbt.central(plant, gamma=bound).gain_predictor
+
+    def variance(gain):
+        error = plant.error_system(gain.reshape(start.shape))
+        if not error.spectral_radius < 1:
+            return 1e12
+        P = stationary_covariance(error.A, error.B @ error.B.T)
+        return float(np.trace(plant.L @ P @ plant.L.T))
+
+    def room(gain):
+        error = plant.error_system(gain.reshape(start.shape))
+        return bound - float(lbt.hinf_norm(error)) if error.spectral_radius < 1 else -1e3
+
+    unit = np.abs(start.ravel())
+    found = minimize(
+        lambda g: variance(g * unit) / 1e4, start.ravel() / unit, method="SLSQP",
+        constraints=[{"type": "ineq", "fun": lambda g: room(g * unit) / 100}], options={"maxiter": 200, "ftol": 1e-10},
+    )  # fmt: skip
+    assert room(found.x * unit) > -1e-6 * bound
+    searched = np.sqrt(variance(found.x * unit))
+    assert searched < np.sqrt(variance(start.ravel()))  # the search did something
+    assert best.rms < searched
+
+
+@settings(max_examples=8)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 4), q=st.integers(1, 2), l=st.integers(1, 2))
+def test_bounds_hold_on_any_problem(seed, n, q, l):
+    problem = random_problem(np.random.default_rng(seed), n, q, l=l)
+    least, kalman = lbt.hinf(problem, method="riccati"), lbt.kalman(problem)
+    bound = 0.5 * (least.gamma_least + kalman.gamma)
+    design = lbt.mixed(problem, gamma=bound, taps=6)
+    assert design.gamma <= bound * (1 + 1e-6)
+    assert (
+        kalman.rms * (1 - 1e-9) <= design.rms <= lbt.central(problem, gamma=bound).rms * (1 + 1e-6)
+    )
+    assert design.recertified().passed
+
+
+def test_a_mixed_filter_is_a_design_like_any_other(tmp_path, plant):
+    design = lbt.mixed(plant, gamma_ratio=1.1, taps=8)
+    assert design.problem.n_states == plant.n_states + 8
+    loaded = lbt.load_gain(lbt.save_gain(tmp_path / "mixed.fits", design))
+    assert loaded.recertified().passed
+    assert loaded.gamma_requested == pytest.approx(1.1 * loaded.gamma_least)
+    loop = lbt.close_loop(loaded.hardware, loaded.controller)
+    assert loop.is_stable
+    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
+    assert lbt.residual_budget(loop, truth).rms_nm == pytest.approx(design.rms, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "text"),
+    [
+        ({}, lbt.ProblemError, "give one of gamma, gamma_ratio and rms"),
+        ({"gamma": 200.0, "rms": 140.0}, lbt.ProblemError, "give one of"),
+        ({"gamma": 100.0}, lbt.InfeasibleError, "gamma must be at least 155.5"),
+        ({"gamma_ratio": 0.9}, lbt.ProblemError, "gamma_ratio must be at least 1"),
+        ({"rms": 100.0}, lbt.InfeasibleError, "rms must be at least 135.9"),
+        ({"rms": np.nan}, lbt.ProblemError, "rms must be finite"),
+        ({"rms": 140.0, "taps": 0}, lbt.ProblemError, "taps must be at least 1"),
+        ({"rms": 140.0, "taps": 257}, lbt.ProblemError, "taps must be at most 256"),
+    ],
+)
+def test_wrong_demands(plant, arguments, error, text):
+    with pytest.raises(error, match=text):
+        lbt.mixed(plant, **arguments)
+
+
+def test_memory_that_does_not_fit(plant):
+    with pytest.raises(lbt.DimensionError, match="taps must have 1 row to match L"):
+        plant.with_memory(np.ones((2, 3)))
+    with pytest.raises(lbt.DimensionError, match="multiple of 2 columns"):
+        lbt_axis_plant(modes=2).with_memory(np.ones((2, 3)))
+
+
+def test_the_front_of_the_lbt(plant):
+    """A norm close to its least costs sensor-gain robustness, whichever filter has it."""
+    points = list(lbt.tradeoff(plant, points=5, taps=8))
+    for family in ("mixed", "central"):
+        own = [point for point in points if point.family == family]
+        gamma, rms, low = ([getattr(p, key) for p in own] for key in ("gamma", "rms", "gain_low"))
+        assert gamma == sorted(gamma)
+        assert rms == sorted(rms, reverse=True)
+        assert low == sorted(low, reverse=True)
+        assert low[0] > 0.7 > 0.1 > low[-1]
+    for mixed, central in zip(points[2:-2:2], points[3:-2:2], strict=True):
+        assert mixed.rms < central.rms
+        assert mixed.gain_low < central.gain_low  # it tolerates more, too
+    figure = lbt.tradeoff_figure(points)
+    assert len(figure.axes) == 2
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert labels[0] == "least variance at this norm"
+    assert figure.axes[1].get_xlabel() == r"H$_\infty$ norm of the estimation error [nm]"
+
+
+def test_a_front_without_a_loop():
+    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    points = list(lbt.tradeoff(walk, points=2, families=["central"]))
+    assert np.isnan(points[0].gain_low)
+    assert len(lbt.tradeoff_figure(points).axes) == 1
+    with pytest.raises(lbt.ProblemError, match="families must be"):
+        next(lbt.tradeoff(walk, families=["best"]))
+    with pytest.raises(lbt.ProblemError, match="points must be at least 2"):
+        next(lbt.tradeoff(walk, points=1))
+    with pytest.raises(lbt.ProblemError, match="at least one point"):
+        lbt.tradeoff_figure([])
+
+
+def test_two_axes_on_the_command_line(tmp_path, capsys):
+    from lbt_synth.cli.main import main
+
+    assert (
+        main(
+            [
+                "tradeoff",
+                str(LBT_YAML),
+                "--points",
+                "2",
+                "-o",
+                str(tmp_path / "f.png"),
+                "-o",
+                str(tmp_path / "f.csv"),
+            ]
+        )
+        == 0
+    )
+    out = capsys.readouterr().out
+    assert "the least norm of any filter lies between 155.803" in out
+    assert (tmp_path / "f.csv").read_text().splitlines()[
+        0
+    ] == "family,gamma,gamma_ratio,rms,gain_low,gain_high,modulus"
+    assert (tmp_path / "f.png").stat().st_size > 10_000
+    for wrong, text in (
+        (["tradeoff", str(LBT_YAML), "-o", "f.txt"], "must end in .csv"),
+        (["tradeoff", str(LBT_YAML), "--points", "1"], "--points must be at least 2"),
+        (["tradeoff", "nowhere.yaml"], "nowhere.yaml"),
+        (["design", str(LBT_YAML), "--method", "kalman", "--rms", "200", "-o", str(tmp_path / "k.fits")], "--rms goes with --method mixed"),
+        (["design", str(LBT_YAML), "--method", "integrator", "--horizon", "2", "-o", str(tmp_path / "k.fits")], "no horizon"),
+        (["design", str(LBT_YAML), "--method", "kalman", "--horizon", "-3", "-o", str(tmp_path / "k.fits")], "horizon must leave the loop a delay"),
+    ):  # fmt: skip
+        assert main(wrong) == 2
+        assert text in capsys.readouterr().err
+    target = str(tmp_path / "m.fits")
+    assert main(["design", str(LBT_YAML), "--method", "mixed", "--rms", "100", "-o", target]) == 1
+    assert "rms must be at least 192.6" in capsys.readouterr().err
+    assert (
+        main(["design", str(LBT_YAML), "--method", "kalman", "--horizon", "2", "-o", target]) == 0
+    )
+    assert main(["verify", target]) == 0
+    assert lbt.load_gain(target).hardware.delay_frames == 3
