@@ -1,19 +1,16 @@
-"""Speed of the everyday operations, each as a ratio to a peer in the same run.
+"""Speed, each operation as a ratio to a peer in the same run, and its growth with size.
 
-``make bench`` prints a table and writes ``benchmarks/results.json``. A ratio
-above 1 means that this package is faster than its peer, except for the imports,
-where it is the time over that of ``import numpy, scipy.linalg``.
+``make bench`` prints tables and writes ``benchmarks/results.json`` and the page of the
+documentation that shows them. A ratio above 1 means that this package is faster than its
+peer, except for the imports, where it is the time over that of ``import numpy, scipy.linalg``.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import platform
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,53 +18,21 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import control
 import numpy as np
+from engine import SIZED
+from harness import Row, machine, paired, seconds
 
 import lbt_synth as lbt
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "benchmarks_table.md"
 FRAMES = 8000
-
-
-def seconds(call: Callable[[], object], repeats: int) -> float:
-    """Median time of a call after one warm-up."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
-
-
-def paired(
-    ours: Callable[[], object], peer: Callable[[], object], repeats: int, *, calls: int = 1
-) -> dict[str, float]:
-    """Medians of both and of the ratio peer / ours, taken in turn.
-
-    ``calls`` of ours follow each other and their mean counts, so that a call of a
-    millisecond is not measured on the caches that the peer has just emptied.
-    """
-    ours(), peer()
-    mine, theirs = [], []
-    for _ in range(repeats):
-        for call, count, times in ((ours, calls, mine), (peer, 1, theirs)):
-            start = time.perf_counter()
-            for _ in range(count):
-                call()
-            times.append((time.perf_counter() - start) / count)
-    ratios = [t / m for m, t in zip(mine, theirs, strict=True)]
-    return {
-        "ours_s": statistics.median(mine),
-        "peer_s": statistics.median(theirs),
-        "ratio": statistics.median(ratios),
-    }
 
 
 def interpreter(arguments: list[str]) -> Callable[[], object]:
     return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
 
 
-def imports() -> dict[str, dict[str, float]]:
+def imports() -> dict[str, Row]:
     base = interpreter(["-c", "import numpy, scipy.linalg"])
     out = {}
     for name, arguments in (
@@ -82,7 +47,7 @@ def imports() -> dict[str, dict[str, float]]:
     return out
 
 
-def time_domain() -> dict[str, dict[str, float]]:
+def time_domain() -> dict[str, Row]:
     config = lbt.load_config(ROOT / "examples" / "lbt.yaml")
     loop = lbt.close_loop(config.hardware, lbt.kalman(config.plant).controller)
     system, peer = loop.system, loop.system.to_control()
@@ -115,7 +80,7 @@ def time_domain() -> dict[str, dict[str, float]]:
     return out
 
 
-def synthesis() -> dict[str, dict[str, float]]:
+def synthesis() -> dict[str, Row]:
     plant = lbt.load_config(ROOT / "examples" / "lbt.yaml").plant
     return {
         name: {"ours_s": seconds(call, 5)}
@@ -128,24 +93,58 @@ def synthesis() -> dict[str, dict[str, float]]:
     }
 
 
+def cells(name: str, row: Row) -> list[str]:
+    """One line of a table: name, ours, peer, ratio, bar, growth."""
+
+    def shown(key: str, factor: float, form: str) -> str:
+        return f"{factor * row[key]:{form}}" if key in row else ""
+
+    bar = shown("bar", 1, "g")
+    if "bar_s" in row:
+        bar = f"{1e3 * row['bar_s']:g} ms"
+    return [
+        name,
+        shown("ours_s", 1e3, ".3f") + (f" ({row['status']})" if "status" in row else ""),
+        shown("peer_s", 1e3, ".3f") + (f" ({row['peer_status']})" if "peer_status" in row else ""),
+        shown("ratio", 1, ".2f"),
+        bar,
+        shown("growth", 1, ".2f"),
+        shown("peer_growth", 1, ".2f"),
+    ]
+
+
+HEADINGS = ["", "ours [ms]", "peer [ms]", "ratio", "bar", "growth", "peer's growth"]
+
+
+def page(title: str, first: str, lines: list[list[str]]) -> str:
+    head = [first, *HEADINGS[1:]]
+    rule = "|---|" + "---:|" * (len(head) - 1)
+    body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"## {title}\n\n| {' | '.join(head)} |\n{rule}\n{body}\n"
+
+
 def main() -> None:
-    results = {**imports(), **time_domain(), **synthesis()}
-    machine = {
-        "python": platform.python_version(),
-        "system": platform.platform(),
-        "processors": os.cpu_count(),
-        "blas_threads": os.environ["OPENBLAS_NUM_THREADS"],
-    }
-    print(f"{'operation':32} {'ours [ms]':>12} {'peer [ms]':>12} {'ratio':>8} {'bar':>6}")
-    for name, row in results.items():
-        cells = [
-            f"{1e3 * row[key]:12.3f}" if key in row else " " * 12 for key in ("ours_s", "peer_s")
-        ]
-        ratio = f"{row['ratio']:8.2f}" if "ratio" in row else " " * 8
-        print(f"{name:32} {' '.join(cells)} {ratio} {row.get('bar', ''):>6}")
+    here = machine()
+    results: dict[str, object] = {}
+    pages = []
+    everyday = {**imports(), **time_domain(), **synthesis()}
+    tables = [("everyday operations", "operation", everyday)]
+    for title, first, case in SIZED:
+        print(f"... {title}", file=sys.stderr)
+        tables.append((title, first, {str(size): row for size, row in case().items()}))
+    for title, first, rows in tables:
+        lines = [cells(name, row) for name, row in rows.items()]
+        widths = [max(len(line[i]) for line in [*lines, HEADINGS]) for i in range(len(HEADINGS))]
+        print(f"\n{title}\n" + "  ".join(h.rjust(w) for h, w in zip(HEADINGS, widths, strict=True)))
+        for line in lines:
+            print("  ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)))
+        results[title] = rows
+        pages.append(page(title[0].upper() + title[1:], first, lines))
     target = Path(__file__).with_name("results.json")
-    target.write_text(json.dumps({"machine": machine, "results": results}, indent=1) + "\n")
-    print(f"written: {target}")
+    target.write_text(json.dumps({"machine": here, "results": results}, indent=1) + "\n")
+    listing = "\n".join(f"- {key.replace('_', ' ')}: {value}" for key, value in here.items())
+    PAGE.write_text("## Machine\n\n" + listing + "\n\n" + "\n".join(pages))
+    print(f"\nwritten: {target}, {PAGE}")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,202 @@
+"""Cases of the synthesis engine: equations, norms, inequalities, responses."""
+
+from __future__ import annotations
+
+import control
+import cvxpy as cp
+import numpy as np
+import scipy.linalg
+import slycot
+from harness import Row, once, paired, seconds, with_growth
+
+import lbt_synth as lbt
+from lbt_synth.riccati import kalman_riccati, least_gamma
+
+RATE_HZ = 800.0
+POINTS = 10_000
+
+
+def plant(vibrations: int) -> lbt.TipTiltPlant:
+    """One axis, AR1 turbulence, some lines from 10 to 120 Hz: 2 states a line and 2 more."""
+    slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE_HZ)
+    lines = [
+        lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=100, direction=(1,))
+        for f in np.linspace(10, 120, vibrations)
+    ]
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=RATE_HZ, turbulence=slow, vibrations=lines, noise_nm=15.5, modes=1
+    )
+
+
+def modal_bank(count: int) -> tuple[np.ndarray, ...]:
+    """Filter equations of single modes: AR2 turbulence of 0.5 to 5 Hz, two frames of delay."""
+    rng = np.random.default_rng(3)
+    slow, damping = 2 * np.pi * rng.uniform(0.5, 5, count) / RATE_HZ, 0.14
+    decay = np.exp(-damping * slow)
+    A = np.zeros((count, 3, 3))
+    A[:, 0, 0] = 2 * decay * np.cos(slow * np.sqrt(1 - damping**2))
+    A[:, 0, 1] = -(decay**2)
+    A[:, 1, 0] = A[:, 2, 0] = 1
+    C, Q = np.zeros((count, 1, 3)), np.zeros((count, 3, 3))
+    C[:, 0, 2] = Q[:, 0, 0] = 1
+    R = (10 ** rng.uniform(0, 2, count))[:, None, None] ** 2
+    return np.swapaxes(A, 1, 2), np.swapaxes(C, 1, 2), Q, R
+
+
+def scipy_loop(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> None:
+    """X and gain of each equation; where scipy refuses, nothing is computed."""
+    for i in range(len(A)):
+        try:
+            X = scipy.linalg.solve_discrete_are(A[i], B[i], Q[i], R[i])
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        np.linalg.solve(R[i] + B[i].T @ X @ B[i], B[i].T @ X @ A[i])
+
+
+def modal_equations() -> dict[int, Row]:
+    rows = {}
+    for count in (42, 168, 672, 2688):
+        bank = modal_bank(count)
+        rows[count] = paired(
+            lambda b=bank: lbt.solve_dare(*b), lambda b=bank: scipy_loop(*b), 5, calls=3
+        )
+    rows[672]["bar"] = 20
+    return with_growth(rows)
+
+
+def single_equations() -> dict[int, Row]:
+    rows = {}
+    for lines in (1, 4, 12, 24, 49):
+        p = plant(lines)
+        parts = (p.A.T, p.C.T, p.Q, p.R)
+        rows[p.n_states] = paired(
+            lambda q=parts: lbt.solve_dare(*q),
+            lambda q=parts: scipy.linalg.solve_discrete_are(*q),
+            5,
+        )
+    return with_growth(rows)
+
+
+def least_gamma_riccati() -> dict[int, Row]:
+    """Whole designs: Kalman start, search, refinement, proof from below, certificate."""
+    rows = {}
+    for lines in (1, 4, 12, 20):
+        p = plant(lines)
+        rows[p.n_states] = {"ours_s": seconds(lambda q=p: lbt.hinf(q, method="riccati"), 7)}
+    rows[26]["bar_s"] = 0.05
+    return with_growth(rows)
+
+
+def least_gamma_search() -> dict[int, Row]:
+    """The search alone, from a Kalman solution that is at hand."""
+    rows = {}
+    for lines in (1, 4, 12, 20):
+        p = plant(lines)
+        start = kalman_riccati(p)
+        upper = lbt.hinf_norm(p.error_system(start.gain_predictor)).upper
+        lower = float(np.sqrt(np.linalg.eigvalsh(p.L @ start.P @ p.L.T)[-1]))
+        rows[p.n_states] = {
+            "ours_s": seconds(
+                lambda q=p, s=start, a=lower, b=upper: least_gamma(q, lower=a, upper=b, start=s), 7
+            )
+        }
+    return with_growth(rows)
+
+
+def least_gamma_lmi() -> dict[int, Row]:
+    """The eliminated, balanced inequality; the peer is the textbook one, up to 26 states."""
+    rows: dict[int, Row] = {}
+    for lines, bar_s in ((1, None), (4, None), (12, 3.0), (20, 60.0)):
+        p = plant(lines)
+        designs: list[lbt.FilterDesign] = []
+        row: Row = {"ours_s": seconds(lambda q=p, d=designs: d.append(lbt.hinf(q)), 1)}
+        row["status"] = designs[-1].solver.status
+        if bar_s is not None:
+            row["bar_s"] = bar_s
+        if p.n_states <= 26:
+            words: list[str] = []
+            row["peer_s"] = once(lambda q=p, w=words: w.append(textbook_lmi(q)))
+            row["peer_status"] = words[-1]
+            row["ratio"] = row["peer_s"] / row["ours_s"]
+        rows[p.n_states] = row
+    return with_growth(rows)
+
+
+def textbook_lmi(p: lbt.EstimationProblem) -> str:
+    """Least gamma with storage matrix and gain as unknowns, in the states as they come."""
+    n, w = p.B.shape
+    q, outputs = p.C.shape[0], p.L.shape[0]
+    P, Y = cp.Variable((n, n), symmetric=True), cp.Variable((n, q))
+    level = cp.Variable(nonneg=True)
+    step, push = P @ p.A - Y @ p.C, P @ p.B - Y @ p.D
+    block = cp.bmat(
+        [
+            [P, np.zeros((n, w)), step.T, p.L.T],
+            [np.zeros((w, n)), level * np.eye(w), push.T, np.zeros((w, outputs))],
+            [step, push, P, np.zeros((n, outputs))],
+            [p.L, np.zeros((outputs, w)), np.zeros((outputs, n)), np.eye(outputs)],
+        ]
+    )
+    programme = cp.Problem(cp.Minimize(level), [(block + block.T) / 2 >> 0])
+    try:
+        programme.solve(solver=cp.CLARABEL)
+    except cp.error.SolverError:
+        return "solver error"
+    return str(programme.status)
+
+
+def error_system(lines: int) -> lbt.StateSpace:
+    p = plant(lines)
+    return p.error_system(kalman_riccati(p).gain_predictor)
+
+
+def norms() -> dict[int, Row]:
+    rows = {}
+    for lines in (1, 4, 12, 20):
+        G = error_system(lines)
+        n, m, p = G.n_states, G.B.shape[1], G.C.shape[0]
+        rows[n] = paired(
+            lambda g=G: lbt.hinf_norm(g),
+            lambda g=G, n=n, m=m, p=p: slycot.ab13dd(
+                "D", "I", "N", "D", n, m, p, g.A, np.eye(n), g.B, g.C, g.D, 1e-10
+            ),
+            9,
+        )
+    return with_growth(rows)
+
+
+def responses() -> dict[int, Row]:
+    """Largest singular value at 10,000 frequencies."""
+    rows = {}
+    frequency = np.geomspace(0.1, RATE_HZ / 2, POINTS)
+    for lines in (1, 4, 12, 20):
+        G = error_system(lines)
+        peer = G.to_control()
+        rows[G.n_states] = paired(
+            lambda g=G: lbt.largest_singular_values(g, frequency),
+            lambda g=peer: control.singular_values_response(g, 2 * np.pi * frequency),
+            9,
+            calls=3,
+        )
+    rows[26]["bar"] = 10
+    return with_growth(rows)
+
+
+def mixed_filters() -> dict[int, Row]:
+    rows = {}
+    for lines in (1, 4, 12):
+        p = plant(lines)
+        rows[p.n_states] = {"ours_s": seconds(lambda q=p: lbt.mixed(q, gamma_ratio=1.1), 1)}
+    return with_growth(rows)
+
+
+SIZED = (
+    ("modal filter equations in one call (scipy in a loop)", "equations", modal_equations),
+    ("one filter equation (scipy)", "states", single_equations),
+    ("least gamma, Riccati, whole design", "states", least_gamma_riccati),
+    ("least gamma, Riccati, the search alone", "states", least_gamma_search),
+    ("least gamma, LMI, whole design (textbook LMI)", "states", least_gamma_lmi),
+    ("H-infinity norm (SLICOT's AB13DD)", "states", norms),
+    (f"singular values at {POINTS} points (python-control)", "states", responses),
+    ("mixed filter, 16 taps, whole design", "states", mixed_filters),
+)
