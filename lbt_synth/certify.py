@@ -244,9 +244,9 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
         )
     proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
     return Check(
-        name="level claimed infeasible, over the level proved",
-        value=level / max(proved, 1e-300),
-        limit=1 + INFEASIBLE_TOLERANCE,
+        name="level claimed infeasible, above the level proved",
+        value=level / max(proved, 1e-300) - 1,
+        limit=INFEASIBLE_TOLERANCE,
         method="disturbances that no measurement shows",
     )
 

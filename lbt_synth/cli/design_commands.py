@@ -171,8 +171,8 @@ def _description(made: Design) -> Report:
             facts.append(("bound asked for", made.gamma_requested, unit))
         if made.gamma_least is not None:
             facts += [
-                ("least norm of any filter, not above", made.gamma_least, unit),
-                ("least norm of any filter, not below", made.gamma_infeasible, unit),
+                ("least norm of any filter, not above", f"{made.gamma_least:.9g}", unit),
+                ("least norm of any filter, not below", _digits(made.gamma_infeasible), unit),
             ]
     if isinstance(made, IntegratorDesign):
         facts.append(("gain", made.gain, ""))
@@ -209,6 +209,11 @@ def _description(made: Design) -> Report:
             "commands grow. Reset it whenever the loop opens."
         )
     return Report(data=data, tables=tables, notes=notes)
+
+
+def _digits(level: float | None) -> str:
+    """Nine digits of a level; files of version 0.1 have none."""
+    return "-" if level is None else f"{level:.9g}"
 
 
 def _check_table(certificate: Certificate) -> TableText:

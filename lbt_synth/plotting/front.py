@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.front import TradeoffPoint
-from lbt_synth.plotting.style import MARKERS, house_style, looks, new_figure, plain_ticks
+from lbt_synth.plotting.style import MARKERS, house_style, looks, new_figure, number_ticks
 
 _NAMES = {
     "mixed": "least variance at this norm",
@@ -84,7 +84,7 @@ def tradeoff_figure(points: Sequence[TradeoffPoint]) -> Any:
                 0.99, 1, "nominal ", transform=axes[1].get_yaxis_transform(), ha="right",
                 va="bottom", fontsize=8, color="0.3",
             )  # fmt: skip
-            plain_ticks(axes[1])
+            number_ticks(axes[1])
     return figure
 
 

@@ -64,15 +64,20 @@ def new_figure(width_in: float, height_in: float) -> Any:
 
 def plain_ticks(axis: Any) -> None:
     """Label an axis of less than two decades with plain numbers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
-
     low, high = axis.get_ylim()
     if high / low < 3:
         axis.set_yscale("linear")
     elif high / low < 30:
-        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        axis.yaxis.set_major_formatter(ScalarFormatter())
-        axis.yaxis.set_minor_formatter(NullFormatter())
+        number_ticks(axis)
+
+
+def number_ticks(axis: Any) -> None:
+    """Label a logarithmic axis with plain numbers: 0.1, 0.2, 0.5 and so on."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def require_figure_name(path: str | os.PathLike[str]) -> Path:

@@ -21,8 +21,9 @@ from lbt_synth.validation import (
     symmetric,
 )
 
-RESIDUAL_LIMIT = 1e-9  # a solution beyond it is not returned
-_SATISFIED = 1e-12  # beyond it the next route is tried
+RESIDUAL_LIMIT = 1e-12  # a solution beyond these limits is not returned
+ERROR_LIMIT = 1e-3
+_SATISFIED = 1e-8  # beyond this estimate of its error the next route is tried
 _DOUBTFUL = 1e-9  # a pole this close to the unit circle makes the conditions be checked
 
 
@@ -59,6 +60,9 @@ class DareSolution:
         Relative residual of each equation: its norm (Frobenius) over ``||X|| (1 + ||closed
         loop||^2) + ||A'XA|| + ||Q||``, in units of the states that balance the equation.
         The first term is what rounding X can make of it.
+    errors : (...) ndarray
+        Estimate of the relative error of X: the size of the next Newton step. It grows
+        with the condition of the equation.
     negative : (...) int ndarray
         Number of negative eigenvalues of ``R + B'XB``. Where it is zero, X is the least
         cost of the control problem; elsewhere X is a saddle point.
@@ -72,6 +76,7 @@ class DareSolution:
     gain_feedback: FloatArray
     poles: ComplexArray
     residuals: FloatArray
+    errors: FloatArray
     negative: IntArray
     iterations: int
     attempts: tuple[Attempt, ...]
@@ -82,9 +87,15 @@ class DareSolution:
         return float(np.max(self.residuals, initial=0.0))
 
     @property
+    def error(self) -> float:
+        """Largest estimate of the relative error of X."""
+        return float(np.max(self.errors, initial=0.0))
+
+    @property
     def method(self) -> str:
         """Routes that solved something, in the order they were tried."""
-        return ", ".join(attempt.method for attempt in self.attempts if attempt.solved)
+        solvers = [attempt.method for attempt in self.attempts if attempt.solved]
+        return ", ".join(solvers or [attempt.method for attempt in self.attempts])
 
 
 def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
@@ -130,7 +141,8 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     InfeasibleError
         If R is indefinite and the stabilising solution does not meet its conditions.
     NumericalError
-        If no route reaches a relative residual of 1e-9 with a stable closed loop.
+        If no route reaches a stable closed loop, a relative residual of 1e-12 and an
+        estimated error of 1e-3.
 
     Examples
     --------
@@ -146,14 +158,15 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     equations, lead = _stacked(A, B, Q, R, S)
     units = equations.balancing_units()
     balanced = equations.in_units(units)
-    X, gains, poles, residuals, steps, attempts = _attempted(balanced)
-    radius = np.abs(poles).max(axis=-1)
+    best = _attempted(balanced)
+    radius = np.abs(best.poles).max(axis=-1)
 
-    solved = (radius < 1) & (residuals <= RESIDUAL_LIMIT)
+    solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
     for i in np.flatnonzero(~solved | (radius > 1 - _DOUBTFUL)):
         require_stabilising(balanced, int(i), _name(int(i), lead))
     if not solved.all():
-        _refuse(int(np.flatnonzero(~solved)[0]), lead, residuals, radius, attempts)
+        _refuse(int(np.flatnonzero(~solved)[0]), lead, best)
+    X = best.X
     weights = balanced.weights(X)
     negative = np.sum(np.linalg.eigvalsh(weights) < 0, axis=-1)
     _require_saddle(balanced.R, X, negative, lead)
@@ -162,12 +175,13 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     n, m = equations.B.shape[-2:]
     return DareSolution(
         X=frozen((X / column / row).reshape(*lead, n, n)),
-        gain_feedback=frozen((gains / column).reshape(*lead, m, n)),
-        poles=poles.reshape(*lead, n),
-        residuals=frozen(residuals.reshape(lead)),
+        gain_feedback=frozen((best.gains / column).reshape(*lead, m, n)),
+        poles=best.poles.reshape(*lead, n),
+        residuals=frozen(best.residuals.reshape(lead)),
+        errors=frozen(best.errors.reshape(lead)),
         negative=negative.reshape(lead),
-        iterations=int(steps.max(initial=0)),
-        attempts=attempts,
+        iterations=int(best.steps.max(initial=0)),
+        attempts=tuple(best.attempts),
     )
 
 
@@ -199,35 +213,42 @@ def _stacked(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[i
     return Equations(**stacks), lead
 
 
-def _attempted(
-    equations: Equations,
-) -> tuple[FloatArray, FloatArray, ComplexArray, FloatArray, IntArray, tuple[Attempt, ...]]:
-    """Try the routes in order; keep the best answer to each equation."""
-    count, n, m = equations.B.shape
-    X = np.full((count, n, n), np.nan)
-    gains, residuals = np.full((count, m, n), np.nan), np.full(count, np.inf)
-    poles = np.full((count, n), np.inf, dtype=np.complex128)
-    steps = np.zeros(count, dtype=np.int64)
-    attempts: list[Attempt] = []
-    pending = np.arange(count)
+class _Best:
+    """The best answer to each equation so far, and what was tried."""
+
+    def __init__(self, equations: Equations) -> None:
+        count, n, m = equations.B.shape
+        self.X = np.full((count, n, n), np.nan)
+        self.gains = np.full((count, m, n), np.nan)
+        self.poles: ComplexArray = np.full((count, n), np.inf, dtype=np.complex128)
+        self.residuals, self.errors = np.full(count, np.inf), np.full(count, np.inf)
+        self.steps: IntArray = np.zeros(count, dtype=np.int64)
+        self.attempts: list[Attempt] = []
+
+
+def _attempted(equations: Equations) -> _Best:
+    """Try the routes in order, each on what the ones before have not solved."""
+    best = _Best(equations)
+    pending = np.arange(len(best.X))
     for method, route in ROUTES:
         if pending.size == 0:
             break
         part = equations.take(pending)
-        found, taken = route(part)
-        found, gain, size = part.refined(found)
-        closed = part.poles(gain)
-        size = np.where(np.abs(closed).max(axis=-1) < 1, size, np.inf)
-        better = size < residuals[pending]
+        found, steps = route(part)
+        refined = part.refined(found)
+        poles = part.poles(refined.gains)
+        size = np.where(np.abs(poles).max(axis=-1) < 1, refined.residuals, np.inf)
+        better = size < best.residuals[pending]
         chosen = pending[better]
-        X[chosen], gains[chosen], residuals[chosen] = found[better], gain[better], size[better]
-        poles[chosen], steps[chosen] = closed[better], taken[better]
-        satisfied = size <= _SATISFIED
-        attempts.append(
+        best.X[chosen], best.gains[chosen] = refined.X[better], refined.gains[better]
+        best.residuals[chosen], best.errors[chosen] = size[better], refined.errors[better]
+        best.poles[chosen], best.steps[chosen] = poles[better], steps[better]
+        satisfied = (size <= RESIDUAL_LIMIT) & (refined.errors <= _SATISFIED)
+        best.attempts.append(
             Attempt(method=method, tried=int(pending.size), solved=int(satisfied.sum()))
         )
         pending = pending[~satisfied]
-    return X, gains, poles, residuals, steps, tuple(attempts)
+    return best
 
 
 def _name(index: int, lead: tuple[int, ...]) -> str:
@@ -238,21 +259,20 @@ def _name(index: int, lead: tuple[int, ...]) -> str:
     return f"equation {where[0] if len(where) == 1 else where}: "
 
 
-def _refuse(
-    index: int,
-    lead: tuple[int, ...],
-    residuals: FloatArray,
-    radius: FloatArray,
-    attempts: tuple[Attempt, ...],
-) -> None:
-    residual = float(residuals[index])
+def _refuse(index: int, lead: tuple[int, ...], best: _Best) -> None:
+    residual, error = float(best.residuals[index]), float(best.errors[index])
     stable = bool(np.isfinite(residual))
-    found = f"a residual of {residual:.3g}" if stable else "no stable closed loop"
+    found = (
+        f"a relative residual of {residual:.3g} and an estimated error of {error:.3g}"
+        if stable
+        else "no stable closed loop"
+    )
     raise NumericalError(
         f"{_name(index, lead)}the Riccati equation was not solved: "
-        f"{', '.join(attempt.method for attempt in attempts)} gave {found}; expected a relative "
-        f"residual below {RESIDUAL_LIMIT:g} and a stable closed loop. There may be no stabilising "
-        "solution; look for modes near the unit circle that are barely driven or seen.",
+        f"{', '.join(attempt.method for attempt in best.attempts)} gave {found}; expected a stable "
+        f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an error below {ERROR_LIMIT:g}. "
+        "There may be no stabilising solution; look for modes near the unit circle that are "
+        "barely driven or seen.",
         status="residual",
         residual=residual if stable else None,
     )

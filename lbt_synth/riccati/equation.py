@@ -13,9 +13,19 @@ from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 # Where the platform has it, the residual is formed with 64 bits of mantissa instead of 53:
 # the limit of accuracy is then the rounding of X itself, not that of the products.
 _Extended = np.longdouble
-_NEWTON_STEPS = 6
+_NEWTON_STEPS = 10
 _SETTLED = 1e-13  # a Newton step this small is the last one
 _SWEEPS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Refined:
+    """Solutions after Newton steps: X and gains, relative residuals, estimated errors of X."""
+
+    X: FloatArray
+    gains: FloatArray
+    residuals: FloatArray
+    errors: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,14 +121,15 @@ class Equations:
         scale = size + norms(AXA.astype(np.float64)) + norms(self.Q)
         return gains, residual, norms(residual) / np.maximum(scale, 1e-300)
 
-    def refined(self, X: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Newton steps while they lower the residual: X, gains and relative residuals.
+    def refined(self, X: FloatArray) -> Refined:
+        """Newton steps while they lower the residual.
 
-        An equation whose closed loop is not stable is left as it came.
+        An equation whose closed loop is not stable is left as it came. The next Newton
+        step, that is not taken, estimates the error of X.
         """
         with np.errstate(all="ignore"):
             gains, residual, size = self.evaluated(X)
-            X = X.copy()
+            X, error = X.copy(), np.full(len(X), np.inf)
             active = np.flatnonzero(np.isfinite(size))
             for _ in range(_NEWTON_STEPS):
                 if active.size == 0:
@@ -129,12 +140,13 @@ class Equations:
                 trial = symmetrised(X[active] + step)
                 new_gains, new_residual, new_size = part.evaluated(trial)
                 better = np.isfinite(new_size) & (new_size < size[active])
-                large = norms(step) > _SETTLED * norms(trial)
+                change = norms(step) / np.maximum(norms(trial), 1e-300)
+                error[active] = np.where(np.isfinite(change), change, np.inf)
                 done = active[better]
                 X[done], gains[done] = trial[better], new_gains[better]
                 residual[done], size[done] = new_residual[better], new_size[better]
-                active = active[better & large]
-        return X, gains, size
+                active = active[better & (change > _SETTLED)]
+        return Refined(X=X, gains=gains, residuals=size, errors=error)
 
 
 def _diagonal(stack: FloatArray) -> FloatArray:

@@ -118,8 +118,8 @@ class GammaEquation:
             R=weight[None],
             S=np.zeros((1, *outputs.T.shape)),
         )
-        refined, _, size = equation.refined(trial.P[None])
-        P, residual = refined[0], float(size[0])
+        refined = equation.refined(trial.P[None])
+        P, residual = refined.X[0], float(refined.residuals[0])
         if residual > _RESIDUAL_LIMIT:
             raise NumericalError(
                 f"the gamma-Riccati equation at gamma = {gamma:.9g} was solved only to a relative "

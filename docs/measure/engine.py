@@ -1,0 +1,119 @@
+"""How accurate the engine is, and what its choices buy: ``python docs/measure/engine.py``.
+
+Needs the test dependencies (SLICOT through slycot, mpmath).
+"""
+
+import runpy
+import sys
+
+import mpmath
+import numpy as np
+import slycot
+from scipy.optimize import minimize
+
+import lbt_synth as lbt
+from lbt_synth.lyapunov import stationary_covariance
+
+sys.path.insert(0, "tests")
+from darex import EXAMPLES, example_2_1, example_2_4
+from plants import lbt_axis_plant
+from test_darex import error_in_digits, exact_solution, peers, relative
+from test_norms import random_system
+
+
+def darex() -> None:
+    """Relative errors on the examples with known solutions."""
+    print(f"{'DAREX':20s} {'ours':>9s} {'scipy':>9s} {'slycot':>9s}")
+    for e in EXAMPLES:
+        found = peers(e)
+        errors = [relative(lbt.solve_dare(e.A, e.B, e.Q, e.R).X, e.X)]
+        errors += [relative(found[k], e.X) if k in found else np.nan for k in ("scipy", "slycot")]
+        print(f"{e.name:20s} " + " ".join(f"{x:9.1e}" for x in errors))
+    print("the same against the exact solution of the data in double precision:")
+    for e in (example_2_1(1e6), example_2_4(1e6)):
+        exact = exact_solution(e)
+        answers = {"ours": lbt.solve_dare(e.A, e.B, e.Q, e.R).X} | peers(e)
+        errors = [f"{name} {error_in_digits(X, exact):.1e}" for name, X in answers.items()]
+        print(f"{e.name:20s} " + ", ".join(errors))
+
+
+def plain_residual(A, B, Q, R, S, X) -> float:
+    gain = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
+    residual = A.T @ X @ A - X + Q - (A.T @ X @ B + S) @ gain
+    return float(np.linalg.norm(residual) / np.linalg.norm(X))
+
+
+def output_feedback() -> None:
+    """The second equation of the SB10DD example: no X in double precision does better."""
+    script = runpy.run_path("examples/output_feedback.py")
+    calls, solve = [], lbt.solve_dare
+
+    def spy(*parts):
+        calls.append((parts, solve(*parts)))
+        return calls[-1][1]
+
+    lbt.solve_dare = spy
+    plant = [script[name] for name in "ABCD"]
+    script["central_controller"](*plant, controls=2, measurements=2, gamma=script["GAMMA"])
+    lbt.solve_dare = solve
+    parts, solution = calls[1]
+    theirs = slycot.sb10dd(6, 5, 5, 2, 2, script["GAMMA"], *plant)[6]
+    print(
+        f"SB10DD: |Z| {np.linalg.norm(solution.X):.1e}, plain relative residual "
+        f"{plain_residual(*parts, solution.X):.1e}, of SLICOT's Z "
+        f"{plain_residual(*parts, theirs):.1e}; estimated error {solution.error:.1e}, distance from "
+        f"SLICOT's Z {relative(solution.X, theirs):.1e}"
+    )
+
+
+def responses() -> None:
+    """The Schur form and single solutions next to a pole at 1 - 1e-6."""
+    A, B, C, D = random_system(0, 6, 1, 2, 1 - 1e-6)
+    system = lbt.StateSpace(A=A, B=B, C=C, D=D)
+    with mpmath.workdps(40):
+        G = mpmath.matrix(C.tolist()) * mpmath.lu_solve(
+            -mpmath.eye(6) - mpmath.matrix(A.tolist()), mpmath.matrix(B.tolist())
+        ) + mpmath.matrix(D.tolist())
+        exact = float(mpmath.sqrt(sum(abs(x) ** 2 for x in G)))
+    one = lbt.largest_singular_values(system, [0.5])[0]
+    many = lbt.largest_singular_values(system, np.linspace(0, 0.5, 101))[-1]
+    print(f"response next to a pole at 1 - 1e-6: Schur form {abs(many / exact - 1):.1e}, "
+          f"one by one {abs(one / exact - 1):.1e}")  # fmt: skip
+
+
+def mixed() -> None:
+    """Least variance at 1.05 times the least gamma: central, best own gain, mixed."""
+    plant = lbt_axis_plant()
+    bound = 1.05 * lbt.hinf(plant, method="riccati").gamma_least
+    central = lbt.central(plant, gamma=bound)
+    gain = central.gain_predictor
+    unit = np.abs(gain.ravel())
+
+    def deviation(g):
+        error = plant.error_system((g * unit).reshape(gain.shape))
+        if not error.spectral_radius < 1:
+            return 1e6
+        P = stationary_covariance(error.A, error.B @ error.B.T)
+        return float(np.sqrt(np.trace(plant.L @ P @ plant.L.T)))
+
+    def room(g):
+        error = plant.error_system((g * unit).reshape(gain.shape))
+        return (bound - float(lbt.hinf_norm(error))) / 100 if error.spectral_radius < 1 else -10.0
+
+    found = minimize(
+        lambda g: deviation(g) ** 2 / 1e4, gain.ravel() / unit, method="SLSQP",
+        constraints=[{"type": "ineq", "fun": room}], options={"maxiter": 200, "ftol": 1e-10},
+    )  # fmt: skip
+    own = deviation(found.x)
+    print(f"rms at {bound:.2f} nm: central {central.rms:.2f}, best own gain {own:.2f}")
+    for taps in (1, 4, 16, 48, 128):
+        design = lbt.mixed(plant, gamma=bound, taps=taps)
+        print(f"  mixed, {taps} taps: {design.rms:.3f} nm, {design.solver.iterations} rounds")
+
+
+if __name__ == "__main__":
+    with np.errstate(all="ignore"):
+        darex()
+        output_feedback()
+    responses()
+    mixed()
