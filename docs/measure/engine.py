@@ -61,8 +61,8 @@ def output_feedback() -> None:
     print(
         f"SB10DD: |Z| {np.linalg.norm(solution.X):.1e}, plain relative residual "
         f"{plain_residual(*parts, solution.X):.1e}, of SLICOT's Z "
-        f"{plain_residual(*parts, theirs):.1e}; estimated error {solution.error:.1e}, distance from "
-        f"SLICOT's Z {relative(solution.X, theirs):.1e}"
+        f"{plain_residual(*parts, theirs):.1e}; estimated error {solution.error:.1e}, "
+        f"distance from SLICOT's Z {relative(solution.X, theirs):.1e}"
     )
 
 

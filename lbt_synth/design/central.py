@@ -54,14 +54,7 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     require_problem(problem)
     bound = number(gamma, "gamma", above=0)
     least = hinf(problem, method="riccati")
-    assert least.gamma_least is not None  # of an H-infinity design
-    if bound < least.gamma_least * (1 - _SAME):
-        raise InfeasibleError(
-            f"gamma must be at least {least.gamma_least:.9g}, the least of this problem; got "
-            f"{bound:.9g}.",
-            gamma=bound,
-            gamma_least=least.gamma_least,
-        )
+    require_reachable(least, bound)
     gains = CentralFamily(problem, least).member(lambda norm, _: norm - bound)
     return filter_design(
         problem,
@@ -74,6 +67,25 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
         gamma_infeasible=least.gamma_infeasible,
         witness=least.witness,
     )
+
+
+def require_reachable(least: FilterDesign, gamma: float) -> float:
+    """Return the least gamma of a problem, or raise if a level is below it.
+
+    Raises
+    ------
+    InfeasibleError
+        With the least level.
+    """
+    assert least.gamma_least is not None  # of an H-infinity design
+    if gamma < least.gamma_least * (1 - _SAME):
+        raise InfeasibleError(
+            f"gamma must be at least {least.gamma_least:.9g}, the least of this problem; got "
+            f"{gamma:.9g}. Try gamma_ratio=1.1.",
+            gamma=gamma,
+            gamma_least=least.gamma_least,
+        )
+    return least.gamma_least
 
 
 class CentralFamily:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lbt_synth.design.central import CentralFamily
+from lbt_synth.design.central import CentralFamily, require_reachable
 from lbt_synth.design.hinf import Gains, hinf
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
@@ -117,13 +117,7 @@ def mixed(
         if gamma_ratio is not None:
             gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
         bound = number(gamma, "gamma", above=0)
-        if bound < least.gamma_least * (1 - _SAME):
-            raise InfeasibleError(
-                f"gamma must be at least {least.gamma_least:.9g}, the least of this problem; got "
-                f"{bound:.9g}. Try gamma_ratio=1.1.",
-                gamma=bound,
-                gamma_least=least.gamma_least,
-            )
+        require_reachable(least, bound)
         family = CentralFamily(problem, least)
         base = family.member(lambda norm, _: norm - bound)
         if bound <= least.gamma_least * (1 + _EDGE):  # there is no room for anything else

@@ -19,13 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.parts import checked_vibrations, noise_factor, per_mode
 from lbt_synth.models.problem import LONGEST_HORIZON, EstimationProblem
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import FloatArray, definite, frozen, integer, number
+from lbt_synth.validation import FloatArray, frozen, integer, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -384,9 +385,9 @@ def tip_tilt_plant(
             sensor_matrix=gain * hardware.sensor,
             influence_matrix=hardware.influence,
         )
-    models = _per_mode(turbulence, hardware)
-    lines = _checked_vibrations(vibrations, hardware)
-    noise_factor = _noise_factor(noise_nm, hardware.n_measurements)
+    models = per_mode(turbulence, hardware)
+    lines = checked_vibrations(vibrations, hardware)
+    factor = noise_factor(noise_nm, hardware.n_measurements)
 
     n, p, order = hardware.modes, len(lines), max(model.order for model in models)
     ceil_delay = max(int(np.ceil(hardware.delay_frames)), 2)
@@ -416,7 +417,7 @@ def tip_tilt_plant(
     B[tur : tur + n, p : p + n] = np.diag([m.driving_rms_nm for m in models])
     C = np.zeros((q, size))
     C[:, size - n :] = hardware.sensor
-    D = np.hstack([np.zeros((q, p + n)), noise_factor])
+    D = np.hstack([np.zeros((q, p + n)), factor])
 
     late = ceil_delay - hardware.delay_frames  # weight of the frame before
     L = np.zeros((n, size))
@@ -427,51 +428,6 @@ def tip_tilt_plant(
         A=A, B=B, C=C, D=D, L=L, dt_s=hardware.dt_s,
         hardware=hardware, turbulence=models, vibrations=lines,
     )  # fmt: skip
-
-
-def _per_mode(
-    turbulence: ARModel | Sequence[ARModel], hardware: LoopHardware
-) -> tuple[ARModel, ...]:
-    n = hardware.modes
-    models = (turbulence,) * n if isinstance(turbulence, ARModel) else tuple(turbulence)
-    if len(models) != n:
-        raise DimensionError(
-            f"turbulence must be one ARModel, or one a mode ({n}); got {len(models)}."
-        )
-    for model in models:
-        if not np.isclose(model.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
-            raise ProblemError(
-                f"the turbulence model must be sampled at the frame rate "
-                f"{hardware.frame_rate_hz:.6g} Hz; got {model.frame_rate_hz:.6g} Hz."
-            )
-    return models
-
-
-def _checked_vibrations(
-    vibrations: Sequence[Vibration] | None, hardware: LoopHardware
-) -> tuple[Vibration, ...]:
-    if vibrations is None:
-        return ()
-    lines = tuple(vibrations)
-    if not lines:
-        raise ProblemError(
-            "vibrations is empty; expected at least one Vibration, or None (leave it out) "
-            "for a plant without vibrations."
-        )
-    for line in lines:
-        if len(line.direction) != hardware.modes:
-            raise DimensionError(
-                f"the direction of a vibration must have {hardware.modes} components, one a mode; "
-                f"got {len(line.direction)} at {line.frequency_hz:.6g} Hz."
-            )
-    return lines
-
-
-def _noise_factor(noise_nm: Any, q: int) -> FloatArray:
-    if np.ndim(noise_nm) == 0:
-        return frozen(number(noise_nm, "noise_nm", above=0) * np.eye(q))
-    covariance = definite(noise_nm, "noise_nm", size=(q, "to match the measurements"))
-    return frozen(np.linalg.cholesky(covariance))
 
 
 def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") -> TipTiltPlant:
