@@ -339,3 +339,39 @@ def test_sb10dd_the_published_digits():
         assert np.max(np.abs(found - digits)) < 5.1e-5
     loop = script["closed_loop"](*plant, controller, **sizes)
     assert float(lbt.hinf_norm(loop)) < 111.294
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_undriven_blocks_on_the_unit_circle_are_named(seed, size):
+    """Defective, and turned at random: their eigenvalues are found 1e-5 off the circle."""
+    rng = np.random.default_rng(seed)
+    n = size + 2
+    A = np.zeros((n, n))
+    A[:size, :size] = np.eye(size) + np.eye(size, k=1)
+    A[size:, size:] = np.diag([0.5, 0.8])
+    B = np.zeros((n, 2))
+    B[size:] = rng.standard_normal((2, 2))
+    turn = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    problem = lbt.EstimationProblem(
+        A=turn @ A @ turn.T, B=np.hstack([turn @ B, np.zeros((n, 1))]), L=np.ones((1, n)),
+        C=rng.standard_normal((1, n)), D=[[0.0, 0.0, 1.0]],
+    )  # fmt: skip
+    with pytest.raises(
+        lbt.DetectabilityError, match="must be driven by noise; the mode of A at"
+    ) as caught:
+        lbt.kalman(problem)
+    assert abs(caught.value.eigenvalue - 1) < 1e-4
+    if (
+        size == 1
+    ):  # a larger block is driven by the rounding of Q = B B', which is all solve_dare sees
+        with pytest.raises(lbt.DetectabilityError, match="Q must see every mode on the unit"):
+            lbt.solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R)
+
+
+def test_an_undriven_mode_that_decays_slowly_is_let_be():
+    for gap in (1e-3, 1e-6, 1e-8):
+        p = lbt.EstimationProblem(
+            A=[[1 - gap, 0], [0, 0.5]], B=[[0, 0], [1, 0]], C=[[1, 1]], D=[[0, 1]], L=[[1, 1]]
+        )
+        assert np.max(np.abs(lbt.kalman(p).poles)) == pytest.approx(1 - gap, rel=1e-12)

@@ -24,7 +24,8 @@ from lbt_synth.validation import (
 RESIDUAL_LIMIT = 1e-12  # a solution beyond these limits is not returned
 ERROR_LIMIT = 1e-3
 _SATISFIED = 1e-8  # beyond this estimate of its error the next route is tried
-_DOUBTFUL = 1e-9  # a pole this close to the unit circle makes the conditions be checked
+_DOUBTFUL = 1e-6  # a pole this close to the unit circle makes the conditions be checked
+_ON_CIRCLE = 1e-9  # and one this close is taken for one on it, if there is a zero
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +164,8 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
 
     solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
     for i in np.flatnonzero(~solved | (radius > 1 - _DOUBTFUL)):
-        require_stabilising(balanced, int(i), _name(int(i), lead))
+        zeros = not solved[i] or radius[i] > 1 - _ON_CIRCLE
+        require_stabilising(balanced, int(i), _name(int(i), lead), zeros=zeros)
     if not solved.all():
         _refuse(int(np.flatnonzero(~solved)[0]), lead, best)
     X = best.X

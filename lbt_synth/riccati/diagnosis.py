@@ -11,6 +11,8 @@ from lbt_synth.validation import FloatArray
 
 _RANK = 1e-10
 _CIRCLE = 1e-6  # a double root on the circle is found this far from it
+_CLUSTER = 1e-4  # and one of several, of a defective matrix, this far
+_CLUSTER_RANK = 1e-13  # which is then tested at the circle, where a mode that decays passes
 
 
 def unstable_hidden_mode(
@@ -34,17 +36,23 @@ def unstable_hidden_mode(
     A, C = A * units / units[:, None], C * units
     scale_A = max(float(np.linalg.norm(A, 2)), 1e-300)
     scale_C = max(float(np.linalg.norm(C, 2)), 1e-300)
+    points: list[tuple[complex, float]] = []
     for value in np.linalg.eigvals(A):
         size = abs(value)
-        if size < 1 - _RANK or (only_unit_circle and size > 1 + _RANK):
-            continue
-        pencil = np.vstack([(A - value * np.eye(n)) / scale_A, C / scale_C])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < _RANK:
-            return complex(value)
+        if size >= 1 - _RANK and not (only_unit_circle and size > 1 + _RANK):
+            points.append((complex(value), _RANK))
+        if abs(size - 1) < _CLUSTER:
+            points.append((complex(value / size), _CLUSTER_RANK))
+    for point, tolerance in points:
+        pencil = np.vstack([(A - point * np.eye(n)) / scale_A, C / scale_C])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < tolerance:
+            return point
     return None
 
 
-def require_stabilising(equations: Equations, index: int, name: str = "") -> None:
+def require_stabilising(
+    equations: Equations, index: int, name: str = "", *, zeros: bool = True
+) -> None:
     """Raise if an equation has no stabilising solution for a reason that can be named.
 
     Parameters
@@ -55,6 +63,9 @@ def require_stabilising(equations: Equations, index: int, name: str = "") -> Non
         Which of them.
     name : str, optional
         Begins the message, for an equation of many.
+    zeros : bool, optional
+        Whether to look for zeros on the unit circle, too: a search that takes a pole within
+        1e-8 of the circle for one on it.
 
     Raises
     ------
@@ -89,7 +100,7 @@ def require_stabilising(equations: Equations, index: int, name: str = "") -> Non
                 "has no weight, so there is no stabilising solution. Add a small weight on it.",
                 eigenvalue=hidden,
             )
-    zero = _unit_circle_zero(A, B, Q, R, S)
+    zero = _unit_circle_zero(A, B, Q, R, S) if zeros else None
     if zero is not None:
         raise DetectabilityError(
             f"{name}the equation has a zero on the unit circle, at {zero:.6g}: there its weights "
@@ -102,7 +113,9 @@ def require_stabilising(equations: Equations, index: int, name: str = "") -> Non
 def _root(weight: FloatArray) -> FloatArray:
     """Columns whose squares add up to the absolute value of a symmetric matrix."""
     values, vectors = np.linalg.eigh(weight)
-    return np.asarray(vectors * np.sqrt(np.abs(values)), dtype=np.float64)
+    size = np.abs(values)
+    size = np.where(size > 1e-14 * size.max(initial=0.0), size, 0.0)  # a root doubles its digits
+    return np.asarray(vectors * np.sqrt(size), dtype=np.float64)
 
 
 def _unit_circle_zero(
