@@ -14,14 +14,15 @@ from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.norms import hinf_norm, largest_singular_values
 from lbt_synth.riccati import kalman_riccati
-from lbt_synth.statespace import Controller
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.validation import FloatArray, frozen, number
 from lbt_synth.witness import Witness, infeasible_level
 
 GAIN_TOLERANCE = 1e-6
 NORM_TOLERANCE = 1e-6
 RESIDUAL_TOLERANCE = 1e-8
 INFEASIBLE_TOLERANCE = 1e-9
+VARIANCE_TOLERANCE = 1e-6
 _GRID = 513
 
 
@@ -165,6 +166,8 @@ def certify_filter(
             method="relative, 1-norm",
         )
     )
+    variances = np.diag(problem.L @ P @ problem.L.T)
+    checks.append(_variance_both_ways(error, float(variances.sum())))
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     excess = float(np.max(largest_singular_values(error, grid))) / max(norm.upper, 1e-300) - 1
@@ -197,11 +200,23 @@ def certify_filter(
                 method="gain recomputed from the Lyapunov covariance",
             )
         )
-    variances = np.diag(problem.L @ P @ problem.L.T)
     return Certificate(
         checks=tuple(checks),
         gamma=norm.value,
         rms_per_output=frozen(np.sqrt(np.maximum(variances, 0))),
+    )
+
+
+def _variance_both_ways(error: StateSpace, variance: float) -> Check:
+    """Compare the variance with that of the adjoint equation, which sums it in another order."""
+    weight = stationary_covariance(error.A.T, error.C.T @ error.C)
+    adjoint = float(np.trace(error.B.T @ weight @ error.B))
+    size = max(abs(variance), abs(adjoint))
+    return Check(
+        name="variance, against its adjoint equation",
+        value=abs(variance - adjoint) / size if size > 0 else 0.0,
+        limit=VARIANCE_TOLERANCE,
+        method="relative, two Lyapunov equations",
     )
 
 
@@ -242,10 +257,11 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
             f"a witness must have {problem.n_states} rows of states, {problem.B.shape[1]} rows of "
             f"disturbances and as many columns in both; got {x.shape} and {w.shape}."
         )
+    claimed = number(level, "level", above=0)
     proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
     return Check(
         name="level claimed infeasible, above the level proved",
-        value=level / max(proved, 1e-300) - 1,
+        value=claimed / max(proved, 1e-300) - 1,
         limit=INFEASIBLE_TOLERANCE,
         method="disturbances that no measurement shows",
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.design import FilterDesign, central, hinf, kalman, mixed
+from lbt_synth.design.mixed import require_taps
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.models import EstimationProblem
 from lbt_synth.models.problem import require_problem
@@ -96,6 +97,7 @@ def tradeoff(
     """
     require_problem(problem)
     count = integer(points, "points", at_least=2)
+    length = require_taps(taps)
     for family in families:
         choice(family, "families", FAMILIES)
     least, best = hinf(problem, method="riccati"), kalman(problem)
@@ -109,7 +111,7 @@ def tradeoff(
             elif i == count - 1:
                 design = best
             elif family == "mixed":
-                design = mixed(problem, gamma=level, taps=taps)
+                design = mixed(problem, gamma=level, taps=length)
             else:
                 design = central(problem, gamma=level)
             yield _point(design, family, least.gamma_least)

@@ -33,7 +33,8 @@ class HinfNorm:
     value : float
         Largest singular value found, attained at ``peak_frequency_hz``.
     lower, upper : float
-        Two-sided bracket.
+        Two-sided bracket of the level sets. Next to a pole on the unit circle the evaluation
+        itself is only as good as the distance to it: with a pole at 1 - 1e-9, some 1e-7.
     peak_frequency_hz : float
         Frequency of the peak [Hz] (cycles a sample when the system has no period).
     """
@@ -84,6 +85,7 @@ def hinf_norm(system: Any) -> HinfNorm:
             f"{radius:.9g}. An unstable system has no finite norm.",
             spectral_radius=radius,
         )
+    G = G.balanced()
     seeds = np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)])
     peak, angle = _largest(G, _folded(seeds))
     if peak == 0:

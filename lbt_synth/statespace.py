@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.linalg import schur
+from scipy.linalg import matrix_balance, schur
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import (
@@ -149,6 +149,43 @@ class StateSpace(LinearSystem):
             self.A, self.B, self.C, self.D, self.dt_s, remove_useless_states=False
         )
 
+    def balanced(self) -> StateSpace:
+        """Return the same input-output map with states in units (powers of two) that balance it.
+
+        Returns
+        -------
+        StateSpace
+            Rows and columns of ``[[A, B], [C, 0]]`` are of similar size, state by state.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> lag = lbt.StateSpace(A=[[0.5]], B=[[1024.0]], C=[[2.0**-10]], D=[[0.0]])
+        >>> float(lag.balanced().B[0, 0])
+        1.0
+        """
+        n = self.n_states
+        scale = max(float(np.abs(self.A).max()), 1e-300)
+        entry, leaving = np.linalg.norm(self.B, axis=1), np.linalg.norm(self.C, axis=0)
+        border = np.zeros((n + 1, n + 1))
+        border[:n, :n] = np.abs(self.A)
+        border[:n, n], border[n, :n] = _of_size(entry, scale), _of_size(leaving, scale)
+        _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
+        units = np.asarray(scaling[:n] / scaling[n], dtype=np.float64)
+        if not np.all(np.isfinite(units)):
+            return self
+        # the sizes of B and C as a whole are shared between them, too
+        large, small = entry / units, leaving * units
+        both = float(np.sqrt(max(large.max(), 1e-300) / max(small.max(), 1e-300)))
+        units = units * np.exp2(np.round(np.log2(both))) if 0 < both < np.inf else units
+        return StateSpace(
+            A=self.A * units / units[:, None],
+            B=self.B / units[:, None],
+            C=self.C * units,
+            D=self.D,
+            dt_s=self.dt_s,
+        )
+
     @property
     def poles(self) -> ComplexArray:
         """Eigenvalues of A, (n,)."""
@@ -188,7 +225,7 @@ class StateSpace(LinearSystem):
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         # a few points are solved one by one, which is more accurate next to a pole
         few = z.size <= self.n_states
-        response = pointwise_response(self, z) if few else _response(self, z)
+        response = pointwise_response(self, z) if few else _response(self.balanced(), z)
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -196,6 +233,11 @@ class StateSpace(LinearSystem):
                 "and no response there; leave that frequency out."
             )
         return response
+
+
+def _of_size(vector: FloatArray, size: float) -> FloatArray:
+    largest = float(vector.max(initial=0.0))
+    return vector * (size / largest) if largest > 0 else vector
 
 
 def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:

@@ -97,8 +97,9 @@ def symmetric(
     turned = np.swapaxes(out, -1, -2)
     scale = np.max(np.abs(out), axis=(-2, -1), initial=0.0)
     skew = np.max(np.abs(out - turned), axis=(-2, -1), initial=0.0)
-    worst = np.unravel_index(np.argmax(skew - 1e-10 * scale), skew.shape)
-    if skew[worst] > 1e-10 * scale[worst]:
+    crooked = skew > 1e-10 * scale
+    if np.any(crooked):
+        worst = tuple(np.argwhere(crooked)[0])
         raise DefinitenessError(
             f"{name} must be symmetric; got an asymmetry of {skew[worst]:.3g} beside entries of "
             f"{scale[worst]:.3g}. Try {name} = ({name} + {name}.T) / 2 if it is rounding."

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.models.problem import EstimationProblem
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, matrix
 
 _RANK_TOLERANCE = 1e-13
+_STRAYED = 1e-9  # what of the successors may lie where a filter has no error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,6 +39,13 @@ class Witness:
 
     states: FloatArray
     disturbances: FloatArray
+
+    def __post_init__(self) -> None:
+        states = matrix(self.states, "states")
+        columns = (states.shape[1], f"to match the states {states.shape}")
+        disturbances = matrix(self.disturbances, "disturbances", cols=columns)
+        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "disturbances", disturbances)
 
 
 def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: FloatArray) -> float:
@@ -70,10 +78,17 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
     >>> infeasible_level(p, push, np.eye(1))
     1.0
     """
-    x, w = witness.states, witness.disturbances
+    basis, inverse = identity_coordinates(covariance)
+    x = basis @ (inverse @ witness.states)  # the error of a filter stays in this space
+    w = witness.disturbances
     w = w - problem.D.T @ np.linalg.solve(problem.R, problem.C @ x + problem.D @ w)
     after = problem.A @ x + problem.B @ w
-    basis, inverse = identity_coordinates(covariance)
+    deviation = np.sqrt(np.diag(covariance))
+    units = np.maximum(deviation, 1e-7 * deviation.max(initial=0.0))[:, None]
+    units = np.where(units > 0, units, 1.0)
+    strayed = np.linalg.norm((after - basis @ (inverse @ after)) / units)
+    if strayed > _STRAYED * np.linalg.norm(after / units):
+        return 0.0
     growth = inverse @ (after @ after.T - x @ x.T) @ inverse.T
     values, vectors = np.linalg.eigh((growth + growth.T) / 2)
     grown = basis @ (vectors * np.sqrt(np.maximum(values, 0)))

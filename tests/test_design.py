@@ -280,3 +280,28 @@ def test_only_problems_are_designed_for():
     for make in (lbt.kalman, lbt.hinf):
         with pytest.raises(lbt.ProblemError, match="expected an EstimationProblem.*got ndarray"):
             make(np.eye(2))
+
+
+def test_a_variance_that_rounding_has_spoilt_is_not_certified():
+    """Two Lyapunov equations that sum it in different orders have to agree."""
+    rng = np.random.default_rng(0)
+    spoilt = 0
+    for _ in range(40):
+        turn = (
+            rng.standard_normal((4, 4))
+            @ np.diag([1, 1e-3, 1e-6, 1e-9])
+            @ rng.standard_normal((4, 4))
+        )
+        A = turn @ np.diag([0.5, 0.4, 0.3, 0.2]) @ np.linalg.inv(turn)
+        problem = lbt.EstimationProblem(
+            A=A, B=rng.standard_normal((4, 5)), C=rng.standard_normal((1, 4)),
+            D=rng.standard_normal((1, 5)), L=rng.standard_normal((1, 4)),
+        )  # fmt: skip
+        try:
+            design = lbt.kalman(problem)
+        except lbt.LbtSynthError:
+            spoilt += 1
+            continue
+        check = next(c for c in design.certificate.checks if "adjoint" in c.name)
+        assert check.value < 1e-6
+    assert 0 < spoilt

@@ -93,7 +93,7 @@ def test_correlated_noise_is_refused_beyond_one_frame():
         lbt.kalman(p, horizon=2)
 
 
-@pytest.mark.parametrize("horizon", [1.0, "1", None, True, 1001, -1001])
+@pytest.mark.parametrize("horizon", [1.0, "1", None, True, 101, -101])
 def test_wrong_horizons(horizon):
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     with pytest.raises(lbt.ProblemError, match="horizon must be"):
@@ -117,7 +117,7 @@ def test_a_horizon_is_a_delay_of_the_loop(method):
         p = lbt_axis_plant()
         bare = lbt.EstimationProblem(A=p.A, B=p.B, C=p.C, D=p.D, L=p.L, dt_s=p.dt_s)
         assert make(bare, horizon=horizon).rms == pytest.approx(direct.rms, rel=1e-9)
-    with pytest.raises(lbt.ProblemError, match="delay of 1 to 1000 frames; got -1"):
+    with pytest.raises(lbt.ProblemError, match="delay of 1 to 100 frames; got -1"):
         make(lbt_axis_plant(), horizon=-1)
     with pytest.raises(lbt.ProblemError, match="horizon of 1; got 2"):
         make(lbt_axis_plant().full(), horizon=2)

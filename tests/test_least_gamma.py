@@ -162,3 +162,48 @@ def test_the_proof_travels_with_the_gain_file(tmp_path, axis_plant):
         assert loaded.gamma_infeasible == design.gamma_infeasible
         assert np.array_equal(loaded.witness.states, design.witness.states)
         assert loaded.recertified().passed
+
+
+def test_states_without_error_prove_nothing():
+    """A direction in which no filter errs has no price: a witness that uses it is worth nothing."""
+    p = lbt.EstimationProblem(
+        A=np.diag([0.9, 0.5]), B=[[1, 0], [0, 0]], C=[[1, 0]], D=[[0, 1]], L=[[1, 1]]
+    )
+    free = lbt.Witness(states=[[0.0], [1.0]], disturbances=[[1e-6], [0.0]])
+    assert not lbt.certify_infeasible(p, 1e5, free).passed
+    least = lbt.hinf(p, method="riccati").gamma_least
+    assert least == pytest.approx(1.34536, abs=1e-5)
+    extended = lbt.mixed(p, gamma_ratio=1.01, taps=3).problem
+    memory = np.eye(extended.n_states)[:, -2:]
+    assert not lbt.certify_infeasible(
+        extended, 1.1 * least, lbt.Witness(states=memory, disturbances=1e-6 * np.ones((2, 2)))
+    ).passed
+
+
+def test_claims_need_a_proof_and_must_fit_the_filter(axis_plant):
+    design = lbt.hinf(axis_plant, gamma_ratio=1.2, method="riccati")
+    bare = dataclasses.replace(design, witness=None)
+    assert not bare.recertified().passed
+    with pytest.raises(lbt.DimensionError, match="states must be a matrix"):
+        lbt.Witness(states=np.zeros(2), disturbances=np.zeros(2))
+    with pytest.raises(lbt.DimensionError, match="disturbances must have 3 columns"):
+        lbt.Witness(states=np.zeros((2, 3)), disturbances=np.zeros((2, 2)))
+    with pytest.raises(lbt.NonFiniteError):
+        lbt.Witness(states=[[np.nan]], disturbances=[[1.0]])
+    with pytest.raises(lbt.ProblemError, match="level must be above 0"):
+        lbt.certify_infeasible(axis_plant, -5.0, design.witness)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000))
+def test_the_bracket_does_not_depend_on_the_units_of_states(seed):
+    rng = np.random.default_rng(seed)
+    problem = random_problem(rng, 4)
+    units = 10.0 ** rng.uniform(-5, 5, 4)
+    scaled = lbt.EstimationProblem(
+        A=problem.A * units[:, None] / units, B=problem.B * units[:, None], C=problem.C / units,
+        D=problem.D, L=problem.L / units,
+    )  # fmt: skip
+    one, other = (lbt.hinf(p, method="riccati") for p in (problem, scaled))
+    assert other.gamma_least == pytest.approx(one.gamma_least, rel=1e-8)
+    assert other.gamma_infeasible == pytest.approx(one.gamma_infeasible, rel=1e-8)

@@ -213,3 +213,45 @@ def test_two_axes_on_the_command_line(tmp_path, capsys):
     )
     assert main(["verify", target]) == 0
     assert lbt.load_gain(target).hardware.delay_frames == 3
+
+
+def test_a_plant_with_its_commands_as_states(plant):
+    design = lbt.mixed(plant.full(), gamma_ratio=1.1, taps=4)
+    same = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
+    assert design.rms == pytest.approx(same.rms, rel=1e-7)
+    assert lbt.close_loop(design.hardware, design.controller).is_stable
+
+
+def test_a_plant_with_memory_is_not_assembled_anew(plant):
+    design = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
+    for again in (lambda: design.problem.ahead(2), lambda: lbt.retuned_plant(design.problem, 1.0)):
+        with pytest.raises(lbt.ProblemError, match="holds the memory of a mixed filter"):
+            again()
+
+
+def test_bounds_without_a_limit(plant, ends, tmp_path, capsys):
+    from lbt_synth.cli.main import main
+
+    assert lbt.mixed(plant, gamma_ratio=1e300 / ends[0].gamma_least).rms == ends[1].rms
+    assert lbt.mixed(plant, rms=1e200).gamma == ends[0].gamma
+    target = str(tmp_path / "m.npz")
+    for size in ("1e30", "1e200"):
+        assert (
+            main(["design", str(LBT_YAML), "--method", "mixed", "--rms", size, "-o", target]) == 0
+        )
+    capsys.readouterr()
+
+
+def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
+    import cvxpy
+
+    class PanicException(BaseException):
+        pass
+
+    def panic(*arguments, **options):
+        raise PanicException("out of range")
+
+    monkeypatch.setattr(cvxpy.Problem, "solve", panic)
+    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    with pytest.raises(lbt.NumericalError, match="numbers out of its range"):
+        lbt.hinf(walk)

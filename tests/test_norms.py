@@ -174,3 +174,28 @@ def test_the_bracket_is_narrow_and_holds():
         lbt.StateSpace(A=A, B=B, C=C, D=D), np.linspace(0, 0.5, 20_001)
     )
     assert dense.max() <= norm.upper
+
+
+@given(
+    seed=st.integers(0, 100_000), n=st.integers(1, 4), scale=st.sampled_from([1e-9, 1e-5, 1e5, 1e9])
+)
+def test_units_of_states_change_nothing(seed, n, scale):
+    """B s, C / s, and each state in units of its own."""
+    A, B, C, D = random_system(seed, n, 2, 2, 0.9)
+    expected = float(lbt.hinf_norm((A, B, C, D)))
+    assert float(lbt.hinf_norm((A, scale * B, C / scale, D))) == pytest.approx(expected, rel=1e-9)
+    units = 10.0 ** np.random.default_rng(seed).uniform(-6, 6, n)
+    turned = (A * units[:, None] / units, B * units[:, None], C / units, D)
+    assert float(lbt.hinf_norm(turned)) == pytest.approx(expected, rel=1e-9)
+    frequency = np.linspace(0, 0.5, 201)
+    plain = lbt.StateSpace(A=A, B=B, C=C, D=D).frequency_response(frequency)
+    scaled = lbt.StateSpace(A=turned[0], B=turned[1], C=turned[2], D=D).frequency_response(
+        frequency
+    )
+    assert np.allclose(scaled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
+
+
+def test_a_peak_that_units_hid():
+    A, s = [[0.7, 0.6], [-0.1, 0.9]], 1e5
+    norm = lbt.hinf_norm((A, [[0.1 * s], [-1 * s]], [[-0.8 / s, 0.4 / s]], [[0]]))
+    assert float(norm) == pytest.approx(4.48499, abs=1e-5)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import slycot
+from darex import example_2_5
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import ROOT, lbt_axis_plant, random_problem
@@ -375,3 +376,58 @@ def test_an_undriven_mode_that_decays_slowly_is_let_be():
             A=[[1 - gap, 0], [0, 0.5]], B=[[0, 0], [1, 0]], C=[[1, 1]], D=[[0, 1]], L=[[1, 1]]
         )
         assert np.max(np.abs(lbt.kalman(p).poles)) == pytest.approx(1 - gap, rel=1e-12)
+
+
+def test_sizes_from_1e_minus_300_to_1e300():
+    """Weights of any size give X of that size; nothing under- or overflows on the way."""
+    A, B = np.array([[1.2, 1.0], [0.0, 0.5]]), [[0.0], [1.0]]
+    expected = lbt.solve_dare(A, B, np.eye(2), 1.0)
+    assert expected.X[0, 0] == pytest.approx(4.517, abs=1e-3)
+    for size in (1e-300, 1e-162, 1e-150, 1e150, 1e155, 1e300):
+        found = lbt.solve_dare(A, B, size * np.eye(2), size)
+        assert np.allclose(found.X / size, expected.X, rtol=1e-12)
+        assert 0 < found.residual < 1e-14
+    for numbers in ((1e200, 1, 1, 1), ([[0, 1e160], [0, 0]], [[0], [1]], np.eye(2), 1)):
+        with pytest.raises(lbt.NumericalError, match="was not solved"):
+            lbt.solve_dare(*numbers)
+
+
+@pytest.mark.parametrize("weight", [1e-8, 1e-12, 1e-16, 1e-20])
+def test_a_pole_next_to_the_circle_is_accurate(weight):
+    """x^2 = weight (x + 1): the pole is 1 / (1 + x), the closer the smaller the weight."""
+    exact = (weight + np.sqrt(weight**2 + 4 * weight)) / 2
+    solution = lbt.solve_dare(1, 1, weight, 1)
+    assert solution.X[0, 0] == pytest.approx(exact, rel=1e-14)
+    assert 1 - abs(solution.poles[0]) == pytest.approx(exact / (1 + exact), rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_no_solution_is_made_up_where_a_pole_is_on_the_circle(seed):
+    """Unweighted modes at 1, single or double, in bases that hide them."""
+    rng = np.random.default_rng(seed)
+    T = rng.integers(-2, 3, (3, 3)).astype(float)
+    if abs(np.linalg.det(T)) < 0.5:
+        T = T + 3 * np.eye(3)
+    inner = np.array([[1, 1, 0], [0, 1, 1], [0, 0, 0.5]]) if seed % 2 else np.diag([1, 0.3, 0.5])
+    A, weighted = T @ inner @ np.linalg.inv(T), np.linalg.inv(T)[2]
+    B = rng.integers(-2, 3, (3, 1)).astype(float)
+    with pytest.raises((lbt.DetectabilityError, lbt.NumericalError)):
+        lbt.solve_dare(A, B, np.outer(weighted, weighted), 1)
+
+
+def test_empty_stacks():
+    empty = lbt.solve_dare(
+        np.zeros((0, 2, 2)), np.zeros((0, 2, 1)), np.zeros((0, 2, 2)), np.zeros((0, 1, 1))
+    )
+    assert empty.X.shape == (0, 2, 2)
+    assert empty.residual == empty.error == 0
+
+
+def test_the_estimated_error_is_of_the_size_of_the_error():
+    """A nearly singular problem: 2.5 of DAREX with tau = 1e8, and an easy one."""
+    hard = example_2_5(1e8)
+    solution = lbt.solve_dare(hard.A, hard.B, hard.Q, hard.R)
+    error = np.linalg.norm(solution.X - hard.X) / np.linalg.norm(hard.X)
+    assert 1e-15 < solution.error < 1e-10
+    assert error < 100 * solution.error
+    assert lbt.solve_dare(1, 1, 1, 1).error < 1e-15

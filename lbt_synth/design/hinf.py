@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ from lbt_synth.riccati import (
     least_gamma,
     worst_invisible,
 )
-from lbt_synth.validation import FloatArray, choice, number
+from lbt_synth.validation import FloatArray, choice, frozen, number
 from lbt_synth.witness import Witness, infeasible_level
 
 # A level this close to the least one counts as the least one itself.
@@ -137,8 +138,8 @@ def hinf(
         requested = gamma
     if requested < least * (1 - _AT_LEAST):
         raise InfeasibleError(
-            f"gamma must be at least {least:.9g}, the least of this problem; got {requested:.9g}. "
-            "Try gamma_ratio=1.2.",
+            f"gamma must be at least {least:.12g}, the least of this problem; got "
+            f"{requested:.12g}. Try gamma_ratio=1.2.",
             gamma=requested,
             gamma_least=least,
         )
@@ -161,17 +162,38 @@ def hinf(
 
 
 class _RiccatiRoute:
-    """Levels by the gamma-Riccati equation."""
+    """Levels by the gamma-Riccati equation, in units in which the Kalman errors are of size one."""
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
-        self.problem, self.start = problem, start
+        spread = np.sqrt(np.diag(start.P))
+        usable = (spread > 1e-150) & (spread < 1e150)
+        # powers of two: the change of units rounds nothing
+        self.units = np.exp2(np.round(np.log2(np.where(usable, spread, 1.0))))[:, None]
+        self.problem, self.start = (
+            in_units(problem, self.units),
+            self._scaled(start, 1 / self.units),
+        )
 
     def least(self) -> tuple[_Solved, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)
         _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
-        return best, worst_invisible(self.problem, best.P, level, self.start.P)
+        witness = worst_invisible(self.problem, best.P, level, self.start.P)
+        states = frozen(self.units * witness.states)
+        return self._scaled(best, self.units), replace(witness, states=states)
 
     def at(self, gamma: float) -> _Solved:
+        return self._scaled(self._at(gamma), self.units)
+
+    @staticmethod
+    def _scaled(solution: FilterRiccati, units: FloatArray) -> FilterRiccati:
+        return replace(
+            solution,
+            P=frozen(units * solution.P * units.T),
+            gain_predictor=frozen(units * solution.gain_predictor),
+            gain_filter=frozen(units * solution.gain_filter),
+        )
+
+    def _at(self, gamma: float) -> FilterRiccati:
         solution = gamma_riccati(self.problem, gamma, start=self.start)
         if solution is None:
             raise InfeasibleError(
@@ -200,6 +222,18 @@ class _LmiRoute:
         from lbt_synth.lmi import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
+
+
+def in_units(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:
+    """Problem with the states divided by units (n, 1)."""
+    return EstimationProblem(
+        A=problem.A * units.T / units,
+        B=problem.B / units,
+        C=problem.C * units.T,
+        D=problem.D,
+        L=problem.L * units.T,
+        dt_s=problem.dt_s,
+    )
 
 
 def _verified_bracket(

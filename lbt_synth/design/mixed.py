@@ -15,9 +15,10 @@ from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.models.problem import EstimationProblem, require_problem
 from lbt_synth.norms import hinf_norm, largest_singular_values
+from lbt_synth.riccati import kalman_riccati
 from lbt_synth.statespace import StateSpace
 from lbt_synth.validation import FloatArray, frozen, integer, number
-from lbt_synth.witness import Witness
+from lbt_synth.witness import Witness, infeasible_level
 
 if TYPE_CHECKING:
     from lbt_synth.lmi import InnovationProgramme
@@ -28,6 +29,7 @@ _FINE_GRID = 1024
 _EXCESS = 4e-7  # by which the norm may exceed its bound; the certificate allows 1e-6
 _ROOM = 2e-7  # by which the bound at the frequencies is drawn in
 _SAME = 1e-9
+_MOST_TAPS = 256
 _EDGE = 1e-5  # so close to the least gamma the filter of the least gamma is returned
 
 
@@ -66,8 +68,9 @@ def mixed(
     Returns
     -------
     FilterDesign
-        Certified design; its problem has the past innovations as further states. Within
-        1e-5 of the least gamma it is the filter of the least gamma itself.
+        Certified design; its problem has the past innovations as further states. A bound
+        that the Kalman filter meets gives the Kalman filter; one that only the filter of
+        the least gamma meets (within 1e-5), or that lets it in, gives that one.
 
     Raises
     ------
@@ -96,9 +99,7 @@ def mixed(
             "give one of gamma, gamma_ratio and rms; "
             f"got gamma={gamma!r}, gamma_ratio={gamma_ratio!r}, rms={rms!r}."
         )
-    length = integer(taps, "taps", at_least=1)
-    if length > 256:
-        raise ProblemError(f"taps must be at most 256; got {length}.")
+    length = require_taps(taps)
     problem = problem.ahead(horizon)
     least, best = hinf(problem, method="riccati"), kalman(problem)
     assert least.gamma_least is not None  # of an H-infinity design
@@ -108,6 +109,8 @@ def mixed(
             raise InfeasibleError(
                 f"rms must be at least {best.rms:.9g}, that of the Kalman filter; got {bound:.9g}."
             )
+        if bound >= least.rms:  # the least norm of all is within the bound
+            return least
         family = CentralFamily(problem, least)
         base = family.member(lambda _, deviation: bound - deviation)
         made = _completed(
@@ -118,6 +121,8 @@ def mixed(
             gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
         bound = number(gamma, "gamma", above=0)
         require_reachable(least, bound)
+        if bound >= best.gamma:  # the least variance of all is within the bound
+            return best
         family = CentralFamily(problem, least)
         base = family.member(lambda norm, _: norm - bound)
         if bound <= least.gamma_least * (1 + _EDGE):  # there is no room for anything else
@@ -126,6 +131,20 @@ def mixed(
             problem, base, length, lambda p, grid: p.least_variance(bound * (1 - _ROOM), grid)
         )
     return _certified(problem, base, made, least, bound if rms is None else None)
+
+
+def require_taps(taps: int) -> int:
+    """Return a length of the impulse response that is fit for use.
+
+    Raises
+    ------
+    ProblemError
+        If it is none.
+    """
+    length = integer(taps, "taps", at_least=1)
+    if length > _MOST_TAPS:
+        raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {length}.")
+    return length
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,7 +200,13 @@ def _certified(
     size, q = made.taps.shape[1], base.gain_predictor.shape[1]
     gain = _with_memory(base.gain_predictor, size // q)
     assert least.witness is not None
+    assert least.gamma_infeasible is not None
     padding = np.zeros((size, least.witness.states.shape[1]))
+    witness = Witness(
+        states=frozen(np.vstack([least.witness.states, padding])),
+        disturbances=least.witness.disturbances,
+    )
+    proved = infeasible_level(extended, witness, kalman_riccati(extended).P)
     innovation_gain = np.vstack([base.gain_filter, np.zeros((size, q))])
     return filter_design(
         extended,
@@ -191,11 +216,8 @@ def _certified(
         solver=SolverReport(route="youla", status=made.status, iterations=made.rounds),
         gamma_requested=gamma,
         gamma_least=least.gamma_least,
-        gamma_infeasible=least.gamma_infeasible,
-        witness=Witness(
-            states=frozen(np.vstack([least.witness.states, padding])),
-            disturbances=least.witness.disturbances,
-        ),
+        gamma_infeasible=min(least.gamma_infeasible, proved),
+        witness=witness,
     )
 
 

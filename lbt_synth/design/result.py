@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.certify import (
+    INFEASIBLE_TOLERANCE,
     Certificate,
     Check,
     certify_filter,
@@ -220,8 +221,21 @@ def certify_design(
         problem, gain_predictor, gamma=gamma, least_variance=method == "kalman"
     )
     checks = list(certificate.checks)
-    if infeasible is not None and witness is not None:
-        checks.append(certify_infeasible(problem, infeasible, witness))
+    if infeasible is not None:
+        checks.append(
+            Check(
+                name="level claimed infeasible, above the norm achieved",
+                value=infeasible / certificate.gamma - 1,
+                limit=INFEASIBLE_TOLERANCE,
+                method="level sets on the symplectic pencil",
+            )
+        )
+        # a claim without a proof is not believed
+        proof = witness or Witness(
+            states=np.zeros((problem.n_states, 1)),
+            disturbances=np.zeros((problem.B.shape[1], 1)),
+        )
+        checks.append(certify_infeasible(problem, infeasible, proof))
     if isinstance(problem, TipTiltPlant | FullStatePlant):
         checks.append(certify_loop(problem.hardware, controller))
     return Certificate(

@@ -51,6 +51,14 @@ def symmetrised(expression: Any) -> Any:
     return (expression + expression.T) / 2
 
 
+def _unsolved(reason: str) -> NumericalError:
+    return NumericalError(
+        f"the semidefinite programme was not solved: {reason} Try a bound that is further from its "
+        "limit, states of similar sizes, or the Riccati route where there is one.",
+        status="solver error",
+    )
+
+
 def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
     """Solve with Clarabel; return the status and the iteration count.
 
@@ -66,10 +74,11 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
             warnings.filterwarnings("ignore", message="Solution may be inaccurate")
             programme.solve(solver=cp.CLARABEL, **_SETTINGS)
     except cp.error.SolverError as error:
-        raise NumericalError(
-            f"the semidefinite programme was not solved: {error} "
-            'Try method="riccati", or scale the states to similar sizes.',
-            status="solver error",
-        ) from error
+        raise _unsolved(str(error)) from error
+    except BaseException as error:
+        # what the compiled solver raises on numbers out of all range is no Exception
+        if type(error).__name__ != "PanicException":
+            raise
+        raise _unsolved("the solver gave up on numbers out of its range.") from error
     iterations = programme.solver_stats.num_iters if programme.solver_stats else 0
     return str(programme.status), int(iterations or 0)

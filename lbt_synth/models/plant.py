@@ -14,7 +14,7 @@ the known input u, whose estimation error is zero.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -125,6 +125,33 @@ class FullStatePlant(EstimationProblem):
                 "Try plant.ahead(frames).full() on the reduced plant."
             )
         return self
+
+    def with_memory(self, taps: FloatArray) -> EstimationProblem:
+        """Return the plant with past innovations as states, which no command reaches.
+
+        Parameters
+        ----------
+        taps : (l, T q) array_like
+            Weights of the innovations, the newest first.
+
+        Returns
+        -------
+        FullStatePlant
+            With T q more states.
+
+        Raises
+        ------
+        DimensionError
+            If the taps do not fit.
+        """
+        bare = EstimationProblem(A=self.A, B=self.B, C=self.C, D=self.D, L=self.L)
+        longer = bare.with_memory(taps)
+        more = longer.n_states - self.n_states
+        return replace(
+            self,
+            **{name: getattr(longer, name) for name in "ABCL"},
+            B_known=np.vstack([self.B_known, np.zeros((more, self.B_known.shape[1]))]),
+        )
 
     def generalised(self) -> tuple[FloatArray, FloatArray]:
         """Matrices of the H-infinity filter's generalised plant (eq. 8, errata 2 and 7).
@@ -288,6 +315,7 @@ class TipTiltPlant(EstimationProblem):
         steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
         if steps == 1:
             return self
+        require_no_memory(self)
         hw = self.hardware
         delay = hw.delay_frames + steps - 1
         if not 1 <= delay <= LONGEST_HORIZON:
@@ -430,6 +458,24 @@ def tip_tilt_plant(
     )  # fmt: skip
 
 
+def require_no_memory(plant: TipTiltPlant) -> None:
+    """Refuse a plant that holds the past innovations of a filter: it cannot be assembled anew.
+
+    Raises
+    ------
+    ProblemError
+        If it has more states than its parts.
+    """
+    hw = plant.hardware
+    order = max(model.order for model in plant.turbulence)
+    chain = max(int(np.ceil(hw.delay_frames)), 2) - 1
+    if plant.n_states != 2 * len(plant.vibrations) + (order + chain) * hw.modes:
+        raise ProblemError(
+            "this plant holds the memory of a mixed filter, and cannot be assembled anew; take the "
+            "plant that the filter was designed for."
+        )
+
+
 def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") -> TipTiltPlant:
     """Return a plant whose model has every vibration at another frequency.
 
@@ -463,6 +509,7 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
     16.5
     """
     shift = number(shift_hz, "shift_hz")
+    require_no_memory(plant)
     hw = plant.hardware
     return tip_tilt_plant(
         frame_rate_hz=hw.frame_rate_hz,

@@ -10,7 +10,7 @@ from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
 from lbt_synth.statespace import Controller, LinearSystem, StateSpace
 from lbt_synth.validation import FloatArray, definite, frozen, integer, matrix
 
-LONGEST_HORIZON = 1000  # frames of a horizon
+LONGEST_HORIZON = 100  # frames of a horizon
 
 
 def require_problem(problem: object) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError
+from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.riccati.diagnosis import require_stabilising
 from lbt_synth.riccati.equation import Equations
 from lbt_synth.riccati.routes import ROUTES
@@ -25,7 +25,8 @@ RESIDUAL_LIMIT = 1e-12  # a solution beyond these limits is not returned
 ERROR_LIMIT = 1e-3
 _SATISFIED = 1e-8  # beyond this estimate of its error the next route is tried
 _DOUBTFUL = 1e-6  # a pole this close to the unit circle makes the conditions be checked
-_ON_CIRCLE = 1e-9  # and one this close is taken for one on it, if there is a zero
+_NEAR = 1e-2  # from here to the unit circle, a pole may be one on it that rounding has moved:
+_CLEAR = 1e-5  # part of its distance that the error of X may be
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,15 +158,27 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     [1.618034, 2.732051, 6.872983]
     """
     equations, lead = _stacked(A, B, Q, R, S)
+    with np.errstate(all="ignore"):  # what is not finite is refused
+        return _solved(equations, lead)
+
+
+def _solved(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
+    """Solve a stack, verify each answer, and put the leading dimensions back."""
+    factors = equations.normalising_factors()
     units = equations.balancing_units()
-    balanced = equations.in_units(units)
+    balanced = equations.divided(factors).in_units(units)
     best = _attempted(balanced)
     radius = np.abs(best.poles).max(axis=-1)
 
     solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
+    solved &= (1 - radius > _NEAR) | (best.errors <= _CLEAR * (1 - radius))
     for i in np.flatnonzero(~solved | (radius > 1 - _DOUBTFUL)):
-        zeros = not solved[i] or radius[i] > 1 - _ON_CIRCLE
-        require_stabilising(balanced, int(i), _name(int(i), lead), zeros=zeros)
+        try:
+            require_stabilising(balanced, int(i), _name(int(i), lead), zeros=not solved[i])
+        except ProblemError:
+            raise
+        except ValueError:  # numbers out of range (LinAlgError): refused without a reason
+            continue
     if not solved.all():
         _refuse(int(np.flatnonzero(~solved)[0]), lead, best)
     X = best.X
@@ -176,7 +189,7 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     column, row = units[:, None, :], units[:, :, None]
     n, m = equations.B.shape[-2:]
     return DareSolution(
-        X=frozen((X / column / row).reshape(*lead, n, n)),
+        X=frozen((X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
         gain_feedback=frozen((best.gains / column).reshape(*lead, m, n)),
         poles=best.poles.reshape(*lead, n),
         residuals=frozen(best.residuals.reshape(lead)),
@@ -264,17 +277,19 @@ def _name(index: int, lead: tuple[int, ...]) -> str:
 def _refuse(index: int, lead: tuple[int, ...], best: _Best) -> None:
     residual, error = float(best.residuals[index]), float(best.errors[index])
     stable = bool(np.isfinite(residual))
+    gap = 1 - float(np.abs(best.poles[index]).max())
     found = (
-        f"a relative residual of {residual:.3g} and an estimated error of {error:.3g}"
+        f"a relative residual of {residual:.3g}, an estimated error of {error:.3g} and a pole "
+        f"{gap:.3g} inside the unit circle"
         if stable
         else "no stable closed loop"
     )
     raise NumericalError(
         f"{_name(index, lead)}the Riccati equation was not solved: "
         f"{', '.join(attempt.method for attempt in best.attempts)} gave {found}; expected a stable "
-        f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an error below {ERROR_LIMIT:g}. "
-        "There may be no stabilising solution; look for modes near the unit circle that are "
-        "barely driven or seen.",
+        f"closed loop, a residual below {RESIDUAL_LIMIT:g}, an error below {ERROR_LIMIT:g} and "
+        f"{_CLEAR:g} of the pole's distance. There may be no stabilising solution; look for modes "
+        "near the unit circle that are barely driven or seen.",
         status="residual",
         residual=residual if stable else None,
     )

@@ -10,7 +10,8 @@ from lbt_synth.riccati.equation import Equations
 from lbt_synth.validation import FloatArray
 
 _RANK = 1e-10
-_CIRCLE = 1e-6  # a double root on the circle is found this far from it
+_CIRCLE = 1e-3  # a multiple root on the circle is found this far from it
+_SINGULAR = 1e-11  # ratio of singular values of a pencil that is taken for a zero
 _CLUSTER = 1e-4  # and one of several, of a defective matrix, this far
 _CLUSTER_RANK = 1e-13  # which is then tested at the circle, where a mode that decays passes
 
@@ -65,7 +66,7 @@ def require_stabilising(
         Begins the message, for an equation of many.
     zeros : bool, optional
         Whether to look for zeros on the unit circle, too: a search that takes a pole within
-        1e-8 of the circle for one on it.
+        some 1e-6 of the circle for one on it.
 
     Raises
     ------
@@ -146,6 +147,6 @@ def _unit_circle_zero(
         if abs(abs(value) - 1) > _CIRCLE:
             continue
         on_circle = value / abs(value)
-        if np.linalg.svd(M - on_circle * N, compute_uv=False)[-1] < _RANK * size:
+        if np.linalg.svd(M - on_circle * N, compute_uv=False)[-1] < _SINGULAR * size:
             return complex(on_circle)
     return None

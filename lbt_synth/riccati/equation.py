@@ -54,6 +54,18 @@ class Equations:
             A=self.A[which], B=self.B[which], Q=self.Q[which], R=self.R[which], S=self.S[which]
         )
 
+    def normalising_factors(self) -> FloatArray:
+        """Powers of two by which Q, R and S can be divided so that they are of size one, (N,)."""
+        largest = np.maximum.reduce(
+            [np.abs(part).max(axis=(-2, -1), initial=0.0) for part in (self.Q, self.R, self.S)]
+        )
+        return np.exp2(np.round(np.log2(np.where(largest > 0, largest, 1.0))))
+
+    def divided(self, factors: FloatArray) -> Equations:
+        """Divide Q, R and S by a number each; X is then divided by it, too."""
+        f = factors[:, None, None]
+        return Equations(A=self.A, B=self.B, Q=self.Q / f, R=self.R / f, S=self.S / f)
+
     def in_units(self, units: FloatArray) -> Equations:
         """Change to states ``x_i / units_i``, (N, n); exact for powers of two."""
         column, row = units[:, None, :], units[:, :, None]
@@ -67,20 +79,23 @@ class Equations:
 
     def balancing_units(self) -> FloatArray:
         """Powers of two in which rows and columns of A, bordered by B and Q, are alike, (N, n)."""
-        off = np.abs(self.A) * (1 - np.eye(self.A.shape[-1]))
-        scale = np.maximum(np.abs(self.A).max(axis=(-2, -1)), 1e-300)[:, None]
-        entry, weight = np.linalg.norm(self.B, axis=-1), np.sqrt(np.abs(_diagonal(self.Q)))
-        entry = entry * scale / np.maximum(entry.max(axis=-1, keepdims=True), 1e-300)
-        weight = weight * scale / np.maximum(weight.max(axis=-1, keepdims=True), 1e-300)
-        exponent = np.zeros(entry.shape)
-        for _ in range(_SWEEPS):
-            units = np.exp2(exponent)
-            rows = (off * units[:, None, :]).sum(axis=-1) / units + entry / units
-            columns = (off / units[:, :, None]).sum(axis=-2) * units + weight * units
-            both = (rows > 0) & (columns > 0)
-            ratio = np.where(both, rows, 1.0) / np.where(both, columns, 1.0)
-            exponent = exponent + 0.25 * np.log2(ratio)  # half a step: all states move at once
-        return np.asarray(np.exp2(np.round(exponent)), dtype=np.float64)
+        with np.errstate(all="ignore"):  # numbers out of range are refused later
+            off = np.abs(self.A) * (1 - np.eye(self.A.shape[-1]))
+            scale = np.maximum(np.abs(self.A).max(axis=(-2, -1)), 1e-300)[:, None]
+            entry, weight = np.linalg.norm(self.B, axis=-1), np.sqrt(np.abs(_diagonal(self.Q)))
+            entry = entry * scale / np.maximum(entry.max(axis=-1, keepdims=True), 1e-300)
+            weight = weight * scale / np.maximum(weight.max(axis=-1, keepdims=True), 1e-300)
+            exponent = np.zeros(entry.shape)
+            for _ in range(_SWEEPS):
+                units = np.exp2(exponent)
+                rows = (off * units[:, None, :]).sum(axis=-1) / units + entry / units
+                columns = (off / units[:, :, None]).sum(axis=-2) * units + weight * units
+                both = (rows > 0) & (columns > 0)
+                ratio = np.where(both, rows, 1.0) / np.where(both, columns, 1.0)
+                exponent = exponent + 0.25 * np.log2(ratio)  # half a step: all states move at once
+            units = np.exp2(np.round(exponent))
+        usable = np.isfinite(units) & (units > 0)
+        return np.where(usable.all(axis=-1, keepdims=True), units, 1.0)
 
     def weights(self, X: FloatArray) -> FloatArray:
         """``R + B'XB``, (N, m, m)."""
