@@ -167,6 +167,8 @@ def test_a_stack_is_its_equations_one_by_one(seed, n, m):
     assert stack.gain_feedback.shape == (2, 3, m, n)
     assert stack.poles.shape == (2, 3, n)
     assert stack.residuals.shape == stack.negative.shape == (2, 3)
+    for name in ("X", "gain_feedback", "poles", "residuals", "errors", "negative"):
+        assert not getattr(stack, name).flags.writeable
     for i in range(6):
         one = lbt.solve_dare(*(part[i] for part in parts))
         where = np.unravel_index(i, (2, 3))

@@ -191,13 +191,18 @@ def _solved(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     return DareSolution(
         X=frozen((X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
         gain_feedback=frozen((best.gains / column).reshape(*lead, m, n)),
-        poles=best.poles.reshape(*lead, n),
+        poles=_read_only(best.poles.reshape(*lead, n)),
         residuals=frozen(best.residuals.reshape(lead)),
         errors=frozen(best.errors.reshape(lead)),
-        negative=negative.reshape(lead),
+        negative=_read_only(negative.reshape(lead)),
         iterations=int(best.steps.max(initial=0)),
         attempts=tuple(best.attempts),
     )
+
+
+def _read_only(array: Any) -> Any:
+    array.setflags(write=False)
+    return array
 
 
 def _stacked(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[int, ...]]:
