@@ -176,7 +176,7 @@ class StateSpace(LinearSystem):
             return self
         # the sizes of B and C as a whole are shared between them, too
         large, small = entry / units, leaving * units
-        both = float(np.sqrt(max(large.max(), 1e-300) / max(small.max(), 1e-300)))
+        both = float(np.sqrt(max(float(np.max(large)), 1e-300) / max(float(np.max(small)), 1e-300)))
         units = units * np.exp2(np.round(np.log2(both))) if 0 < both < np.inf else units
         return StateSpace(
             A=self.A * units / units[:, None],
@@ -236,7 +236,7 @@ class StateSpace(LinearSystem):
 
 
 def _of_size(vector: FloatArray, size: float) -> FloatArray:
-    largest = float(vector.max(initial=0.0))
+    largest = float(np.max(vector, initial=0.0))
     return vector * (size / largest) if largest > 0 else vector
 
 

@@ -195,7 +195,7 @@ def _solved(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
         residuals=frozen(best.residuals.reshape(lead)),
         errors=frozen(best.errors.reshape(lead)),
         negative=_read_only(negative.reshape(lead)),
-        iterations=int(best.steps.max(initial=0)),
+        iterations=int(np.max(best.steps, initial=0)),
         attempts=tuple(best.attempts),
     )
 

@@ -56,10 +56,10 @@ class Equations:
 
     def normalising_factors(self) -> FloatArray:
         """Powers of two by which Q, R and S can be divided so that they are of size one, (N,)."""
-        largest = np.maximum.reduce(
-            [np.abs(part).max(axis=(-2, -1), initial=0.0) for part in (self.Q, self.R, self.S)]
-        )
-        return np.exp2(np.round(np.log2(np.where(largest > 0, largest, 1.0))))
+        sizes = [np.max(np.abs(part), axis=(-2, -1)) for part in (self.Q, self.R, self.S)]
+        largest = np.max(np.stack(sizes), axis=0)
+        exponents = np.round(np.log2(np.where(largest > 0, largest, 1.0)))
+        return np.asarray(np.exp2(exponents), dtype=np.float64)
 
     def divided(self, factors: FloatArray) -> Equations:
         """Divide Q, R and S by a number each; X is then divided by it, too."""
