@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.errors import CertificateError, DimensionError
+from lbt_synth.errors import CertificateError, DimensionError, ProblemError
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.lyapunov import lyapunov_residual, stationary_covariance
@@ -251,6 +251,11 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     >>> lbt.certify_infeasible(p, 1.0, push).passed, lbt.certify_infeasible(p, 1.1, push).passed
     (True, False)
     """
+    if not isinstance(witness, Witness):
+        raise ProblemError(
+            "expected a Witness, such as that of an H-infinity design; got "
+            f"{type(witness).__name__}."
+        )
     x, w = witness.states, witness.disturbances
     if x.shape[:1] != (problem.n_states,) or w.shape != (problem.B.shape[1], *x.shape[1:]):
         raise DimensionError(
@@ -260,7 +265,7 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     claimed = number(level, "level", above=0)
     proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
     return Check(
-        name="level claimed infeasible, above the level proved",
+        name="infeasible level over the level proved, less 1",
         value=claimed / max(proved, 1e-300) - 1,
         limit=INFEASIBLE_TOLERANCE,
         method="disturbances that no measurement shows",

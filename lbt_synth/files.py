@@ -21,7 +21,8 @@ def require_writable(*paths: str | os.PathLike[str]) -> None:
     Raises
     ------
     OutputError
-        If the directory of one does not exist, or its name is that of a directory.
+        If the directory of one does not exist or takes no files, or its name is that of a
+        directory.
 
     Examples
     --------
@@ -37,6 +38,15 @@ def require_writable(*paths: str | os.PathLike[str]) -> None:
             raise OutputError(f"cannot write {target}: no directory {target.parent}.", path=target)
         if target.is_dir():
             raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+        try:
+            with tempfile.TemporaryFile(dir=target.parent):
+                pass
+        except (OSError, ValueError) as error:
+            raise OutputError(
+                f"cannot write {target}: the directory {target.parent} takes no new files "
+                f"({getattr(error, 'strerror', None) or error}).",
+                path=target,
+            ) from error
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:

@@ -9,12 +9,14 @@ import numpy as np
 
 from lbt_synth.design import FilterDesign, central, hinf, kalman, mixed
 from lbt_synth.design.mixed import require_taps
+from lbt_synth.errors import ProblemError
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.models import EstimationProblem
 from lbt_synth.models.problem import require_problem
 from lbt_synth.validation import choice, integer
 
 FAMILIES = ("mixed", "central")
+_MOST_POINTS = 200
 _CROWDING = 1.5  # points crowd where the norm is near its least
 
 
@@ -58,7 +60,7 @@ def tradeoff(
     families: Sequence[str] = FAMILIES,
     taps: int = 16,
 ) -> Iterator[TradeoffPoint]:
-    """Make filters from the least norm to the least variance, and examine their loops.
+    """Return filters from the least norm to the least variance, and examine their loops.
 
     The levels run from the least gamma to the norm of the Kalman filter, at which all
     families meet.
@@ -68,16 +70,16 @@ def tradeoff(
     problem : EstimationProblem
         The problem; with a plant, each filter's loop is examined.
     points : int, optional
-        Levels of the norm, at least 2.
+        Levels of the norm, 2 to 200.
     families : sequence of {"mixed", "central"}, optional
         Which filters to make at each level.
     taps : int, optional
         Length of the mixed filters' impulse response.
 
-    Yields
-    ------
-    TradeoffPoint
-        In the order of levels, then families.
+    Returns
+    -------
+    iterator of TradeoffPoint
+        In the order of levels, then families; each is made when it is asked for.
 
     Raises
     ------
@@ -97,9 +99,17 @@ def tradeoff(
     """
     require_problem(problem)
     count = integer(points, "points", at_least=2)
+    if count > _MOST_POINTS:
+        raise ProblemError(f"points must be at most {_MOST_POINTS}; got {count}.")
     length = require_taps(taps)
     for family in families:
         choice(family, "families", FAMILIES)
+    return _points(problem, count, tuple(families), length)
+
+
+def _points(
+    problem: EstimationProblem, count: int, families: tuple[str, ...], taps: int
+) -> Iterator[TradeoffPoint]:
     least, best = hinf(problem, method="riccati"), kalman(problem)
     assert least.gamma_least is not None  # of an H-infinity design
     spread = max(best.gamma / least.gamma_least, 1.0)
@@ -111,7 +121,7 @@ def tradeoff(
             elif i == count - 1:
                 design = best
             elif family == "mixed":
-                design = mixed(problem, gamma=level, taps=length)
+                design = mixed(problem, gamma=level, taps=taps)
             else:
                 design = central(problem, gamma=level)
             yield _point(design, family, least.gamma_least)
@@ -125,7 +135,7 @@ def _point(design: FilterDesign, family: str, least: float) -> TradeoffPoint:
     return TradeoffPoint(
         family=family,
         gamma=design.gamma,
-        gamma_ratio=design.gamma / least,
+        gamma_ratio=max(design.gamma / least, 1.0),
         rms=design.rms,
         gain_low=low,
         gain_high=high,

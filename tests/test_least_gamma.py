@@ -148,7 +148,7 @@ def test_a_forged_claim_is_found_out(axis_plant):
     assert design.recertified().passed
     forged = dataclasses.replace(design, gamma_infeasible=1.001 * design.gamma_infeasible)
     failed = [check.name for check in forged.recertified().checks if not check.passed]
-    assert failed == ["level claimed infeasible, above the level proved"]
+    assert failed == ["infeasible level over the level proved, less 1"]
     with pytest.raises(lbt.DimensionError, match="a witness must have 4 rows of states"):
         lbt.certify_infeasible(
             axis_plant, 1.0, lbt.Witness(states=np.ones((3, 1)), disturbances=np.ones((3, 1)))

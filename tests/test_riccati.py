@@ -116,6 +116,7 @@ def test_an_undriven_mode_on_the_unit_circle_is_refused():
         ((np.eye(2), np.ones((2, 1)), [[1, 1], [0, 1]], 1), "Q must be symmetric"),
         ((np.eye(2), np.zeros((2, 0)), np.eye(2), np.zeros((0, 0))), "at least one column"),
         ((0.5 * np.eye(2), np.ones((2, 2)), np.eye(2), np.zeros((2, 2))), "R must be positive def"),
+        ((0.5, 1, 0, 0), "must not be singular; it is, whatever X"),
         ((np.eye(2), np.ones((2, 1)), np.eye(2), np.nan), "R must be finite"),
         ((np.eye(2)[None], np.ones((2, 1)), np.eye(2), 1, np.ones((3, 1))), "S must have 2 rows"),
         ((np.ones((2, 1, 1)), 1, np.ones((3, 1, 1)), 1), "leading dimensions.*A .2, 1, 1."),

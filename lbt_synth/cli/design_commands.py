@@ -51,6 +51,11 @@ def design(arguments: Namespace) -> Report:
     path = save_gain(arguments.output, made)
     report = _description(made)
     report.data["file"] = str(path)
+    if made.method != arguments.method:
+        name = {"kalman": "Kalman filter", "hinf": "filter of the least norm"}[made.method]
+        report.notes.append(
+            f"note: the bound leaves no better choice than the {name}, which is it."
+        )
     report.notes.append(f"written: {path}")
     return report
 
@@ -167,12 +172,15 @@ def _description(made: Design) -> Report:
             "gamma_least": made.gamma_least,
             "gamma_infeasible": made.gamma_infeasible,
         }
+        if made.rms_requested is not None:
+            facts.append(("rms asked for", made.rms_requested, unit))
+            data["rms_requested"] = made.rms_requested
         if made.gamma_requested is not None:
             facts.append(("bound asked for", made.gamma_requested, unit))
         if made.gamma_least is not None:
             facts += [
-                ("least norm of any filter, not above", f"{made.gamma_least:.9g}", unit),
-                ("least norm of any filter, not below", _digits(made.gamma_infeasible), unit),
+                ("least norm of any filter, upper bound", f"{made.gamma_least:.9g}", unit),
+                ("least norm of any filter, lower bound", _digits(made.gamma_infeasible), unit),
             ]
     if isinstance(made, IntegratorDesign):
         facts.append(("gain", made.gain, ""))

@@ -12,10 +12,10 @@ from lbt_synth.cli.output import Report, TableText, progress, working
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, FilterDesign
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
-from lbt_synth.loop import close_loop, loop_margins, residual_budget, strehl
+from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
 from lbt_synth.plotting import (
     require_figure_name,
@@ -91,6 +91,7 @@ def simulate(arguments: Namespace) -> Report:
         return int(getattr(settings, name) if given is None else given)
 
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
+    _require_fitting_delay(loop, design)
     budget = residual_budget(loop, truth)
     # the same settling for all controllers, so that one seed is one weather
     settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
@@ -151,6 +152,19 @@ def simulate(arguments: Namespace) -> Report:
         report.data["file"] = str(path)
         report.notes.append(f"written: {path}")
     return report
+
+
+def _require_fitting_delay(loop: ClosedLoop, design: Design) -> None:
+    """Refuse an unstable loop of another delay than the file's, naming both."""
+    own, here = design.hardware, loop.hardware
+    if loop.is_stable or own is None or own.delay_frames == here.delay_frames:
+        return
+    raise UnstableLoopError(
+        f"the closed loop is unstable: the file was designed for a delay of {own.delay_frames:g} "
+        f"frames, the configuration has {here.delay_frames:g}. Set loop.delay_frames to "
+        f"{own.delay_frames:g}, or design for {here.delay_frames:g}.",
+        spectral_radius=loop.spectral_radius,
+    )
 
 
 def _simulation_notes(config: Config, design: Design, scatter: float, settle: int) -> list[str]:

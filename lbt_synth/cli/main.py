@@ -56,17 +56,22 @@ def build_parser() -> argparse.ArgumentParser:
         help="the same as a multiple of the least one (default: the configuration's, else 1.2)",
     )
     bound.add_argument(
-        "--rms", type=float, help="mixed: bound of the estimation error [nm rms], for a least norm"
+        "--rms",
+        type=float,
+        help="mixed, instead of a bound of the norm: bound of the estimation error [nm rms]; the "
+        "norm is then made least",
     )
     design.add_argument(
-        "--taps", type=int, help="mixed: past innovations that the filter weighs (default 16)"
+        "--taps",
+        type=int,
+        help="mixed: past innovations that the filter weighs, 1 to 64 (default 16)",
     )
     design.add_argument(
         "--horizon",
         type=int,
         default=1,
-        help="frames from the newest measurement to the estimate (default 1); another one is for "
-        "a loop that is later by as much",
+        help="frames from the newest measurement to the estimate (default 1): the filter is for a "
+        "loop with a delay of loop.delay_frames + horizon - 1, at least 1 frame",
     )
     design.add_argument(
         "--gain", type=float, help="integrator gain (default: the best for the truth)"
@@ -108,12 +113,26 @@ def build_parser() -> argparse.ArgumentParser:
         "tradeoff", "Filters from the least norm to the least variance, and their sensor gains"
     )
     tradeoff.add_argument("config", help=config_help)
-    tradeoff.add_argument("--points", type=int, default=9, help="levels of the norm (default 9)")
     tradeoff.add_argument(
-        "--taps", type=int, default=16, help="taps of the mixed filters (default 16)"
+        "--points",
+        type=int,
+        default=9,
+        help="levels of the norm, from the least of any filter to that of the Kalman filter, 2 to "
+        "200 (default 9)",
     )
     tradeoff.add_argument(
-        "-o", "--output", action="append", default=[], help="table (.csv) or figure; repeatable"
+        "--taps",
+        type=int,
+        default=16,
+        help="past innovations that the mixed filters (least variance at each norm) weigh, 1 to 64 "
+        "(default 16)",
+    )
+    tradeoff.add_argument(
+        "-o",
+        "--output",
+        action="append",
+        default=[],
+        help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
     )
 
     paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")

@@ -29,7 +29,7 @@ _FINE_GRID = 1024
 _EXCESS = 4e-7  # by which the norm may exceed its bound; the certificate allows 1e-6
 _ROOM = 2e-7  # by which the bound at the frequencies is drawn in
 _SAME = 1e-9
-_MOST_TAPS = 256
+_MOST_TAPS = 64
 _EDGE = 1e-5  # so close to the least gamma the filter of the least gamma is returned
 
 
@@ -61,7 +61,8 @@ def mixed(
     rms : float, optional
         Bound on the standard deviation of the error; the norm is made least.
     taps : int, optional
-        Length of the impulse response: states that the filter gets for each measurement.
+        Length of the impulse response, at most 64: states that the filter gets for each
+        measurement.
     horizon : int, optional
         Frames from the newest measurement to the estimate, as ``problem.ahead``.
 
@@ -130,7 +131,7 @@ def mixed(
         made = _completed(
             problem, base, length, lambda p, grid: p.least_variance(bound * (1 - _ROOM), grid)
         )
-    return _certified(problem, base, made, least, bound if rms is None else None)
+    return _certified(problem, base, made, least, gamma=gamma, rms=rms)
 
 
 def require_taps(taps: int) -> int:
@@ -194,7 +195,9 @@ def _certified(
     base: Gains,
     made: _Completed,
     least: FilterDesign,
+    *,
     gamma: float | None,
+    rms: float | None,
 ) -> FilterDesign:
     extended = problem.with_memory(made.taps)
     size, q = made.taps.shape[1], base.gain_predictor.shape[1]
@@ -215,6 +218,7 @@ def _certified(
         method="mixed",
         solver=SolverReport(route="youla", status=made.status, iterations=made.rounds),
         gamma_requested=gamma,
+        rms_requested=rms,
         gamma_least=least.gamma_least,
         gamma_infeasible=min(least.gamma_infeasible, proved),
         witness=witness,

@@ -9,6 +9,7 @@ import numpy as np
 
 from lbt_synth.certify import (
     INFEASIBLE_TOLERANCE,
+    NORM_TOLERANCE,
     Certificate,
     Check,
     certify_filter,
@@ -103,6 +104,8 @@ class FilterDesign(Design):
         ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
     gamma_requested : float or None
         Bound that the H-infinity design was asked for.
+    rms_requested : float or None
+        Bound on the standard deviation that the design was asked for.
     gamma_least : float or None
         Norm that a filter of the problem achieves, with the least gamma.
     gamma_infeasible : float or None
@@ -118,6 +121,7 @@ class FilterDesign(Design):
     gamma_least: float | None = None
     gamma_infeasible: float | None = None
     witness: Witness | None = None
+    rms_requested: float | None = None
 
     @property
     def gamma(self) -> float:
@@ -162,6 +166,7 @@ class FilterDesign(Design):
             controller=self.controller,
             infeasible=self.gamma_infeasible,
             witness=self.witness,
+            rms=self.rms_requested,
         )
 
 
@@ -215,16 +220,26 @@ def certify_design(
     controller: Controller,
     infeasible: float | None = None,
     witness: Witness | None = None,
+    rms: float | None = None,
 ) -> Certificate:
     """Certificate of a filter, and of its closed loop where the problem is a plant."""
     certificate = certify_filter(
         problem, gain_predictor, gamma=gamma, least_variance=method == "kalman"
     )
     checks = list(certificate.checks)
+    if rms is not None:
+        checks.append(
+            Check(
+                name="standard deviation of the estimation error",
+                value=certificate.rms,
+                limit=rms * (1 + NORM_TOLERANCE),
+                method="Lyapunov equation",
+            )
+        )
     if infeasible is not None:
         checks.append(
             Check(
-                name="level claimed infeasible, above the norm achieved",
+                name="infeasible level over the norm achieved, less 1",
                 value=infeasible / certificate.gamma - 1,
                 limit=INFEASIBLE_TOLERANCE,
                 method="level sets on the symplectic pencil",
@@ -256,6 +271,7 @@ def filter_design(
     gamma_least: float | None = None,
     gamma_infeasible: float | None = None,
     witness: Witness | None = None,
+    rms_requested: float | None = None,
 ) -> FilterDesign:
     """Certify a gain and make the design; raise CertificateError if it fails."""
     controller = problem.controller(gain_predictor)
@@ -267,6 +283,7 @@ def filter_design(
         controller=controller,
         infeasible=gamma_infeasible,
         witness=witness,
+        rms=rms_requested,
     )
     return FilterDesign(
         method=method,
@@ -282,4 +299,5 @@ def filter_design(
         gamma_least=gamma_least,
         gamma_infeasible=gamma_infeasible,
         witness=witness,
+        rms_requested=rms_requested,
     )

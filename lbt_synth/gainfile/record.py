@@ -70,6 +70,7 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
         meta["gamma_requested"] = design.gamma_requested
         meta["gamma_least"] = design.gamma_least
         meta["gamma_infeasible"] = design.gamma_infeasible
+        meta["rms_requested"] = design.rms_requested
         if design.witness is not None:
             arrays |= {
                 "WITNESS_X": design.witness.states,
@@ -103,6 +104,7 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
         gain_filter=arrays["GAIN_FILTER"],
         gamma_requested=meta["gamma_requested"],
         gamma_least=meta["gamma_least"],
+        rms_requested=meta.get("rms_requested"),
         gamma_infeasible=meta.get("gamma_infeasible"),  # files of 0.1 have none, nor a witness
         witness=Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
         if "WITNESS_X" in arrays

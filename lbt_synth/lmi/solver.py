@@ -14,6 +14,13 @@ from lbt_synth.witness import Witness
 
 # Tighter ones end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 _SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
+# Close to the edge of what is feasible it loses its accuracy, now with its own scaling of the
+# programme, now without: the next one is tried.
+_ATTEMPTS: tuple[dict[str, Any], ...] = (
+    {},
+    {"equilibrate_enable": False},
+    {"static_regularization_constant": 1e-9},
+)
 USABLE = ("optimal", "optimal_inaccurate")
 
 
@@ -53,8 +60,8 @@ def symmetrised(expression: Any) -> Any:
 
 def _unsolved(reason: str) -> NumericalError:
     return NumericalError(
-        f"the semidefinite programme was not solved: {reason} Try a bound that is further from its "
-        "limit, states of similar sizes, or the Riccati route where there is one.",
+        f"the semidefinite programme was not solved: {reason} Try a slightly "
+        "different bound or number of taps; for kalman and hinf, the Riccati route.",
         status="solver error",
     )
 
@@ -68,17 +75,20 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
         If the solver gave up.
     """
     programme = cp.Problem(objective, constraints)
-    try:
-        with warnings.catch_warnings():
-            # an inaccurate solution is judged by the certificate, not by a warning
-            warnings.filterwarnings("ignore", message="Solution may be inaccurate")
-            programme.solve(solver=cp.CLARABEL, **_SETTINGS)
-    except cp.error.SolverError as error:
-        raise _unsolved(str(error)) from error
-    except BaseException as error:
-        # what the compiled solver raises on numbers out of all range is no Exception
-        if type(error).__name__ != "PanicException":
-            raise
-        raise _unsolved("the solver gave up on numbers out of its range.") from error
+    for attempt, settings in enumerate(_ATTEMPTS):
+        try:
+            with warnings.catch_warnings():
+                # an inaccurate solution is judged by the certificate, not by a warning
+                warnings.filterwarnings("ignore", message="Solution may be inaccurate")
+                programme.solve(solver=cp.CLARABEL, **_SETTINGS, **settings)
+            break
+        except cp.error.SolverError as error:
+            if attempt == len(_ATTEMPTS) - 1:
+                raise _unsolved("the solver lost its accuracy on the way.") from error
+        except BaseException as error:
+            # what the compiled solver raises on numbers out of all range is no Exception
+            if type(error).__name__ != "PanicException":
+                raise
+            raise _unsolved("the solver gave up on numbers out of its range.") from error
     iterations = programme.solver_stats.num_iters if programme.solver_stats else 0
     return str(programme.status), int(iterations or 0)

@@ -292,9 +292,10 @@ def _refuse(index: int, lead: tuple[int, ...], best: _Best) -> None:
     raise NumericalError(
         f"{_name(index, lead)}the Riccati equation was not solved: "
         f"{', '.join(attempt.method for attempt in best.attempts)} gave {found}; expected a stable "
-        f"closed loop, a residual below {RESIDUAL_LIMIT:g}, an error below {ERROR_LIMIT:g} and "
-        f"{_CLEAR:g} of the pole's distance. There may be no stabilising solution; look for modes "
-        "near the unit circle that are barely driven or seen.",
+        f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
+        f"{ERROR_LIMIT:g} (of a pole near the unit circle, below {_CLEAR:g} of its distance). "
+        "There may be no stabilising solution; look for modes near the unit circle that are barely "
+        "driven or seen.",
         status="residual",
         residual=residual if stable else None,
     )

@@ -12,6 +12,8 @@ from lbt_synth.validation import FloatArray
 _RANK = 1e-10
 _CIRCLE = 1e-3  # a multiple root on the circle is found this far from it
 _SINGULAR = 1e-11  # ratio of singular values of a pencil that is taken for a zero
+_LARGE = 1e6  # beyond, the ratio of singular values says little
+_ELSEWHERE = 0.37 + 0.61j  # a point like any other
 _CLUSTER = 1e-4  # and one of several, of a defective matrix, this far
 _CLUSTER_RANK = 1e-13  # which is then tested at the circle, where a mode that decays passes
 
@@ -101,7 +103,7 @@ def require_stabilising(
                 "has no weight, so there is no stabilising solution. Add a small weight on it.",
                 eigenvalue=hidden,
             )
-    zero = _unit_circle_zero(A, B, Q, R, S) if zeros else None
+    zero = _unit_circle_zero(A, B, Q, R, S, name) if zeros else None
     if zero is not None:
         raise DetectabilityError(
             f"{name}the equation has a zero on the unit circle, at {zero:.6g}: there its weights "
@@ -120,7 +122,7 @@ def _root(weight: FloatArray) -> FloatArray:
 
 
 def _unit_circle_zero(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray, name: str
 ) -> complex | None:
     """Eigenvalue on the unit circle of the extended symplectic pencil, or None."""
     n, m = B.shape
@@ -140,9 +142,15 @@ def _unit_circle_zero(
             [zero((m, n)), -B.T, zero((m, m))],
         ]
     )
+    size = float(np.linalg.norm(M, 2))
+    elsewhere = np.linalg.svd(M - _ELSEWHERE * N, compute_uv=False)[-1]
+    if size < _LARGE and elsewhere < _SINGULAR * size:
+        raise DefinitenessError(
+            f"{name}R + B'XB must not be singular; it is, whatever X: some input has neither a "
+            "weight nor an effect that Q sees. Give R or Q a small weight there."
+        )
     with np.errstate(all="ignore"):
         values = eigvals(M, N)
-    size = float(np.linalg.norm(M, 2))
     for value in values[np.isfinite(values)]:
         if abs(abs(value) - 1) > _CIRCLE:
             continue
