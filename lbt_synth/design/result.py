@@ -17,8 +17,9 @@ from lbt_synth.certify import (
     certify_loop,
 )
 from lbt_synth.loop import close_loop
+from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.plant import FullStatePlant, TipTiltPlant
+from lbt_synth.models.plant import TipTiltPlant
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import ComplexArray, FloatArray

@@ -2,8 +2,9 @@
 
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.plant import FullStatePlant, TipTiltPlant, retuned_plant, tip_tilt_plant
+from lbt_synth.models.plant import TipTiltPlant, retuned_plant, tip_tilt_plant
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.models.sensor import illuminated_subapertures, pyramid_tilt_noise_nm
 from lbt_synth.models.truth import SinusoidalVibration, Spectrum, TabulatedSpectrum, Truth
