@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import eigvals
 
 from lbt_synth.errors import NumericalError, UnstableLoopError
-from lbt_synth.statespace import StateSpace, pointwise_response
+from lbt_synth.statespace import StateSpace, pointwise_response, swept_response
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _TOLERANCE = 2e-11
@@ -172,10 +172,10 @@ def _folded(angles: FloatArray) -> FloatArray:
 
 
 def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
-    """Largest singular value over some angles; the highest few are evaluated with more care."""
-    sigma = largest_singular_values(G, angles / (2 * np.pi * G.dt_s))
-    high = np.argsort(sigma)[-_CAREFUL:]
-    careful = spectral_norms(pointwise_response(G, np.exp(1j * angles[high])))
+    """Largest singular value of a balanced system; the highest few are evaluated with care."""
+    z = np.exp(1j * angles)
+    high = np.argsort(spectral_norms(swept_response(G, z)))[-_CAREFUL:]
+    careful = spectral_norms(pointwise_response(G, z[high]))
     best = int(np.argmax(careful))
     return float(careful[best]), float(angles[high[best]])
 

@@ -167,10 +167,7 @@ class StateSpace(LinearSystem):
         n = self.n_states
         scale = max(float(np.abs(self.A).max()), 1e-300)
         entry, leaving = np.linalg.norm(self.B, axis=1), np.linalg.norm(self.C, axis=0)
-        border = np.zeros((n + 1, n + 1))
-        border[:n, :n] = np.abs(self.A)
-        border[:n, n], border[n, :n] = _of_size(entry, scale), _of_size(leaving, scale)
-        _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
+        scaling = bordered_scaling(self.A, _of_size(entry, scale), _of_size(leaving, scale))
         units = np.asarray(scaling[:n] / scaling[n], dtype=np.float64)
         if not np.all(np.isfinite(units)):
             return self
@@ -225,7 +222,7 @@ class StateSpace(LinearSystem):
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         # a few points are solved one by one, which is more accurate next to a pole
         few = z.size <= self.n_states
-        response = pointwise_response(self, z) if few else _response(self.balanced(), z)
+        response = pointwise_response(self, z) if few else swept_response(self.balanced(), z)
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -233,6 +230,13 @@ class StateSpace(LinearSystem):
                 "and no response there; leave that frequency out."
             )
         return response
+
+
+def bordered_scaling(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> FloatArray:
+    """Scaling, powers of two, that balances ``[[|A|, entry], [leaving', 0]]``, (n + 1,)."""
+    border = np.block([[np.abs(A), entry[:, None]], [leaving[None, :], np.zeros((1, 1))]])
+    _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
+    return np.asarray(scaling, dtype=np.float64)
 
 
 def _of_size(vector: FloatArray, size: float) -> FloatArray:
@@ -254,15 +258,16 @@ def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     return np.asarray(system.C @ states + system.D, dtype=np.complex128)
 
 
-def _response(system: StateSpace, z: ComplexArray) -> ComplexArray:
+def swept_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     """Transfer matrices at points z, by one Schur form and a substitution a point.
 
     ``A = U T U*`` is unitary, so nothing is lost when A is defective, as it is with
     every delay. The smaller of inputs and outputs is carried through the substitution.
+    The system should be balanced; not finite at a pole.
     """
     if len(system.C) > system.B.shape[1]:
         dual = StateSpace(A=system.A.T, B=system.C.T, C=system.B.T, D=system.D.T)
-        return np.swapaxes(_response(dual, z), 1, 2)
+        return np.swapaxes(swept_response(dual, z), 1, 2)
     T, U = schur(system.A.astype(np.complex128), output="complex")
     rows, B = system.C @ U, U.conj().T @ system.B
     p, n = rows.shape

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import brentq
 
-from lbt_synth.design.hinf import Gains, hinf
+from lbt_synth.design.hinf import Gains, hinf, require_reachable
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
-from lbt_synth.errors import InfeasibleError
 from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.problem import EstimationProblem, require_problem
 from lbt_synth.norms import hinf_norm
@@ -17,7 +16,6 @@ from lbt_synth.riccati import gamma_riccati, kalman_riccati
 from lbt_synth.validation import number
 
 _DECADES = 4.0  # of gamma, over which a member is searched
-_SAME = 1e-9
 _SLACK = 4e-7  # by which a member may miss its norm
 
 
@@ -54,7 +52,8 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     require_problem(problem)
     bound = number(gamma, "gamma", above=0)
     least = hinf(problem, method="riccati")
-    require_reachable(least, bound)
+    assert least.gamma_least is not None  # of an H-infinity design
+    require_reachable(bound, least.gamma_least)
     gains = CentralFamily(problem, least).member(lambda norm, _: norm - bound)
     return filter_design(
         problem,
@@ -67,25 +66,6 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
         gamma_infeasible=least.gamma_infeasible,
         witness=least.witness,
     )
-
-
-def require_reachable(least: FilterDesign, gamma: float) -> float:
-    """Return the least gamma of a problem, or raise if a level is below it.
-
-    Raises
-    ------
-    InfeasibleError
-        With the least level.
-    """
-    assert least.gamma_least is not None  # of an H-infinity design
-    if gamma < least.gamma_least * (1 - _SAME):
-        raise InfeasibleError(
-            f"gamma must be at least {least.gamma_least:.9g}, the least of this problem; got "
-            f"{gamma:.9g}. Try gamma_ratio=1.1.",
-            gamma=gamma,
-            gamma_least=least.gamma_least,
-        )
-    return least.gamma_least
 
 
 class CentralFamily:

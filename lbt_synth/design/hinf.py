@@ -136,13 +136,7 @@ def hinf(
         requested = least * gamma_ratio
     if gamma is not None:
         requested = gamma
-    if requested < least * (1 - _AT_LEAST):
-        raise InfeasibleError(
-            f"gamma must be at least {least:.12g}, the least of this problem; got "
-            f"{requested:.12g}. Try gamma_ratio=1.2.",
-            gamma=requested,
-            gamma_least=least,
-        )
+    require_reachable(requested, least)
     if requested > least * (1 + _AT_LEAST):
         gains = synthesis.at(requested)
     design = filter_design(
@@ -161,6 +155,23 @@ def hinf(
     return design
 
 
+def require_reachable(gamma: float, least: float) -> None:
+    """Refuse a level below the least one.
+
+    Raises
+    ------
+    InfeasibleError
+        With both levels.
+    """
+    if gamma < least * (1 - _AT_LEAST):
+        raise InfeasibleError(
+            f"gamma must be at least {least:.12g}, the least of this problem; got {gamma:.12g}. "
+            "Try gamma_ratio=1.2.",
+            gamma=gamma,
+            gamma_least=least,
+        )
+
+
 class _RiccatiRoute:
     """Levels by the gamma-Riccati equation, in units in which the Kalman errors are of size one."""
 
@@ -169,10 +180,8 @@ class _RiccatiRoute:
         usable = (spread > 1e-150) & (spread < 1e150)
         # powers of two: the change of units rounds nothing
         self.units = np.exp2(np.round(np.log2(np.where(usable, spread, 1.0))))[:, None]
-        self.problem, self.start = (
-            in_units(problem, self.units),
-            self._scaled(start, 1 / self.units),
-        )
+        self.problem = in_units(problem, self.units)
+        self.start = self._scaled(start, 1 / self.units)
 
     def least(self) -> tuple[_Solved, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from lbt_synth.design.central import CentralFamily, require_reachable
-from lbt_synth.design.hinf import Gains, hinf
+from lbt_synth.design.central import CentralFamily
+from lbt_synth.design.hinf import Gains, hinf, require_reachable
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
@@ -22,6 +22,8 @@ from lbt_synth.witness import Witness, infeasible_level
 
 if TYPE_CHECKING:
     from lbt_synth.lmi import InnovationProgramme
+
+_Answer: TypeAlias = tuple[FloatArray, float, str]  # taps, level, the solver's word
 
 _ROUNDS = 20
 _FIRST_GRID = 48
@@ -112,25 +114,30 @@ def mixed(
             )
         if bound >= least.rms:  # the least norm of all is within the bound
             return least
-        family = CentralFamily(problem, least)
-        base = family.member(lambda _, deviation: bound - deviation)
-        made = _completed(
-            problem, base, length, lambda p, grid: p.least_level((bound * (1 - _ROOM)) ** 2, grid)
-        )
+
+        def measure(norm: float, deviation: float) -> float:
+            return bound - deviation
+
+        def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
+            return programme.least_level((bound * (1 - _ROOM)) ** 2, grid)
     else:
         if gamma_ratio is not None:
             gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
         bound = number(gamma, "gamma", above=0)
-        require_reachable(least, bound)
+        require_reachable(bound, least.gamma_least)
         if bound >= best.gamma:  # the least variance of all is within the bound
             return best
-        family = CentralFamily(problem, least)
-        base = family.member(lambda norm, _: norm - bound)
         if bound <= least.gamma_least * (1 + _EDGE):  # there is no room for anything else
             return least
-        made = _completed(
-            problem, base, length, lambda p, grid: p.least_variance(bound * (1 - _ROOM), grid)
-        )
+
+        def measure(norm: float, deviation: float) -> float:
+            return norm - bound
+
+        def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
+            return programme.least_variance(bound * (1 - _ROOM), grid)
+
+    base = CentralFamily(problem, least).member(measure)
+    made = _completed(problem, base, length, solve)
     return _certified(problem, base, made, least, gamma=gamma, rms=rms)
 
 
@@ -161,7 +168,7 @@ def _completed(
     problem: EstimationProblem,
     base: Gains,
     length: int,
-    programme_of: Callable[[InnovationProgramme, FloatArray], tuple[FloatArray, float, str]],
+    solve: Callable[[InnovationProgramme, FloatArray], _Answer],
 ) -> _Completed:
     """Solve on a set of frequencies, and add to it until the norm holds between them."""
     from lbt_synth.lmi import InnovationProgramme
@@ -170,7 +177,7 @@ def _completed(
     grid = _first_grid(programme.error)
     excess = np.inf
     for rounds in range(1, _ROUNDS + 1):
-        taps, level, status = programme_of(programme, grid)
+        taps, level, status = solve(programme, grid)
         error = problem.with_memory(taps).error_system(_with_memory(base.gain_predictor, length))
         peak = hinf_norm(error)
         excess = peak.value / level - 1

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -159,16 +159,7 @@ class FilterDesign(Design):
         Certificate
             Passed or not.
         """
-        return certify_design(
-            self.problem,
-            self.gain_predictor,
-            method=self.method,
-            gamma=self.gamma_requested,
-            controller=self.controller,
-            infeasible=self.gamma_infeasible,
-            witness=self.witness,
-            rms=self.rms_requested,
-        )
+        return certify_design(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,53 +203,53 @@ def loop_certificate(check: Check) -> Certificate:
     return Certificate(checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0))
 
 
-def certify_design(
-    problem: EstimationProblem,
-    gain_predictor: FloatArray,
-    *,
-    method: str,
-    gamma: float | None,
-    controller: Controller,
-    infeasible: float | None = None,
-    witness: Witness | None = None,
-    rms: float | None = None,
-) -> Certificate:
-    """Certificate of a filter, and of its closed loop where the problem is a plant."""
+class Demands(TypedDict, total=False):
+    """What a filter design was asked for, and what is claimed of its problem."""
+
+    gamma_requested: float | None
+    rms_requested: float | None
+    gamma_least: float | None
+    gamma_infeasible: float | None
+    witness: Witness | None
+
+
+def certify_design(design: FilterDesign) -> Certificate:
+    """Certificate of a filter and its claims, and of its closed loop where it is of a plant."""
+    problem = design.problem
     certificate = certify_filter(
-        problem, gain_predictor, gamma=gamma, least_variance=method == "kalman"
+        problem,
+        design.gain_predictor,
+        gamma=design.gamma_requested,
+        least_variance=design.method == "kalman",
     )
     checks = list(certificate.checks)
-    if rms is not None:
+    if design.rms_requested is not None:
         checks.append(
             Check(
                 name="standard deviation of the estimation error",
                 value=certificate.rms,
-                limit=rms * (1 + NORM_TOLERANCE),
+                limit=design.rms_requested * (1 + NORM_TOLERANCE),
                 method="Lyapunov equation",
             )
         )
-    if infeasible is not None:
+    if design.gamma_infeasible is not None:
         checks.append(
             Check(
                 name="infeasible level over the norm achieved, less 1",
-                value=infeasible / certificate.gamma - 1,
+                value=design.gamma_infeasible / certificate.gamma - 1,
                 limit=INFEASIBLE_TOLERANCE,
                 method="level sets on the symplectic pencil",
             )
         )
         # a claim without a proof is not believed
-        proof = witness or Witness(
+        proof = design.witness or Witness(
             states=np.zeros((problem.n_states, 1)),
             disturbances=np.zeros((problem.B.shape[1], 1)),
         )
-        checks.append(certify_infeasible(problem, infeasible, proof))
-    if isinstance(problem, TipTiltPlant | FullStatePlant):
-        checks.append(certify_loop(problem.hardware, controller))
-    return Certificate(
-        checks=tuple(checks),
-        gamma=certificate.gamma,
-        rms_per_output=certificate.rms_per_output,
-    )
+        checks.append(certify_infeasible(problem, design.gamma_infeasible, proof))
+    if design.hardware is not None:
+        checks.append(certify_loop(design.hardware, design.controller))
+    return replace(certificate, checks=tuple(checks))
 
 
 def filter_design(
@@ -268,37 +259,20 @@ def filter_design(
     *,
     method: str,
     solver: SolverReport,
-    gamma_requested: float | None = None,
-    gamma_least: float | None = None,
-    gamma_infeasible: float | None = None,
-    witness: Witness | None = None,
-    rms_requested: float | None = None,
+    **demands: Unpack[Demands],
 ) -> FilterDesign:
-    """Certify a gain and make the design; raise CertificateError if it fails."""
-    controller = problem.controller(gain_predictor)
-    certificate = certify_design(
-        problem,
-        gain_predictor,
+    """Make a design and certify it; raise CertificateError if it fails."""
+    design = FilterDesign(
         method=method,
-        gamma=gamma_requested,
-        controller=controller,
-        infeasible=gamma_infeasible,
-        witness=witness,
-        rms=rms_requested,
-    )
-    return FilterDesign(
-        method=method,
-        controller=controller,
-        certificate=certificate.require(
-            "Try the other method, or scale the states to similar sizes."
-        ),
+        controller=problem.controller(gain_predictor),
+        certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
         solver=solver,
         problem=problem,
         gain_predictor=gain_predictor,
         gain_filter=gain_filter,
-        gamma_requested=gamma_requested,
-        gamma_least=gamma_least,
-        gamma_infeasible=gamma_infeasible,
-        witness=witness,
-        rms_requested=rms_requested,
+        **demands,
     )
+    certificate = design.recertified().require(
+        "Try the other method, or scale the states to similar sizes."
+    )
+    return replace(design, certificate=certificate)

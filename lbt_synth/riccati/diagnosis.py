@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import eigvals, matrix_balance
+from scipy.linalg import eigvals
 
 from lbt_synth.errors import DefinitenessError, DetectabilityError
 from lbt_synth.riccati.equation import Equations
+from lbt_synth.statespace import bordered_scaling
 from lbt_synth.validation import FloatArray
 
 _RANK = 1e-10
@@ -28,14 +29,8 @@ def unstable_hidden_mode(
     it their units are chosen, on which the answer must not depend.
     """
     n = A.shape[0]
-    border = np.block(
-        [
-            [np.abs(A), np.linalg.norm(drive, axis=1)[:, None]],
-            [np.linalg.norm(C, axis=0)[None, :], np.zeros((1, 1))],
-        ]
-    )
-    _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
-    units = np.asarray(scaling[:n], dtype=np.float64)
+    entry, leaving = np.linalg.norm(drive, axis=1), np.linalg.norm(C, axis=0)
+    units = bordered_scaling(A, entry, leaving)[:n]
     A, C = A * units / units[:, None], C * units
     scale_A = max(float(np.linalg.norm(A, 2)), 1e-300)
     scale_C = max(float(np.linalg.norm(C, 2)), 1e-300)
@@ -149,8 +144,7 @@ def _unit_circle_zero(
             f"{name}R + B'XB must not be singular; it is, whatever X: some input has neither a "
             "weight nor an effect that Q sees. Give R or Q a small weight there."
         )
-    with np.errstate(all="ignore"):
-        values = eigvals(M, N)
+    values = eigvals(M, N)
     for value in values[np.isfinite(values)]:
         if abs(abs(value) - 1) > _CIRCLE:
             continue

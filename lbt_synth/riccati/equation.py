@@ -79,21 +79,20 @@ class Equations:
 
     def balancing_units(self) -> FloatArray:
         """Powers of two in which rows and columns of A, bordered by B and Q, are alike, (N, n)."""
-        with np.errstate(all="ignore"):  # numbers out of range are refused later
-            off = np.abs(self.A) * (1 - np.eye(self.A.shape[-1]))
-            scale = np.maximum(np.abs(self.A).max(axis=(-2, -1)), 1e-300)[:, None]
-            entry, weight = np.linalg.norm(self.B, axis=-1), np.sqrt(np.abs(_diagonal(self.Q)))
-            entry = entry * scale / np.maximum(entry.max(axis=-1, keepdims=True), 1e-300)
-            weight = weight * scale / np.maximum(weight.max(axis=-1, keepdims=True), 1e-300)
-            exponent = np.zeros(entry.shape)
-            for _ in range(_SWEEPS):
-                units = np.exp2(exponent)
-                rows = (off * units[:, None, :]).sum(axis=-1) / units + entry / units
-                columns = (off / units[:, :, None]).sum(axis=-2) * units + weight * units
-                both = (rows > 0) & (columns > 0)
-                ratio = np.where(both, rows, 1.0) / np.where(both, columns, 1.0)
-                exponent = exponent + 0.25 * np.log2(ratio)  # half a step: all states move at once
-            units = np.exp2(np.round(exponent))
+        off = np.abs(self.A) * (1 - np.eye(self.A.shape[-1]))
+        scale = np.maximum(np.abs(self.A).max(axis=(-2, -1)), 1e-300)[:, None]
+        entry, weight = np.linalg.norm(self.B, axis=-1), np.sqrt(np.abs(_diagonal(self.Q)))
+        entry = entry * scale / np.maximum(entry.max(axis=-1, keepdims=True), 1e-300)
+        weight = weight * scale / np.maximum(weight.max(axis=-1, keepdims=True), 1e-300)
+        exponent = np.zeros(entry.shape)
+        for _ in range(_SWEEPS):
+            units = np.exp2(exponent)
+            rows = (off * units[:, None, :]).sum(axis=-1) / units + entry / units
+            columns = (off / units[:, :, None]).sum(axis=-2) * units + weight * units
+            both = (rows > 0) & (columns > 0)
+            ratio = np.where(both, rows, 1.0) / np.where(both, columns, 1.0)
+            exponent = exponent + 0.25 * np.log2(ratio)  # half a step: all states move at once
+        units = np.exp2(np.round(exponent))
         usable = np.isfinite(units) & (units > 0)
         return np.where(usable.all(axis=-1, keepdims=True), units, 1.0)
 

@@ -37,22 +37,21 @@ def by_shifted_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
     """
     P = np.zeros_like(equations.Q)
     ready = np.zeros(len(P), dtype=bool)  # without a shift it is the first route
-    with np.errstate(all="ignore"):
-        for _ in range(equations.A.shape[-1] + 1):
-            if np.all(ready):
-                break
-            weights = equations.weights(P)
-            cross = transposed(equations.B) @ P @ equations.A + transposed(equations.S)
-            inverse = np.linalg.pinv(
-                np.where(np.isfinite(weights), weights, 0.0), rcond=1e-10, hermitian=True
-            )
-            step = symmetrised(
-                equations.Q
-                + transposed(equations.A) @ P @ equations.A
-                - transposed(cross) @ inverse @ cross
-            )
-            P = np.where(ready[:, None, None], P, step)
-            ready = ready | _invertible(equations.weights(P))
+    for _ in range(equations.A.shape[-1] + 1):
+        if np.all(ready):
+            break
+        weights = equations.weights(P)
+        cross = transposed(equations.B) @ P @ equations.A + transposed(equations.S)
+        inverse = np.linalg.pinv(
+            np.where(np.isfinite(weights), weights, 0.0), rcond=1e-10, hermitian=True
+        )
+        step = symmetrised(
+            equations.Q
+            + transposed(equations.A) @ P @ equations.A
+            - transposed(cross) @ inverse @ cross
+        )
+        P = np.where(ready[:, None, None], P, step)
+        ready = ready | _invertible(equations.weights(P))
     return _doubled_from(equations, P, ready)
 
 
