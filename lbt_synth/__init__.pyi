@@ -47,6 +47,7 @@ from .loop import residual_budget as residual_budget
 from .loop import stable_sensor_gains as stable_sensor_gains
 from .loop import strehl as strehl
 from .loop import strehl_of_series as strehl_of_series
+from .loop import youla_controller as youla_controller
 from .models import ARModel as ARModel
 from .models import Atmosphere as Atmosphere
 from .models import EstimationProblem as EstimationProblem

@@ -4,6 +4,7 @@ from lbt_synth.loop.budget import ResidualBudget, residual_budget
 from lbt_synth.loop.closed_loop import ClosedLoop, close_loop
 from lbt_synth.loop.margins import LoopMargins, loop_margins, stable_sensor_gains
 from lbt_synth.loop.strehl import Imaging, jitter_strehl, strehl, strehl_of_series
+from lbt_synth.loop.youla import youla_controller
 
 __all__ = [
     "ClosedLoop",
@@ -17,4 +18,5 @@ __all__ = [
     "stable_sensor_gains",
     "strehl",
     "strehl_of_series",
+    "youla_controller",
 ]
