@@ -8,6 +8,7 @@ from .config import load_config as load_config
 from .design import Design as Design
 from .design import FilterDesign as FilterDesign
 from .design import IntegratorDesign as IntegratorDesign
+from .design import ShapedDesign as ShapedDesign
 from .design import SolverReport as SolverReport
 from .design import central as central
 from .design import hinf as hinf
@@ -16,6 +17,8 @@ from .design import integrator_gain_limit as integrator_gain_limit
 from .design import kalman as kalman
 from .design import mixed as mixed
 from .design import optimal_integrator as optimal_integrator
+from .design import robust as robust
+from .design import shape as shape
 from .errors import CertificateError as CertificateError
 from .errors import ConfigError as ConfigError
 from .errors import DefinitenessError as DefinitenessError
@@ -78,6 +81,18 @@ from .plotting import tradeoff_figure as tradeoff_figure
 from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare
+from .shaping import Attenuation as Attenuation
+from .shaping import CommandRms as CommandRms
+from .shaping import DelayError as DelayError
+from .shaping import MirrorUncertainty as MirrorUncertainty
+from .shaping import ModulusMargin as ModulusMargin
+from .shaping import NoisePeak as NoisePeak
+from .shaping import ResidualVariance as ResidualVariance
+from .shaping import SensorGainRange as SensorGainRange
+from .shaping import Specification as Specification
+from .shaping import Total as Total
+from .shaping import VibrationBand as VibrationBand
+from .shaping import Worst as Worst
 from .simulation import Simulation as Simulation
 from .simulation import filter_series as filter_series
 from .simulation import simulate as simulate

@@ -76,14 +76,22 @@ class InfeasibleError(SynthesisError):
         The level that was asked for.
     gamma_least : float or None
         The least level that can be met.
+    conflict : tuple of str
+        Demands that cannot hold together, none of which can be spared.
     """
 
     def __init__(
-        self, message: str, *, gamma: float | None = None, gamma_least: float | None = None
+        self,
+        message: str,
+        *,
+        gamma: float | None = None,
+        gamma_least: float | None = None,
+        conflict: tuple[str, ...] = (),
     ) -> None:
         super().__init__(message)
         self.gamma = gamma
         self.gamma_least = gamma_least
+        self.conflict = conflict
 
 
 class NumericalError(SynthesisError):

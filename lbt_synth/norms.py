@@ -10,6 +10,7 @@ a peak, and a spurious angle does no harm.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,27 +87,134 @@ def hinf_norm(system: Any) -> HinfNorm:
             spectral_radius=radius,
         )
     G = G.balanced()
-    seeds = np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)])
-    peak, angle = _largest(G, _folded(seeds))
+    peak, angle = _climbed(
+        seeds=_folded(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)])),
+        largest=lambda angles: _largest(G, angles),
+        proposed=lambda level: _folded(_level_angles(G, level)),
+    )
+    return HinfNorm(
+        value=peak,
+        lower=peak,
+        upper=peak * (1 + 2 * _TOLERANCE),
+        peak_frequency_hz=angle / (2 * np.pi * G.dt_s),
+    )
+
+
+def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
+    """Largest singular value of a stable system over a band of frequencies, its ends included.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The system; not checked for stability.
+    low_hz, high_hz : float
+        Ends of the band [Hz], within 0 and the Nyquist frequency.
+
+    Returns
+    -------
+    HinfNorm
+        Value, bracket and peak frequency.
+
+    Raises
+    ------
+    NumericalError
+        If the level sets do not close.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.norms import band_norm
+    >>> lag = lbt.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> band_norm(lag, 0.1, 0.2).peak_frequency_hz
+    0.1
+    """
+    G = system.balanced()
+    low, high = (2 * np.pi * f * G.dt_s for f in (low_hz, high_hz))
+    peak, angle = _climbed(
+        seeds=_within(np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)]), low, high),
+        largest=lambda angles: _largest(G, angles),
+        proposed=lambda level: _within(_level_angles(G, level), low, high),
+    )
+    return HinfNorm(
+        value=peak,
+        lower=peak,
+        upper=peak * (1 + 2 * _TOLERANCE),
+        peak_frequency_hz=float(np.clip(angle / (2 * np.pi * G.dt_s), low_hz, high_hz)),
+    )
+
+
+def largest_real_part(system: StateSpace) -> float:
+    """Largest real part of a stable scalar system's response over all frequencies.
+
+    By the level sets of ``G(z) + G(1/z) = 2 level``, as the norm.
+
+    Parameters
+    ----------
+    system : StateSpace
+        Of one input and one output; not checked for stability.
+
+    Returns
+    -------
+    float
+        The least upper bound of ``Re G(exp(j theta))``, plus the tolerance of the level sets
+        (2e-11 of the largest modulus).
+
+    Raises
+    ------
+    NumericalError
+        If the level sets do not close.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.norms import largest_real_part
+    >>> lag = lbt.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[-1.0]])
+    >>> round(largest_real_part(lag), 9)
+    1.0
+    """
+    G = system.balanced()
+    size = max(float(hinf_norm(G)), 1e-300)
+    # the response moved by its own size is positive, and so are its levels
+    moved = StateSpace(A=G.A, B=G.B, C=G.C, D=G.D + 2 * size, dt_s=G.dt_s)
+
+    def largest(angles: FloatArray) -> tuple[float, float]:
+        values = np.real(pointwise_response(moved, np.exp(1j * angles))[:, 0, 0])
+        best = int(np.argmax(values))
+        return float(values[best]), float(angles[best])
+
+    peak, _ = _climbed(
+        seeds=_folded(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)])),
+        largest=largest,
+        proposed=lambda level: _folded(_real_part_angles(moved, level)),
+    )
+    return peak * (1 + 2 * _TOLERANCE) - 2 * size
+
+
+def _climbed(
+    *,
+    seeds: FloatArray,
+    largest: Callable[[FloatArray], tuple[float, float]],
+    proposed: Callable[[float], FloatArray],
+) -> tuple[float, float]:
+    """Peak over angles, and where: raise a level until nothing lies above it.
+
+    ``largest`` gives the largest value at some angles, at least 0, and its angle;
+    ``proposed`` the angles that delimit what may lie above a level.
+    """
+    peak, angle = largest(seeds)
     if peak == 0:
-        return HinfNorm(value=0.0, lower=0.0, upper=0.0, peak_frequency_hz=0.0)
+        return peak, angle
     for _ in range(100):
         level = peak * (1 + _TOLERANCE)
-        candidates = _folded(_level_angles(G, level))
+        candidates = proposed(level)
         tests = np.concatenate([candidates, (candidates[1:] + candidates[:-1]) / 2])
-        new_peak, new_angle = _largest(G, tests)
+        new_peak, new_angle = largest(tests)
+        if new_peak > peak:
+            peak, angle = new_peak, new_angle
         if new_peak <= level:
-            if new_peak > peak:
-                peak, angle = new_peak, new_angle
-            return HinfNorm(
-                value=peak,
-                lower=peak,
-                upper=peak * (1 + 2 * _TOLERANCE),
-                peak_frequency_hz=angle / (2 * np.pi * G.dt_s),
-            )
-        peak, angle = new_peak, new_angle
+            return peak, angle
     raise NumericalError(
-        f"the H-infinity norm was not bracketed: it is at least {peak:.9g}. "
+        f"the largest value over frequency was not bracketed: it is at least {peak:.9g}. "
         "Balance the system's states.",
         status="level sets",
     )
@@ -171,6 +279,13 @@ def _folded(angles: FloatArray) -> FloatArray:
     return np.unique(np.concatenate([inside, [0.0, np.pi]]))
 
 
+def _within(angles: FloatArray, low: float, high: float) -> FloatArray:
+    """Sorted distinct angles in [low, high], the ends included."""
+    inside = _folded(angles)
+    inside = inside[(inside > low) & (inside < high)]
+    return np.unique(np.concatenate([inside, [low, high]]))
+
+
 def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
     """Largest singular value of a balanced system; the highest few are evaluated with care."""
     z = np.exp(1j * angles)
@@ -205,7 +320,30 @@ def _level_angles(G: StateSpace, level: float) -> FloatArray:
             [D.T @ C, B.T, D.T @ D - np.eye(m)],
         ]
     )
+    return _pencil_angles(F, E)
+
+
+def _real_part_angles(G: StateSpace, level: float) -> FloatArray:
+    """Angles of the generalised eigenvalues at which ``Re G`` of a scalar system may be a level.
+
+    ``z [x; A'p + C'u; 0] = [A x + B u; p; C x + B'p + 2 (D - level) u]``.
+    """
+    n = G.n_states
+    zero = np.zeros
+    E = np.block(
+        [[np.eye(n), zero((n, n + 1))], [zero((n, n)), G.A.T, G.C.T], [zero((1, 2 * n + 1))]]
+    )
+    F = np.block(
+        [
+            [G.A, zero((n, n)), G.B],
+            [zero((n, n)), np.eye(n), zero((n, 1))],
+            [G.C, G.B.T, 2 * (G.D - level)],
+        ]
+    )
+    return _pencil_angles(F, E)
+
+
+def _pencil_angles(F: FloatArray, E: FloatArray) -> FloatArray:
     with np.errstate(all="ignore"):
         values = eigvals(F, E)
-    finite = values[np.isfinite(values) & (values != 0)]
-    return np.asarray(np.angle(finite))
+    return np.asarray(np.angle(values[np.isfinite(values) & (values != 0)]))

@@ -10,11 +10,12 @@ import numpy as np
 
 from lbt_synth.certify import Certificate
 from lbt_synth.cli.output import Report, TableText, working
-from lbt_synth.config import Config, load_config
+from lbt_synth.config import Config, load_config, robust_design
 from lbt_synth.design import (
     Design,
     FilterDesign,
     IntegratorDesign,
+    ShapedDesign,
     hinf,
     integrator,
     kalman,
@@ -32,6 +33,7 @@ _ROUTES = {
     "hinf": ("lmi", "riccati"),
     "mixed": (),
     "integrator": (),
+    "robust": (),
 }
 _OWNERS = {
     "gamma": ("hinf", "mixed"),
@@ -51,7 +53,7 @@ def design(arguments: Namespace) -> Report:
     path = save_gain(arguments.output, made)
     report = _description(made)
     report.data["file"] = str(path)
-    if made.method != arguments.method:
+    if made.method != arguments.method:  # a mixed filter may be one of these
         name = {"kalman": "Kalman filter", "hinf": "filter of the least norm"}[made.method]
         report.notes.append(
             f"note: the bound leaves no better choice than the {name}, which is it."
@@ -73,9 +75,9 @@ def _refuse_foreign_options(arguments: Namespace) -> None:
                 f"--{option.replace('_', '-')} goes with --method {' or '.join(owners)}; "
                 f"got --method {method}."
             )
-    if method == "integrator" and arguments.horizon != 1:
+    if method in ("integrator", "robust") and arguments.horizon != 1:
         raise ProblemError(
-            "an integrator has no horizon; set loop.delay_frames in the configuration instead. "
+            f"--method {method} takes no horizon; set loop.delay_frames in the configuration instead. "
             f"Got --horizon {arguments.horizon}."
         )
 
@@ -87,6 +89,8 @@ def _synthesise(config: Config, arguments: Namespace) -> Design:
         if arguments.gain is not None:
             return integrator(config.hardware, gain=arguments.gain)
         return optimal_integrator(config.hardware, config.truth)
+    if arguments.method == "robust":
+        return robust_design(config)
     ratio = arguments.gamma_ratio
     if arguments.gamma is None and ratio is None and arguments.rms is None:
         ratio = config.settings.design.gamma_ratio
@@ -185,6 +189,19 @@ def _description(made: Design) -> Report:
     if isinstance(made, IntegratorDesign):
         facts.append(("gain", made.gain, ""))
         data["gain"] = made.gain
+    if isinstance(made, ShapedDesign):
+        facts += [
+            ("states of one mode, past commands included", made.states_per_mode, ""),
+            ("loss by having few states", 100 * made.loss, "%"),
+        ]
+        terms = made.terms_nm()
+        data |= {
+            "states_per_mode": made.states_per_mode,
+            "loss": made.loss,
+            "objective_nm": made.objective_nm,
+            "long_objective_nm": made.long_objective_nm,
+            "terms": [{"mode": m + 1, "term": text, "rms_nm": rms} for m, text, rms in terms],
+        }
     tables = []
     if made.hardware is not None:
         margins = loop_margins(close_loop(made.hardware, made.controller))
@@ -204,6 +221,14 @@ def _description(made: Design) -> Report:
             ("highest crossover", margins.crossover_hz, "Hz"),
         ]
     tables.append(TableText(title="Design", headings=("quantity", "value", "unit"), rows=facts))
+    if isinstance(made, ShapedDesign):
+        tables.append(
+            TableText(
+                title="Residual of each term",
+                headings=("term", "mode", "residual [nm rms]"),
+                rows=[(text, mode + 1, rms) for mode, text, rms in terms],
+            )
+        )
     tables.append(_check_table(made.certificate))
     notes = []
     if made.hardware is not None and margins.modulus < _SMALL_MODULUS:

@@ -41,7 +41,7 @@ def build_parser() -> argparse.ArgumentParser:
     design = command("design", "Design a controller and write its gain file")
     design.add_argument("config", help=config_help)
     design.add_argument(
-        "--method", choices=("kalman", "hinf", "mixed", "integrator"), required=True
+        "--method", choices=("kalman", "hinf", "mixed", "robust", "integrator"), required=True
     )
     design.add_argument(
         "--route",

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from lbt_synth.config.schema import FileSection, TrueVibrationSection, VibrationSection
+from lbt_synth.config.schema import BandSection, FileSection, TrueVibrationSection, VibrationSection
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.loop import Imaging
 from lbt_synth.models import (
@@ -257,7 +257,7 @@ def _plant(settings: FileSection, atmosphere: Atmosphere, noise_nm: float) -> Ti
                 Vibration(
                     frequency_hz=section.frequency_hz,
                     damping=section.damping,
-                    rms_nm=_rms_nm(section, settings),
+                    rms_nm=rms_nm(section, settings),
                     direction=direction,
                 )
                 for direction in _directions(section)
@@ -284,7 +284,7 @@ def _truth(
         for direction in _directions(section):
             size: dict[str, Any] = {
                 "frequency_hz": section.frequency_hz,
-                "rms_nm": _rms_nm(section, settings),
+                "rms_nm": rms_nm(section, settings),
                 "direction": direction,
             }
             if section.damping is None:
@@ -305,7 +305,10 @@ def _truth(
     )
 
 
-def _rms_nm(section: VibrationSection | TrueVibrationSection, settings: FileSection) -> float:
+def rms_nm(
+    section: VibrationSection | TrueVibrationSection | BandSection, settings: FileSection
+) -> float:
+    """Standard deviation of a vibration [nm rms wavefront], given in nm or in mas."""
     if section.rms_nm is not None:
         return section.rms_nm
     assert section.rms_mas is not None  # the schema wants exactly one of the two

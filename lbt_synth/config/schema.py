@@ -152,10 +152,63 @@ class ImagingSection(_Section):
     other_modes_strehl: Fraction = 1.0
 
 
+class BandSection(_Section):
+    """A band in which a vibration may be anywhere."""
+
+    low_hz: Annotated[float, Field(ge=0)]
+    high_hz: Positive
+    rms_nm: Positive | None = None
+    rms_mas: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_size(self) -> BandSection:
+        if (self.rms_nm is None) == (self.rms_mas is None):
+            raise ValueError("expected exactly one of rms_nm, rms_mas")
+        return self
+
+
+class AttenuationSection(_Section):
+    """One step of a mask on the rejection."""
+
+    low_hz: Annotated[float, Field(ge=0)]
+    high_hz: Positive
+    at_most: Positive
+    sensor_gain: Positive | None = None
+
+
+class MirrorUncertaintySection(_Section):
+    """Relative size of what is not known of the mirror, in a band."""
+
+    relative: Positive
+    low_hz: Annotated[float, Field(ge=0)]
+    high_hz: Positive
+
+
+class RobustSection(_Section):
+    """The robust design: bands of vibrations, sensor gains, demands."""
+
+    bands: Annotated[list[BandSection], Field(min_length=1)]
+    turbulence: Literal["frozen_flow", "model"] = "frozen_flow"
+    sensor_gain: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
+    scenarios: Annotated[list[Positive], Field(min_length=1)] | None = None
+    modulus_margin: Annotated[float, Field(gt=0, lt=1)] = 0.45
+    noise_peak: Positive | None = None
+    delay_error_frames: Annotated[float, Field(gt=0, le=1)] | None = None
+    command_stroke_nm: Positive | None = None
+    command_step_nm: Positive | None = None
+    attenuation: list[AttenuationSection] = []
+    mirror_uncertainty: list[MirrorUncertaintySection] = []
+    functions: Annotated[int, Field(ge=1)] = 60
+    pole: Annotated[float, Field(ge=0, lt=1)] = 0.7
+    states: Annotated[int, Field(ge=2)] | None = 20
+    loss: Annotated[float, Field(ge=0)] = 0.25
+
+
 class DesignSection(_Section):
     """Defaults of the synthesis."""
 
     gamma_ratio: Annotated[float, Field(ge=1)] = 1.2
+    robust: RobustSection | None = None
 
 
 class SimulationSection(_Section):

@@ -6,11 +6,15 @@ from lbt_synth.design.integrator import integrator, integrator_gain_limit, optim
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.mixed import mixed
 from lbt_synth.design.result import Design, FilterDesign, IntegratorDesign, SolverReport
+from lbt_synth.design.robust import robust
+from lbt_synth.design.shape import shape
+from lbt_synth.design.shaped import ShapedDesign
 
 __all__ = [
     "Design",
     "FilterDesign",
     "IntegratorDesign",
+    "ShapedDesign",
     "SolverReport",
     "central",
     "hinf",
@@ -19,4 +23,6 @@ __all__ = [
     "kalman",
     "mixed",
     "optimal_integrator",
+    "robust",
+    "shape",
 ]

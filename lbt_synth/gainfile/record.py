@@ -9,7 +9,13 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.certify import Certificate, Check
-from lbt_synth.design import Design, FilterDesign, IntegratorDesign, SolverReport
+from lbt_synth.design import (
+    Design,
+    FilterDesign,
+    IntegratorDesign,
+    ShapedDesign,
+    SolverReport,
+)
 from lbt_synth.models import (
     ARModel,
     EstimationProblem,
@@ -18,6 +24,7 @@ from lbt_synth.models import (
     TipTiltPlant,
     Vibration,
 )
+from lbt_synth.shaping.record import packed, unpacked
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import FloatArray, frozen
 from lbt_synth.witness import Witness
@@ -65,6 +72,15 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
         }
     if isinstance(design, IntegratorDesign):
         meta["integrator_gain"] = design.gain
+    if isinstance(design, ShapedDesign):
+        for mode, parameter in enumerate(design.parameters):
+            arrays |= {f"YOULA{mode + 1}_{n}": getattr(parameter, n) for n in "ABC"}
+        meta["shaped"] = {
+            "specifications": [packed(spec) for spec in design.specifications],
+            "objective_nm": list(design.objective_nm),
+            "long_objective_nm": list(design.long_objective_nm),
+            "long_functions": design.long_functions,
+        }
     if isinstance(design, FilterDesign):
         arrays |= {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
         meta["gamma_requested"] = design.gamma_requested
@@ -92,6 +108,8 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
         return IntegratorDesign(
             **common, loop_hardware=_unpack_hardware(arrays, meta), gain=meta["integrator_gain"]
         )
+    if "shaped" in meta:
+        return _unpack_shaped(arrays, meta, common)
     problem = _unpack_problem(arrays, meta)
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
     for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
@@ -109,6 +127,30 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
         witness=Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
         if "WITNESS_X" in arrays
         else None,
+    )
+
+
+def _unpack_shaped(arrays: Arrays, meta: Meta, common: Meta) -> ShapedDesign:
+    hardware, shaped = _unpack_hardware(arrays, meta), meta["shaped"]
+    parameters = tuple(
+        Controller(
+            **{n: arrays[f"YOULA{mode + 1}_{n}"] for n in "ABC"},
+            D=np.zeros((1, 1)),
+            dt_s=meta["dt_s"],
+        )
+        for mode in range(hardware.modes)
+    )
+    specifications = tuple(unpacked(spec) for spec in shaped["specifications"])
+    if len(specifications) != hardware.modes:
+        raise ValueError(f"it must have {hardware.modes} specifications, one a mode")
+    return ShapedDesign(
+        **common,
+        loop_hardware=hardware,
+        specifications=specifications,
+        parameters=parameters,
+        objective_nm=tuple(float(v) for v in shaped["objective_nm"]),
+        long_objective_nm=tuple(float(v) for v in shaped["long_objective_nm"]),
+        long_functions=int(shaped["long_functions"]),
     )
 
 

@@ -80,8 +80,28 @@ class ClosedLoop:
     def output_sensitivity(self) -> StateSpace:
         """System from measurement noise to measurement, ``(I + loop)^-1``."""
         n, m = self.hardware.modes, self.hardware.n_commands
+        return self._part(slice(n + m, None), slice(n, None))
+
+    def rejection(self) -> StateSpace:
+        """System from the total phase to the residual."""
+        n = self.hardware.modes
+        return self._part(slice(n), slice(n))
+
+    def noise_propagation(self) -> StateSpace:
+        """System from the measurement noise to the residual."""
+        n = self.hardware.modes
+        return self._part(slice(n), slice(n, None))
+
+    def commanding(self) -> StateSpace:
+        """System from ``[phi_tot, noise]`` to the command."""
+        n, m = self.hardware.modes, self.hardware.n_commands
+        return self._part(slice(n, n + m), slice(None))
+
+    def _part(self, outputs: slice, inputs: slice) -> StateSpace:
         s = self.system
-        return StateSpace(A=s.A, B=s.B[:, n:], C=s.C[n + m :], D=s.D[n + m :, n:], dt_s=s.dt_s)
+        return StateSpace(
+            A=s.A, B=s.B[:, inputs], C=s.C[outputs], D=s.D[outputs, inputs], dt_s=s.dt_s
+        )
 
 
 def close_loop(

@@ -1,0 +1,112 @@
+"""The robust design of a configuration file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lbt_synth.config.load import Config, rms_nm
+from lbt_synth.design import ShapedDesign, robust
+from lbt_synth.design.shaped import noise_of_modes
+from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.models import Spectrum
+from lbt_synth.shaping import (
+    Attenuation,
+    CommandRms,
+    DelayError,
+    Demand,
+    MirrorUncertainty,
+    NoisePeak,
+    VibrationBand,
+)
+
+_KEY = "design.robust"
+
+
+def robust_design(config: Config) -> ShapedDesign:
+    """Design the robust controller that the section ``design.robust`` describes.
+
+    Sensor gains of the file are real ones; the design takes them relative to
+    ``model.sensor_gain``.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+
+    Returns
+    -------
+    ShapedDesign
+        Certified design.
+
+    Raises
+    ------
+    ConfigError
+        If the section is missing, or a value in it does not fit.
+    SynthesisError
+        If no such controller is found.
+    """
+    section = config.settings.design.robust
+    if section is None:
+        raise ConfigError(
+            f"the key {_KEY} is missing: the robust design needs its bands at least. Try "
+            "examples/lbt_robust.yaml.",
+            path=_KEY,
+        )
+    believed = config.settings.model.sensor_gain
+    spectrum: Spectrum | None = config.atmosphere if section.turbulence == "frozen_flow" else None
+    try:
+        bands = [
+            VibrationBand(
+                low_hz=band.low_hz, high_hz=band.high_hz, rms_nm=rms_nm(band, config.settings)
+            )
+            for band in section.bands
+        ]
+        arguments: dict[str, Any] = {
+            "bands": bands,
+            "turbulence": spectrum,
+            "modulus_margin": section.modulus_margin,
+            "demands": _demands(config, spectrum),
+            "functions": section.functions,
+            "pole": section.pole,
+            "states": section.states,
+            "loss": section.loss,
+        }
+        if section.sensor_gain is not None:
+            arguments["sensor_gain"] = tuple(gain / believed for gain in section.sensor_gain)
+        if section.scenarios is not None:
+            arguments["scenarios"] = tuple(gain / believed for gain in section.scenarios)
+        return robust(config.plant, **arguments)
+    except ProblemError as error:
+        raise ConfigError(f"{_KEY}: {error}", path=_KEY) from error
+
+
+def _demands(config: Config, spectrum: Spectrum | None) -> list[Demand]:
+    section = config.settings.design.robust
+    assert section is not None  # of a robust design
+    believed = config.settings.model.sensor_gain
+    out: list[Demand] = []
+    if section.noise_peak is not None:
+        out.append(NoisePeak(at_most=section.noise_peak))
+    if section.delay_error_frames is not None:
+        out.append(DelayError(frames=section.delay_error_frames))
+    out += [
+        Attenuation(
+            low_hz=step.low_hz,
+            high_hz=step.high_hz,
+            at_most=step.at_most,
+            sensor_gain=1.0 if step.sensor_gain is None else step.sensor_gain / believed,
+        )
+        for step in section.attenuation
+    ]
+    out += [
+        MirrorUncertainty(relative=part.relative, low_hz=part.low_hz, high_hz=part.high_hz)
+        for part in section.mirror_uncertainty
+    ]
+    noise = float(max(noise_of_modes(config.hardware, config.plant.R)))
+    turbulence = config.plant.turbulence[0] if spectrum is None else spectrum
+    for bound, rate in ((section.command_stroke_nm, False), (section.command_step_nm, True)):
+        if bound is not None:
+            out.append(
+                CommandRms(at_most_nm=bound, turbulence=turbulence, noise_nm=noise, rate=rate)
+            )
+    return out

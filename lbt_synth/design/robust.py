@@ -1,0 +1,132 @@
+"""The ready-made robust problem: vibrations in bands, an unknown sensor gain, a margin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lbt_synth.design.shape import shape
+from lbt_synth.design.shaped import ShapedDesign, noise_of_modes
+from lbt_synth.errors import ProblemError
+from lbt_synth.models.plant import TipTiltPlant
+from lbt_synth.models.truth import Spectrum
+from lbt_synth.shaping import (
+    Demand,
+    ModulusMargin,
+    ResidualVariance,
+    SensorGainRange,
+    Specification,
+    Term,
+    Total,
+    VibrationBand,
+)
+from lbt_synth.validation import number
+
+
+def robust(
+    plant: TipTiltPlant,
+    *,
+    bands: Sequence[VibrationBand],
+    sensor_gain: tuple[float, float] = (1.0, 1.0),
+    scenarios: Sequence[float] = (1.0,),
+    modulus_margin: float = 0.45,
+    turbulence: Spectrum | None = None,
+    demands: Sequence[Demand] = (),
+    functions: int = 60,
+    pole: float = 0.7,
+    states: int | None = 20,
+    loss: float = 0.25,
+) -> ShapedDesign:
+    """Design one controller for vibrations anywhere in bands and an uncertain sensor gain.
+
+    For each mode it minimises, summed over some sensor gains, the variance of turbulence and
+    noise plus the worst residual of a vibration in each band; under a modulus margin at unit
+    sensor gain, and stability for every sensor gain of an interval.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        Loop, noise and turbulence; its vibrations are not used, the bands take their place.
+    bands : sequence of VibrationBand
+        Bands, each with the rms of its vibration; every mode may have all of them.
+    sensor_gain : tuple of float, optional
+        Interval of sensor gains, around 1, for which the loop stays stable.
+    scenarios : sequence of float, optional
+        Sensor gains whose residuals are added up.
+    modulus_margin : float, optional
+        Modulus margin at unit sensor gain.
+    turbulence : Atmosphere, ARModel or TabulatedSpectrum, optional
+        Spectrum of each mode instead of the plant's models.
+    demands : sequence of demands, optional
+        Further demands, as :class:`Specification` takes them.
+    functions, pole, states, loss
+        As :func:`shape`.
+
+    Returns
+    -------
+    ShapedDesign
+        Certified design.
+
+    Raises
+    ------
+    ProblemError
+        If an argument is out of its range.
+    InfeasibleError
+        If the demands cannot hold together, or not with so few states.
+    NumericalError
+        If a programme fails.
+    CertificateError
+        If the design does not pass its checks.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0, modes=1)
+    >>> line = lbt.VibrationBand(low_hz=18, high_hz=22, rms_nm=100)
+    >>> design = lbt.robust(plant, bands=[line], sensor_gain=(0.5, 1.2), functions=16, states=None)
+    >>> low, high = lbt.stable_sensor_gains(plant.hardware, design.controller)
+    >>> low < 0.5 and high > 1.2
+    True
+    """
+    if not isinstance(plant, TipTiltPlant):
+        raise ProblemError(f"plant must be a TipTiltPlant; got {type(plant).__name__}.")
+    lines = tuple(bands)
+    for line in lines:
+        if not isinstance(line, VibrationBand):
+            raise ProblemError(f"bands must be VibrationBands; got {type(line).__name__}.")
+    gains = tuple(number(g, "scenarios", above=0) for g in scenarios)
+    if not gains:
+        raise ProblemError("scenarios must name at least one sensor gain; got none.")
+    low, high = sensor_gain
+    fixed: list[Demand] = [ModulusMargin(at_least=modulus_margin)]
+    if (low, high) != (1, 1):
+        fixed.append(SensorGainRange(low=low, high=high))
+    deviations = noise_of_modes(plant.hardware, plant.R)
+    made: dict[tuple[float, int], Specification] = {}
+    specifications = []
+    for noise_nm, model in zip(deviations, plant.turbulence, strict=True):
+        # equal modes share one specification, and are solved once
+        key = float(np.round(noise_nm, 9)), 0 if turbulence is not None else id(model)
+        if key not in made:
+            spectrum = model if turbulence is None else turbulence
+            terms: list[Term] = [
+                term
+                for gain in gains
+                for term in (
+                    ResidualVariance(
+                        turbulence=spectrum, noise_nm=float(noise_nm), sensor_gain=gain
+                    ),
+                    *(replace(line, sensor_gain=gain) for line in lines),
+                )
+            ]
+            made[key] = Specification(
+                objective=Total(terms=tuple(terms)), demands=(*fixed, *demands)
+            )
+        specifications.append(made[key])
+    design = shape(
+        plant.hardware, specifications, functions=functions, pole=pole, states=states, loss=loss
+    )
+    return replace(design, method="robust")

@@ -1,0 +1,178 @@
+"""Shaping of the closed loop: the best controller of a specification, and few states for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.certify import Certificate
+from lbt_synth.design.result import SolverReport
+from lbt_synth.design.shaped import ShapedDesign, assembled, require_separable
+from lbt_synth.errors import ProblemError
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.shaping import Specification
+from lbt_synth.shaping.basis import laguerre_basis
+from lbt_synth.shaping.channel import Channel
+from lbt_synth.shaping.measured import mode_hardware
+from lbt_synth.shaping.reduction import Solved, reduced, solved
+from lbt_synth.statespace import Controller
+from lbt_synth.validation import integer, number
+
+_MOST_FUNCTIONS = 400
+_ROUNDED = 5e-7
+
+
+def shape(
+    hardware: LoopHardware,
+    specification: Specification | Sequence[Specification],
+    *,
+    functions: int = 60,
+    pole: float = 0.7,
+    states: int | None = 20,
+    loss: float = 0.25,
+) -> ShapedDesign:
+    """Design the controller that minimises an objective under demands on the closed loop.
+
+    The path from command to measurement is a delay, so the loop is affine in the Youla
+    parameter, a stable filter from the pseudo-open-loop measurement to the command. A long
+    parameter, of many fixed functions, is found by convex programmes; then one of few
+    states, by fitting the poles to the long one's response and solving the same programmes
+    with these poles.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop; its modes are controlled one by one.
+    specification : Specification or sequence of them
+        One for all modes, or one for each.
+    functions : int, optional
+        Functions of the long parameter.
+    pole : float, optional
+        Their common pole (Laguerre functions), in [0, 1); 0 makes them taps of an impulse
+        response. A larger one resolves lower frequencies with fewer functions.
+    states : int or None, optional
+        Largest number of states of one mode's controller, its past commands included; None
+        keeps the long parameter.
+    loss : float, optional
+        Tolerated increase of the objective's root by the reduction, relative; the fewest
+        states that keep to it are taken.
+
+    Returns
+    -------
+    ShapedDesign
+        Certified design: each demand is checked on the real loop, over all frequencies.
+
+    Raises
+    ------
+    ProblemError
+        If an argument is out of its range.
+    InfeasibleError
+        If the demands cannot hold together; ``conflict`` on the error names a smallest set
+        that cannot. Or if no controller of so few states keeps to the loss.
+    NumericalError
+        If a programme fails.
+    CertificateError
+        If the design does not pass its checks.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    >>> spec = lbt.Specification(
+    ...     objective=lbt.ResidualVariance(turbulence=slow, noise_nm=20.0),
+    ...     demands=[lbt.ModulusMargin(at_least=0.6)])
+    >>> design = lbt.shape(path, spec, functions=12, states=None)
+    >>> loop = lbt.close_loop(path, design.controller)
+    >>> lbt.loop_margins(loop).modulus > 0.6
+    True
+    """
+    if not isinstance(hardware, LoopHardware):
+        raise ProblemError(
+            "hardware must be a LoopHardware, such as plant.hardware; got "
+            f"{type(hardware).__name__}."
+        )
+    specifications = _one_a_mode(specification, hardware.modes)
+    size = integer(functions, "functions", at_least=1)
+    if size > _MOST_FUNCTIONS:
+        raise ProblemError(f"functions must be at most {_MOST_FUNCTIONS}; got {size}.")
+    common = number(pole, "pole", at_least=0, below=1)
+    tolerance = number(loss, "loss", at_least=0)
+    require_separable(hardware)
+    single = mode_hardware(hardware)
+    stored = len(single.mirror_taps) - 1
+    order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
+    for spec in specifications:
+        spec.require_below(hardware.frame_rate_hz / 2)
+
+    made: dict[int, _Mode] = {}
+    for spec in specifications:
+        if id(spec) not in made:
+            channel = Channel(hardware=single, basis=laguerre_basis(size, common, dt_s=single.dt_s))
+            made[id(spec)] = _designed(spec, channel, order, tolerance)
+    modes = [made[id(spec)] for spec in specifications]
+    parameters = tuple(mode.parameter for mode in modes)
+    design = ShapedDesign(
+        method="shaped",
+        controller=assembled(hardware, parameters),
+        certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
+        solver=SolverReport(
+            route="youla",
+            status=modes[0].status,
+            iterations=max(mode.programmes for mode in modes),
+        ),
+        loop_hardware=hardware,
+        specifications=specifications,
+        parameters=parameters,
+        objective_nm=tuple(mode.objective_nm for mode in modes),
+        long_objective_nm=tuple(mode.long_objective_nm for mode in modes),
+        long_functions=size,
+    )
+    certificate = design.recertified().require("Try more functions, or looser demands.")
+    return replace(design, certificate=certificate)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Mode:
+    parameter: Controller
+    objective_nm: float
+    long_objective_nm: float
+    status: str
+    programmes: int
+
+
+def _one_a_mode(
+    specification: Specification | Sequence[Specification], modes: int
+) -> tuple[Specification, ...]:
+    given = (
+        (specification,) * modes
+        if isinstance(specification, Specification)
+        else tuple(specification)
+    )
+    for spec in given:
+        if not isinstance(spec, Specification):
+            raise ProblemError(f"expected a Specification; got {type(spec).__name__}.")
+    if len(given) != modes:
+        raise ProblemError(
+            f"give one specification, or one for each of {modes} modes; got {len(given)}."
+        )
+    return given
+
+
+def _designed(spec: Specification, channel: Channel, order: int | None, tolerance: float) -> _Mode:
+    long = solved(spec, channel)
+    if order is None or order >= channel.basis.size:
+        return _mode(long, long)
+    return _mode(reduced(spec, long, order, tolerance), long)
+
+
+def _mode(result: Solved, long: Solved) -> _Mode:
+    return _Mode(
+        parameter=result.parameter,
+        objective_nm=result.objective_nm * (1 + _ROUNDED),
+        long_objective_nm=long.objective_nm,
+        status=result.sequence.status,
+        programmes=len(long.sequence.objectives_nm2),
+    )

@@ -1,0 +1,92 @@
+"""Frequencies at which a specification becomes a finite programme."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.quadrature import gauss_panels
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_ORDER = 5
+_BAND_POINTS = 15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Grid:
+    """Nodes of the variances' quadrature, and points of the bounds.
+
+    Attributes
+    ----------
+    nodes_hz, weights_hz : (F,) ndarray
+        Quadrature over 0 to the Nyquist frequency.
+    points_hz : (P,) ndarray
+        Where bounds over frequency are imposed; added to until they hold between.
+    """
+
+    nodes_hz: FloatArray
+    weights_hz: FloatArray
+    points_hz: FloatArray
+
+    def within(self, low_hz: float, high_hz: float) -> FloatArray:
+        """Points of a band, its ends and some more included."""
+        inside = self.points_hz[(self.points_hz > low_hz) & (self.points_hz < high_hz)]
+        return np.unique(np.concatenate([inside, np.linspace(low_hz, high_hz, _BAND_POINTS)]))
+
+    def with_points(self, frequency_hz: FloatArray) -> Grid:
+        """Return the grid with further points."""
+        return replace(self, points_hz=np.unique(np.concatenate([self.points_hz, frequency_hz])))
+
+
+def first_grid(
+    frame_rate_hz: float,
+    *,
+    bands_hz: tuple[tuple[float, float], ...],
+    poles: ComplexArray,
+    fineness: int = 1,
+) -> Grid:
+    """Panels that are geometric at low frequencies, finer in the bands and at slow poles.
+
+    Parameters
+    ----------
+    frame_rate_hz : float
+        Frame rate [Hz].
+    bands_hz : tuple of (low, high)
+        Bands that matter [Hz].
+    poles : (n,) complex ndarray
+        Poles of the basis.
+    fineness : int, optional
+        Factor on the number of panels.
+    """
+    nyquist = frame_rate_hz / 2
+    edges = [
+        np.array([0.0]),
+        np.geomspace(6e-5, 0.01, 13 * fineness + 1) * frame_rate_hz,
+        np.geomspace(0.0125, 0.5, 24 * fineness + 1) * frame_rate_hz,
+    ]
+    for low, high in bands_hz:
+        width = high - low
+        edges.append(
+            np.linspace(max(low - width, 0), min(high + width, nyquist), 12 * fineness + 1)
+        )
+    for pole in poles:
+        centre, width = abs(np.angle(pole)), 1 - abs(pole)
+        if width < 0.05:
+            offsets = np.array([-4.0, -1.0, 1.0, 4.0]) * width
+            edges.append((centre + offsets) / (2 * np.pi) * frame_rate_hz)
+    every = np.unique(np.clip(np.concatenate(edges), 0, nyquist))
+    every = every[np.concatenate([[True], np.diff(every) > 1e-6 * nyquist])]
+    nodes, weights = gauss_panels(every, _ORDER)
+    points = np.unique(np.concatenate([np.linspace(0, nyquist, 128 * fineness), every]))
+    return Grid(nodes_hz=nodes, weights_hz=weights, points_hz=points)
+
+
+def fine_frequencies(frame_rate_hz: float, poles: ComplexArray, count: int) -> FloatArray:
+    """Frequencies at which the bounds are watched between the points [Hz]."""
+    even = np.linspace(0, 0.5, count)
+    low = np.geomspace(1e-5, 0.1, count // 2)
+    centres, widths = np.abs(np.angle(poles)) / (2 * np.pi), (1 - np.abs(poles)) / (2 * np.pi)
+    offsets = np.linspace(-3, 3, 13)
+    near = (centres[:, None] + widths[:, None] * offsets).ravel()
+    return np.unique(np.clip(np.concatenate([even, low, near]), 0, 0.5)) * frame_rate_hz

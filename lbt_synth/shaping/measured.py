@@ -1,0 +1,58 @@
+"""One mode's closed loops at any sensor gain, for the exact evaluation of terms and demands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.statespace import Controller, StateSpace
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MeasuredLoop:
+    """A controller of one mode in its loop.
+
+    Attributes
+    ----------
+    hardware : LoopHardware
+        Loop of one mode.
+    controller : Controller
+        The controller of this mode.
+    """
+
+    hardware: LoopHardware
+    controller: Controller
+    _loops: dict[float, ClosedLoop] = field(default_factory=dict)
+
+    def at(self, sensor_gain: float) -> ClosedLoop:
+        """Return the loop at a sensor gain."""
+        if sensor_gain not in self._loops:
+            self._loops[sensor_gain] = close_loop(
+                self.hardware, self.controller, sensor_gain=sensor_gain
+            )
+        return self._loops[sensor_gain]
+
+    @property
+    def sensitivity(self) -> StateSpace:
+        """S at unit sensor gain."""
+        return self.at(1.0).output_sensitivity()
+
+    @property
+    def complementary(self) -> StateSpace:
+        """``T = 1 - S`` at unit sensor gain."""
+        s = self.sensitivity
+        return StateSpace(A=s.A, B=s.B, C=-s.C, D=1 - s.D, dt_s=s.dt_s)
+
+
+def mode_loop(hardware: LoopHardware, parameter: Controller) -> MeasuredLoop:
+    """Return the loop of one mode, of the delay of a whole loop, around its parameter."""
+    single = mode_hardware(hardware)
+    return MeasuredLoop(hardware=single, controller=youla_controller(single, parameter))
+
+
+def mode_hardware(hardware: LoopHardware) -> LoopHardware:
+    """Return the loop of one mode, with unit sensor and mirror."""
+    return LoopHardware(
+        frame_rate_hz=hardware.frame_rate_hz, delay_frames=hardware.delay_frames, modes=1
+    )

@@ -1,0 +1,145 @@
+"""From a long Youla parameter to one of few poles, with the programme solved anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import InfeasibleError, NumericalError
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.shaping.basis import orthonormal_basis
+from lbt_synth.shaping.channel import Channel
+from lbt_synth.shaping.measured import mode_loop
+from lbt_synth.shaping.poles import first_poles, fitted_poles, leaving_out, without_least_pair
+from lbt_synth.shaping.sequence import SequenceResult, solve_sequence
+from lbt_synth.shaping.specification import Specification
+from lbt_synth.shaping.terms import noise_level, spread_weights
+from lbt_synth.statespace import Controller
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_FLAT = 0.3  # weight of the whole response in the fit of poles, beside the spectra
+_INTEGRAL = 2e-3  # by which the objective over the grid may miss that of the real loop
+_SLOW_HZ = (0.002, 0.004, 0.008)  # where turbulence meets the noise, of the frame rate: starts
+_LEAST_POLES = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solved:
+    """A solved specification in one basis.
+
+    Attributes
+    ----------
+    sequence : SequenceResult
+        How it was solved.
+    objective_nm : float
+        Root of the objective in the real loop [nm].
+    """
+
+    sequence: SequenceResult
+    objective_nm: float
+
+    @property
+    def parameter(self) -> Controller:
+        """The Youla parameter."""
+        return self.sequence.channel.basis.parameter(self.sequence.coefficients)
+
+
+def solved(spec: Specification, channel: Channel) -> Solved:
+    """Solve in a basis, on a grid that is fine enough for the objective.
+
+    Raises
+    ------
+    InfeasibleError, NumericalError
+        As :func:`solve_sequence`; also if no grid is fine enough.
+    """
+    miss = np.inf
+    for fineness in (1, 2, 4):
+        sequence = solve_sequence(spec, channel, fineness=fineness)
+        parameter = channel.basis.parameter(sequence.coefficients)
+        exact = spec.objective.measured_nm2(mode_loop(channel.hardware, parameter))
+        miss = abs(sequence.objective_nm2 / exact - 1)
+        if miss < _INTEGRAL:
+            return Solved(sequence=sequence, objective_nm=float(np.sqrt(exact)))
+    raise NumericalError(
+        f"the objective over the frequencies of the programme misses that of the real loop by "
+        f"{miss:.2g}; expected {_INTEGRAL:g}. Try a smaller pole, or wider bands.",
+        status="quadrature",
+    )
+
+
+def reduced(spec: Specification, long: Solved, order: int, tolerance: float) -> Solved:
+    """Fewest poles whose programme keeps the objective within a tolerance.
+
+    Parameters
+    ----------
+    spec : Specification
+        Objective and demands.
+    long : Solved
+        The long parameter.
+    order : int
+        Largest number of poles.
+    tolerance : float
+        Largest relative increase of the objective's root.
+
+    Raises
+    ------
+    InfeasibleError
+        If the tolerance is not kept with this many poles.
+    """
+    sequence = long.sequence
+    hardware, f = sequence.channel.hardware, sequence.grid.nodes_hz
+    angles = 2 * np.pi * f * hardware.dt_s
+    target = sequence.channel.command_rows(f) @ sequence.coefficients
+    weight = _fit_weight(spec, sequence)
+    bands = tuple(
+        (2 * np.pi * low * hardware.dt_s, 2 * np.pi * high * hardware.dt_s)
+        for low, high in spec.objective.bands_hz
+    )
+    starts = [
+        fitted_poles(
+            angles,
+            target,
+            weight,
+            first_poles(order, bands=tuple(dict.fromkeys(bands)), noise_rad=2 * np.pi * slow),
+        )
+        for slow in _SLOW_HZ
+    ]
+    poles = min(starts, key=lambda start: start[1])[0]
+    accepted, worst = None, np.inf
+    while True:
+        attempt = _with_poles(spec, hardware, poles)
+        loss = np.inf if attempt is None else attempt.objective_nm / long.objective_nm - 1
+        worst = min(worst, loss)
+        if attempt is None or loss > tolerance:
+            break
+        accepted = attempt
+        if np.count_nonzero(poles.imag > 0) * 2 <= _LEAST_POLES:
+            break
+        poles = without_least_pair(poles, leaving_out(angles, target, weight, poles))
+        poles = fitted_poles(angles, target, weight, poles)[0]
+    if accepted is None:
+        found = f"the best lost {100 * worst:.3g} %" if np.isfinite(worst) else "none was feasible"
+        raise InfeasibleError(
+            f"no controller with {order} poles a mode came within {100 * tolerance:.3g} % of the "
+            f"long parameter's {long.objective_nm:.4g} nm: {found}. Allow more states or a larger "
+            "loss."
+        )
+    return accepted
+
+
+def _with_poles(spec: Specification, hardware: LoopHardware, poles: ComplexArray) -> Solved | None:
+    """Solve the specification with given poles; None if that cannot be done."""
+    basis = orthonormal_basis(poles, dt_s=hardware.dt_s)
+    try:
+        return solved(spec, Channel(hardware=hardware, basis=basis))
+    except (InfeasibleError, NumericalError):
+        return None
+
+
+def _fit_weight(spec: Specification, sequence: SequenceResult) -> FloatArray:
+    """Weight of an error of the parameter at the nodes: spectra, and some everywhere."""
+    f, w = sequence.grid.nodes_hz, sequence.grid.weights_hz
+    nyquist = sequence.channel.nyquist_hz
+    cost = w * (spread_weights(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
+    return np.asarray(np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist))

@@ -1,0 +1,127 @@
+"""A specification: one objective and any number of demands, for one mode of the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.certify import Check
+from lbt_synth.cones import Constraint, Function
+from lbt_synth.errors import ProblemError
+from lbt_synth.models.ar import ARModel
+from lbt_synth.shaping.channel import Channel
+from lbt_synth.shaping.demands import (
+    DEMANDS,
+    Attenuation,
+    Demand,
+    MirrorUncertainty,
+    SensorGainRange,
+)
+from lbt_synth.shaping.grid import Grid, first_grid
+from lbt_synth.shaping.measured import MeasuredLoop
+from lbt_synth.shaping.terms import (
+    ResidualVariance,
+    Term,
+    leaves,
+    require_term,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Specification:
+    """Objective and demands of one mode.
+
+    Parameters
+    ----------
+    objective : ResidualVariance, VibrationBand, Total or Worst
+        What is made least.
+    demands : sequence of demands, optional
+        What has to hold: ModulusMargin, NoisePeak, Attenuation, SensorGainRange, DelayError,
+        MirrorUncertainty, CommandRms. Stability at every sensor gain that the objective or a
+        demand names is added where no range covers it.
+
+    Raises
+    ------
+    ProblemError
+        If one of them is of another kind.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> spec = lbt.Specification(
+    ...     objective=lbt.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797, sensor_gain=0.5),
+    ...     demands=[lbt.ModulusMargin(at_least=0.45)])
+    >>> [demand.label for demand in spec.demands][1]
+    'stability for sensor gains 0.5 to 1'
+    """
+
+    objective: Term
+    demands: tuple[Demand, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_term(self.objective)
+        demands: list[Any] = list(self.demands)
+        for demand in demands:
+            if not isinstance(demand, DEMANDS):
+                known = ", ".join(kind.__name__ for kind in DEMANDS)
+                raise ProblemError(f"a demand must be one of {known}; got {type(demand).__name__}.")
+        gains = [leaf.sensor_gain for leaf in leaves(self.objective)]
+        gains += [d.sensor_gain for d in demands if isinstance(d, Attenuation)]
+        low, high = min(1.0, *gains), max(1.0, *gains)
+        ranges = [d for d in demands if isinstance(d, SensorGainRange)]
+        if not any(r.low <= low and r.high >= high for r in ranges) and low < high:
+            demands.append(SensorGainRange(low=low, high=high))
+        object.__setattr__(self, "demands", tuple(demands))
+
+    @property
+    def bands_hz(self) -> tuple[tuple[float, float], ...]:
+        """Bands of the objective and of the demands [Hz]."""
+        masks = [d for d in self.demands if isinstance(d, Attenuation | MirrorUncertainty)]
+        named = [*self.objective.bands_hz, *((d.low_hz, d.high_hz) for d in masks)]
+        return tuple(dict.fromkeys(named))
+
+    def require_below(self, nyquist_hz: float) -> None:
+        """Refuse bands beyond the Nyquist frequency.
+
+        Raises
+        ------
+        ProblemError
+            Naming the band.
+        """
+        for low, high in self.bands_hz:
+            if high > nyquist_hz:
+                raise ProblemError(
+                    f"a band must lie below the Nyquist frequency {nyquist_hz:.6g} Hz; got "
+                    f"{low:g} to {high:g} Hz."
+                )
+
+    def grid(self, channel: Channel, *, fineness: int = 1) -> Grid:
+        """Return the first grid of frequencies for a channel."""
+        models = [
+            leaf.turbulence
+            for leaf in leaves(self.objective)
+            if isinstance(leaf, ResidualVariance) and isinstance(leaf.turbulence, ARModel)
+        ]
+        poles = [channel.basis.poles, *(np.linalg.eigvals(m.companion) for m in models)]
+        return first_grid(
+            channel.hardware.frame_rate_hz,
+            bands_hz=self.bands_hz,
+            poles=np.concatenate(poles),
+            fineness=fineness,
+        )
+
+    def compiled(
+        self, channel: Channel, grid: Grid
+    ) -> tuple[Function, tuple[tuple[Constraint, ...], ...]]:
+        """Return the objective, and the constraints of each demand, over a grid."""
+        return self.objective.function(channel, grid), self.constraints(channel, grid)
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[tuple[Constraint, ...], ...]:
+        """Return the constraints of each demand over a grid."""
+        return tuple(demand.constraints(channel, grid) for demand in self.demands)
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check each demand on the real loop."""
+        return tuple(check for demand in self.demands for check in demand.checks(loop))
