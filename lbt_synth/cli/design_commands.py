@@ -77,8 +77,8 @@ def _refuse_foreign_options(arguments: Namespace) -> None:
             )
     if method in ("integrator", "robust") and arguments.horizon != 1:
         raise ProblemError(
-            f"--method {method} takes no horizon; set loop.delay_frames in the configuration instead. "
-            f"Got --horizon {arguments.horizon}."
+            f"--method {method} takes no horizon; set loop.delay_frames in the configuration "
+            f"instead. Got --horizon {arguments.horizon}."
         )
 
 

@@ -308,7 +308,7 @@ def _truth(
 def rms_nm(
     section: VibrationSection | TrueVibrationSection | BandSection, settings: FileSection
 ) -> float:
-    """Standard deviation of a vibration [nm rms wavefront], given in nm or in mas."""
+    """Return the deviation of a vibration [nm rms wavefront], given in nm or in mas."""
     if section.rms_nm is not None:
         return section.rms_nm
     assert section.rms_mas is not None  # the schema wants exactly one of the two

@@ -112,16 +112,14 @@ def robust(
         key = float(np.round(noise_nm, 9)), 0 if turbulence is not None else id(model)
         if key not in made:
             spectrum = model if turbulence is None else turbulence
-            terms: list[Term] = [
-                term
-                for gain in gains
-                for term in (
+            terms: list[Term] = []
+            for gain in gains:
+                terms.append(
                     ResidualVariance(
                         turbulence=spectrum, noise_nm=float(noise_nm), sensor_gain=gain
-                    ),
-                    *(replace(line, sensor_gain=gain) for line in lines),
+                    )
                 )
-            ]
+                terms += [replace(line, sensor_gain=gain) for line in lines]
             made[key] = Specification(
                 objective=Total(terms=tuple(terms)), demands=(*fixed, *demands)
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -146,10 +147,10 @@ class _Mode:
 def _one_a_mode(
     specification: Specification | Sequence[Specification], modes: int
 ) -> tuple[Specification, ...]:
-    given = (
-        (specification,) * modes
-        if isinstance(specification, Specification)
-        else tuple(specification)
+    given: tuple[Any, ...] = (
+        tuple(specification)
+        if isinstance(specification, list | tuple)
+        else (specification,) * modes
     )
     for spec in given:
         if not isinstance(spec, Specification):

@@ -10,7 +10,7 @@ M is the mirror's delay. At the sensor gain g all of it is divided by ``1 - (1 -
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class Channel:
 
     hardware: LoopHardware
     basis: Basis
+    _responses: dict[bytes, ComplexArray] = field(default_factory=dict)
 
     @property
     def nyquist_hz(self) -> float:
@@ -41,11 +42,14 @@ class Channel:
 
     def command_rows(self, frequency_hz: FloatArray) -> ComplexArray:
         """Slopes of Q, (f, n)."""
-        return self.basis.response(frequency_hz)
+        key = frequency_hz.tobytes()
+        if key not in self._responses:  # several terms and demands ask for the same frequencies
+            self._responses[key] = self.basis.response(frequency_hz)
+        return self._responses[key]
 
     def noise_rows(self, frequency_hz: FloatArray) -> ComplexArray:
         """Slopes of M Q, (f, n)."""
-        return self.basis.response(frequency_hz) * self.mirror(frequency_hz)[:, None]
+        return self.command_rows(frequency_hz) * self.mirror(frequency_hz)[:, None]
 
     def complementary_rows(self, frequency_hz: FloatArray) -> ComplexArray:
         """Slopes of T, (f, n)."""

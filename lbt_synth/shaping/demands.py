@@ -27,6 +27,7 @@ from lbt_synth.statespace import StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray, number
 
 ROOM = 2e-4  # part of a bound that the programme leaves unused, for what lies between its points
+_TIGHT = 2e-4  # to which a bound over an interval is made tight
 _LEVEL_SETS = "level sets, all frequencies"
 
 
@@ -325,26 +326,25 @@ class DelayError:
         """Check the real loop: on short intervals, |T| by level sets and the rest by its end."""
         T, nyquist = loop.complementary, loop.hardware.frame_rate_hz / 2
         edges = np.linspace(0, nyquist, 33)
-        worst, peak = 0.0, float(hinf_norm(T).upper)
+        reached, bound, peak = 0.0, 0.0, float(hinf_norm(T).upper)
         stack = list(pairwise(edges))
-        # halve where the bound of an interval does not tell yet
-        while stack:
+        while stack:  # halve the intervals that may hold more than what was reached
             low, high = stack.pop()
-            turning = float(self._turning(np.array([2 * np.pi * high * T.dt_s]))[0])
-            if peak * turning <= worst:
+            turning = self._turning(2 * np.pi * np.array([high]) * T.dt_s)[0]
+            if peak * turning <= bound:
                 continue
             found = band_norm(T, low, high)
-            bound = found.upper * turning
-            at_peak = 2 * np.pi * found.peak_frequency_hz * T.dt_s
-            reached = found.value * float(self._turning(np.array([at_peak]))[0])
-            if bound > 0.999 and reached < 0.999 and high - low > 1e-6 * nyquist:
+            at_peak = self._turning(2 * np.pi * np.array([found.peak_frequency_hz]) * T.dt_s)[0]
+            reached = max(reached, float(found.value * at_peak))
+            above = float(found.upper * turning)
+            if above > max(reached * (1 + _TIGHT), 0.5) and high - low > 1e-6 * nyquist:
                 stack += [(low, (low + high) / 2), ((low + high) / 2, high)]
-                continue
-            worst = max(worst, bound)
+            else:
+                bound = max(bound, above)
         return (
             Check(
                 name=f"|T| times the turn of {self.frames:g} frames",
-                value=worst,
+                value=bound,
                 limit=1.0,
                 method="level sets, interval by interval",
             ),

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import InfeasibleError, NumericalError
-from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.shaping.basis import orthonormal_basis
 from lbt_synth.shaping.channel import Channel
 from lbt_synth.shaping.measured import mode_loop
@@ -45,7 +44,7 @@ class Solved:
         return self.sequence.channel.basis.parameter(self.sequence.coefficients)
 
 
-def solved(spec: Specification, channel: Channel) -> Solved:
+def solved(spec: Specification, channel: Channel, *, start: FloatArray | None = None) -> Solved:
     """Solve in a basis, on a grid that is fine enough for the objective.
 
     Raises
@@ -55,7 +54,7 @@ def solved(spec: Specification, channel: Channel) -> Solved:
     """
     miss = np.inf
     for fineness in (1, 2, 4):
-        sequence = solve_sequence(spec, channel, fineness=fineness)
+        sequence = solve_sequence(spec, channel, start=start, fineness=fineness)
         parameter = channel.basis.parameter(sequence.coefficients)
         exact = spec.objective.measured_nm2(mode_loop(channel.hardware, parameter))
         miss = abs(sequence.objective_nm2 / exact - 1)
@@ -105,34 +104,54 @@ def reduced(spec: Specification, long: Solved, order: int, tolerance: float) -> 
         )
         for slow in _SLOW_HZ
     ]
-    poles = min(starts, key=lambda start: start[1])[0]
-    accepted, worst = None, np.inf
-    while True:
-        attempt = _with_poles(spec, hardware, poles)
-        loss = np.inf if attempt is None else attempt.objective_nm / long.objective_nm - 1
-        worst = min(worst, loss)
-        if attempt is None or loss > tolerance:
-            break
-        accepted = attempt
-        if np.count_nonzero(poles.imag > 0) * 2 <= _LEAST_POLES:
-            break
-        poles = without_least_pair(poles, leaving_out(angles, target, weight, poles))
-        poles = fitted_poles(angles, target, weight, poles)[0]
-    if accepted is None:
-        found = f"the best lost {100 * worst:.3g} %" if np.isfinite(worst) else "none was feasible"
+    candidates = [min(starts, key=lambda start: start[1])[0]]
+    while np.count_nonzero(candidates[-1].imag) > _LEAST_POLES:
+        fewer = without_least_pair(
+            candidates[-1], leaving_out(angles, target, weight, candidates[-1])
+        )
+        candidates.append(fitted_poles(angles, target, weight, fewer)[0])
+
+    def attempt(index: int) -> tuple[Solved | None, float]:
+        found = _with_poles(spec, sequence, candidates[index], target, weight)
+        return found, np.inf if found is None else found.objective_nm / long.objective_nm - 1
+
+    accepted, loss = attempt(0)
+    if accepted is None or loss > tolerance:
+        best = f"the best lost {100 * loss:.3g} %" if np.isfinite(loss) else "none was feasible"
         raise InfeasibleError(
             f"no controller with {order} poles a mode came within {100 * tolerance:.3g} % of the "
-            f"long parameter's {long.objective_nm:.4g} nm: {found}. Allow more states or a larger "
+            f"long parameter's {long.objective_nm:.4g} nm: {best}. Allow more states or a larger "
             "loss."
         )
+    kept, failed = 0, len(candidates)
+    while failed - kept > 1:  # fewer poles lose more: halve what is not decided
+        middle = (kept + failed) // 2
+        found, loss = attempt(middle)
+        if found is not None and loss <= tolerance:
+            kept, accepted = middle, found
+        else:
+            failed = middle
     return accepted
 
 
-def _with_poles(spec: Specification, hardware: LoopHardware, poles: ComplexArray) -> Solved | None:
+def _with_poles(
+    spec: Specification,
+    long: SequenceResult,
+    poles: ComplexArray,
+    target: ComplexArray,
+    weight: FloatArray,
+) -> Solved | None:
     """Solve the specification with given poles; None if that cannot be done."""
-    basis = orthonormal_basis(poles, dt_s=hardware.dt_s)
+    hardware = long.channel.hardware
+    channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
+    # start from the fit of the long response
+    rows = weight[:, None] * channel.command_rows(long.grid.nodes_hz)
+    goal = weight * target
+    start = np.linalg.lstsq(
+        np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
+    )[0]
     try:
-        return solved(spec, Channel(hardware=hardware, basis=basis))
+        return solved(spec, channel, start=start)
     except (InfeasibleError, NumericalError):
         return None
 

@@ -25,7 +25,7 @@ from lbt_synth.shaping.terms import noise_level
 from lbt_synth.validation import FloatArray
 
 _STEPS = 24
-_DECREASE = 1e-3  # of the objective, below which a step is the last
+_DECREASE = 2e-3  # of the objective, below which a step is the last
 _FINE = 2048
 _CLOSE = 0.98  # of a bound: the neighbourhood is looked at more closely
 _BETWEEN = 33
