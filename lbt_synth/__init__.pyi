@@ -36,6 +36,10 @@ from .front import TradeoffPoint as TradeoffPoint
 from .front import tradeoff as tradeoff
 from .gainfile import load_gain as load_gain
 from .gainfile import save_gain as save_gain
+from .limits import BandLimit as BandLimit
+from .limits import ResidualLimit as ResidualLimit
+from .limits import least_residual as least_residual
+from .limits import least_worst_residual as least_worst_residual
 from .loop import ClosedLoop as ClosedLoop
 from .loop import Imaging as Imaging
 from .loop import LoopMargins as LoopMargins
