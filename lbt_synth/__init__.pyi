@@ -16,6 +16,9 @@ from .design import integrator_gain_limit as integrator_gain_limit
 from .design import kalman as kalman
 from .design import mixed as mixed
 from .design import optimal_integrator as optimal_integrator
+from .distance import LimitRow as LimitRow
+from .distance import LimitStudy as LimitStudy
+from .distance import limit_study as limit_study
 from .errors import CertificateError as CertificateError
 from .errors import ConfigError as ConfigError
 from .errors import DefinitenessError as DefinitenessError
@@ -74,6 +77,7 @@ from .models import tip_tilt_plant as tip_tilt_plant
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
+from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure

@@ -211,7 +211,8 @@ def settled_panels(
         )
         coarse = np.concatenate([left[open_], right[open_]])
     raise NumericalError(
-        "the integral of a spectrum's logarithm did not settle: it changes still after 45 halvings. "
-        "Check that the spectrum is finite and without jumps; give a table its own frequencies.",
+        "the integral of a spectrum's logarithm did not settle: it changes still after 45 "
+        "halvings. Check that the spectrum is finite and without jumps; give a table its own "
+        "frequencies.",
         status="quadrature",
     )

@@ -30,7 +30,7 @@ _ORDER = 10
 _ROUNDS = 100
 _WHOLE_STEPS = 12
 _SETTLED = 1e-8  # relative gap of the variance at which the search ends
-_LARGEST_GAP = 0.02  # and with which it is still an answer
+_LARGEST_GAP = 0.1  # and with which it is still an answer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,8 +43,8 @@ class BandLimit:
         No linear controller has a smaller worst residual over the band [nm rms].
     achieved_nm : float
         Worst residual of the filter that was found (of infinite order) [nm rms]; what can be
-        had lies between the two, which are within 1 % (1e-8, but for bands of almost all
-        frequencies).
+        had lies between the two, which are within 1e-8, for bands of almost all
+        frequencies within some percent.
     variance_nm2 : (n,) ndarray
         The limit by direction, that of the sinusoid included [nm^2].
     directions : (n, n) ndarray

@@ -66,7 +66,7 @@ class ModeSpectrum:
         return np.unique(np.concatenate([points[keep], [1.0], np.array(extra, dtype=float)]))
 
     def reference(self) -> float:
-        """Unit of the logarithm [nm^2]: the noise, else the largest of the spectrum."""
+        """Return the unit of the logarithm [nm^2]: the noise, else the largest of the spectrum."""
         if self.noise_nm2 > 0:
             return self.noise_nm2
         edges = self.edges()
