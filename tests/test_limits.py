@@ -307,10 +307,10 @@ def test_a_sinusoid_of_known_frequency_costs_nothing():
             path(), turbulence=ar(0.99), noise_nm=3.0,
             vibrations=(lbt.Vibration(frequency_hz=20, damping=k, rms_nm=797, direction=(1,)),),
         )
-        for k in (1e-2, 1e-4, 1e-6)
+        for k in (1e-2, 1e-6, 1e-10)
     ]  # fmt: skip
     assert narrow[0] > narrow[1] > narrow[2] > with_line
-    assert narrow[2] == pytest.approx(with_line, rel=1e-3)
+    assert narrow[2] == pytest.approx(with_line, rel=1e-2)
 
 
 def test_kolmogorov_turbulence(air):
@@ -339,7 +339,7 @@ def test_band_of_the_example(config):
 def test_the_density_found_is_the_hardest(config):
     """Its Wiener limit, as a table of its own, is the band limit; the flat one is below."""
     hardware, still = config.hardware, replace(config.truth, vibrations=())
-    limit = lbt.least_worst_residual(hardware, still, band_hz=(10.0, 40.0), rms_nm=300.0)
+    limit = lbt.least_worst_residual(hardware, still, band_hz=(10.0, 40.0), rms_nm=5.0)
     edges = np.linspace(10, 40, 61)
     share = np.histogram(limit.frequency_hz, edges, weights=limit.weight)[0]
     assert not np.allclose(share, 1 / 60, rtol=0.01)
@@ -348,7 +348,7 @@ def test_the_density_found_is_the_hardest(config):
         def psd(f):
             place = np.clip(np.searchsorted(edges, f, side="right") - 1, 0, 59)
             inside = (f > 10) & (f < 40)
-            return still.turbulence.psd(f) + np.where(inside, power[place] * 300**2 / 0.5, 0)
+            return still.turbulence.psd(f) + np.where(inside, power[place] * 5**2 / 0.5, 0)
 
         spectrum = Anonymous(psd)
         spectrum.breakpoints_hz = edges
@@ -453,7 +453,7 @@ def test_bad_loops():
     upright = lbt.Vibration(frequency_hz=30, damping=0.01, rms_nm=5, direction=(1, 0))
     with pytest.raises(lbt.ProblemError, match="modes that decouple.*Turn the directions"):
         variance(path(modes=2), **calm, vibrations=(slanted, upright))
-    with pytest.raises(lbt.ProblemError, match="got the vibration at 20 Hz across"):
+    with pytest.raises(lbt.ProblemError, match="along principal axes of the sensor's noise"):
         variance(path(sensor_matrix=np.diag([1.0, 2.0])), **calm, vibrations=(slanted,))
     with pytest.raises(lbt.DimensionError, match="must have 1 components"):
         variance(path(), **calm, vibrations=(upright,))
@@ -499,6 +499,7 @@ def test_bad_bands(arguments, text):
 
 def test_a_search_that_does_not_settle(monkeypatch):
     monkeypatch.setattr(band_module, "_ROUNDS", 1)
+    monkeypatch.setattr(band_module, "_LARGEST_GAP", 1e-6)
     with pytest.raises(lbt.NumericalError, match="a gap of .* is left") as caught:
         lbt.least_worst_residual(
             path(3), lbt.Truth(turbulence=ar(0.9), noise_nm=1.0), band_hz=(1, 399), rms_nm=50,

@@ -87,7 +87,8 @@ class ModeSpectrum:
         noiseless = self.noise_nm2 == 0
 
         def integrand(x: FloatArray) -> FloatArray:
-            ratio = self.power(x) / reference
+            with np.errstate(over="ignore"):
+                ratio = self.power(x) / reference
             if not np.all(np.isfinite(ratio)):
                 raise ProblemError(
                     f"the noise variance {self.noise_nm2:.3g} nm^2 is too small beside the "
@@ -199,14 +200,15 @@ def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray
     if not np.any(noise_nm2):
         return np.zeros((n, n))
     try:
-        factor = np.linalg.cholesky(noise_nm2)
+        size = float(np.max(np.abs(noise_nm2)))
+        factor = np.linalg.cholesky(noise_nm2 / size)
     except np.linalg.LinAlgError as error:
         raise ProblemError(
             "the noise must be zero, or have a positive definite covariance; got a singular one. "
             "Add a little noise to each measurement."
         ) from error
     white = np.linalg.solve(factor, sensor)
-    return np.asarray(np.linalg.inv(white.T @ white))
+    return np.asarray(size * np.linalg.inv(white.T @ white))
 
 
 def _common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
