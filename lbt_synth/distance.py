@@ -18,7 +18,7 @@ from lbt_synth.limits import (
     least_worst_residual,
 )
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
-from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth
+from lbt_synth.models import FullStatePlant, LoopHardware, SinusoidalVibration, TipTiltPlant, Truth
 from lbt_synth.validation import FloatArray, frozen, number
 
 T = TypeVar("T")
@@ -257,7 +257,7 @@ def model_distance(design: FilterDesign) -> tuple[float, float]:
     filter's estimation error is not its residual.
     """
     plant = design.problem
-    if not isinstance(plant, TipTiltPlant):
+    if not isinstance(plant, TipTiltPlant | FullStatePlant):
         return float("nan"), float("nan")
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     delay = plant.hardware.delay_frames

@@ -617,3 +617,33 @@ def test_show_without_a_limit(tmp_path, capsys):
     gain = lbt.save_gain(tmp_path / "k.fits", lbt.kalman(plant))
     assert json.loads(run(capsys, "show", gain, "--json")[1])["limit_nm"] is None
     assert run(capsys, "show", gain)[0] == 0
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 2.7])
+def test_plants_in_the_full_form(delay):
+    for plant in (lbt_axis_plant(delay_frames=delay), lbt_axis_plant(delay_frames=delay, modes=2)):
+        limit = least_model_residual(plant.full())
+        assert limit.rms_nm == pytest.approx(least_model_residual(plant).rms_nm, rel=1e-9)
+    found, above = model_distance(lbt.kalman(plant.full()))
+    assert found == pytest.approx(limit.rms_nm)
+    assert np.isnan(above) if delay == 2.7 else abs(above) < 1e-6
+
+
+def test_full_plants_that_do_not_decouple():
+    lines = [
+        lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50, direction=d)
+        for f, d in ((20, (1, 1)), (31, (1, 0)))
+    ]
+    parts = {"frame_rate_hz": RATE, "turbulence": ar(0.99, driving=10), "noise_nm": 5.0}
+    full = lbt.tip_tilt_plant(**parts, vibrations=lines).full()
+    with pytest.raises(lbt.ProblemError, match="the disturbance across them"):
+        least_model_residual(full)
+    assert np.isnan(model_distance(lbt.kalman(full))).all()
+    plain = lbt.tip_tilt_plant(**parts, vibrations=lines[1:]).full()
+    entry = plain.D.copy()
+    entry[:, 0] = 1.0
+    with pytest.raises(lbt.ProblemError, match="independent of the disturbance"):
+        least_model_residual(replace(plain, D=entry))
+    assert np.isnan(model_distance(lbt.kalman(lbt.EstimationProblem(
+        A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0
+    )))).all()  # fmt: skip

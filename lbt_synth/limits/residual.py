@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.limits.prediction import Prediction, Reach
+from lbt_synth.limits.response import plant_modes
 from lbt_synth.limits.spectra import DecoupledModes, ModeSpectrum, decoupled_modes
+from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import TipTiltPlant
 from lbt_synth.models.truth import Truth, fitted_direction
@@ -83,12 +85,12 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     return _limit(Reach.of(hardware), truth_modes(hardware, truth))
 
 
-def least_model_residual(plant: TipTiltPlant) -> ResidualLimit:
+def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth.
 
     Parameters
     ----------
-    plant : TipTiltPlant
+    plant : TipTiltPlant or FullStatePlant
         Turbulence, vibrations, noise and loop.
 
     Returns
@@ -103,6 +105,8 @@ def least_model_residual(plant: TipTiltPlant) -> ResidualLimit:
     NumericalError
         If an integral over a spectrum does not settle.
     """
+    if isinstance(plant, FullStatePlant):
+        return _limit(Reach.of(plant.hardware), plant_modes(plant))
     # modes with the same model may be turned into each other
     models = {
         m.coefficients.tobytes() + repr(m.driving_rms_nm).encode(): m for m in plant.turbulence

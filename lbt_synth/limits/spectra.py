@@ -148,7 +148,7 @@ def decoupled_modes(
         If a mode is not seen or not reached, or the modes do not decouple.
     """
     n, rate = hardware.modes, hardware.frame_rate_hz
-    noise = _noise_on_modes(hardware, noise_nm2)
+    noise = noise_on_modes(hardware, noise_nm2)
     if np.linalg.matrix_rank(hardware.influence) < n:
         raise ProblemError(
             "the mirror must reach every mode: an influence matrix with full row rank; got rank "
@@ -172,7 +172,7 @@ def decoupled_modes(
         for along, line in vibrations
     ]
     matrices += [("the given direction", np.outer(along, along)) for along in directions]
-    axes = _common_axes(matrices)
+    axes = common_axes(matrices)
     modes = []
     for axis in axes:
         own = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
@@ -188,7 +188,7 @@ def decoupled_modes(
     return DecoupledModes(directions=axes, modes=tuple(modes))
 
 
-def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
+def noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
     """Covariance (n, n) of the best unbiased estimate of the modes from one measurement."""
     sensor, n = hardware.sensor, hardware.modes
     if np.linalg.matrix_rank(sensor) < n:
@@ -211,7 +211,7 @@ def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray
     return np.asarray(size * np.linalg.inv(white.T @ white))
 
 
-def _common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
+def common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
     """Orthonormal rows that make all symmetric matrices diagonal."""
     n = len(matrices[0][1])
     unit = [(name, m / max(float(np.linalg.norm(m, 2)), 1e-300)) for name, m in matrices]
