@@ -19,6 +19,9 @@ from .design import mixed as mixed
 from .design import optimal_integrator as optimal_integrator
 from .design import robust as robust
 from .design import shape as shape
+from .distance import LimitRow as LimitRow
+from .distance import LimitStudy as LimitStudy
+from .distance import limit_study as limit_study
 from .errors import CertificateError as CertificateError
 from .errors import ConfigError as ConfigError
 from .errors import DefinitenessError as DefinitenessError
@@ -39,6 +42,10 @@ from .front import TradeoffPoint as TradeoffPoint
 from .front import tradeoff as tradeoff
 from .gainfile import load_gain as load_gain
 from .gainfile import save_gain as save_gain
+from .limits import BandLimit as BandLimit
+from .limits import ResidualLimit as ResidualLimit
+from .limits import least_residual as least_residual
+from .limits import least_worst_residual as least_worst_residual
 from .loop import ClosedLoop as ClosedLoop
 from .loop import Imaging as Imaging
 from .loop import LoopMargins as LoopMargins
@@ -73,6 +80,7 @@ from .models import tip_tilt_plant as tip_tilt_plant
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
+from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure

@@ -22,6 +22,7 @@ from lbt_synth.design import (
     mixed,
     optimal_integrator,
 )
+from lbt_synth.distance import model_distance
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain, require_gain_name, save_gain
@@ -169,6 +170,13 @@ def _description(made: Design) -> Report:
             ("estimation error, rms", made.rms, unit),
             ("estimation error, H-infinity norm", made.gamma, unit),
         ]
+        if made.hardware is not None:
+            limit_nm, above = model_distance(made)
+            facts += [
+                ("least residual of any linear controller", limit_nm, unit),
+                ("estimation error above it", above, "%"),
+            ]
+            data |= {"limit_nm": limit_nm, "above_limit_percent": above}
         data |= {
             "rms": made.rms,
             "gamma": made.gamma,

@@ -12,9 +12,11 @@ from lbt_synth.cli.output import Report, TableText, progress, working
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, FilterDesign
+from lbt_synth.distance import above_percent, limit_or_nan
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
+from lbt_synth.limits import least_residual
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
 from lbt_synth.plotting import (
@@ -32,7 +34,7 @@ from lbt_synth.sweep import METHODS, frequency_robustness
 def sigma(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
     _require_figure(arguments.output)
-    designs = _named(arguments.gains)
+    designs = named_designs(arguments.gains)
     with working("drawing", quiet=arguments.json):
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
     rows, data = [], {}
@@ -107,6 +109,8 @@ def simulate(arguments: Namespace) -> Report:
         )
         strehls = run.strehl(config.imaging)
     exact = strehl(budget, config.imaging)
+    limit_nm = limit_or_nan(lambda: least_residual(config.hardware, truth))
+    above = above_percent(budget.rms_nm, limit_nm)
     command_rms = np.sqrt(np.sum(np.mean(run.commands**2, axis=(0, 1))))
     scatter = float(np.std(strehls, ddof=1)) if len(strehls) > 1 else float("nan")
     rows = [
@@ -116,6 +120,8 @@ def simulate(arguments: Namespace) -> Report:
         ("  vibration", None, budget.vibration_nm, "nm rms"),
         ("  noise", None, budget.noise_nm, "nm rms"),
         ("commands", float(command_rms), None, "nm rms"),
+        ("least residual of any linear controller", None, limit_nm, "nm rms"),
+        ("  residual above it", None, above, "%"),
     ]
     report = Report(
         data={
@@ -126,6 +132,8 @@ def simulate(arguments: Namespace) -> Report:
             "turbulence_nm": budget.turbulence_nm,
             "vibration_nm": budget.vibration_nm,
             "noise_nm": budget.noise_nm,
+            "limit_nm": limit_nm,
+            "above_limit_percent": above,
             "command_rms": command_rms,
             "frames": run.residual_nm.shape[1],
             "cases": len(strehls),
@@ -259,7 +267,7 @@ def _require_figure(output: str) -> None:
     require_writable(require_figure_name(output))
 
 
-def _named(paths: list[str]) -> dict[str, Design]:
+def named_designs(paths: list[str]) -> dict[str, Design]:
     """Designs by the stems of their files, by the paths where stems repeat."""
     stems = [Path(path).stem for path in paths]
     names = stems if len(set(stems)) == len(stems) else paths

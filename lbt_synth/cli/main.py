@@ -135,6 +135,25 @@ def build_parser() -> argparse.ArgumentParser:
         help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
     )
 
+    limits = command(
+        "limits", "How far designs are from the least residual of any linear controller"
+    )
+    limits.add_argument("config", help=config_help)
+    limits.add_argument(
+        "gains",
+        nargs="*",
+        metavar="gain",
+        help="gain files to add to the integrator, the Kalman and the H-infinity filter of the "
+        "configuration",
+    )
+    limits.add_argument(
+        "-o",
+        "--output",
+        action="append",
+        default=[],
+        help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
+    )
+
     paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")
     paper.add_argument("-o", "--output", required=True, help="directory to write into")
     return parser
