@@ -78,6 +78,8 @@ from .plotting import tradeoff_figure as tradeoff_figure
 from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare
+from .robustness_map import StrehlMap as StrehlMap
+from .robustness_map import strehl_map as strehl_map
 from .simulation import Simulation as Simulation
 from .simulation import filter_series as filter_series
 from .simulation import simulate as simulate
