@@ -71,6 +71,7 @@ from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
 from .plotting import loop_figure as loop_figure
+from .plotting import map_figure as map_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure

@@ -1,4 +1,4 @@
-"""Commands that close the loop: sigma, simulate, robustness."""
+"""Commands that close the loop: sigma, simulate."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lbt_synth.cli.output import Report, TableText, progress, working
-from lbt_synth.cli.writing import require_outputs, write_outputs
+from lbt_synth.cli.output import Report, TableText, working
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import ProblemError, UnstableLoopError
@@ -17,22 +16,15 @@ from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
-from lbt_synth.plotting import (
-    require_figure_name,
-    robustness_figure,
-    save_figure,
-    sigma_figure,
-    simulation_figure,
-)
+from lbt_synth.plotting import require_figure_name, save_figure, sigma_figure, simulation_figure
 from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
-from lbt_synth.sweep import METHODS, frequency_robustness
 
 
 def sigma(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
     _require_figure(arguments.output)
-    designs = _named(arguments.gains)
+    designs = named_designs(arguments.gains)
     with working("drawing", quiet=arguments.json):
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
     rows, data = [], {}
@@ -83,7 +75,7 @@ def simulate(arguments: Namespace) -> Report:
         _require_figure(arguments.output)
     config = load_config(arguments.config)
     design = load_gain(arguments.gain)
-    truth = _truth(config, arguments)
+    truth = real_truth(config, arguments)
     settings = config.settings.simulation
 
     def chosen(name: str) -> int:
@@ -190,63 +182,8 @@ def _simulation_notes(config: Config, design: Design, scatter: float, settle: in
     return notes
 
 
-def robustness(arguments: Namespace) -> Report:
-    """Strehl ratio over an error of the vibration frequency."""
-    require_outputs(arguments.output)
-    config = load_config(arguments.config)
-    settings = config.settings
-    ratio = arguments.gamma_ratio
-    errors = settings.robustness.errors_hz
-    rows = list(
-        progress(
-            frequency_robustness(
-                config.plant,
-                _truth(config, arguments),
-                config.imaging,
-                errors_hz=errors,
-                gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
-                hold=settings.robustness.hold,
-            ),
-            total=len(errors) * len(METHODS),
-            what="designs",
-            quiet=arguments.json,
-        )
-    )
-    report = Report(
-        data={"rows": [asdict(row) for row in rows]},
-        tables=[
-            TableText(
-                title="Robustness to the vibration frequency",
-                headings=(
-                    "error [Hz]", "method", "Strehl [%]", "residual [nm]", "vibration [nm]",
-                    "turbulence [nm]", "noise [nm]", "stable",
-                ),
-                rows=[
-                    (
-                        f"{row.error_hz:+.2f}", row.method, _fixed(100 * row.strehl, 2),
-                        _fixed(row.residual_nm, 1), _fixed(row.vibration_nm, 1),
-                        _fixed(row.turbulence_nm, 1), _fixed(row.noise_nm, 1), row.stable,
-                    )
-                    for row in rows
-                ],
-            )
-        ],
-    )  # fmt: skip
-    write_outputs(
-        report,
-        arguments.output,
-        records=[asdict(row) for row in rows],
-        figure=lambda: robustness_figure(rows),
-    )
-    return report
-
-
-def _fixed(value: float, digits: int) -> str:
-    """Return a number with a fixed count of decimals, a dash where there is none."""
-    return "-" if np.isnan(value) else f"{value:.{digits}f}"
-
-
-def _truth(config: Config, arguments: Namespace) -> Truth:
+def real_truth(config: Config, arguments: Namespace) -> Truth:
+    """Truth of the configuration, at the sensor gain of the command line if there is one."""
     if arguments.sensor_gain is None:
         return config.truth
     return replace(
@@ -259,7 +196,7 @@ def _require_figure(output: str) -> None:
     require_writable(require_figure_name(output))
 
 
-def _named(paths: list[str]) -> dict[str, Design]:
+def named_designs(paths: list[str]) -> dict[str, Design]:
     """Designs by the stems of their files, by the paths where stems repeat."""
     stems = [Path(path).stem for path in paths]
     names = stems if len(set(stems)) == len(stems) else paths

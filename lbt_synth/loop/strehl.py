@@ -22,7 +22,14 @@ from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.models.atmosphere import ARCSEC_RAD
 from lbt_synth.models.units import nm_per_mas
 from lbt_synth.quadrature import gauss_panels
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray, number, real_array, semidefinite
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    number,
+    real_array,
+    semidefinite,
+)
 
 _DIRECTIONS = 64
 _STRIPS = np.linspace(0.2, 4, 20)
@@ -148,9 +155,7 @@ def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: 
     return float(strehls[0])
 
 
-def jitter_strehls(
-    covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any
-) -> FloatArray:
+def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any) -> FloatArray:
     """Strehl ratios of many jitters.
 
     Parameters

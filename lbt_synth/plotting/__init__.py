@@ -7,11 +7,13 @@ from lbt_synth.plotting.figures import (
     simulation_figure,
 )
 from lbt_synth.plotting.front import tradeoff_figure
+from lbt_synth.plotting.strehl_map import map_figure
 from lbt_synth.plotting.style import FIGURE_ENDINGS, require_figure_name, save_figure
 
 __all__ = [
     "FIGURE_ENDINGS",
     "loop_figure",
+    "map_figure",
     "require_figure_name",
     "robustness_figure",
     "save_figure",
