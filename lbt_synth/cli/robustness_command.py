@@ -108,7 +108,7 @@ def _fixed(value: float, digits: int) -> str:
 def _maps(config: Config, arguments: Namespace) -> Report:
     """Strehl ratio of the designs of gain files over error, sensor gain and delay error."""
     settings = config.settings.robustness
-    errors = _values(arguments.errors_hz, "--errors-hz", settings.errors_hz)
+    errors = _values(arguments.errors_hz, "--errors-hz", _refined(settings.errors_hz))
     gains = _values(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
     delays = arguments.delay_errors or settings.delay_errors_frames
     for gain in gains:
@@ -149,7 +149,15 @@ def _maps(config: Config, arguments: Namespace) -> Report:
     return report
 
 
-def _values(given: Sequence[float] | None, option: str, default: Sequence[float]) -> FloatArray:
+def _refined(values: Sequence[float]) -> FloatArray:
+    """Return values in increasing order, with three more between any two of them."""
+    known = np.unique(values)
+    return np.interp(np.arange(4 * known.size - 3) / 4, np.arange(known.size), known)
+
+
+def _values(
+    given: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
+) -> FloatArray:
     """Values of one axis: LOW HIGH COUNT of the command line, or those of the configuration."""
     if given is None:
         return np.array(default)

@@ -63,10 +63,10 @@ def map_figure(maps: Mapping[str, StrehlMap]) -> Any:
                 panel.label_outer()
             panels[0, column].set_title(name)
         for row, delay in enumerate(delays):
-            late = f"delay {delay:+g} frames\n" if rows > 1 or delay != 0 else ""
+            late = f"delay error {delay:+g} frames\n" if rows > 1 or delay != 0 else ""
             panels[row, 0].set_ylabel(f"{late}sensor gain [-]")
         figure.supxlabel("frequency in the design less the true one [Hz]", fontsize=9)
-        bar = figure.colorbar(mesh, ax=panels, pad=0.02, fraction=0.06 if columns > 1 else 0.1)
+        bar = figure.colorbar(mesh, ax=panels, pad=0.02, fraction=0.06, aspect=22 * rows)
         bar.set_label("Strehl ratio [%]")
         bar.outline.set_visible(False)
     return figure
@@ -91,23 +91,23 @@ def _panel(panel: Any, found: StrehlMap, row: int, low: float, high: float) -> A
     mesh = panel.pcolormesh(
         x, y, np.ma.masked_invalid(percent), cmap="viridis", vmin=low, vmax=high, rasterized=True
     )
-    levels = [level for level in _LEVELS if low < level < high]
-    if min(percent.shape) > 1 and levels and not np.all(np.isnan(percent)):
+    inside = percent[np.isfinite(percent)]
+    levels = [level for level in _LEVELS if inside.size and inside.min() < level < inside.max()]
+    if min(percent.shape) > 1 and levels:
         lines = panel.contour(
             errors, gains, np.ma.masked_invalid(percent), levels=levels, linewidths=0.8,
             colors=["white" if level < (low + high) / 2 else "black" for level in levels],
         )  # fmt: skip
         panel.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+    height = y[-1] - y[0]
     for bottom, top in _bands(~found.stable[row][up], y):
         panel.axhspan(bottom, top, facecolor="0.85", edgecolor="0.55", hatch="////", linewidth=0)
         panel.text(
-            (x[0] + x[-1]) / 2, (bottom + top) / 2, "unstable", ha="center", va="center",
-            fontsize=8, bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
-            clip_on=True,
+            (x[0] + x[-1]) / 2,
+            np.clip((bottom + top) / 2, y[0] + 0.05 * height, y[-1] - 0.05 * height),
+            "unstable", ha="center", va="center", fontsize=8,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
         )  # fmt: skip
-    if y[0] < 1 < y[-1]:
-        panel.plot(0, 1, marker="+", color="white", markersize=9, markeredgewidth=2.6)
-        panel.plot(0, 1, marker="+", color="black", markersize=8, markeredgewidth=1.0)
     panel.set_xlim(x[0], x[-1])
     panel.set_ylim(y[0], y[-1])
     return mesh
