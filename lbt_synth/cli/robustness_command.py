@@ -35,16 +35,16 @@ def robustness(arguments: Namespace) -> Report:
 
 def _require_matching_options(arguments: Namespace) -> None:
     """Refuse options of designing anew beside gain files, and those of maps without."""
-    anew = {"--gamma-ratio": arguments.gamma_ratio, "--sensor-gain": arguments.sensor_gain}
+    anew = {"--sensor-gain": arguments.sensor_gain, "--gamma-ratio": arguments.gamma_ratio}
     fixed = {
         "--errors-hz": arguments.errors_hz,
         "--sensor-gains": arguments.sensor_gains,
         "--delay-errors": arguments.delay_errors,
     }
     if arguments.gains:
-        wrong, reason = anew, "designs anew and goes without gain files; leave it out"
-        if arguments.sensor_gain is not None:
-            reason += f", or try --sensor-gains {arguments.sensor_gain:g} 1 2"
+        wrong = anew
+        reason = "is for designing anew, without gain files; the options of these are "
+        reason += ", ".join(fixed)
     else:
         wrong, reason = fixed, "goes with gain files, whose designs stay as they are; name some"
     for option, value in wrong.items():

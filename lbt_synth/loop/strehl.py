@@ -201,6 +201,8 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
         raise ProblemError(
             f"the jitter must stay below {most:.3g} nm; got {spread.max():.3g} nm. Check the units."
         )
+    if count == 0:
+        return np.empty(0)
     rules = _rules(covariance, lines, spread, imaging.cycles_per_nm)
     kinds, own, counts = np.unique(
         np.column_stack([rules, covariance.reshape(count, -1)]),
