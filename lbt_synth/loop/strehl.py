@@ -26,12 +26,14 @@ from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     IntArray,
+    matrix,
     number,
     real_array,
     semidefinite,
 )
 
 _DIRECTIONS = 64
+_FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])
 _STRIPS = np.linspace(0.2, 4, 20)
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
@@ -149,7 +151,7 @@ def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: 
     >>> round(lbt.jitter_strehl([[300**2, 0], [0, 300**2]], imaging=camera), 3)
     0.379
     """
-    covariance = semidefinite(covariance_nm2, "covariance_nm2")
+    covariance = matrix(covariance_nm2, "covariance_nm2")
     lines = np.asarray(line_amplitudes_nm, dtype=np.complex128).reshape(1, -1, len(covariance))
     strehls = jitter_strehls(covariance[None], imaging=imaging, line_amplitudes_nm=lines)
     return float(strehls[0])
@@ -204,18 +206,14 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
     if count == 0:
         return np.empty(0)
     rules = _rules(covariance, lines, spread, imaging.cycles_per_nm)
-    kinds, own, counts = np.unique(
-        np.column_stack([rules, covariance.reshape(count, -1)]),
-        axis=0, return_inverse=True, return_counts=True,
-    )  # fmt: skip
-    groups = np.split(np.argsort(own.reshape(-1), kind="stable"), np.cumsum(counts)[:-1])
     # |f.a|^2 and f'Sf are quadratic forms of f
     forms = np.real(np.einsum("psi,psj->psij", lines, lines.conj()))
     out = np.empty(count)
-    for kind, members in zip(kinds, groups, strict=True):
-        squares, weight = _weighted_otf(imaging.obstruction, int(kind[0]), int(kind[1]))
+    for members in _alike(rules, covariance):
+        fineness, directions = rules[members[0]].tolist()
+        squares, weight = _weighted_otf(imaging.obstruction, fineness, directions)
         squares = squares * imaging.cycles_per_nm**2
-        common = weight * np.exp(-2 * np.pi**2 * (_form(kind[2:].reshape(size, size)) @ squares))
+        common = weight * np.exp(-2 * np.pi**2 * (_form(covariance[members[0]]) @ squares))
         step = max(1, _POINT_CHUNK // weight.size)
         for start in range(0, len(members), step):
             part = members[start : start + step]
@@ -245,6 +243,17 @@ def _form(matrices: FloatArray) -> FloatArray:
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
 
 
+def _alike(rules: IntArray, covariance: FloatArray) -> list[IntArray]:
+    """Return the indices of the points that share a rule and a covariance, group by group."""
+    count = len(rules)
+    if count == 1:
+        return [np.zeros(1, dtype=np.int64)]
+    keys = np.column_stack([rules, covariance.reshape(count, -1)])
+    _, own, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(own.reshape(-1), kind="stable")
+    return np.split(order, np.cumsum(counts)[:-1])
+
+
 def _rules(
     covariance: FloatArray, lines: ComplexArray, spread: FloatArray, cycles_per_nm: float
 ) -> IntArray:
@@ -257,16 +266,16 @@ def _rules(
     """
     turns = np.maximum(spread * cycles_per_nm, 1e-9)
     fineness = np.maximum(0, np.ceil(np.log2(turns / 5))).astype(np.int64)
-    values = np.linalg.eigvalsh(covariance) * cycles_per_nm**2
-    unequal = values if values.shape[1] == 1 else values[:, 1:] - values[:, :1]
-    gaussian = np.pi**2 * unequal
-    sinusoids = 2 * np.pi * cycles_per_nm * np.sum(np.linalg.norm(lines, axis=2), axis=1)[:, None]
-    growth = gaussian * (np.cosh(2 * _STRIPS) - 1) + sinusoids * np.sinh(_STRIPS)
-    directions = np.full(len(turns), _DIRECTIONS)
-    for fewer in (_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8):
-        enough = np.min(growth - 2 * fewer * _STRIPS, axis=1) < np.log(1e-15)
-        directions[enough & (fineness == 0)] = fewer
-    return np.stack([fineness, directions * 2**fineness], axis=1)
+    variance, last = covariance[:, 0, 0], covariance[:, -1, -1]
+    two = covariance.shape[1] == 2
+    unequal = np.hypot(variance - last, 2 * covariance[:, 0, 1]) if two else variance
+    gaussian = (np.pi * cycles_per_nm) ** 2 * unequal
+    sinusoids = 2 * np.pi * cycles_per_nm * np.sum(np.linalg.norm(lines, axis=2), axis=1)
+    growth = np.outer(gaussian, np.cosh(2 * _STRIPS) - 1) + np.outer(sinusoids, np.sinh(_STRIPS))
+    error = np.min(growth[:, None] - 2 * np.outer(_FEWER, _STRIPS), axis=2)
+    halvings = np.sum(error < np.log(1e-15), axis=1)
+    directions = np.where(fineness == 0, _DIRECTIONS >> halvings, _DIRECTIONS << fineness)
+    return np.stack([fineness, directions], axis=1)
 
 
 def strehl_of_series(residual_nm: Any, imaging: Imaging) -> float:
