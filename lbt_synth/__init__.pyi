@@ -82,6 +82,7 @@ from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
 from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure
+from .plotting import map_figure as map_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
@@ -89,6 +90,8 @@ from .plotting import tradeoff_figure as tradeoff_figure
 from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare
+from .robustness_map import StrehlMap as StrehlMap
+from .robustness_map import strehl_map as strehl_map
 from .shaping import Attenuation as Attenuation
 from .shaping import CommandRms as CommandRms
 from .shaping import DelayError as DelayError

@@ -57,17 +57,18 @@ def adaptive_integral(
     Parameters
     ----------
     integrand : callable
-        From (f,) points to (f, n, n) values with diagonals of at least 0.
+        From (f,) points to (f, n, n) values with diagonals of at least 0, or to stacks of
+        them, (f, ..., n, n).
     edges : (panels + 1,) ndarray
         Increasing ends of the first panels.
     tolerance : float, optional
-        A panel is halved while that changes the trace by more than this part of the whole.
+        A panel is halved while that changes a trace by more than this part of the whole.
     order : int, optional
         Nodes a panel.
 
     Returns
     -------
-    (n, n) ndarray
+    (..., n, n) ndarray
         The integral.
 
     Raises
@@ -88,7 +89,7 @@ def adaptive_integral(
         nodes, weights = _panel_rule(low, high, order)
         values = integrand(nodes.ravel())
         values = values.reshape(low.size, order, *values.shape[1:])
-        return np.asarray(np.einsum("po,poij->pij", weights, values))
+        return np.asarray(np.einsum("po,po...->p...", weights, values))
 
     low, high = edges[:-1], edges[1:]
     coarse = panels(low, high)
@@ -97,9 +98,9 @@ def adaptive_integral(
         middle = (low + high) / 2
         left, right = panels(low, middle), panels(middle, high)
         fine = left + right
-        total = np.trace(done) + np.trace(fine.sum(axis=0))
-        change = np.abs(np.trace(fine - coarse, axis1=1, axis2=2))
-        open_ = change > tolerance * total
+        total = np.trace(done + fine.sum(axis=0), axis1=-2, axis2=-1)
+        change = np.abs(np.trace(fine - coarse, axis1=-2, axis2=-1))
+        open_ = np.any((change > tolerance * total).reshape(low.size, -1), axis=1)
         done = done + fine[~open_].sum(axis=0)
         if not open_.any():
             return np.asarray(done)

@@ -107,13 +107,17 @@ def symmetric(
     return frozen((out + turned) / 2)
 
 
-def semidefinite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> FloatArray:
+def semidefinite(
+    value: Any, name: str, *, size: tuple[int, str] | None = None, stacked: bool = False
+) -> FloatArray:
     """Return a symmetric positive semidefinite matrix."""
-    out = symmetric(value, name, size=size)
+    out = symmetric(value, name, size=size, stacked=stacked)
     least, scale = _extreme_eigenvalues(out)
-    if least < -1e-10 * scale:
+    wrong = least < -1e-10 * scale
+    if np.any(wrong):
         raise DefinitenessError(
-            f"{name} must be positive semidefinite; got a least eigenvalue of {least:.6g}."
+            f"{name} must be positive semidefinite; got a least eigenvalue of "
+            f"{least[wrong].min():.6g}."
         )
     return out
 
@@ -122,16 +126,17 @@ def definite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> F
     """Return a symmetric positive definite matrix."""
     out = symmetric(value, name, size=size)
     least, scale = _extreme_eigenvalues(out)
-    if not least > 1e-14 * scale:
+    if not np.all(least > 1e-14 * scale):
         raise DefinitenessError(
-            f"{name} must be positive definite; got a least eigenvalue of {least:.6g}."
+            f"{name} must be positive definite; got a least eigenvalue of {least.min():.6g}."
         )
     return out
 
 
-def _extreme_eigenvalues(symmetric_matrix: FloatArray) -> tuple[float, float]:
-    values = np.linalg.eigvalsh(symmetric_matrix)
-    return float(values[0]), float(np.max(np.abs(values)))
+def _extreme_eigenvalues(symmetric_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least eigenvalue and largest modulus, of each matrix of a stack."""
+    values = np.atleast_2d(np.linalg.eigvalsh(symmetric_matrix))
+    return values[..., 0], np.max(np.abs(values), axis=-1)
 
 
 def number(

@@ -1,4 +1,4 @@
-"""Commands that close the loop: sigma, simulate, robustness."""
+"""Commands that close the loop: sigma, simulate."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lbt_synth.cli.output import Report, TableText, progress, working
-from lbt_synth.cli.writing import require_outputs, write_outputs
+from lbt_synth.cli.output import Report, TableText, working
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, FilterDesign
 from lbt_synth.distance import above_percent, limit_or_nan
@@ -19,16 +18,9 @@ from lbt_synth.gainfile import load_gain
 from lbt_synth.limits import least_residual
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
-from lbt_synth.plotting import (
-    require_figure_name,
-    robustness_figure,
-    save_figure,
-    sigma_figure,
-    simulation_figure,
-)
+from lbt_synth.plotting import require_figure_name, save_figure, sigma_figure, simulation_figure
 from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
-from lbt_synth.sweep import METHODS, frequency_robustness
 
 
 def sigma(arguments: Namespace) -> Report:
@@ -85,7 +77,7 @@ def simulate(arguments: Namespace) -> Report:
         _require_figure(arguments.output)
     config = load_config(arguments.config)
     design = load_gain(arguments.gain)
-    truth = _truth(config, arguments)
+    truth = real_truth(config, arguments)
     settings = config.settings.simulation
 
     def chosen(name: str) -> int:
@@ -198,63 +190,8 @@ def _simulation_notes(config: Config, design: Design, scatter: float, settle: in
     return notes
 
 
-def robustness(arguments: Namespace) -> Report:
-    """Strehl ratio over an error of the vibration frequency."""
-    require_outputs(arguments.output)
-    config = load_config(arguments.config)
-    settings = config.settings
-    ratio = arguments.gamma_ratio
-    errors = settings.robustness.errors_hz
-    rows = list(
-        progress(
-            frequency_robustness(
-                config.plant,
-                _truth(config, arguments),
-                config.imaging,
-                errors_hz=errors,
-                gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
-                hold=settings.robustness.hold,
-            ),
-            total=len(errors) * len(METHODS),
-            what="designs",
-            quiet=arguments.json,
-        )
-    )
-    report = Report(
-        data={"rows": [asdict(row) for row in rows]},
-        tables=[
-            TableText(
-                title="Robustness to the vibration frequency",
-                headings=(
-                    "error [Hz]", "method", "Strehl [%]", "residual [nm]", "vibration [nm]",
-                    "turbulence [nm]", "noise [nm]", "stable",
-                ),
-                rows=[
-                    (
-                        f"{row.error_hz:+.2f}", row.method, _fixed(100 * row.strehl, 2),
-                        _fixed(row.residual_nm, 1), _fixed(row.vibration_nm, 1),
-                        _fixed(row.turbulence_nm, 1), _fixed(row.noise_nm, 1), row.stable,
-                    )
-                    for row in rows
-                ],
-            )
-        ],
-    )  # fmt: skip
-    write_outputs(
-        report,
-        arguments.output,
-        records=[asdict(row) for row in rows],
-        figure=lambda: robustness_figure(rows),
-    )
-    return report
-
-
-def _fixed(value: float, digits: int) -> str:
-    """Return a number with a fixed count of decimals, a dash where there is none."""
-    return "-" if np.isnan(value) else f"{value:.{digits}f}"
-
-
-def _truth(config: Config, arguments: Namespace) -> Truth:
+def real_truth(config: Config, arguments: Namespace) -> Truth:
+    """Truth of the configuration, at the sensor gain of the command line if there is one."""
     if arguments.sensor_gain is None:
         return config.truth
     return replace(

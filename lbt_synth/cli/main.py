@@ -100,11 +100,34 @@ def build_parser() -> argparse.ArgumentParser:
     simulate.add_argument("-o", "--output", help="figure (.png, .pdf or .svg)")
 
     robustness = command(
-        "robustness", "Strehl ratio over an error of all vibration frequencies of the model"
+        "robustness",
+        "Strehl ratio over an error of all vibration frequencies of the model: of filters designed "
+        "anew at each error, or of the designs of gain files at many sensor gains",
     )
     robustness.add_argument("config", help=config_help)
-    robustness.add_argument("--gamma-ratio", type=float, help="H-infinity bound of each row")
-    robustness.add_argument("--sensor-gain", type=float, help="real sensor gain")
+    robustness.add_argument("gains", nargs="*", metavar="gain", help=gain_help)
+    anew = robustness.add_argument_group("without gain files")
+    anew.add_argument("--gamma-ratio", type=float, help="H-infinity bound of each row")
+    anew.add_argument("--sensor-gain", type=float, help="real sensor gain")
+    fixed = robustness.add_argument_group("with gain files")
+    for option, text in (
+        ("--errors-hz", "frequency in the design less the true one [Hz]"),
+        ("--sensor-gains", "real sensor gain"),
+    ):
+        fixed.add_argument(
+            option,
+            nargs=3,
+            type=float,
+            metavar=("LOW", "HIGH", "COUNT"),
+            help=f"{text}: COUNT values (default: the configuration's)",
+        )
+    fixed.add_argument(
+        "--delay-errors",
+        nargs="+",
+        type=float,
+        metavar="FRAMES",
+        help="real delay less that of the design [frames] (default: the configuration's, else 0)",
+    )
     robustness.add_argument(
         "-o", "--output", action="append", default=[], help="table (.csv) or figure; repeatable"
     )

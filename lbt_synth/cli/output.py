@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -117,11 +118,31 @@ def working(what: str, *, quiet: bool) -> Iterator[None]:
 
 def progress(items: Iterable[Any], *, total: int, what: str, quiet: bool) -> Iterator[Any]:
     """Pass items on with a bar on standard error, when that is a terminal."""
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(
-        *columns, console=console, disable=quiet or not console.is_terminal, transient=True
-    ) as bar:
+    with _bar(quiet=quiet) as bar:
         yield from bar.track(items, total=total, description=what)
+
+
+@contextmanager
+def counting(*, total: int, what: str, quiet: bool) -> Iterator[Callable[[int], None]]:
+    """Give a function that counts what is done, for a bar that shows after two seconds."""
+    start = time.monotonic()
+    with _bar(quiet=quiet) as bar:
+        task = bar.add_task(what, total=total, visible=False)
+
+        def count(done: int) -> None:
+            bar.update(task, advance=done, visible=time.monotonic() - start > 2)
+
+        yield count
+
+
+def _bar(*, quiet: bool) -> Progress:
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=quiet or not console.is_terminal,
+        transient=True,
+    )

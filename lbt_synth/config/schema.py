@@ -221,10 +221,12 @@ class SimulationSection(_Section):
 
 
 class RobustnessSection(_Section):
-    """The frequency-error study."""
+    """The studies over a frequency error, a sensor gain and a delay error."""
 
     errors_hz: Annotated[list[float], Field(min_length=1)] = [x / 2 for x in range(-7, 8)]
     hold: Literal["driving", "rms"] = "driving"
+    sensor_gains: Annotated[list[Positive], Field(min_length=1)] = [x / 40 for x in range(10, 53)]
+    delay_errors_frames: Annotated[list[float], Field(min_length=1)] = [0.0]
 
 
 class FileSection(_Section):

@@ -120,11 +120,9 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
             f"got {loop.sensor_gain:.6g}."
         )
     n = loop.hardware.modes
-    modes = np.eye(n)
     turbulence = np.zeros((n, n))
     if isinstance(truth.turbulence, ARModel):
-        for mode in modes:
-            turbulence += _ar_covariance(loop, truth.turbulence, mode)
+        turbulence = ar_covariance(loop, truth.turbulence, np.eye(n))
     elif truth.turbulence is not None:
         turbulence = _spectrum_covariance(loop, truth.turbulence)
 
@@ -134,32 +132,40 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
         direction = fitted_direction(vibration, loop.hardware)
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(loop.hardware.frame_rate_hz)
-            random_vibration += _ar_covariance(loop, model, direction)
+            random_vibration += ar_covariance(loop, model, direction[None])
         else:
             response = loop.sensitivity([vibration.frequency_hz])[0]
             lines.append(vibration.amplitude_nm * response @ direction)
     return ResidualBudget(
         turbulence_nm2=frozen(turbulence),
-        noise_nm2=frozen(_noise_covariance(loop, truth.noise_nm)),
+        noise_nm2=frozen(noise_covariance(loop, truth.noise_nm)),
         random_vibration_nm2=frozen(random_vibration),
         line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
     )
 
 
-def _noise_covariance(loop: ClosedLoop, noise_nm: float) -> FloatArray:
+def noise_covariance(loop: ClosedLoop, noise_nm: float) -> FloatArray:
+    """Covariance of the residual that white noise on each measurement leaves."""
     n, s = loop.hardware.modes, loop.system
     B, D = s.B[:, n:] * noise_nm, s.D[:n, n:] * noise_nm
     states = stationary_covariance(s.A, B @ B.T)
     return np.asarray(s.C[:n] @ states @ s.C[:n].T + D @ D.T)
 
 
-def _ar_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray) -> FloatArray:
-    """Covariance of the residual that an AR process along one direction leaves."""
+def ar_covariance(loop: ClosedLoop, model: ARModel, directions: FloatArray) -> FloatArray:
+    """Covariance of the residual that independent AR processes, one a direction, leave."""
     if not np.isclose(model.frame_rate_hz, loop.hardware.frame_rate_hz, rtol=1e-9):
         raise ProblemError(
             f"a disturbance must be sampled at the loop's {loop.hardware.frame_rate_hz:.6g} Hz; "
             f"got {model.frame_rate_hz:.6g} Hz."
         )
+    total = np.zeros((loop.hardware.modes, loop.hardware.modes))
+    for direction in directions:
+        total += _directed_covariance(loop, model, direction)
+    return total
+
+
+def _directed_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray) -> FloatArray:
     n, s, order = loop.hardware.modes, loop.system, model.order
     # the newest sample of the process, x(k), acts on frame k
     entry = np.zeros((s.n_states, order))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,25 +137,46 @@ def close_loop(
     >>> lbt.close_loop(path, lazy).is_stable
     True
     """
-    gain = number(sensor_gain, "sensor_gain", above=0)
+    return close_loops(hardware, controller, [sensor_gain])[0]
+
+
+def close_loops(
+    hardware: LoopHardware, controller: Controller, sensor_gains: Sequence[float] | FloatArray
+) -> list[ClosedLoop]:
+    """Return the loops closed at several sensor gains."""
+    gains = [number(gain, "sensor_gain", above=0) for gain in sensor_gains]
     A0, A1, inputs, outputs0, outputs1, direct = _loop_matrices(hardware, controller)
-    return ClosedLoop(
-        system=StateSpace(
-            A=A0 + gain * A1, B=inputs, C=outputs0 + gain * outputs1, D=direct, dt_s=hardware.dt_s
-        ),
-        hardware=hardware,
-        controller=controller,
-        sensor_gain=gain,
-    )
+    return [
+        ClosedLoop(
+            system=StateSpace(
+                A=A0 + gain * A1,
+                B=inputs,
+                C=outputs0 + gain * outputs1,
+                D=direct,
+                dt_s=hardware.dt_s,
+            ),
+            hardware=hardware,
+            controller=controller,
+            sensor_gain=gain,
+        )
+        for gain in gains
+    ]
+
+
+def loop_poles(
+    hardware: LoopHardware, controller: Controller, sensor_gains: FloatArray
+) -> ComplexArray:
+    """Poles of the closed loop for many sensor gains at once, (g, states)."""
+    A0, A1, *_ = _loop_matrices(hardware, controller)
+    loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
+    return np.linalg.eigvals(loops).astype(np.complex128)
 
 
 def spectral_radii(
     hardware: LoopHardware, controller: Controller, sensor_gains: FloatArray
 ) -> FloatArray:
     """Spectral radius of the closed loop for many sensor gains at once, (g,)."""
-    A0, A1, *_ = _loop_matrices(hardware, controller)
-    loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
-    return np.asarray(np.max(np.abs(np.linalg.eigvals(loops)), axis=1))
+    return np.asarray(np.max(np.abs(loop_poles(hardware, controller, sensor_gains)), axis=1))
 
 
 def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:

@@ -22,9 +22,20 @@ from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.models.atmosphere import ARCSEC_RAD
 from lbt_synth.models.units import nm_per_mas
 from lbt_synth.quadrature import gauss_panels
-from lbt_synth.validation import FloatArray, number, real_array, semidefinite
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    matrix,
+    number,
+    real_array,
+    semidefinite,
+)
 
 _DIRECTIONS = 64
+_FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])
+_STRIPS = np.linspace(0.2, 4, 20)
+_POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
 _SERIES_CHUNK = 20_000  # frames at once
 
@@ -140,27 +151,131 @@ def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: 
     >>> round(lbt.jitter_strehl([[300**2, 0], [0, 300**2]], imaging=camera), 3)
     0.379
     """
-    covariance = semidefinite(covariance_nm2, "covariance_nm2")
-    size = covariance.shape[0]
+    covariance = matrix(covariance_nm2, "covariance_nm2")
+    lines = np.asarray(line_amplitudes_nm, dtype=np.complex128).reshape(1, -1, len(covariance))
+    strehls = jitter_strehls(covariance[None], imaging=imaging, line_amplitudes_nm=lines)
+    return float(strehls[0])
+
+
+def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any) -> FloatArray:
+    """Strehl ratios of many jitters.
+
+    Parameters
+    ----------
+    covariance_nm2 : (p, n, n) array_like
+        Covariance of the Gaussian jitter on n = 1 or 2 axes [nm^2 rms wavefront]. Points
+        that share one are quicker.
+    imaging : Imaging
+        The camera.
+    line_amplitudes_nm : (p, s, n) complex array_like
+        Amplitude and phase of each sinusoid on each axis [nm].
+
+    Returns
+    -------
+    (p,) ndarray
+        Strehl ratios in [0, 1], the other modes included.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite, a covariance is indefinite, or sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, numpy as np
+    >>> from lbt_synth.loop.strehl import jitter_strehls
+    >>> jitters = np.array([0.0, 300.0])[:, None, None] ** 2 * np.eye(2)
+    >>> jitter_strehls(jitters, imaging=lbt.Imaging(diameter_m=8.22),
+    ...                line_amplitudes_nm=np.zeros((2, 0, 2))).round(3).tolist()
+    [1.0, 0.379]
+    """
+    covariance = semidefinite(covariance_nm2, "covariance_nm2", stacked=True)
+    count, size, _ = covariance.shape
     _require_axes(size)
-    lines = np.asarray(line_amplitudes_nm, dtype=np.complex128).reshape(-1, size)
+    lines = np.asarray(line_amplitudes_nm, dtype=np.complex128)
     real_array(np.abs(lines), "line_amplitudes_nm")
-    spread = np.sqrt(np.max(np.diag(covariance))) + np.sum(np.abs(lines))
-    turns = float(spread * imaging.cycles_per_nm)
-    if turns > _MOST_TURNS:
-        raise ProblemError(
-            f"the jitter must stay below {_MOST_TURNS / imaging.cycles_per_nm:.3g} nm; got "
-            f"{spread:.3g} nm. Check the units."
+    if lines.ndim != 3 or (len(lines), lines.shape[2]) != (count, size):
+        raise DimensionError(
+            f"line_amplitudes_nm must be ({count}, sinusoids, {size}); got {lines.shape}."
         )
-    # beyond some 5 turns of phase over the pupil the nodes are made denser
-    fineness = max(0, int(np.ceil(np.log2(max(turns, 1e-9) / 5))))
-    fx, fy, weight = _weighted_otf(imaging.obstruction, fineness)
-    axes = np.stack([fx, fy])[:size] * imaging.cycles_per_nm
-    exponent = np.einsum("if,ij,jf->f", axes, covariance, axes)
-    factor = np.exp(-2 * np.pi**2 * exponent)
-    for amplitude in lines:
-        factor = factor * j0(2 * np.pi * np.abs(amplitude @ axes))
-    return float(imaging.other_modes * np.sum(weight * factor))
+    spread, most = jitter_spread_nm(covariance, lines), widest_jitter_nm(imaging)
+    if np.any(spread > most):
+        raise ProblemError(
+            f"the jitter must stay below {most:.3g} nm; got {spread.max():.3g} nm. Check the units."
+        )
+    if count == 0:
+        return np.empty(0)
+    rules = _rules(covariance, lines, spread, imaging.cycles_per_nm)
+    # |f.a|^2 and f'Sf are quadratic forms of f
+    forms = np.real(np.einsum("psi,psj->psij", lines, lines.conj()))
+    out = np.empty(count)
+    for members in _alike(rules, covariance):
+        fineness, directions = rules[members[0]].tolist()
+        squares, weight = _weighted_otf(imaging.obstruction, fineness, directions)
+        squares = squares * imaging.cycles_per_nm**2
+        common = weight * np.exp(-2 * np.pi**2 * (_form(covariance[members[0]]) @ squares))
+        step = max(1, _POINT_CHUNK // weight.size)
+        for start in range(0, len(members), step):
+            part = members[start : start + step]
+            factor = np.ones((1, weight.size))
+            for line in range(lines.shape[1]):
+                turns_squared = np.maximum(_form(forms[part, line]) @ squares, 0)
+                factor = factor * j0(2 * np.pi * np.sqrt(turns_squared))
+            out[part] = imaging.other_modes * (factor @ common)
+    return out
+
+
+def jitter_spread_nm(covariance_nm2: FloatArray, line_amplitudes_nm: ComplexArray) -> FloatArray:
+    """How far jitter of covariances (p, n, n) and sinusoids (p, s, n) moves an image [nm], (p,)."""
+    deviation = np.sqrt(np.max(np.diagonal(covariance_nm2, axis1=1, axis2=2), axis=1))
+    return np.asarray(deviation + np.sum(np.abs(line_amplitudes_nm), axis=(1, 2)))
+
+
+def widest_jitter_nm(imaging: Imaging) -> float:
+    """Spread beyond which the integral is not evaluated [nm]; the image is gone long before."""
+    return _MOST_TURNS / imaging.cycles_per_nm
+
+
+def _form(matrices: FloatArray) -> FloatArray:
+    """Coefficients of the quadratic forms of symmetric matrices, to go with the squares of f."""
+    if matrices.shape[-1] == 1:
+        return np.concatenate([matrices[..., 0], np.zeros((*matrices.shape[:-2], 2))], axis=-1)
+    return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
+
+
+def _alike(rules: IntArray, covariance: FloatArray) -> list[IntArray]:
+    """Return the indices of the points that share a rule and a covariance, group by group."""
+    count = len(rules)
+    if count == 1:
+        return [np.zeros(1, dtype=np.int64)]
+    keys = np.column_stack([rules, covariance.reshape(count, -1)])
+    _, own, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(own.reshape(-1), kind="stable")
+    return np.split(order, np.cumsum(counts)[:-1])
+
+
+def _rules(
+    covariance: FloatArray, lines: ComplexArray, spread: FloatArray, cycles_per_nm: float
+) -> IntArray:
+    """Fineness and number of directions of the nodes that each point needs, (p, 2).
+
+    Beyond some 5 turns of phase over the pupil the nodes are made denser. Where the jitter is
+    the same in all directions, or small, fewer of them do: the equidistant sum over N
+    directions of half a turn misses only harmonics from 2 N on, which decay faster than
+    ``exp(-2 N t)`` times the largest value of the integrand on a strip of width t.
+    """
+    turns = np.maximum(spread * cycles_per_nm, 1e-9)
+    fineness = np.maximum(0, np.ceil(np.log2(turns / 5))).astype(np.int64)
+    variance, last = covariance[:, 0, 0], covariance[:, -1, -1]
+    two = covariance.shape[1] == 2
+    unequal = np.hypot(variance - last, 2 * covariance[:, 0, 1]) if two else variance
+    gaussian = (np.pi * cycles_per_nm) ** 2 * unequal
+    sinusoids = 2 * np.pi * cycles_per_nm * np.sum(np.linalg.norm(lines, axis=2), axis=1)
+    growth = np.outer(gaussian, np.cosh(2 * _STRIPS) - 1) + np.outer(sinusoids, np.sinh(_STRIPS))
+    error = np.min(growth[:, None] - 2 * np.outer(_FEWER, _STRIPS), axis=2)
+    halvings = np.sum(error < np.log(1e-15), axis=1)
+    directions = np.where(fineness == 0, _DIRECTIONS >> halvings, _DIRECTIONS << fineness)
+    return np.stack([fineness, directions], axis=1)
 
 
 def strehl_of_series(residual_nm: Any, imaging: Imaging) -> float:
@@ -213,21 +328,22 @@ def _require_axes(size: int) -> None:
         raise DimensionError(f"a Strehl ratio of jitter takes 1 or 2 axes; got {size} modes.")
 
 
-@lru_cache(maxsize=16)
-def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Nodes (fx, fy) in units of D/lambda over half the plane, and OTF weights of sum 1."""
+@lru_cache(maxsize=32)
+def _weighted_otf(
+    obstruction: float, fineness: int, directions: int
+) -> tuple[FloatArray, FloatArray]:
+    """Nodes over half the plane, as (fx^2, 2 fx fy, fy^2) [(D/lambda)^2]; OTF weights of sum 1."""
     eps = obstruction
     kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
     edges = np.array(sorted(kinks))
     for _ in range(fineness):
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
-    directions = _DIRECTIONS * 2**fineness
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
     angle = np.pi * np.arange(directions) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
     weights = np.repeat(weight / (weight.sum() * directions), directions)
-    return fx, fy, weights
+    return np.stack([fx**2, 2 * fx * fy, fy**2]), weights
 
 
 @lru_cache(maxsize=16)

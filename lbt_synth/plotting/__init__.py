@@ -8,12 +8,14 @@ from lbt_synth.plotting.figures import (
 )
 from lbt_synth.plotting.front import tradeoff_figure
 from lbt_synth.plotting.limits import limits_figure
+from lbt_synth.plotting.strehl_map import map_figure
 from lbt_synth.plotting.style import FIGURE_ENDINGS, require_figure_name, save_figure
 
 __all__ = [
     "FIGURE_ENDINGS",
     "limits_figure",
     "loop_figure",
+    "map_figure",
     "require_figure_name",
     "robustness_figure",
     "save_figure",

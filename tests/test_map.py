@@ -1,0 +1,364 @@
+"""Maps over frequency error, sensor gain and delay error, against the evaluator of single points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plants import LBT_YAML
+from scipy.special import j0
+
+import lbt_synth as lbt
+from lbt_synth.loop.budget import residual_budget
+from lbt_synth.loop.sensor_gains import graded_edges, rejections
+from lbt_synth.loop.strehl import annular_otf, jitter_strehls
+from lbt_synth.quadrature import adaptive_integral, gauss_panels
+
+CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
+SLOW = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+DIAGONAL = (0.8, 0.6)
+
+
+def sinusoid(frequency_hz=20.0, rms_nm=797.0, direction=(1.0, 0.0)):
+    return lbt.SinusoidalVibration(frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction)
+
+
+def random_line(frequency_hz=20.0, rms_nm=500.0, damping=0.01, direction=(1.0, 0.0)):
+    return lbt.Vibration(
+        frequency_hz=frequency_hz, damping=damping, rms_nm=rms_nm, direction=direction
+    )
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return lbt.load_config(LBT_YAML)
+
+
+@pytest.fixture(scope="module")
+def kalman(settings):
+    return lbt.kalman(settings.plant)
+
+
+@pytest.fixture(scope="module")
+def robust(settings):
+    return lbt.hinf(settings.plant, gamma_ratio=1.2, method="riccati")
+
+
+def single(design, truth, imaging, error_hz, gain, delay_error=0.0):
+    """Strehl ratio and residual [nm] of one point, by the evaluator of single loops."""
+    lines = [replace(v, frequency_hz=v.frequency_hz - error_hz) for v in truth.vibrations]
+    met = replace(truth, sensor_gain=gain, vibrations=tuple(lines))
+    path = design.hardware
+    path = replace(path, delay_frames=path.delay_frames + delay_error)
+    budget = residual_budget(lbt.close_loop(path, design.controller, sensor_gain=gain), met)
+    return lbt.strehl(budget, imaging), budget.rms_nm
+
+
+def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
+    found = lbt.strehl_map(
+        design, truth, imaging, errors_hz=errors, sensor_gains=gains, delay_errors_frames=delays
+    )
+    assert found.stable.any()
+    for i, delay in enumerate(delays):
+        for j, gain in enumerate(gains):
+            for k, error in enumerate(errors):
+                if not found.stable[i, j]:
+                    with pytest.raises(lbt.UnstableLoopError):
+                        single(design, truth, imaging, error, gain, delay)
+                    continue
+                here = found.strehl[i, j, k], found.residual_nm[i, j, k]
+                expected = single(design, truth, imaging, error, gain, delay)
+                assert here == pytest.approx(expected, rel=1e-6), (delay, gain, error)
+    return found
+
+
+TRUTHS = {
+    "sinusoid": ((sinusoid(),), "air"),
+    "two sinusoids": ((sinusoid(), sinusoid(33.0, 120, (0.0, 1.0))), "air"),
+    "diagonal": ((sinusoid(direction=DIAGONAL),), "air"),
+    "random": ((random_line(),), "none"),
+    "random and sinusoid": ((random_line(25.0, 90, 0.02, DIAGONAL), sinusoid()), "ar"),
+    "table": ((sinusoid(),), "table"),
+}
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_each_point_is_that_of_the_single_evaluator(kalman, air, name):
+    vibrations, turbulence = TRUTHS[name]
+    table = lbt.TabulatedSpectrum(frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1])
+    spectra = {"air": air, "ar": SLOW, "none": None, "table": table}
+    truth = lbt.Truth(turbulence=spectra[turbulence], vibrations=vibrations, noise_nm=15.5)
+    assert_as_single(kalman, truth, CAMERA, [-2.5, 0.0, 1.0], [0.07, 0.6, 1.0, 1.9])
+
+
+def test_points_next_to_instability(robust, settings):
+    low, high = lbt.stable_sensor_gains(robust.hardware, robust.controller)
+    gains = [low * 1.01, low * 1.0001, 1.0, high * 0.99, high * (1 - 1e-6)]
+    assert_as_single(robust, settings.truth, settings.imaging, [1.0], gains)
+
+
+def test_delay_errors_whole_and_fractional(air):
+    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(),), noise_nm=15.5)
+    lazy = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
+    found = assert_as_single(lazy, truth, CAMERA, [0.0, 2.0], [0.5, 1.0], [-1.0, 0.0, 0.25, 1.0])
+    assert np.all(np.diff(found.strehl[:, 1, 0]) < 0)  # a later loop is a worse one
+
+
+def test_one_axis(axis_plant, air):
+    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(direction=(1.0,)),), noise_nm=15.5)
+    assert_as_single(lbt.kalman(axis_plant), truth, CAMERA, [0.0, 1.5], [0.4, 1.0])
+
+
+def test_axes_that_the_sensor_mixes(air):
+    """A sensor and a mirror that turn and mix the axes."""
+    path = {
+        "sensor_matrix": [[1.1, 0.3], [-0.2, 0.8], [0.4, 0.1]],
+        "influence_matrix": [[1, 0.2], [0, 0.9]],
+    }
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800, turbulence=SLOW, vibrations=[random_line()], noise_nm=15.5, **path
+    )
+    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(direction=DIAGONAL),), noise_nm=15.5)
+    assert_as_single(lbt.kalman(plant), truth, CAMERA, [-1.0, 0.0], [0.5, 1.0, 1.3])
+
+
+def test_unstable_points_are_nan(robust, settings):
+    found = lbt.strehl_map(
+        robust, settings.truth, settings.imaging, errors_hz=[-1, 0], sensor_gains=[0.3, 1.0, 3.0]
+    )
+    assert found.stable[0].tolist() == [False, True, False]
+    assert np.isnan(found.strehl[0, [0, 2]]).all()
+    assert np.isnan(found.residual_nm[0, [0, 2]]).all()
+    assert np.isfinite(found.strehl[0, 1]).all()
+    none = lbt.strehl_map(
+        robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[0.1]
+    )
+    assert np.isnan(none.strehl).all()
+
+
+def test_an_image_that_is_gone_has_no_strehl(robust, settings):
+    _, high = lbt.stable_sensor_gains(robust.hardware, robust.controller)
+    found = lbt.strehl_map(
+        robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[high * (1 - 1e-8)]
+    )
+    assert found.stable.all()
+    assert found.residual_nm.min() > 9e4
+    assert found.strehl.max() == 0
+
+
+def test_order_and_neighbours_change_nothing(kalman, settings):
+    """A point is the same alone, among others, in any order, and more of them than fit at once."""
+
+    def mapped(errors, gains):
+        return lbt.strehl_map(
+            kalman, settings.truth, settings.imaging, errors_hz=errors, sensor_gains=gains
+        )
+
+    many = np.linspace(0.3, 1.2, 91)
+    found = mapped([0, 2, -2], many)
+    turned = mapped([-2, 2, 0], many[::-1])
+    assert found.strehl[0] == pytest.approx(turned.strehl[0][::-1, ::-1], rel=1e-6)
+    assert found.strehl[0, 70, 1] == pytest.approx(
+        mapped([2], [many[70]]).strehl[0, 0, 0], rel=1e-6
+    )
+
+
+def test_turning_the_vibration_changes_nothing(kalman, air):
+    """Both axes are alike, so its direction does not count."""
+
+    def mapped(direction):
+        truth = lbt.Truth(
+            turbulence=air, vibrations=(sinusoid(direction=direction),), noise_nm=15.5
+        )
+        return lbt.strehl_map(kalman, truth, CAMERA, errors_hz=[0, 2], sensor_gains=[0.5, 1]).strehl
+
+    assert mapped((1.0, 0.0)) == pytest.approx(mapped((0.0, 1.0)), rel=1e-9)
+    assert mapped((1.0, 0.0)) == pytest.approx(mapped(DIAGONAL), rel=1e-6)
+
+
+def test_the_sign_of_the_error_is_that_of_the_sweep(kalman, settings):
+    """The design believes more than is true: the true line lies below."""
+    moved = replace(
+        settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
+    )
+    below = lbt.strehl_map(kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1])
+    above = lbt.strehl_map(
+        kalman, settings.truth, settings.imaging, errors_hz=[1.5], sensor_gains=[1]
+    )
+    assert below.strehl == pytest.approx(above.strehl, rel=1e-12)
+
+
+def test_counts_points_as_they_are_done(kalman, settings):
+    counts = []
+    lbt.strehl_map(
+        kalman, settings.truth, settings.imaging, errors_hz=[0, 1],
+        sensor_gains=np.linspace(0.5, 1, 70), delay_errors_frames=[0, 0.1], advance=counts.append,
+    )  # fmt: skip
+    assert sum(counts) == 2 * 70 * 2
+
+
+def dense_strehl(covariance, lines, imaging):
+    """The rule of all nodes, whatever the jitter: 84 radii, 64 directions."""
+    eps = imaging.obstruction
+    edges = np.array(sorted({0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}))
+    radius, weight = gauss_panels(edges, 12)
+    weight = weight * radius * annular_otf(radius, eps)
+    angle = np.pi * np.arange(64) / 64
+    f = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))])
+    f = f * imaging.cycles_per_nm
+    factor = np.exp(-2 * np.pi**2 * np.einsum("irk,ij,jrk->rk", f, covariance, f))
+    for line in lines:
+        factor = factor * j0(2 * np.pi * np.abs(np.einsum("i,irk->rk", line, f)))
+    return imaging.other_modes * float(weight @ factor.mean(axis=1) / weight.sum())
+
+
+def test_fewer_directions_lose_nothing():
+    rng = np.random.default_rng(5)
+    count = 300
+    roots = 10 ** rng.uniform(0, 3, (count, 1, 1)) * rng.standard_normal((count, 2, 2))
+    roots[::2] = 10 ** rng.uniform(0, 3, (150, 1, 1)) * np.eye(2)  # the same in all directions
+    covariances = roots @ np.swapaxes(roots, 1, 2)
+    lines = 10 ** rng.uniform(-1, 2.8, (count, 2, 1)) * (
+        rng.standard_normal((count, 2, 2)) + 1j * rng.standard_normal((count, 2, 2))
+    )
+    covariances[7] = covariances[9]
+    small = np.sqrt(np.max(np.diagonal(covariances, axis1=1, axis2=2), axis=1))
+    small = (small + np.abs(lines).sum(axis=(1, 2))) * CAMERA.cycles_per_nm < 5
+    assert small.sum() > 200
+    covariances, lines = covariances[small], lines[small]
+    found = jitter_strehls(covariances, imaging=CAMERA, line_amplitudes_nm=lines)
+    for i in range(len(found)):
+        assert found[i] == pytest.approx(dense_strehl(covariances[i], lines[i], CAMERA), abs=1e-13)
+        alone = lbt.jitter_strehl(covariances[i], imaging=CAMERA, line_amplitudes_nm=lines[i])
+        assert alone == pytest.approx(found[i], abs=1e-14)
+
+
+def test_many_jitters_of_wrong_sizes():
+    with pytest.raises(lbt.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"):
+        jitter_strehls(np.zeros((3, 2, 2)), imaging=CAMERA, line_amplitudes_nm=np.zeros((2, 1, 2)))
+    indefinite = np.stack([np.eye(2), np.diag([1, -1])])
+    with pytest.raises(lbt.DefinitenessError, match="least eigenvalue of -1"):
+        jitter_strehls(indefinite, imaging=CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2)))
+
+
+def test_rejections_of_other_gains(robust):
+    one = lbt.close_loop(robust.hardware, robust.controller, sensor_gain=0.8)
+    frequency = np.geomspace(0.01, 399, 60)
+    found = rejections(one, np.array([0.6, 0.8, 1.4]), frequency)
+    for i, gain in enumerate((0.6, 0.8, 1.4)):
+        other = lbt.close_loop(robust.hardware, robust.controller, sensor_gain=gain)
+        expected = other.sensitivity(frequency)
+        assert np.max(np.abs(found[:, i] - expected)) < 1e-11 * np.max(np.abs(expected))
+
+
+def test_panels_are_short_where_a_pole_is_near():
+    poles = np.array([0.999 * np.exp(0.3j), 0.999 * np.exp(-0.3j), 1 - 1e-5, 0.2])
+    edges = graded_edges(poles)
+    assert edges[0] == 0
+    assert edges[-1] == 1
+    assert np.all(np.diff(edges) > 0)
+    inside = np.searchsorted(edges, 0.3 / np.pi)
+    assert edges[inside] - edges[inside - 1] <= 2 * 0.001 / np.pi
+    assert edges.size < 100
+
+
+def test_integrals_of_stacks():
+    """Each member gets its own accuracy, though the panels are shared."""
+
+    def peaks(x):
+        widths = np.array([1e-4, 1e-2])
+        return (1e-3 * widths / (widths**2 + (x[:, None] - 0.3) ** 2))[..., None, None]
+
+    found = adaptive_integral(peaks, np.array([0.0, 1.0]))
+    widths = np.array([1e-4, 1e-2])
+    expected = 1e-3 * (np.arctan(0.7 / widths) + np.arctan(0.3 / widths))
+    assert found[:, 0, 0] == pytest.approx(expected, rel=1e-7)
+
+
+WRONG = [
+    ({"errors_hz": []}, "at least one number"),
+    ({"errors_hz": [[0.0]]}, "at least one number"),
+    ({"errors_hz": [np.nan]}, "finite"),
+    ({"errors_hz": [1, 1]}, "each value once"),
+    ({"errors_hz": [20]}, "moves the one at 20 Hz to 0 Hz"),
+    ({"errors_hz": [-380]}, "between 0 and 400 Hz"),
+    ({"sensor_gains": [0.5, 0]}, "sensor_gains must be above 0"),
+    ({"sensor_gains": "wide"}, "sensor_gains must be an array of numbers"),
+    ({"delay_errors_frames": [-1.5]}, "delay_errors_frames must be at least -1"),
+    ({"delay_errors_frames": [99]}, "together must lie between 1 and 100"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("wrong", "text"), WRONG)
+def test_wrong_axes_are_refused(kalman, settings, wrong, text):
+    axes = {"errors_hz": [0], "sensor_gains": [1]} | wrong
+    with pytest.raises(lbt.ProblemError, match=text):
+        lbt.strehl_map(kalman, settings.truth, settings.imaging, **axes)
+
+
+def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
+    axes = {"errors_hz": [0, 1], "sensor_gains": [1]}
+    walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    with pytest.raises(lbt.ProblemError, match="needs a design for a loop"):
+        lbt.strehl_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
+    with pytest.raises(lbt.ProblemError, match="needs a vibration in the truth"):
+        lbt.strehl_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)
+    with pytest.raises(lbt.DimensionError, match="must have 1 components"):
+        lbt.strehl_map(lbt.kalman(axis_plant), settings.truth, settings.imaging, **axes)
+    three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
+    with pytest.raises(lbt.DimensionError, match="got a loop of 3 modes"):
+        lbt.strehl_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
+
+
+# --------------------------------------------------------------------------
+# The figure.
+# --------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def maps(kalman, robust, settings):
+    axes = {"errors_hz": [2, 0, -2, 1], "sensor_gains": [1.5, 0.3, 0.8, 3.0]}
+    return {
+        name: lbt.strehl_map(design, settings.truth, settings.imaging, **axes)
+        for name, design in (("Kalman", kalman), ("H-infinity", robust))
+    }
+
+
+def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
+    figure = lbt.map_figure(maps)
+    left, right, bar = figure.axes
+    assert [left.get_title(), right.get_title()] == ["Kalman", "H-infinity"]
+    assert bar.get_ylabel() == "Strehl ratio [%]"
+    assert left.get_ylabel() == "sensor gain [-]"
+    assert figure.get_supxlabel() == "frequency in the design less the true one [Hz]"
+    unstable = [[t.get_text() for t in p.texts].count("unstable") for p in (left, right)]
+    assert unstable == [1, 2]  # the Kalman filter at 3, the other at 0.3 as well
+    assert left.collections[0].get_clim() == right.collections[0].get_clim()
+    figure.savefig(tmp_path / "map.png")
+
+
+def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
+    def mapped(design, gains, delays):
+        return lbt.strehl_map(
+            design, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=gains,
+            delay_errors_frames=delays,
+        )  # fmt: skip
+
+    figure = lbt.map_figure(
+        {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
+    )
+    assert len(figure.axes) == 5
+    assert figure.axes[2].get_ylabel() == "delay error +0.1 frames\nsensor gain [-]"
+    figure.savefig(tmp_path / "a.png")
+    nowhere = lbt.map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
+    nowhere.savefig(tmp_path / "b.pdf")
+
+
+def test_map_figures_that_are_refused(maps, kalman, settings):
+    with pytest.raises(lbt.ProblemError, match="at least one map"):
+        lbt.map_figure({})
+    late = lbt.strehl_map(
+        kalman, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[1],
+        delay_errors_frames=[0.1],
+    )  # fmt: skip
+    with pytest.raises(lbt.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"):
+        lbt.map_figure({**maps, "late": late})
