@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
-from lbt_synth.design import Design, FilterDesign
+from lbt_synth.design import Design, FilterDesign, ShapedDesign
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.limits import (
     BandLimit,
@@ -19,6 +20,9 @@ from lbt_synth.limits import (
 )
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.models import FullStatePlant, LoopHardware, SinusoidalVibration, TipTiltPlant, Truth
+from lbt_synth.shaping import ResidualVariance, VibrationBand
+from lbt_synth.shaping.measured import mode_hardware, mode_loop
+from lbt_synth.shaping.terms import leaves
 from lbt_synth.validation import FloatArray, frozen, number
 
 T = TypeVar("T")
@@ -237,7 +241,7 @@ def above_percent(rms_nm: float, limit_nm: float) -> float:
     return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else float("nan")
 
 
-def limit_or_nan(limit: Callable[[], ResidualLimit]) -> float:
+def limit_or_nan(limit: Callable[[], ResidualLimit | BandLimit]) -> float:
     """Least residual [nm rms], nan where it cannot be computed."""
     found = _limit_or_none(limit)
     return float("nan") if found is None else found.rms_nm
@@ -262,3 +266,42 @@ def model_distance(design: FilterDesign) -> tuple[float, float]:
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     delay = plant.hardware.delay_frames
     return limit_nm, above_percent(design.rms, limit_nm) if delay == round(delay) else float("nan")
+
+
+def shaped_distance(design: ShapedDesign) -> tuple[float, float]:
+    """Limit of a shaped design's own spectra [nm rms], and how far its residual is above it [%].
+
+    At unit sensor gain and over all modes. The residual is the variance plus the worst of the
+    band, as the limit. nan where a mode has no variance at unit gain, or several bands: the
+    limit of the sum is not known then.
+    """
+    limit_nm2, residual_nm2 = 0.0, 0.0
+    for spec, parameter in zip(design.specifications, design.parameters, strict=True):
+        at_unit = [leaf for leaf in leaves(spec.objective) if leaf.sensor_gain == 1]
+        variances = [leaf for leaf in at_unit if isinstance(leaf, ResidualVariance)]
+        bands = [leaf for leaf in at_unit if isinstance(leaf, VibrationBand)]
+        if len(variances) != 1 or len(bands) > 1:
+            return float("nan"), float("nan")
+        hardware = mode_hardware(design.loop_hardware)
+        truth = Truth(turbulence=variances[0].turbulence, noise_nm=variances[0].noise_nm)
+        found = limit_or_nan(partial(_mode_limit, hardware, truth, bands))
+        loop = mode_loop(design.loop_hardware, parameter)
+        limit_nm2 += found**2
+        residual_nm2 += variances[0].measured_nm2(loop)
+        residual_nm2 += sum(band.measured_nm2(loop) for band in bands)
+    limit_nm = float(np.sqrt(limit_nm2))
+    return limit_nm, above_percent(float(np.sqrt(residual_nm2)), limit_nm)
+
+
+def _mode_limit(
+    hardware: LoopHardware, truth: Truth, bands: list[VibrationBand]
+) -> ResidualLimit | BandLimit:
+    if not bands:
+        return least_residual(hardware, truth)
+    return least_worst_residual(
+        hardware,
+        truth,
+        band_hz=(bands[0].low_hz, bands[0].high_hz),
+        rms_nm=bands[0].rms_nm,
+        direction=(1.0,),
+    )

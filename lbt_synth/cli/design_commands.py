@@ -22,7 +22,7 @@ from lbt_synth.design import (
     mixed,
     optimal_integrator,
 )
-from lbt_synth.distance import model_distance
+from lbt_synth.distance import model_distance, shaped_distance
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain, require_gain_name, save_gain
@@ -202,10 +202,17 @@ def _description(made: Design) -> Report:
             ("states of one mode, past commands included", made.states_per_mode, ""),
             ("loss by having few states", 100 * made.loss, "%"),
         ]
+        limit_nm, above = shaped_distance(made)
+        facts += [
+            ("least residual of any linear controller", limit_nm, unit),
+            ("residual at unit sensor gain above it", above, "%"),
+        ]
         terms = made.terms_nm()
         data |= {
             "states_per_mode": made.states_per_mode,
             "loss": made.loss,
+            "limit_nm": limit_nm,
+            "above_limit_percent": above,
             "objective_nm": made.objective_nm,
             "long_objective_nm": made.long_objective_nm,
             "terms": [{"mode": m + 1, "term": text, "rms_nm": rms} for m, text, rms in terms],
