@@ -190,6 +190,44 @@ def mixed_filters() -> dict[int, Row]:
     return with_growth(rows)
 
 
+def shaped(functions: int, bands: int) -> Row:
+    """Shape one mode: turbulence, noise and vibrations in bands, under four demands."""
+    air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
+    terms = [
+        lbt.ResidualVariance(turbulence=air, noise_nm=15.5),
+        *(
+            lbt.VibrationBand(low_hz=low, high_hz=low + 3.0, rms_nm=100.0)
+            for low in np.linspace(16.5, 80.0, bands)
+        ),
+    ]
+    spec = lbt.Specification(
+        objective=lbt.Total(terms=tuple(terms)),
+        demands=(
+            lbt.ModulusMargin(at_least=0.45),
+            lbt.SensorGainRange(low=0.25, high=1.3),
+            lbt.Attenuation(low_hz=0, high_hz=1, at_most=0.05),
+            lbt.DelayError(frames=0.3),
+        ),
+    )
+    path = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=1)
+    designs: list[lbt.ShapedDesign] = []
+
+    def whole() -> None:
+        designs.append(lbt.shape(path, spec, functions=functions, states=None))
+
+    return {"ours_s": seconds(whole, 3), "status": designs[-1].solver.status}
+
+
+def shaping_by_functions() -> dict[int, Row]:
+    rows = {n: shaped(n, 3) for n in (30, 60, 120)}
+    rows[60]["bar_s"] = 5.0
+    return with_growth(rows)
+
+
+def shaping_by_bands() -> dict[int, Row]:
+    return with_growth({n: shaped(60, n) for n in (1, 3, 6)})
+
+
 SIZED = (
     ("modal filter equations in one call (scipy in a loop)", "equations", modal_equations),
     ("one filter equation (scipy)", "states", single_equations),
@@ -199,4 +237,6 @@ SIZED = (
     ("H-infinity norm (SLICOT's AB13DD)", "states", norms),
     (f"singular values at {POINTS} points (python-control)", "states", responses),
     ("mixed filter, 16 taps, whole design", "states", mixed_filters),
+    ("shaping with 3 bands, whole design, by functions", "functions", shaping_by_functions),
+    ("shaping with 60 functions, whole design, by bands", "bands", shaping_by_bands),
 )

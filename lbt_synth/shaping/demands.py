@@ -26,8 +26,8 @@ from lbt_synth.shaping.terms import ResidualVariance, checked_band
 from lbt_synth.statespace import StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray, number
 
-ROOM = 2e-4  # part of a bound that the programme leaves unused, for what lies between its points
-_TIGHT = 2e-4  # to which a bound over an interval is made tight
+ROOM = 1e-3  # part of a bound that the programme leaves unused, for what lies between its points
+_TIGHT = 1e-4  # to which a bound over an interval is made tight, where it could decide
 _LEVEL_SETS = "level sets, all frequencies"
 
 
@@ -337,7 +337,7 @@ class DelayError:
             at_peak = self._turning(2 * np.pi * np.array([found.peak_frequency_hz]) * T.dt_s)[0]
             reached = max(reached, float(found.value * at_peak))
             above = float(found.upper * turning)
-            if above > max(reached * (1 + _TIGHT), 0.5) and high - low > 1e-6 * nyquist:
+            if above > max(reached * (1 + _TIGHT), 1 - ROOM / 4) and high - low > 1e-6 * nyquist:
                 stack += [(low, (low + high) / 2), ((low + high) / 2, high)]
             else:
                 bound = max(bound, above)

@@ -1,0 +1,161 @@
+"""Five controllers and the limit, over the vibration's frequency and the sensor gain.
+
+Run with ``python docs/measure/story.py`` from the repository (some minutes). Prints the table
+of docs/robustness.md and writes its figure to docs/figures/robustness_story.png.
+"""
+
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.optimize import minimize
+
+import lbt_synth as lbt
+from lbt_synth.config import robust_design
+from lbt_synth.paper import parameters as paper
+from lbt_synth.paper.compute import paper_filters
+from lbt_synth.plotting.style import house_style
+
+ERRORS = np.arange(-7, 8) / 2
+GAINS = [1.0, 0.7, 0.5, 0.358]
+CAMERA = replace(paper.imaging(), other_modes=0.841)
+TRUTH = replace(paper.PAPER_TRUTH, sensor_gain=1.0)
+AR2 = lbt.ar2_turbulence(
+    paper.ATMOSPHERE, frame_rate_hz=paper.FRAME_RATE_HZ, noise_nm=paper.NOISE_NM
+)
+
+
+def plant(turbulence: lbt.ARModel, damping: float, rms_nm: float) -> lbt.TipTiltPlant:
+    """One line at 20 Hz on either axis."""
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=paper.FRAME_RATE_HZ,
+        turbulence=turbulence,
+        noise_nm=paper.NOISE_NM,
+        vibrations=[
+            lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=rms_nm, direction=d)
+            for d in ((1.0, 0.0), (0.0, 1.0))
+        ],
+    )
+
+
+def worst_strehl(design: lbt.Design, errors=ERRORS) -> np.ndarray:
+    """Worst Strehl ratio over the rows, at each sensor gain [%]; 0 where unstable."""
+    found = lbt.strehl_map(design, TRUTH, CAMERA, errors_hz=errors, sensor_gains=GAINS)
+    return 100 * np.min(np.nan_to_num(found.strehl[0]), axis=1)
+
+
+def tuned(make, start: list[float], what: str) -> lbt.Design:
+    """Design whose mean over the gains of the worst Strehl ratio is largest."""
+    console = Console(stderr=True)
+
+    def cost(x: np.ndarray) -> float:
+        try:
+            return -float(np.mean(worst_strehl(make(*np.exp(x)), ERRORS[::2])))
+        except (lbt.SynthesisError, lbt.ProblemError):
+            return 0.0
+
+    with console.status(f"tuning {what}"):
+        found = minimize(
+            cost, np.log(start), method="Nelder-Mead", options={"maxfev": 90, "xatol": 1e-2}
+        )
+    parameters = np.exp(found.x)
+    print(f"{what}: damping {parameters[0]:.4f}, rms {parameters[1]:.1f} nm")
+    return make(*parameters)
+
+
+def multi_mode(damping: float, rms_nm: float) -> lbt.FilterDesign:
+    """Kalman filter of AR2 turbulence and five lines from 16.5 to 23.5 Hz."""
+    return lbt.kalman(lbt.spread_plant(plant(AR2, damping, rms_nm), half_width_hz=3.5, lines=5))
+
+
+def designs() -> dict[str, lbt.Design]:
+    """The five, from the paper's to the shaped one."""
+    kalman, hinf = paper_filters()
+    slow = paper.turbulence_model()
+    return {
+        "Kalman of the paper": kalman,
+        "H-infinity of the paper": hinf,
+        "Kalman, tuned": tuned(
+            lambda k, rms: lbt.kalman(plant(slow, k, rms)), [0.1, 800.0], "Kalman, AR1 turbulence"
+        ),
+        "Kalman, AR2, five lines, tuned": tuned(
+            multi_mode, [0.02, 400.0], "Kalman, AR2 turbulence, five lines"
+        ),
+        "shaped": robust_design(lbt.load_config("examples/lbt_robust.yaml")),
+    }
+
+
+def limit_strehl(residual_nm: float) -> float:
+    """Strehl ratio of a residual shared evenly by the axes [%]."""
+    return 100 * lbt.jitter_strehl(np.eye(2) * residual_nm**2 / 2, imaging=CAMERA)
+
+
+def main() -> None:
+    """Print the table, draw the figure."""
+    every = designs()
+    bands = {
+        gain: lbt.least_worst_residual(
+            every["shaped"].hardware,
+            replace(TRUTH, vibrations=(), sensor_gain=gain),
+            band_hz=(16.5, 23.5),
+            rms_nm=paper.VIBRATION_NM,
+        ).rms_nm
+        for gain in GAINS
+    }
+    table = Table(title="Worst Strehl ratio over 15 rows [%], by sensor gain")
+    for heading in ("controller", *map(str, GAINS), "stable gains", "modulus", "states",
+                    "residual [nm]", "above limit [%]"):  # fmt: skip
+        table.add_column(heading, justify="left" if heading == "controller" else "right")
+    study = lbt.limit_study(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
+    for (name, design), row in zip(every.items(), study.rows, strict=True):
+        margins = lbt.loop_margins(lbt.close_loop(design.hardware, design.controller))
+        table.add_row(
+            name,
+            *(f"{s:.2f}" for s in worst_strehl(design)),
+            f"{margins.gain_low:.2f}-{margins.gain_high:.2f}",
+            f"{margins.modulus:.2f}",
+            str(design.controller.n_states // 2),
+            f"{row.worst_nm:.1f}",
+            f"{row.above_band_limit_percent:.0f}",
+        )
+    table.add_row("limit", *(f"{limit_strehl(bands[g]):.2f}" for g in GAINS), "", "", "",
+                  f"{bands[1.0]:.1f}", "0")  # fmt: skip
+    Console(width=150).print(table)
+    draw(every, bands)
+
+
+def draw(every: dict[str, lbt.Design], bands: dict[float, float]) -> None:
+    """Strehl ratio over the true frequency, at two sensor gains."""
+    shifts = np.linspace(-3.5, 3.5, 71)
+    styles = ["-", "--", "-.", (0, (1, 1)), "-"]
+    colours = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "black"]
+    with house_style():
+        figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
+        for axis, gain in zip(axes, (1.0, 0.358), strict=True):
+            for (name, design), style, colour in track(
+                list(zip(every.items(), styles, colours, strict=True)), transient=True
+            ):
+                found = lbt.strehl_map(
+                    design, TRUTH, CAMERA, errors_hz=-shifts, sensor_gains=[gain]
+                )
+                axis.plot(20 + shifts, 100 * found.strehl[0, 0], ls=style, color=colour, label=name)
+            axis.axhline(
+                limit_strehl(bands[gain]),
+                color="0.4",
+                lw=0.8,
+                label="limit, any of these frequencies",
+            )
+            axis.set_title(f"sensor gain {gain:g}")
+            axis.set_xlabel("frequency of the true vibration [Hz]")
+        axes[0].set_ylabel("Strehl ratio [%]")
+        axes[0].set_ylim(0, 90)
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+        figure.savefig("docs/figures/robustness_story.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()
