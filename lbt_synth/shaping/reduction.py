@@ -63,12 +63,15 @@ def solved(spec: Specification, channel: Channel, *, start: FloatArray | None = 
             return Solved(sequence=sequence, objective_nm=float(np.sqrt(exact)))
     raise NumericalError(
         f"the objective over the frequencies of the programme misses that of the real loop by "
-        f"{miss:.2g}, expected {_INTEGRAL:g}, or a bound is exceeded between them. Try a smaller pole, or wider bands.",
+        f"{miss:.2g}, expected {_INTEGRAL:g}, or a bound is exceeded between them. Try a "
+        "smaller pole, or wider bands.",
         status="quadrature",
     )
 
 
-def reduced(spec: Specification, long: Solved, order: int, tolerance: float) -> Solved:
+def reduced(
+    spec: Specification, long: Solved, order: int, tolerance: float, *, fewest: bool = True
+) -> Solved:
     """Fewest poles whose programme keeps the objective within a tolerance.
 
     Parameters
@@ -81,6 +84,8 @@ def reduced(spec: Specification, long: Solved, order: int, tolerance: float) -> 
         Largest number of poles.
     tolerance : float
         Largest relative increase of the objective's root.
+    fewest : bool, optional
+        Search for fewer poles than the largest number.
 
     Raises
     ------
@@ -106,7 +111,7 @@ def reduced(spec: Specification, long: Solved, order: int, tolerance: float) -> 
         for slow in _SLOW_HZ
     ]
     candidates = [min(starts, key=lambda start: start[1])[0]]
-    while np.count_nonzero(candidates[-1].imag) > _LEAST_POLES:
+    while fewest and np.count_nonzero(candidates[-1].imag) > _LEAST_POLES:
         fewer = without_least_pair(
             candidates[-1], leaving_out(angles, target, weight, candidates[-1])
         )
