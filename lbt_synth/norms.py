@@ -85,14 +85,50 @@ def hinf_norm(system: Any) -> HinfNorm:
             f"{radius:.9g}. An unstable system has no finite norm.",
             spectral_radius=radius,
         )
-    G = G.balanced()
-    seeds = np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)])
-    peak, angle = _largest(G, _folded(seeds))
+    return _peak(G.balanced(), 0.0, np.pi)
+
+
+def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
+    """Largest singular value over a band of frequencies; poles outside the band do no harm.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The system, stable or not, without a pole on the band.
+    low_hz, high_hz : float
+        Ends of the band, within [0, Nyquist] [Hz].
+
+    Returns
+    -------
+    HinfNorm
+        Value, bracket and peak frequency.
+
+    Raises
+    ------
+    NumericalError
+        If the level sets do not close.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.norms import band_norm
+    >>> walk = lbt.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> round(float(band_norm(walk, 1 / 6, 0.5)), 9)
+    1.0
+    """
+    low, high = (2 * np.pi * f * system.dt_s for f in (low_hz, high_hz))
+    return _peak(system.balanced(), low, high)
+
+
+def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
+    """Largest singular value of a balanced system between two angles, by level sets."""
+    seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
+    peak, angle = _largest(G, _folded(seeds, low, high))
     if peak == 0:
         return HinfNorm(value=0.0, lower=0.0, upper=0.0, peak_frequency_hz=0.0)
     for _ in range(100):
         level = peak * (1 + _TOLERANCE)
-        candidates = _folded(_level_angles(G, level))
+        candidates = _folded(_level_angles(G, level), low, high)
         tests = np.concatenate([candidates, (candidates[1:] + candidates[:-1]) / 2])
         new_peak, new_angle = _largest(G, tests)
         if new_peak <= level:
@@ -165,10 +201,10 @@ def spectral_norms(matrices: ComplexArray) -> FloatArray:
     return np.asarray(scale * np.sqrt(np.maximum(largest, 0.0)), dtype=np.float64)
 
 
-def _folded(angles: FloatArray) -> FloatArray:
-    """Sorted distinct angles in [0, pi], the ends included."""
+def _folded(angles: FloatArray, low: float, high: float) -> FloatArray:
+    """Sorted distinct angles between two of [0, pi], these included."""
     inside = np.abs(np.mod(angles + np.pi, 2 * np.pi) - np.pi)
-    return np.unique(np.concatenate([inside, [0.0, np.pi]]))
+    return np.unique(np.concatenate([np.clip(inside, low, high), [low, high]]))
 
 
 def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import numpy as np
 from lbt_synth.cli.output import Report, TableText, progress, working
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
-from lbt_synth.design import Design, FilterDesign
+from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
@@ -38,7 +38,7 @@ def sigma(arguments: Namespace) -> Report:
     rows, data = [], {}
     for name, design in designs.items():
         entry: dict[str, object] = {"method": design.method}
-        if isinstance(design, FilterDesign):
+        if isinstance(design, EstimatorDesign):
             entry |= {"gamma": design.gamma, "rms": design.rms}
         if design.hardware is not None:
             loop = close_loop(design.hardware, design.controller, sensor_gain=arguments.sensor_gain)

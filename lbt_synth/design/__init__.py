@@ -5,12 +5,21 @@ from lbt_synth.design.hinf import hinf
 from lbt_synth.design.integrator import integrator, integrator_gain_limit, optimal_integrator
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.mixed import mixed
-from lbt_synth.design.result import Design, FilterDesign, IntegratorDesign, SolverReport
+from lbt_synth.design.polytopic import PolytopicDesign, polytopic
+from lbt_synth.design.result import (
+    Design,
+    EstimatorDesign,
+    FilterDesign,
+    IntegratorDesign,
+    SolverReport,
+)
 
 __all__ = [
     "Design",
+    "EstimatorDesign",
     "FilterDesign",
     "IntegratorDesign",
+    "PolytopicDesign",
     "SolverReport",
     "central",
     "hinf",
@@ -19,4 +28,5 @@ __all__ = [
     "kalman",
     "mixed",
     "optimal_integrator",
+    "polytopic",
 ]

@@ -9,7 +9,14 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.certify import Certificate, Check
-from lbt_synth.design import Design, FilterDesign, IntegratorDesign, SolverReport
+from lbt_synth.design import (
+    Design,
+    EstimatorDesign,
+    FilterDesign,
+    IntegratorDesign,
+    PolytopicDesign,
+    SolverReport,
+)
 from lbt_synth.models import (
     ARModel,
     EstimationProblem,
@@ -31,6 +38,14 @@ CONVENTION = (
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
+_INTERVAL = (
+    "half_width_hz",
+    "norm",
+    "bound_guaranteed",
+    "worst_achieved",
+    "worst_frequency_hz",
+    "bound_programme",
+)
 _PROBLEMS: dict[str, type[EstimationProblem]] = {
     "problem": EstimationProblem,
     "plant": TipTiltPlant,
@@ -76,6 +91,10 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
                 "WITNESS_X": design.witness.states,
                 "WITNESS_W": design.witness.disturbances,
             }
+    if isinstance(design, PolytopicDesign):
+        arrays |= {f"PREDICTOR_{name}": getattr(design.predictor, name) for name in "ABC"}
+        meta["interval"] = {name: getattr(design, name) for name in _INTERVAL}
+    if isinstance(design, EstimatorDesign):
         _pack_problem(design.problem, arrays, meta)
     return arrays, meta
 
@@ -93,6 +112,8 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
             **common, loop_hardware=_unpack_hardware(arrays, meta), gain=meta["integrator_gain"]
         )
     problem = _unpack_problem(arrays, meta)
+    if "interval" in meta:
+        return _unpack_polytopic(common, problem, arrays, meta["interval"])
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
     for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
         if arrays[name].shape != rows_cols:
@@ -110,6 +131,24 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
         if "WITNESS_X" in arrays
         else None,
     )
+
+
+def _unpack_polytopic(
+    common: dict[str, Any], problem: EstimationProblem, arrays: Arrays, interval: Meta
+) -> PolytopicDesign:
+    matrices = {name: arrays[f"PREDICTOR_{name}"] for name in "ABC"}
+    feedthrough = np.zeros((len(problem.L), len(problem.C)))
+    design = PolytopicDesign(
+        **common,
+        problem=problem,
+        predictor=Controller(**matrices, D=feedthrough, dt_s=problem.dt_s),
+        **{name: interval[name] for name in _INTERVAL},
+    )
+    if design.method != f"polytopic-{design.norm}" or design.norm not in ("hinf", "h2"):
+        raise ValueError(f"the method {design.method!r} does not match the norm {design.norm!r}")
+    if not design.interval.low_hz <= design.worst_frequency_hz <= design.interval.high_hz:
+        raise ValueError("the worst frequency is not in the interval")
+    return design
 
 
 def _pack_problem(problem: EstimationProblem, arrays: Arrays, meta: Meta) -> None:

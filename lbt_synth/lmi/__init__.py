@@ -3,6 +3,15 @@
 from lbt_synth.lmi.hinf import hinf_lmi, least_gamma_lmi
 from lbt_synth.lmi.kalman import kalman_sdp
 from lbt_synth.lmi.mixed import InnovationProgramme
+from lbt_synth.lmi.polytopic import SegmentFilter, segment_filter
 from lbt_synth.lmi.solver import LmiSolution
 
-__all__ = ["InnovationProgramme", "LmiSolution", "hinf_lmi", "kalman_sdp", "least_gamma_lmi"]
+__all__ = [
+    "InnovationProgramme",
+    "LmiSolution",
+    "SegmentFilter",
+    "hinf_lmi",
+    "kalman_sdp",
+    "least_gamma_lmi",
+    "segment_filter",
+]
