@@ -244,7 +244,7 @@ def _description(made: Design) -> Report:
 def _describe_interval(
     made: PolytopicDesign, facts: list[tuple[str, Any, str]], data: dict[str, Any]
 ) -> None:
-    """What a design guarantees over its interval, beside the worst that was found."""
+    """Add what a design guarantees over its interval, beside the worst that was found."""
     what = {"hinf": "H-infinity norm", "h2": "rms"}[made.norm]
     ratio = made.bound_guaranteed / made.worst_achieved
     facts += [

@@ -282,7 +282,9 @@ def _spread(
         return [line]
     key = f"model.vibrations[{index}].spread_hz"
     try:
-        frequencies = line_frequencies(line.frequency_hz, section.spread_hz, section.lines or 5)
+        frequencies = line_frequencies(
+            line.frequency_hz, section.spread_hz, section.lines or 5, name="the half width"
+        )
         made = spread_lines(line, frequencies)
         made[-1].ar_model(frame_rate_hz)
     except ProblemError as error:

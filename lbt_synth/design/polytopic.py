@@ -26,10 +26,12 @@ class PolytopicDesign(EstimatorDesign):
     """A filter with a bound on its error over an interval of vibration frequencies.
 
     ``gamma``, ``rms`` and the first checks of the certificate are those of the plant at the
-    centre, ``problem``.
+    centre.
 
     Attributes
     ----------
+    problem : TipTiltPlant
+        The plant at the centre of the interval.
     predictor : Controller
         From the pseudo-open-loop measurement ybar(k) to the estimate of z(k+1).
     half_width_hz : float
@@ -46,6 +48,7 @@ class PolytopicDesign(EstimatorDesign):
         The bound that the semidefinite programme gave; the solver's word, no evidence.
     """
 
+    problem: TipTiltPlant
     predictor: Controller
     half_width_hz: float
     norm: str
@@ -57,7 +60,6 @@ class PolytopicDesign(EstimatorDesign):
     @property
     def interval(self) -> FrequencyInterval:
         """The plants of the interval."""
-        assert isinstance(self.problem, TipTiltPlant)  # there is no other kind
         return FrequencyInterval(plant=self.problem, half_width_hz=self.half_width_hz)
 
     @property

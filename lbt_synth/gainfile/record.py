@@ -26,7 +26,7 @@ from lbt_synth.models import (
     Vibration,
 )
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, choice, frozen, number
 from lbt_synth.witness import Witness
 
 CONVENTION = (
@@ -38,14 +38,7 @@ CONVENTION = (
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
-_INTERVAL = (
-    "half_width_hz",
-    "norm",
-    "bound_guaranteed",
-    "worst_achieved",
-    "worst_frequency_hz",
-    "bound_programme",
-)
+_SIZES = ("bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme")
 _PROBLEMS: dict[str, type[EstimationProblem]] = {
     "problem": EstimationProblem,
     "plant": TipTiltPlant,
@@ -93,7 +86,9 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
             }
     if isinstance(design, PolytopicDesign):
         arrays |= {f"PREDICTOR_{name}": getattr(design.predictor, name) for name in "ABC"}
-        meta["interval"] = {name: getattr(design, name) for name in _INTERVAL}
+        meta["interval"] = {
+            name: getattr(design, name) for name in ("half_width_hz", "norm", *_SIZES)
+        }
     if isinstance(design, EstimatorDesign):
         _pack_problem(design.problem, arrays, meta)
     return arrays, meta
@@ -136,18 +131,25 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
 def _unpack_polytopic(
     common: dict[str, Any], problem: EstimationProblem, arrays: Arrays, interval: Meta
 ) -> PolytopicDesign:
-    matrices = {name: arrays[f"PREDICTOR_{name}"] for name in "ABC"}
-    feedthrough = np.zeros((len(problem.L), len(problem.C)))
+    if not isinstance(problem, TipTiltPlant):
+        raise TypeError("an interval of frequencies needs a plant")
+    if common["method"] != f"polytopic-{interval['norm']}":
+        raise ValueError(f"the method {common['method']} is not of the norm {interval['norm']}")
+    sizes: dict[str, Any] = {name: number(interval[name], name, above=0) for name in _SIZES}
     design = PolytopicDesign(
         **common,
+        **sizes,
         problem=problem,
-        predictor=Controller(**matrices, D=feedthrough, dt_s=problem.dt_s),
-        **{name: interval[name] for name in _INTERVAL},
+        predictor=Controller(
+            **{name: arrays[f"PREDICTOR_{name}"] for name in "ABC"},
+            D=np.zeros((len(problem.L), len(problem.C))),
+            dt_s=problem.dt_s,
+        ),
+        norm=choice(interval["norm"], "norm", ("hinf", "h2")),
+        half_width_hz=number(interval["half_width_hz"], "half_width_hz", at_least=0),
     )
-    if design.method != f"polytopic-{design.norm}" or design.norm not in ("hinf", "h2"):
-        raise ValueError(f"the method {design.method!r} does not match the norm {design.norm!r}")
-    if not design.interval.low_hz <= design.worst_frequency_hz <= design.interval.high_hz:
-        raise ValueError("the worst frequency is not in the interval")
+    # an interval that does not fit the plant is refused here, not when it is verified
+    design.interval.coefficient(design.worst_frequency_hz)
     return design
 
 

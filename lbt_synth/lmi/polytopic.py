@@ -33,7 +33,7 @@ from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.validation import FloatArray, frozen
 from lbt_synth.witness import identity_coordinates
 
-_RANK = 1e-11  # share of its variances that is added to a covariance, so that no direction is lost
+_RANK = 1e-11  # share of a covariance that is added to it, so that no direction is lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +43,8 @@ class SegmentFilter:
     Attributes
     ----------
     A, B, C : ndarray
-        ``xf+ = A xf + B y``, ``zf = C xf``.
+        ``xf+ = A xf + B y``, ``zf = C xf``; of the order of the plant, less the states that are
+        sums of others.
     bound : float
         Norm, or standard deviation, that the programme claims for the whole segment.
     status : str
@@ -125,16 +126,16 @@ def segment_filter(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Frame:
-    """The segment in units in which states and errors are of size one."""
+    """The segment in states that are of size one and independent, without those that are none.
 
-    stays: tuple[FloatArray, FloatArray]  # of the states, from scaled states
-    errs: tuple[FloatArray, FloatArray]  # the same, read in the units of the errors
-    drive: FloatArray
-    drive_errs: FloatArray
+    The errors of these states are ``basis`` times errors of size one.
+    """
+
+    ends: tuple[FloatArray, FloatArray]
+    B: FloatArray
     C: FloatArray
     D: FloatArray
     L: FloatArray
-    change: FloatArray  # from scaled states to scaled errors
     basis: FloatArray
     inverse: FloatArray
     sensor_scale: FloatArray
@@ -148,28 +149,22 @@ class _Frame:
         scale: float,
     ) -> _Frame:
         states = stationary_covariance((ends[0] + ends[1]) / 2, problem.Q)
-        wide, narrow = _square_coordinates(states)
-        basis, inverse = _square_coordinates(coordinates)
+        wide, narrow = identity_coordinates(states)
+        errors = narrow @ coordinates @ narrow.T
+        basis, inverse = identity_coordinates(
+            errors + _RANK * np.trace(errors) * np.eye(len(errors))
+        )
         sensor_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
         return cls(
-            stays=(narrow @ ends[0] @ wide, narrow @ ends[1] @ wide),
-            errs=(inverse @ ends[0] @ wide, inverse @ ends[1] @ wide),
-            drive=narrow @ problem.B,
-            drive_errs=inverse @ problem.B,
+            ends=(narrow @ ends[0] @ wide, narrow @ ends[1] @ wide),
+            B=narrow @ problem.B,
             C=sensor_scale @ problem.C @ wide,
             D=sensor_scale @ problem.D,
             L=problem.L @ wide / scale,
-            change=inverse @ wide,
             basis=basis,
             inverse=inverse,
             sensor_scale=np.asarray(sensor_scale, dtype=np.float64),
         )
-
-
-def _square_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    variances = np.diag(covariance)
-    floor = 1e-12 * float(variances.max())
-    return identity_coordinates(covariance + np.diag(_RANK * np.maximum(variances, floor)))
 
 
 class _Programme:
@@ -188,19 +183,20 @@ class _Programme:
     def inequalities(self, k: int, norm: str, level: Any) -> list[Any]:
         """Matrices that are to be positive: the Bernstein coefficients of index k."""
         f, n = self.frame, len(self.frame.basis)
-        p, outputs = f.drive.shape[1], len(f.L)
+        p, outputs = f.B.shape[1], len(f.L)
         Z, U = _coefficient(self.Z, k), _coefficient(self.U, k)
-        own = _product(self.U, f.stays, k) + self.K @ _coefficient(f.errs, k)
         zero = np.zeros((n, n))
+        own = U + self.K @ f.inverse  # of what drives the states
         G = cp.bmat([[Z, zero], [U, self.K]])
+        after = _product(self.U, f.ends, k) + self.K @ f.inverse @ _coefficient(f.ends, k)
         GA = cp.bmat(
             [
-                [_product(self.Z, f.stays, k), zero],
-                [own + self.KB @ f.C - self.KA @ f.change, self.KA],
+                [_product(self.Z, f.ends, k), zero],
+                [after + self.KB @ f.C - self.KA @ f.inverse, self.KA],
             ]
         )
-        GB = cp.vstack([Z @ f.drive, U @ f.drive + self.K @ f.drive_errs + self.KB @ f.D])
-        C = cp.hstack([f.L - self.output @ f.change, self.output])
+        GB = cp.vstack([Z @ f.B, own @ f.B + self.KB @ f.D])
+        C = cp.hstack([f.L - self.output @ f.inverse, self.output])
         P = cp.Variable((2 * n, 2 * n), symmetric=True)
         slack, none = G + G.T - P, np.zeros((2 * n, outputs))
         if norm == "hinf":

@@ -103,7 +103,9 @@ def spread_plant(
     )
 
 
-def line_frequencies(frequency_hz: float, half_width_hz: float | None, lines: int) -> FloatArray:
+def line_frequencies(
+    frequency_hz: float, half_width_hz: float | None, lines: int, *, name: str = "half_width_hz"
+) -> FloatArray:
     """Mid-points of equal parts of an interval of frequencies.
 
     Raises
@@ -113,7 +115,7 @@ def line_frequencies(frequency_hz: float, half_width_hz: float | None, lines: in
     """
     half = number(
         half_width_hz,
-        "half_width_hz",
+        name,
         above=0,
         below=frequency_hz,
         hint="All frequencies must stay above 0 Hz.",

@@ -163,6 +163,6 @@ class Vibration:
         if not frequency > rate:
             raise ProblemError(
                 f"a vibration that decays at {rate:.6g} Hz (damping times frequency) must have a "
-                f"frequency above that; got {frequency:.6g} Hz. Try a narrower range of frequencies."
+                f"frequency above that; got {frequency:.6g} Hz. Try a narrower range."
             )
         return replace(self, frequency_hz=frequency, damping=rate / frequency)
