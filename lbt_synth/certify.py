@@ -176,26 +176,32 @@ def certify_filter(
     return replace(certificate, checks=tuple(checks))
 
 
-def certify_error(error: StateSpace) -> Certificate:
+def certify_error(
+    error: StateSpace, *, stability: str = "spectral radius of the filter"
+) -> Certificate:
     """Certificate of an estimation error: stability, its variance both ways, its norm both ways.
 
     Parameters
     ----------
     error : StateSpace
         System from w to the error.
+    stability : str, optional
+        Name of the first check.
 
     Returns
     -------
     Certificate
         Passed or not.
     """
-    return _examined(error)[0]
+    return _examined(error, stability)[0]
 
 
-def _examined(error: StateSpace) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
+def _examined(
+    error: StateSpace, stability: str = "spectral radius of the filter"
+) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
     """Certificate of an error, with its norm and covariance if it is stable."""
     radius = error.spectral_radius
-    checks = [_stability("spectral radius of the filter", radius)]
+    checks = [_stability(stability, radius)]
     if not checks[0].passed:
         infinite = frozen(np.full(len(error.C), np.inf))
         return Certificate(checks=tuple(checks), gamma=np.inf, rms_per_output=infinite), None, None

@@ -241,8 +241,15 @@ def test_a_solver_that_fails_or_lies_is_not_believed(plant, monkeypatch):
         A=1.01 * np.eye(4), B=np.ones((4, 1)), C=np.ones((1, 4)), bound=1.0, status="optimal", iterations=1
     )  # fmt: skip
     monkeypatch.setattr("lbt_synth.lmi.segment_filter", lambda *_, **__: unstable)
-    with pytest.raises(lbt.CertificateError, match="spectral radius of the filter"):
+    with pytest.raises(lbt.CertificateError, match="spectral radius of plant and filter"):
         lbt.polytopic(plant, half_width_hz=1.0)
+
+
+def test_a_line_too_narrow_to_be_bounded(made):
+    sharp = lbt_axis_plant(damping=1e-7)
+    interval = FrequencyInterval(plant=sharp, half_width_hz=2.0)
+    with pytest.raises(lbt.NumericalError, match="too narrow a line"):
+        worst_guaranteed(interval, made["h2", 1.0].predictor, "h2")
 
 
 def test_claims_that_do_not_hold(made):

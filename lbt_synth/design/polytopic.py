@@ -185,7 +185,9 @@ def _controller(plant: TipTiltPlant, predictor: Controller) -> Controller:
 
 def _certified(design: PolytopicDesign) -> Certificate:
     interval, norm, predictor = design.interval, design.norm, design.predictor
-    certificate = certify_error(design.error_system())
+    certificate = certify_error(
+        design.error_system(), stability="spectral radius of plant and filter"
+    )
     if not certificate.passed:
         return certificate
     found, _ = worst_found(interval, predictor, norm)

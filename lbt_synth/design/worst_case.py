@@ -103,6 +103,8 @@ def _greatest_variance(interval: FrequencyInterval, estimator: Controller) -> fl
     low, high = interval.coefficients
     curvature = _curvature(interval)
     count = 1 + int(np.ceil((high - low) * np.sqrt(curvature / 4)))
+    if count > _MOST_PARTS:
+        raise _unbounded()
     points = np.linspace(low, high, count + 1)
     values = [variance(float(a)) for a in points]
     best = max(values)
@@ -124,9 +126,13 @@ def _greatest_variance(interval: FrequencyInterval, estimator: Controller) -> fl
         best = max(best, at_middle)
         heapq.heapreplace(parts, part(a, middle, at_a, at_middle))
         heapq.heappush(parts, part(middle, b, at_middle, at_b))
-    raise NumericalError(
-        f"the variance over the interval is not bounded to {_GAP:g} with {_MOST_PARTS} parts. Try "
-        "a narrower interval.",
+    raise _unbounded()
+
+
+def _unbounded() -> NumericalError:
+    return NumericalError(
+        f"the variance over the interval is not bounded to {_GAP:g} with {_MOST_PARTS} parts: the "
+        "vibration is too narrow a line for it. Try a narrower interval, or more damping.",
         status="branch and bound",
     )
 
