@@ -15,7 +15,7 @@ the error has a norm below gamma on the whole segment if for some P(t), quadrati
 which is linear in P, Z, U, K and the products ``K Af``, ``K Bf`` and Cf. Z and U multiply
 nothing of the filter, so they may follow the parameter; K may not. The entries are
 polynomials of degree two in t, and their three Bernstein coefficients are asked to be
-positive definite. For the variance the last two rows and columns are split off.
+positive definite. For the variance the third row and column become an inequality of their own.
 """
 
 from __future__ import annotations
