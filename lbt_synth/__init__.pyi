@@ -6,8 +6,10 @@ from .certify import certify_loop as certify_loop
 from .config import Config as Config
 from .config import load_config as load_config
 from .design import Design as Design
+from .design import EstimatorDesign as EstimatorDesign
 from .design import FilterDesign as FilterDesign
 from .design import IntegratorDesign as IntegratorDesign
+from .design import PolytopicDesign as PolytopicDesign
 from .design import ShapedDesign as ShapedDesign
 from .design import SolverReport as SolverReport
 from .design import central as central
@@ -17,6 +19,7 @@ from .design import integrator_gain_limit as integrator_gain_limit
 from .design import kalman as kalman
 from .design import mixed as mixed
 from .design import optimal_integrator as optimal_integrator
+from .design import polytopic as polytopic
 from .design import robust as robust
 from .design import shape as shape
 from .distance import LimitRow as LimitRow
@@ -76,6 +79,7 @@ from .models import le_roux_pole as le_roux_pole
 from .models import nm_per_mas as nm_per_mas
 from .models import pyramid_tilt_noise_nm as pyramid_tilt_noise_nm
 from .models import retuned_plant as retuned_plant
+from .models import spread_plant as spread_plant
 from .models import tip_tilt_plant as tip_tilt_plant
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.lyapunov import lyapunov_residual, stationary_covariance
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.problem import EstimationProblem
-from lbt_synth.norms import hinf_norm, largest_singular_values
+from lbt_synth.norms import HinfNorm, hinf_norm, largest_singular_values
 from lbt_synth.riccati import kalman_riccati
 from lbt_synth.statespace import Controller, StateSpace
 from lbt_synth.validation import FloatArray, frozen, number
@@ -147,38 +147,11 @@ def certify_filter(
     >>> lbt.certify_filter(p, [[0.7]], least_variance=True).passed
     False
     """
-    error = problem.error_system(gain_predictor)
+    certificate, norm, P = _examined(problem.error_system(gain_predictor))
+    if norm is None or P is None:
+        return certificate
     gain = np.asarray(gain_predictor)
-    radius = error.spectral_radius
-    checks = [_stability("spectral radius of the filter", radius)]
-    outputs = problem.L.shape[0]
-    if not checks[0].passed:
-        return Certificate(
-            checks=tuple(checks), gamma=np.inf, rms_per_output=frozen(np.full(outputs, np.inf))
-        )
-    drive = error.B @ error.B.T
-    P = stationary_covariance(error.A, drive)
-    checks.append(
-        Check(
-            name="residual of the Lyapunov equation",
-            value=lyapunov_residual(error.A, drive, P),
-            limit=RESIDUAL_TOLERANCE,
-            method="relative, 1-norm",
-        )
-    )
-    variances = np.diag(problem.L @ P @ problem.L.T)
-    checks.append(_variance_both_ways(error, float(variances.sum())))
-    norm = hinf_norm(error)
-    grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
-    excess = float(np.max(largest_singular_values(error, grid))) / max(norm.upper, 1e-300) - 1
-    checks.append(
-        Check(
-            name="singular values above the norm",
-            value=excess,
-            limit=NORM_TOLERANCE,
-            method=f"{_GRID} frequencies against level sets",
-        )
-    )
+    checks = list(certificate.checks)
     if gamma is not None:
         checks.append(
             Check(
@@ -200,11 +173,67 @@ def certify_filter(
                 method="gain recomputed from the Lyapunov covariance",
             )
         )
-    return Certificate(
+    return replace(certificate, checks=tuple(checks))
+
+
+def certify_error(
+    error: StateSpace, *, stability: str = "spectral radius of the filter"
+) -> Certificate:
+    """Certificate of an estimation error: stability, its variance both ways, its norm both ways.
+
+    Parameters
+    ----------
+    error : StateSpace
+        System from w to the error.
+    stability : str, optional
+        Name of the first check.
+
+    Returns
+    -------
+    Certificate
+        Passed or not.
+    """
+    return _examined(error, stability)[0]
+
+
+def _examined(
+    error: StateSpace, stability: str = "spectral radius of the filter"
+) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
+    """Certificate of an error, with its norm and covariance if it is stable."""
+    radius = error.spectral_radius
+    checks = [_stability(stability, radius)]
+    if not checks[0].passed:
+        infinite = frozen(np.full(len(error.C), np.inf))
+        return Certificate(checks=tuple(checks), gamma=np.inf, rms_per_output=infinite), None, None
+    drive = error.B @ error.B.T
+    P = stationary_covariance(error.A, drive)
+    checks.append(
+        Check(
+            name="residual of the Lyapunov equation",
+            value=lyapunov_residual(error.A, drive, P),
+            limit=RESIDUAL_TOLERANCE,
+            method="relative, 1-norm",
+        )
+    )
+    variances = np.diag(error.C @ P @ error.C.T)
+    checks.append(_variance_both_ways(error, float(variances.sum())))
+    norm = hinf_norm(error)
+    grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
+    excess = float(np.max(largest_singular_values(error, grid))) / max(norm.upper, 1e-300) - 1
+    checks.append(
+        Check(
+            name="singular values above the norm",
+            value=excess,
+            limit=NORM_TOLERANCE,
+            method=f"{_GRID} frequencies against level sets",
+        )
+    )
+    certificate = Certificate(
         checks=tuple(checks),
         gamma=norm.value,
         rms_per_output=frozen(np.sqrt(np.maximum(variances, 0))),
     )
+    return certificate, norm, P
 
 
 def _variance_both_ways(error: StateSpace, variance: float) -> Check:

@@ -11,7 +11,7 @@ a peak, and a spurious angle does no harm.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -86,29 +86,18 @@ def hinf_norm(system: Any) -> HinfNorm:
             f"{radius:.9g}. An unstable system has no finite norm.",
             spectral_radius=radius,
         )
-    G = G.balanced()
-    peak, angle = _climbed(
-        seeds=_folded(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)])),
-        largest=lambda angles: _largest(G, angles),
-        proposed=lambda level: _folded(_level_angles(G, level)),
-    )
-    return HinfNorm(
-        value=peak,
-        lower=peak,
-        upper=peak * (1 + 2 * _TOLERANCE),
-        peak_frequency_hz=angle / (2 * np.pi * G.dt_s),
-    )
+    return _peak(G.balanced(), 0.0, np.pi)
 
 
 def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
-    """Largest singular value of a stable system over a band of frequencies, its ends included.
+    """Largest singular value over a band of frequencies; poles outside the band do no harm.
 
     Parameters
     ----------
     system : StateSpace
-        The system; not checked for stability.
+        The system, stable or not, without a pole on the band.
     low_hz, high_hz : float
-        Ends of the band [Hz], within 0 and the Nyquist frequency.
+        Ends of the band, within [0, Nyquist] [Hz].
 
     Returns
     -------
@@ -124,22 +113,29 @@ def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
     --------
     >>> import lbt_synth as lbt
     >>> from lbt_synth.norms import band_norm
-    >>> lag = lbt.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
-    >>> band_norm(lag, 0.1, 0.2).peak_frequency_hz
-    0.1
+    >>> walk = lbt.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> round(float(band_norm(walk, 1 / 6, 0.5)), 9)
+    1.0
     """
-    G = system.balanced()
-    low, high = (2 * np.pi * f * G.dt_s for f in (low_hz, high_hz))
+    low, high = (2 * np.pi * f * system.dt_s for f in (low_hz, high_hz))
+    found = _peak(system.balanced(), low, high)
+    # an end of the band, there and back, must not fall outside it
+    return replace(found, peak_frequency_hz=min(max(found.peak_frequency_hz, low_hz), high_hz))
+
+
+def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
+    """Largest singular value of a balanced system between two angles, by level sets."""
+    seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
     peak, angle = _climbed(
-        seeds=_within(np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)]), low, high),
+        seeds=_folded(seeds, low, high),
         largest=lambda angles: _largest(G, angles),
-        proposed=lambda level: _within(_level_angles(G, level), low, high),
+        proposed=lambda level: _folded(_level_angles(G, level), low, high),
     )
     return HinfNorm(
         value=peak,
         lower=peak,
         upper=peak * (1 + 2 * _TOLERANCE),
-        peak_frequency_hz=float(np.clip(angle / (2 * np.pi * G.dt_s), low_hz, high_hz)),
+        peak_frequency_hz=angle / (2 * np.pi * G.dt_s),
     )
 
 
@@ -183,9 +179,9 @@ def largest_real_part(system: StateSpace) -> float:
         return float(values[best]), float(angles[best])
 
     peak, _ = _climbed(
-        seeds=_folded(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)])),
+        seeds=_folded(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)]), 0.0, np.pi),
         largest=largest,
-        proposed=lambda level: _folded(_real_part_angles(moved, level)),
+        proposed=lambda level: _folded(_real_part_angles(moved, level), 0.0, np.pi),
     )
     return peak * (1 + 2 * _TOLERANCE) - 2 * size
 
@@ -273,17 +269,10 @@ def spectral_norms(matrices: ComplexArray) -> FloatArray:
     return np.asarray(scale * np.sqrt(np.maximum(largest, 0.0)), dtype=np.float64)
 
 
-def _folded(angles: FloatArray) -> FloatArray:
-    """Sorted distinct angles in [0, pi], the ends included."""
+def _folded(angles: FloatArray, low: float, high: float) -> FloatArray:
+    """Sorted distinct angles between two of [0, pi], these included."""
     inside = np.abs(np.mod(angles + np.pi, 2 * np.pi) - np.pi)
-    return np.unique(np.concatenate([inside, [0.0, np.pi]]))
-
-
-def _within(angles: FloatArray, low: float, high: float) -> FloatArray:
-    """Sorted distinct angles in [low, high], the ends included."""
-    inside = _folded(angles)
-    inside = inside[(inside > low) & (inside < high)]
-    return np.unique(np.concatenate([inside, [low, high]]))
+    return np.unique(np.concatenate([np.clip(inside, low, high), [low, high]]))
 
 
 def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:

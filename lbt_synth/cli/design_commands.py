@@ -13,14 +13,17 @@ from lbt_synth.cli.output import Report, TableText, working
 from lbt_synth.config import Config, load_config, robust_design
 from lbt_synth.design import (
     Design,
+    EstimatorDesign,
     FilterDesign,
     IntegratorDesign,
+    PolytopicDesign,
     ShapedDesign,
     hinf,
     integrator,
     kalman,
     mixed,
     optimal_integrator,
+    polytopic,
 )
 from lbt_synth.distance import model_distance, shaped_distance
 from lbt_synth.errors import ProblemError
@@ -33,6 +36,7 @@ _ROUTES = {
     "kalman": ("riccati", "sdp"),
     "hinf": ("lmi", "riccati"),
     "mixed": (),
+    "polytopic": (),
     "integrator": (),
     "robust": (),
 }
@@ -41,6 +45,8 @@ _OWNERS = {
     "gamma_ratio": ("hinf", "mixed"),
     "rms": ("mixed",),
     "taps": ("mixed",),
+    "norm": ("polytopic",),
+    "half_width_hz": ("polytopic",),
     "gain": ("integrator",),
 }
 
@@ -54,7 +60,7 @@ def design(arguments: Namespace) -> Report:
     path = save_gain(arguments.output, made)
     report = _description(made)
     report.data["file"] = str(path)
-    if made.method != arguments.method:  # a mixed filter may be one of these
+    if arguments.method == "mixed" and made.method != "mixed":
         name = {"kalman": "Kalman filter", "hinf": "filter of the least norm"}[made.method]
         report.notes.append(
             f"note: the bound leaves no better choice than the {name}, which is it."
@@ -76,6 +82,11 @@ def _refuse_foreign_options(arguments: Namespace) -> None:
                 f"--{option.replace('_', '-')} goes with --method {' or '.join(owners)}; "
                 f"got --method {method}."
             )
+    if method == "polytopic" and arguments.half_width_hz is None:
+        raise ProblemError(
+            "--method polytopic needs the half width of the interval of frequencies; try "
+            "--half-width-hz 1."
+        )
     if method in ("integrator", "robust") and arguments.horizon != 1:
         raise ProblemError(
             f"--method {method} takes no horizon; set loop.delay_frames in the configuration "
@@ -92,6 +103,13 @@ def _synthesise(config: Config, arguments: Namespace) -> Design:
         return optimal_integrator(config.hardware, config.truth)
     if arguments.method == "robust":
         return robust_design(config)
+    if arguments.method == "polytopic":
+        return polytopic(
+            config.plant,
+            half_width_hz=arguments.half_width_hz,
+            norm=arguments.norm or "hinf",
+            horizon=arguments.horizon,
+        )
     ratio = arguments.gamma_ratio
     if arguments.gamma is None and ratio is None and arguments.rms is None:
         ratio = config.settings.design.gamma_ratio
@@ -125,6 +143,8 @@ def show(arguments: Namespace) -> Report:
                 "gain_predictor": loaded.gain_predictor,
                 "gain_filter": loaded.gain_filter,
             }
+        if isinstance(loaded, PolytopicDesign):
+            matrices |= {f"predictor_{name}": getattr(loaded.predictor, name) for name in "ABC"}
         report.data["matrices"] = matrices
         with np.printoptions(precision=8, linewidth=160, suppress=False):
             report.notes += [f"{name} =\n{value}" for name, value in matrices.items()]
@@ -165,11 +185,15 @@ def _description(made: Design) -> Report:
         "checks": _check_data(made.certificate),
     }
     unit = "nm" if made.hardware is not None else ""
-    if isinstance(made, FilterDesign):
+    if isinstance(made, EstimatorDesign):
         facts += [
             ("estimation error, rms", made.rms, unit),
             ("estimation error, H-infinity norm", made.gamma, unit),
         ]
+        data |= {"rms": made.rms, "gamma": made.gamma}
+    if isinstance(made, PolytopicDesign):
+        _describe_interval(made, facts, data)
+    if isinstance(made, FilterDesign):
         if made.hardware is not None:
             limit_nm, above = model_distance(made)
             facts += [
@@ -178,8 +202,6 @@ def _description(made: Design) -> Report:
             ]
             data |= {"limit_nm": limit_nm, "above_limit_percent": above}
         data |= {
-            "rms": made.rms,
-            "gamma": made.gamma,
             "gamma_requested": made.gamma_requested,
             "gamma_least": made.gamma_least,
             "gamma_infeasible": made.gamma_infeasible,
@@ -257,6 +279,32 @@ def _description(made: Design) -> Report:
             "commands grow. Reset it whenever the loop opens."
         )
     return Report(data=data, tables=tables, notes=notes)
+
+
+def _describe_interval(
+    made: PolytopicDesign, facts: list[tuple[str, Any, str]], data: dict[str, Any]
+) -> None:
+    """Add what a design guarantees over its interval, beside the worst that was found."""
+    what = {"hinf": "H-infinity norm", "h2": "rms"}[made.norm]
+    ratio = made.bound_guaranteed / made.worst_achieved
+    facts += [
+        ("interval of frequencies, from", made.interval.low_hz, "Hz"),
+        ("interval of frequencies, to", made.interval.high_hz, "Hz"),
+        (f"{what} on the interval, guaranteed", f"{made.bound_guaranteed:.9g}", "nm"),
+        (f"{what} on the interval, worst found", f"{made.worst_achieved:.9g}", "nm"),
+        ("  guaranteed over found", f"{ratio:.6f}", ""),
+        ("  found at", f"{made.worst_frequency_hz:.6g}", "Hz"),
+        ("  bound of the programme", f"{made.bound_programme:.9g}", "nm"),
+    ]
+    data |= {
+        "half_width_hz": made.half_width_hz,
+        "norm": made.norm,
+        "bound_guaranteed": made.bound_guaranteed,
+        "worst_achieved": made.worst_achieved,
+        "worst_frequency_hz": made.worst_frequency_hz,
+        "bound_programme": made.bound_programme,
+        "guaranteed_over_found": ratio,
+    }
 
 
 def _digits(level: float | None) -> str:

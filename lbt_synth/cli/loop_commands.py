@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.cli.output import Report, TableText, working
 from lbt_synth.config import Config, load_config
-from lbt_synth.design import Design, FilterDesign
+from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.distance import above_percent, limit_or_nan
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.files import require_writable
@@ -32,7 +32,7 @@ def sigma(arguments: Namespace) -> Report:
     rows, data = [], {}
     for name, design in designs.items():
         entry: dict[str, object] = {"method": design.method}
-        if isinstance(design, FilterDesign):
+        if isinstance(design, EstimatorDesign):
             entry |= {"gamma": design.gamma, "rms": design.rms}
         if design.hardware is not None:
             loop = close_loop(design.hardware, design.controller, sensor_gain=arguments.sensor_gain)

@@ -41,7 +41,9 @@ def build_parser() -> argparse.ArgumentParser:
     design = command("design", "Design a controller and write its gain file")
     design.add_argument("config", help=config_help)
     design.add_argument(
-        "--method", choices=("kalman", "hinf", "mixed", "robust", "integrator"), required=True
+        "--method",
+        choices=("kalman", "hinf", "mixed", "robust", "polytopic", "integrator"),
+        required=True,
     )
     design.add_argument(
         "--route",
@@ -65,6 +67,17 @@ def build_parser() -> argparse.ArgumentParser:
         "--taps",
         type=int,
         help="mixed: past innovations that the filter weighs, 1 to 64 (default 16)",
+    )
+    design.add_argument(
+        "--norm",
+        choices=("hinf", "h2"),
+        help="polytopic: what is made least over the interval, the H-infinity norm (default) or "
+        "the rms",
+    )
+    design.add_argument(
+        "--half-width-hz",
+        type=float,
+        help="polytopic: half width of the interval of vibration frequencies [Hz]",
     )
     design.add_argument(
         "--horizon",

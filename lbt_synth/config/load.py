@@ -32,6 +32,7 @@ from lbt_synth.models import (
     pyramid_tilt_noise_nm,
     tip_tilt_plant,
 )
+from lbt_synth.models.prior import line_frequencies, spread_lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -253,15 +254,14 @@ def _plant(settings: FileSection, atmosphere: Atmosphere, noise_nm: float) -> Ti
         for i, section in enumerate(model.vibrations):
             key = f"model.vibrations[{i}].frequency_hz"
             _below_nyquist(section.frequency_hz, loop.frame_rate_hz, key)
-            lines += [
-                Vibration(
+            for direction in _directions(section):
+                line = Vibration(
                     frequency_hz=section.frequency_hz,
                     damping=section.damping,
                     rms_nm=rms_nm(section, settings),
                     direction=direction,
                 )
-                for direction in _directions(section)
-            ]
+                lines += _spread(line, section, loop.frame_rate_hz, i)
     return tip_tilt_plant(
         frame_rate_hz=loop.frame_rate_hz,
         delay_frames=loop.delay_frames,
@@ -272,6 +272,24 @@ def _plant(settings: FileSection, atmosphere: Atmosphere, noise_nm: float) -> Ti
         influence_matrix=settings.mirror.influence_matrix,
         sensor_gain=model.sensor_gain,
     )
+
+
+def _spread(
+    line: Vibration, section: VibrationSection, frame_rate_hz: float, index: int
+) -> list[Vibration]:
+    """Return the lines that stand for a vibration of the model."""
+    if section.spread_hz is None:
+        return [line]
+    key = f"model.vibrations[{index}].spread_hz"
+    try:
+        frequencies = line_frequencies(
+            line.frequency_hz, section.spread_hz, section.lines or 5, name="the half width"
+        )
+        made = spread_lines(line, frequencies)
+        made[-1].ar_model(frame_rate_hz)
+    except ProblemError as error:
+        raise ConfigError(f"{key}: {error}", path=key) from error
+    return made
 
 
 def _truth(

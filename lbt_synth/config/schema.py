@@ -88,9 +88,17 @@ class _Line(_Section):
 
 
 class VibrationSection(_Line):
-    """A vibration of the model."""
+    """A vibration of the model; ``spread_hz`` makes several ``lines`` of it."""
 
     damping: Damping
+    spread_hz: Positive | None = None
+    lines: Annotated[int, Field(ge=1, le=64)] | None = None
+
+    @model_validator(mode="after")
+    def _lines_of_a_spread(self) -> VibrationSection:
+        if self.lines is not None and self.spread_hz is None:
+            raise ValueError("lines goes with spread_hz, and only with it")
+        return self
 
 
 class TrueVibrationSection(_Line):

@@ -5,15 +5,24 @@ from lbt_synth.design.hinf import hinf
 from lbt_synth.design.integrator import integrator, integrator_gain_limit, optimal_integrator
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.mixed import mixed
-from lbt_synth.design.result import Design, FilterDesign, IntegratorDesign, SolverReport
+from lbt_synth.design.polytopic import PolytopicDesign, polytopic
+from lbt_synth.design.result import (
+    Design,
+    EstimatorDesign,
+    FilterDesign,
+    IntegratorDesign,
+    SolverReport,
+)
 from lbt_synth.design.robust import robust
 from lbt_synth.design.shape import shape
 from lbt_synth.design.shaped import ShapedDesign
 
 __all__ = [
     "Design",
+    "EstimatorDesign",
     "FilterDesign",
     "IntegratorDesign",
+    "PolytopicDesign",
     "ShapedDesign",
     "SolverReport",
     "central",
@@ -23,6 +32,7 @@ __all__ = [
     "kalman",
     "mixed",
     "optimal_integrator",
+    "polytopic",
     "robust",
     "shape",
 ]

@@ -21,7 +21,7 @@ from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import TipTiltPlant
 from lbt_synth.models.problem import EstimationProblem
-from lbt_synth.statespace import Controller
+from lbt_synth.statespace import Controller, StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray
 from lbt_synth.witness import Witness
 
@@ -52,7 +52,7 @@ class Design:
     Attributes
     ----------
     method : str
-        "kalman", "hinf" or "integrator".
+        "kalman", "hinf", "mixed", "polytopic-hinf", "polytopic-h2" or "integrator".
     controller : Controller
         From y(k) to u(k), the known input included (new-state form).
     certificate : Certificate
@@ -92,7 +92,47 @@ class Design:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FilterDesign(Design):
+class EstimatorDesign(Design):
+    """A controller made of an estimator of z.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+        The problem (a plant, for a telescope).
+    """
+
+    problem: EstimationProblem
+
+    @property
+    def gamma(self) -> float:
+        """Achieved H-infinity norm of the estimation error, recomputed."""
+        return self.certificate.gamma
+
+    @property
+    def rms(self) -> float:
+        """Standard deviation of the estimation error over all outputs, recomputed."""
+        return self.certificate.rms
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the design is for; None for a bare estimation problem."""
+        if isinstance(self.problem, TipTiltPlant | FullStatePlant):
+            return self.problem.hardware
+        return None
+
+    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
+        """System from w to the estimation error.
+
+        Parameters
+        ----------
+        problem : EstimationProblem, optional
+            Problem with other disturbances; the design's own by default.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FilterDesign(EstimatorDesign):
     """A Kalman or H-infinity filter, and the controller made of it.
 
     Attributes
@@ -115,7 +155,6 @@ class FilterDesign(Design):
         The proof of that level: disturbances that no measurement shows.
     """
 
-    problem: EstimationProblem
     gain_predictor: FloatArray
     gain_filter: FloatArray
     gamma_requested: float | None = None
@@ -124,22 +163,20 @@ class FilterDesign(Design):
     witness: Witness | None = None
     rms_requested: float | None = None
 
-    @property
-    def gamma(self) -> float:
-        """Achieved H-infinity norm of the estimation error, recomputed."""
-        return self.certificate.gamma
+    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
+        """System from w to the estimation error.
 
-    @property
-    def rms(self) -> float:
-        """Standard deviation of the estimation error over all outputs, recomputed."""
-        return self.certificate.rms
+        Parameters
+        ----------
+        problem : EstimationProblem, optional
+            Problem with other disturbances; the design's own by default.
 
-    @property
-    def hardware(self) -> LoopHardware | None:
-        """Loop that the design is for; None for a bare estimation problem."""
-        if isinstance(self.problem, TipTiltPlant | FullStatePlant):
-            return self.problem.hardware
-        return None
+        Returns
+        -------
+        StateSpace
+            The system.
+        """
+        return (problem or self.problem).error_system(self.gain_predictor)
 
     @property
     def estimator(self) -> Controller:
@@ -149,7 +186,7 @@ class FilterDesign(Design):
     @property
     def poles(self) -> ComplexArray:
         """Poles of the estimation error, (n,)."""
-        return self.problem.error_system(self.gain_predictor).poles
+        return self.error_system().poles
 
     def recertified(self) -> Certificate:
         """Compute the certificate anew from the matrices.

@@ -11,8 +11,10 @@ import lbt_synth
 from lbt_synth.certify import Certificate, Check
 from lbt_synth.design import (
     Design,
+    EstimatorDesign,
     FilterDesign,
     IntegratorDesign,
+    PolytopicDesign,
     ShapedDesign,
     SolverReport,
 )
@@ -26,7 +28,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.shaping.record import packed, unpacked
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, choice, frozen, number
 from lbt_synth.witness import Witness
 
 CONVENTION = (
@@ -38,6 +40,7 @@ CONVENTION = (
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
+_SIZES = ("bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme")
 _PROBLEMS: dict[str, type[EstimationProblem]] = {
     "problem": EstimationProblem,
     "plant": TipTiltPlant,
@@ -92,6 +95,12 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
                 "WITNESS_X": design.witness.states,
                 "WITNESS_W": design.witness.disturbances,
             }
+    if isinstance(design, PolytopicDesign):
+        arrays |= {f"PREDICTOR_{name}": getattr(design.predictor, name) for name in "ABC"}
+        meta["interval"] = {
+            name: getattr(design, name) for name in ("half_width_hz", "norm", *_SIZES)
+        }
+    if isinstance(design, EstimatorDesign):
         _pack_problem(design.problem, arrays, meta)
     return arrays, meta
 
@@ -111,6 +120,8 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
     if "shaped" in meta:
         return _unpack_shaped(arrays, meta, common)
     problem = _unpack_problem(arrays, meta)
+    if "interval" in meta:
+        return _unpack_polytopic(common, problem, arrays, meta["interval"])
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
     for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
         if arrays[name].shape != rows_cols:
@@ -152,6 +163,31 @@ def _unpack_shaped(arrays: Arrays, meta: Meta, common: Meta) -> ShapedDesign:
         long_objective_nm=tuple(float(v) for v in shaped["long_objective_nm"]),
         long_functions=int(shaped["long_functions"]),
     )
+
+
+def _unpack_polytopic(
+    common: dict[str, Any], problem: EstimationProblem, arrays: Arrays, interval: Meta
+) -> PolytopicDesign:
+    if not isinstance(problem, TipTiltPlant):
+        raise TypeError("an interval of frequencies needs a plant")
+    if common["method"] != f"polytopic-{interval['norm']}":
+        raise ValueError(f"the method {common['method']} is not of the norm {interval['norm']}")
+    sizes: dict[str, Any] = {name: number(interval[name], name, above=0) for name in _SIZES}
+    design = PolytopicDesign(
+        **common,
+        **sizes,
+        problem=problem,
+        predictor=Controller(
+            **{name: arrays[f"PREDICTOR_{name}"] for name in "ABC"},
+            D=np.zeros((len(problem.L), len(problem.C))),
+            dt_s=problem.dt_s,
+        ),
+        norm=choice(interval["norm"], "norm", ("hinf", "h2")),
+        half_width_hz=number(interval["half_width_hz"], "half_width_hz", at_least=0),
+    )
+    # an interval that does not fit the plant is refused here, not when it is verified
+    design.interval.coefficient(design.worst_frequency_hz)
+    return design
 
 
 def _pack_problem(problem: EstimationProblem, arrays: Arrays, meta: Meta) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.design import Design, FilterDesign
+from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files import write_atomically
 from lbt_synth.gainfile import formats
@@ -197,7 +197,7 @@ def _header(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
     if design.hardware is not None:
         cards["RATE_HZ"] = (design.hardware.frame_rate_hz, "[Hz] frame rate")
         cards["DELAY"] = (design.hardware.delay_frames, "[frames] total delay")
-    if isinstance(design, FilterDesign):
+    if isinstance(design, EstimatorDesign):
         cards["RMS"] = (design.rms, "estimation error, standard deviation")
         cards["GAMMA"] = (design.gamma, "estimation error, H-infinity norm")
     cards["SHA256"] = (meta["digest"], "")

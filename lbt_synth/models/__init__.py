@@ -5,6 +5,7 @@ from lbt_synth.models.atmosphere import Atmosphere
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import TipTiltPlant, retuned_plant, tip_tilt_plant
+from lbt_synth.models.prior import spread_plant
 from lbt_synth.models.problem import EstimationProblem
 from lbt_synth.models.sensor import illuminated_subapertures, pyramid_tilt_noise_nm
 from lbt_synth.models.truth import SinusoidalVibration, Spectrum, TabulatedSpectrum, Truth
@@ -31,5 +32,6 @@ __all__ = [
     "nm_per_mas",
     "pyramid_tilt_noise_nm",
     "retuned_plant",
+    "spread_plant",
     "tip_tilt_plant",
 ]

@@ -129,3 +129,40 @@ class Vibration:
         drive = self.ar_model(frame_rate_hz).driving_rms_nm
         ratio = drive / moved.ar_model(frame_rate_hz).driving_rms_nm
         return replace(moved, rms_nm=self.rms_nm * ratio)
+
+    def moved(self, frequency_hz: float) -> Vibration:
+        """Return this vibration at another frequency, with the same rms and the same decay.
+
+        The decay rate is damping times frequency, so the coefficient a2 of the AR2 process
+        stays what it is.
+
+        Parameters
+        ----------
+        frequency_hz : float
+            New frequency [Hz].
+
+        Returns
+        -------
+        Vibration
+            The vibration at its new frequency.
+
+        Raises
+        ------
+        ProblemError
+            If the frequency is not above the decay rate (an oscillation no more).
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
+        >>> line.moved(25).damping
+        0.008
+        """
+        rate = self.damping * self.frequency_hz
+        frequency = number(frequency_hz, "frequency_hz")
+        if not frequency > rate:
+            raise ProblemError(
+                f"a vibration that decays at {rate:.6g} Hz (damping times frequency) must have a "
+                f"frequency above that; got {frequency:.6g} Hz. Try a narrower range."
+            )
+        return replace(self, frequency_hz=frequency, damping=rate / frequency)

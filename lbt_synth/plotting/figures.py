@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.design import Design, FilterDesign
+from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.models import TipTiltPlant
@@ -72,7 +72,7 @@ def sigma_figure(
     if not designs:
         raise ProblemError("a sigma plot needs at least one design; got none.")
     lines_hz = _vibration_frequencies(designs.values())
-    estimators = {k: d for k, d in designs.items() if isinstance(d, FilterDesign)}
+    estimators = {k: d for k, d in designs.items() if isinstance(d, EstimatorDesign)}
     loops = {
         name: close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
         for name, design in designs.items()
@@ -89,7 +89,7 @@ def sigma_figure(
             for name, design in estimators.items():
                 problem = design.problem
                 problem = problem.with_unit_weights() if unit_weights else problem
-                system = problem.error_system(design.gain_predictor)
+                system = design.error_system(problem)
                 grid = frequency_grid(1 / system.dt_s, lines_hz)
                 axis.loglog(grid, largest_singular_values(system, grid), label=name, **styles[name])
             physical = all(design.hardware is not None for design in estimators.values())
@@ -300,7 +300,7 @@ def _vibration_frequencies(designs: Any) -> list[float]:
     found = {
         line.frequency_hz
         for design in designs
-        if isinstance(design, FilterDesign) and isinstance(design.problem, TipTiltPlant)
+        if isinstance(design, EstimatorDesign) and isinstance(design.problem, TipTiltPlant)
         for line in design.problem.vibrations
     }
     return sorted(found)

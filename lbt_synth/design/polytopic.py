@@ -1,0 +1,350 @@
+"""One filter for all plants of an interval of vibration frequencies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from lbt_synth.certify import NORM_TOLERANCE, Certificate, Check, certify_error, certify_loop
+from lbt_synth.design.result import EstimatorDesign, SolverReport
+from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
+from lbt_synth.loop import youla_controller
+from lbt_synth.models.interval import FrequencyInterval, error_system
+from lbt_synth.models.plant import TipTiltPlant, tip_tilt_plant
+from lbt_synth.models.problem import EstimationProblem
+from lbt_synth.riccati import kalman_riccati
+from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.validation import ComplexArray, FloatArray, choice
+
+_NORMS = ("hinf", "h2")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PolytopicDesign(EstimatorDesign):
+    """A filter with a bound on its error over an interval of vibration frequencies.
+
+    ``gamma``, ``rms`` and the first checks of the certificate are those of the plant at the
+    centre.
+
+    Attributes
+    ----------
+    problem : TipTiltPlant
+        The plant at the centre of the interval.
+    predictor : Controller
+        From the pseudo-open-loop measurement ybar(k) to the estimate of z(k+1).
+    half_width_hz : float
+        Half width of the interval of frequencies [Hz].
+    norm : str
+        "hinf" or "h2": what is bounded, the H-infinity norm or the standard deviation.
+    bound_guaranteed : float
+        The error is not above it anywhere on the interval.
+    worst_achieved : float
+        The worst error that a search over the interval found.
+    worst_frequency_hz : float
+        Frequency at which it was found [Hz].
+    bound_programme : float
+        The bound that the semidefinite programme gave; the solver's word, no evidence.
+    """
+
+    problem: TipTiltPlant
+    predictor: Controller
+    half_width_hz: float
+    norm: str
+    bound_guaranteed: float
+    worst_achieved: float
+    worst_frequency_hz: float
+    bound_programme: float
+
+    @property
+    def interval(self) -> FrequencyInterval:
+        """The plants of the interval."""
+        return FrequencyInterval(plant=self.problem, half_width_hz=self.half_width_hz)
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles of the filter, (n,)."""
+        return np.linalg.eigvals(self.predictor.A).astype(np.complex128)
+
+    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
+        """System from w to the estimation error.
+
+        Parameters
+        ----------
+        problem : EstimationProblem, optional
+            Problem with other disturbances, or another plant; that at the centre by default.
+
+        Returns
+        -------
+        StateSpace
+            With the states of the plant and of the filter.
+        """
+        return error_system(problem or self.problem, self.predictor)
+
+    def recertified(self) -> Certificate:
+        """Compute the certificate anew from the matrices.
+
+        Returns
+        -------
+        Certificate
+            Passed or not.
+        """
+        return _certified(self)
+
+
+def polytopic(
+    plant: TipTiltPlant, *, half_width_hz: float, norm: str = "hinf", horizon: int = 1
+) -> PolytopicDesign:
+    """Design one filter for all vibration frequencies of an interval.
+
+    The filter has the order of the plant. Its bound over the whole interval is made least by
+    linear matrix inequalities with Lyapunov matrices that follow the frequency, and then
+    proved anew, without a solver. The frequency is unknown and constant; the decay rate
+    (damping times frequency) and the driving noise are those of the plant.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant at the centre. Its vibrations share frequency and damping.
+    half_width_hz : float
+        Half width of the interval [Hz]; 0 for the plant alone.
+    norm : {"hinf", "h2"}, optional
+        What is made least over the interval: the H-infinity norm of the error, or its
+        standard deviation.
+    horizon : int, optional
+        Frames from the newest measurement to the estimate, as ``plant.ahead``.
+
+    Returns
+    -------
+    PolytopicDesign
+        Certified design.
+
+    Raises
+    ------
+    ProblemError
+        If the plant has no vibration or several frequencies, or a value is out of its range.
+    NumericalError
+        If the solver fails.
+    CertificateError
+        If the design does not pass its checks.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
+    ...                            noise_nm=15.5, modes=1)
+    >>> design = lbt.polytopic(plant, half_width_hz=0.5)
+    >>> design.worst_achieved <= design.bound_guaranteed <= 1.001 * design.worst_achieved
+    True
+    """
+    choice(norm, "norm", _NORMS)
+    interval = FrequencyInterval(plant=plant, half_width_hz=half_width_hz)
+    interval = replace(interval, plant=plant.ahead(horizon))
+    predictor, bound, solver = _synthesised(interval, norm)
+    return polytopic_design(interval, predictor, norm=norm, bound_programme=bound, solver=solver)
+
+
+def polytopic_design(
+    interval: FrequencyInterval,
+    predictor: Controller,
+    *,
+    norm: str,
+    bound_programme: float,
+    solver: SolverReport,
+) -> PolytopicDesign:
+    """Make a design of a filter and certify it; raise CertificateError if it fails."""
+    stable = bool(np.max(np.abs(np.linalg.eigvals(predictor.A))) < 1)
+    found, where = worst_found(interval, predictor, norm) if stable else (np.inf, np.nan)
+    plant = interval.plant
+    design = PolytopicDesign(
+        method=f"polytopic-{norm}",
+        controller=_controller(plant, predictor),
+        certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
+        solver=solver,
+        problem=plant,
+        predictor=predictor,
+        half_width_hz=interval.half_width_hz,
+        norm=norm,
+        bound_guaranteed=worst_guaranteed(interval, predictor, norm) if stable else np.inf,
+        worst_achieved=found,
+        worst_frequency_hz=where,
+        bound_programme=bound_programme,
+    )
+    certificate = design.recertified().require("Try a narrower interval.")
+    return replace(design, certificate=certificate)
+
+
+def _controller(plant: TipTiltPlant, predictor: Controller) -> Controller:
+    to_command = plant.hardware.projector @ predictor.C
+    D = np.zeros((len(to_command), predictor.B.shape[1]))
+    return youla_controller(plant.hardware, replace(predictor, C=to_command, D=D))
+
+
+def _certified(design: PolytopicDesign) -> Certificate:
+    interval, norm, predictor = design.interval, design.norm, design.predictor
+    certificate = certify_error(
+        design.error_system(), stability="spectral radius of plant and filter"
+    )
+    if not certificate.passed:
+        return certificate
+    found, _ = worst_found(interval, predictor, norm)
+    a1 = interval.coefficient(design.worst_frequency_hz)
+    there = error_size(interval.error_system(a1, predictor), norm)
+    outside = abs(design.worst_frequency_hz - interval.plant.vibrations[0].frequency_hz)
+    made = _controller(interval.plant, predictor)
+    search = "grid of frequencies, refined"
+    checks = [
+        Check(
+            name="bound over the interval, recomputed",
+            value=worst_guaranteed(interval, predictor, norm),
+            limit=design.bound_guaranteed * (1 + NORM_TOLERANCE),
+            method="envelope of all plants, level sets"
+            if norm == "hinf"
+            else "branch and bound, Lyapunov equations",
+        ),
+        Check(
+            name="worst error found over the bound, less 1",
+            value=found / design.bound_guaranteed - 1,
+            limit=NORM_TOLERANCE,
+            method=search,
+        ),
+        Check(
+            name="worst error found over the one stated, less 1",
+            value=found / design.worst_achieved - 1,
+            limit=NORM_TOLERANCE,
+            method=search,
+        ),
+        Check(
+            name="worst error stated, against that at its frequency",
+            value=abs(there / design.worst_achieved - 1),
+            limit=NORM_TOLERANCE,
+            method="relative, one error system",
+        ),
+        Check(
+            name="distance of that frequency beyond the interval",
+            value=outside - interval.half_width_hz,
+            limit=1e-9 * interval.high_hz,
+            method="Hz",
+        ),
+        Check(
+            name="controller, against the one made of the filter",
+            value=_distance(design.controller, made),
+            limit=NORM_TOLERANCE,
+            method="relative, largest entry",
+        ),
+        certify_loop(interval.plant.hardware, design.controller),
+    ]
+    return replace(certificate, checks=(*certificate.checks, *checks))
+
+
+def _distance(one: Controller, other: Controller) -> float:
+    """Largest difference of the matrices, relative to the largest entry of each."""
+    worst = 0.0
+    for name in "ABCD":
+        a, b = getattr(one, name), getattr(other, name)
+        if a.shape != b.shape:
+            return np.inf
+        size = float(np.abs(b).max(initial=0.0))
+        worst = max(worst, float(np.abs(a - b).max(initial=0.0)) / (size if size > 0 else 1.0))
+    return worst
+
+
+def _synthesised(interval: FrequencyInterval, norm: str) -> tuple[Controller, float, SolverReport]:
+    """Filter of all axes; those that nothing couples are designed one by one."""
+    from lbt_synth.lmi import SegmentFilter, segment_filter
+
+    plant = interval.plant
+    made: list[SegmentFilter] = []
+    solved: list[tuple[TipTiltPlant, SegmentFilter]] = []
+    for axis in _axes(plant):
+        known = [filtered for other, filtered in solved if _same(axis, other)]
+        if not known:
+            ends = (axis.A, axis.A)
+            if axis.vibrations:
+                own = replace(interval, plant=axis)
+                low, high = own.coefficients
+                ends = (own.state_matrix(low), own.state_matrix(high))
+            coordinates, scale = _expected(axis, interval.half_width_hz, norm)
+            known = [segment_filter(axis, ends, norm=norm, coordinates=coordinates, scale=scale)]
+            solved.append((axis, known[0]))
+        made.append(known[0])
+    bounds = np.array([part.bound for part in made])
+    C = block_diag(*(part.C for part in made))
+    B = block_diag(*(part.B for part in made))
+    predictor = Controller(
+        A=block_diag(*(part.A for part in made)),
+        B=B,
+        C=C,
+        D=np.zeros((len(C), B.shape[1])),
+        dt_s=plant.dt_s,
+    )
+    inaccurate = [part.status for part in made if part.status != "optimal"]
+    report = SolverReport(
+        route="lmi",
+        status=inaccurate[0] if inaccurate else "optimal",
+        iterations=sum(filtered.iterations for _, filtered in solved),
+    )
+    return predictor, float(bounds.max() if norm == "hinf" else np.hypot.reduce(bounds)), report
+
+
+def _axes(plant: TipTiltPlant) -> list[TipTiltPlant]:
+    """Plants of the single axes, or the plant itself where something couples them."""
+    hw, n = plant.hardware, plant.hardware.modes
+    directions = np.array([line.direction for line in plant.vibrations])
+    decoupled = (
+        n > 1
+        and hw.n_measurements == n
+        and _is_diagonal(hw.sensor)
+        and bool(np.all(np.diag(hw.sensor) != 0))
+        and _is_diagonal(plant.R)
+        and bool(np.all(np.count_nonzero(directions, axis=1) == 1))
+    )
+    if not decoupled:
+        return [plant]
+    axes = []
+    for i in range(n):
+        lines = [
+            replace(line, direction=(1.0,)) for line in plant.vibrations if line.direction[i] != 0
+        ]
+        axes.append(
+            tip_tilt_plant(
+                frame_rate_hz=hw.frame_rate_hz,
+                turbulence=plant.turbulence[i],
+                vibrations=lines or None,
+                noise_nm=plant.R[i : i + 1, i : i + 1],
+                delay_frames=hw.delay_frames,
+                sensor_matrix=hw.sensor[i : i + 1, i : i + 1],
+            )
+        )
+    return axes
+
+
+def _is_diagonal(matrix: FloatArray) -> bool:
+    return not np.any(matrix - np.diag(np.diag(matrix)))
+
+
+def _same(one: TipTiltPlant, other: TipTiltPlant) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in "ABCDL")
+
+
+def _expected(plant: TipTiltPlant, half_width_hz: float, norm: str) -> tuple[FloatArray, float]:
+    """Covariance and size of the error to expect: of a line as wide as the interval."""
+    if plant.vibrations:
+        hw = plant.hardware
+        plant = tip_tilt_plant(
+            frame_rate_hz=hw.frame_rate_hz,
+            turbulence=plant.turbulence,
+            vibrations=[
+                replace(line, damping=max(line.damping, half_width_hz / (2 * line.frequency_hz)))
+                for line in plant.vibrations
+            ],
+            noise_nm=plant.R,
+            delay_frames=hw.delay_frames,
+            sensor_matrix=hw.sensor,
+            influence_matrix=hw.influence,
+        )
+    solution = kalman_riccati(plant)
+    return solution.P, error_size(plant.error_system(solution.gain_predictor), norm)
