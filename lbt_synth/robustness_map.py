@@ -18,7 +18,15 @@ from lbt_synth.loop.strehl import jitter_spread_nm, jitter_strehls, widest_jitte
 from lbt_synth.models import ARModel, LoopHardware, Truth, Vibration
 from lbt_synth.models.truth import fitted_direction
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen, number, real_array
+from lbt_synth.validation import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    frozen,
+    instance,
+    number,
+    real_array,
+)
 
 _GAINS_AT_ONCE = 64
 
@@ -110,6 +118,8 @@ def strehl_map(
     >>> bool(found.strehl[0, 1, 0] > found.strehl[0, 1, 1])
     True
     """
+    for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
+        instance(value, kind)
     hardware = design.hardware
     if hardware is None:
         raise ProblemError(

@@ -186,3 +186,17 @@ def choice(value: Any, name: str, options: Sequence[str]) -> str:
     if value not in options:
         raise ProblemError(f"{name} must be one of {', '.join(options)}; got {value!r}.")
     return cast(str, value)
+
+
+def sequence(value: Any, name: str) -> tuple[Any, ...]:
+    """Return a list or tuple as a tuple; anything else is refused."""
+    if not isinstance(value, list | tuple):
+        raise ProblemError(f"{name} must be a list; got {type(value).__name__}.")
+    return tuple(value)
+
+
+def instance(value: object, kind: type[Any]) -> None:
+    """Refuse anything that is not of a kind."""
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise ProblemError(f"expected {article} {kind.__name__}; got {type(value).__name__}.")

@@ -1,5 +1,6 @@
 """Convex shaping: its parts against the real loop, its designs against closed forms and oracles."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
+from lbt_synth.gainfile.store import _digest
 from lbt_synth.norms import band_norm, largest_real_part
 from lbt_synth.shaping.basis import laguerre_basis, orthonormal_basis
 from lbt_synth.shaping.channel import Channel
@@ -20,6 +22,7 @@ SLOW = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=RATE)
 AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
 ONE = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
 NOISE = 20.0
+OTHER_RATE = lbt.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=100)
 BASIC = lbt.ResidualVariance(turbulence=SLOW, noise_nm=NOISE)
 
 
@@ -141,36 +144,71 @@ def test_a_term_over_the_grid_is_the_residual_of_the_real_loop(term, delay):
 def test_a_demand_holds_in_the_programme_where_it_holds_in_the_loop(demand, seed):
     mode = channel()
     grid = spec(demand).grid(mode).with_points(np.linspace(0, 400, 4001))
-    (constraint,) = demand.constraints(mode, grid)
+    constraints = demand.constraints(mode, grid)
     for size in (0.02, 0.1, 0.3, 1.0, 3.0):
         c = random_coefficients(12, seed) * size
-        if hasattr(constraint, "limit"):
-            held = constraint.function.value(c) <= constraint.limit
-        else:
-            held = np.max(constraint.use(c)) <= 1
+        held = all(
+            x.function.value(c) <= x.limit if hasattr(x, "limit") else np.max(x.use(c)) <= 1
+            for x in constraints
+        )
         loop = mode_loop(mode.hardware, mode.basis.parameter(c))
         if not loop.at(getattr(demand, "sensor_gain", 1.0)).is_stable:
             continue
-        (check,) = demand.checks(loop)
-        if abs(check.value / check.limit - 1) > 2e-3:  # not on the edge
-            assert held == check.passed
+        checks = demand.checks(loop)
+        if all(abs(check.value / check.limit - 1) > 5e-3 for check in checks):  # not on the edge
+            assert held == all(check.passed for check in checks)
 
 
-def test_the_turn_of_a_delay_error_is_the_worst_over_its_errors():
-    demand, mode = lbt.DelayError(frames=0.5), channel()
-    loop = mode_loop(mode.hardware, mode.basis.parameter(random_coefficients(12, 4)))
-    f = np.linspace(0, 400, 20001)
-    T = np.abs(loop.complementary.frequency_response(f)[:, 0, 0])
-    turns = max(
-        np.max(T * np.abs(np.exp(-2j * np.pi * f / RATE * e) - 1))
-        for e in np.linspace(-0.5, 0.5, 101)
+@pytest.mark.parametrize(
+    ("delay", "error"),
+    [(1.0, 1.0), (1.5, 0.3), (2.0, 1.0), (2.3, 0.5), (2.5, 0.5), (2.7, 0.3), (3.0, 0.6)],
+)
+def test_a_loop_is_stable_at_every_delay_within_its_error(delay, error):
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
+    eager = lbt.ResidualVariance(turbulence=SLOW, noise_nm=1.0)
+    design = lbt.shape(
+        path, spec(lbt.DelayError(frames=error), objective=eager), functions=20, states=None
     )
-    (check,) = demand.checks(loop)
-    assert turns * (1 - 1e-9) <= check.value
-    # next to its limit the bound is tight
-    close = mode_loop(mode.hardware, mode.basis.parameter(random_coefficients(12, 4) / turns))
-    (check,) = demand.checks(close)
-    assert check.value == pytest.approx(1, abs=2e-3)
+    for e in np.linspace(-error, error, 41):
+        real = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=max(delay + e, 1.0), modes=1)
+        assert lbt.close_loop(real, design.controller).is_stable
+    if delay == 2.5:  # without the demand it is not
+        free = lbt.shape(path, spec(objective=eager), functions=20, states=None)
+        late = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=3.0, modes=1)
+        assert not lbt.close_loop(late, free.controller).is_stable
+
+
+def test_a_narrow_line_of_a_tabulated_spectrum_is_not_missed():
+    f0, w = 53.0, 1e-3  # 100 nm rms
+    line = lbt.TabulatedSpectrum(
+        frequency_hz=[1, f0 - w, f0, f0 + w, 300], density_nm2_hz=[1e-3, 1e-3, 1e4 / w, 1e-3, 1e-3]
+    )
+    bound = lbt.CommandRms(at_most_nm=10, turbulence=line, noise_nm=1e-3)
+    design = lbt.shape(ONE, spec(bound), functions=20, states=None)
+    loop = lbt.close_loop(ONE, design.controller)
+    assert 100 * abs(loop.commanding().frequency_response([f0])[0, 0, 1]) < 10
+    seen = lbt.ResidualVariance(turbulence=line, noise_nm=NOISE)
+    rejecting = lbt.shape(ONE, spec(objective=seen), functions=30, states=None)
+    left = 100 * abs(lbt.close_loop(ONE, rejecting.controller).sensitivity([f0])[0, 0, 0])
+    assert left < rejecting.objective_nm[0]
+
+
+@pytest.mark.parametrize(("at_most", "gain"), [(1.6, 1.5), (1.9, 1.5), (2.2, 1.3), (1.7, 0.45)])
+def test_attenuation_near_the_edge_of_convexity_is_certified(at_most, gain):
+    eager = lbt.ResidualVariance(turbulence=SLOW, noise_nm=2.0)
+    mask = lbt.Attenuation(low_hz=0, high_hz=400, at_most=at_most, sensor_gain=gain)
+    design = lbt.shape(ONE, spec(mask, objective=eager), functions=20, states=None)
+    f = np.linspace(0, 400, 8001)
+    loop = lbt.close_loop(ONE, design.controller, sensor_gain=gain)
+    assert np.max(np.abs(loop.sensitivity(f))) < at_most
+
+
+def test_nothing_to_reject_leaves_nothing():
+    idle = lbt.ResidualVariance(turbulence=None, noise_nm=10, sensor_gain=0.5)
+    design = lbt.shape(
+        ONE, spec(lbt.ModulusMargin(at_least=0.5), objective=idle), functions=8, states=None
+    )
+    assert design.objective_nm[0] < 1e-3
 
 
 # -- designs against oracles --------------------------------------------------------------------
@@ -385,6 +423,37 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
     assert not replace(small, objective_nm=(small.objective_nm[0] * 0.999,)).recertified().passed
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(objective_nm=[-1.0]), "objective_nm must be above 0"),
+        (lambda m: m.update(objective_nm=[0.0]), "objective_nm must be above 0"),
+        (lambda m: m.update(long_objective_nm=["inf"]), "long_objective_nm must be a number"),
+        (lambda m: m.update(objective_nm=[30.0, 30.0]), "one for each mode"),
+        (
+            lambda m: m.update(specifications=[{"kind": "ModulusMargin", "at_least": 0.5}]),
+            "are none",
+        ),
+        (lambda m: m.update(specifications=[3]), "are none"),
+        (
+            lambda m: m["specifications"][0]["objective"]["terms"][1].update(high_hz=900.0),
+            "below the Nyquist",
+        ),
+        (lambda m: m["specifications"][0].update(kind="Anything"), "Anything"),
+    ],
+)
+def test_impossible_claims_of_a_gain_file_are_refused(small, tmp_path, change, message):
+    path = lbt.save_gain(tmp_path / "gain.json", small)
+    document = json.loads(path.read_text())
+    change(document["meta"]["shaped"])
+    arrays = {k: np.array(v) for k, v in document["arrays"].items()}
+    meta = {k: v for k, v in document["meta"].items() if k != "digest"}
+    document["meta"]["digest"] = _digest(arrays, meta)
+    path.write_text(json.dumps(document))
+    with pytest.raises(lbt.GainFileError, match=message):
+        lbt.load_gain(path)
+
+
 # -- refusals --------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("make", "message"),
@@ -437,6 +506,35 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
             ),
             "sensor_matrix must have rank 2",
         ),
+        (
+            lambda: lbt.shape(
+                ONE, spec(lbt.CommandRms(at_most_nm=9, turbulence=OTHER_RATE, noise_nm=1))
+            ),
+            "sampled at the loop's 800 Hz; got 100",
+        ),
+        (
+            lambda: lbt.CommandRms(at_most_nm=9, turbulence=SLOW, noise_nm=1, rate="x"),
+            "rate must be True or False",
+        ),
+        (lambda: lbt.Total(terms=BASIC), "terms must be a list"),
+        (
+            lambda: lbt.Specification(objective=BASIC, demands=lbt.NoisePeak(at_most=3)),
+            "demands must be a list",
+        ),
+        (lambda: lbt.robust(plant_of_one(), bands=None), "bands must be a list"),
+        (lambda: lbt.robust(plant_of_one(), bands=[], sensor_gain=(1,)), r"must be \(low, high\)"),
+        (lambda: lbt.robust(plant_of_one(), bands=[], scenarios=1.0), "scenarios must be a list"),
+        (
+            lambda: lbt.strehl_map(
+                None,
+                lbt.Truth(turbulence=None),
+                lbt.Imaging(diameter_m=8),
+                errors_hz=[0],
+                sensor_gains=[1],
+            ),
+            "expected a Design",
+        ),
+        (lambda: lbt.least_residual(None, None), "expected a LoopHardware"),
         (lambda: lbt.robust(3, bands=[]), "plant must be a TipTiltPlant"),
         (
             lambda: lbt.robust(replace_sensor(plant_of_one()), bands=[3]),
@@ -452,6 +550,21 @@ def test_what_makes_no_sense_is_refused(make, message):
 
 def plant_of_one():
     return lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, noise_nm=NOISE, modes=1)
+
+
+def test_noise_of_any_size_stays_with_its_mode():
+    tiny = lbt.ARModel(coefficients=[0.99], driving_rms_nm=1e-11, frame_rate_hz=RATE)
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=tiny, noise_nm=4e-10, sensor_matrix=np.diag([1.0, 3.0])
+    )
+    design = lbt.robust(plant, bands=[], functions=8, states=None)
+    noise = [s.objective.terms[0].noise_nm for s in design.specifications]
+    assert noise == pytest.approx([4e-10, 4e-10 / 3], rel=1e-6)
+
+
+def test_few_states_may_be_as_few_as_are_needed():
+    design = lbt.shape(ONE, spec(), functions=20, states=4, loss=0.01)
+    assert design.states_per_mode == 2
 
 
 def test_poles_of_a_response_are_found():

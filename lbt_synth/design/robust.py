@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from lbt_synth.design.shape import shape
 from lbt_synth.design.shaped import ShapedDesign, noise_of_modes
 from lbt_synth.errors import ProblemError
@@ -22,7 +20,7 @@ from lbt_synth.shaping import (
     Total,
     VibrationBand,
 )
-from lbt_synth.validation import number
+from lbt_synth.validation import number, sequence
 
 
 def robust(
@@ -93,23 +91,27 @@ def robust(
     """
     if not isinstance(plant, TipTiltPlant):
         raise ProblemError(f"plant must be a TipTiltPlant; got {type(plant).__name__}.")
-    lines = tuple(bands)
+    lines = sequence(bands, "bands")
     for line in lines:
         if not isinstance(line, VibrationBand):
             raise ProblemError(f"bands must be VibrationBands; got {type(line).__name__}.")
-    gains = tuple(number(g, "scenarios", above=0) for g in scenarios)
+    gains = tuple(number(g, "scenarios", above=0) for g in sequence(scenarios, "scenarios"))
     if not gains:
         raise ProblemError("scenarios must name at least one sensor gain; got none.")
-    low, high = sensor_gain
+    ends = sequence(sensor_gain, "sensor_gain")
+    if len(ends) != 2:
+        raise ProblemError(f"sensor_gain must be (low, high); got {sensor_gain!r}.")
+    low, high = ends
+    further = sequence(demands, "demands")
     fixed: list[Demand] = [ModulusMargin(at_least=modulus_margin)]
     if (low, high) != (1, 1):
         fixed.append(SensorGainRange(low=low, high=high))
     deviations = noise_of_modes(plant.hardware, plant.R)
-    made: dict[tuple[float, int], Specification] = {}
+    made: dict[tuple[str, int], Specification] = {}
     specifications = []
     for noise_nm, model in zip(deviations, plant.turbulence, strict=True):
         # equal modes share one specification, and are solved once
-        key = float(np.round(noise_nm, 9)), 0 if turbulence is not None else id(model)
+        key = f"{noise_nm:.9g}", 0 if turbulence is not None else id(model)
         if key not in made:
             spectrum = model if turbulence is None else turbulence
             terms: list[Term] = []
@@ -121,7 +123,7 @@ def robust(
                 )
                 terms += [replace(line, sensor_gain=gain) for line in lines]
             made[key] = Specification(
-                objective=Total(terms=tuple(terms)), demands=(*fixed, *demands)
+                objective=Total(terms=tuple(terms)), demands=(*fixed, *further)
             )
         specifications.append(made[key])
     design = shape(

@@ -106,7 +106,7 @@ def shape(
     stored = len(single.mirror_taps) - 1
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
     for spec in specifications:
-        spec.require_below(hardware.frame_rate_hz / 2)
+        spec.require_fitting(hardware.frame_rate_hz)
 
     made: dict[int, _Mode] = {}
     for spec in specifications:

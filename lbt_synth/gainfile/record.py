@@ -26,6 +26,7 @@ from lbt_synth.models import (
     TipTiltPlant,
     Vibration,
 )
+from lbt_synth.shaping import Specification
 from lbt_synth.shaping.record import packed, unpacked
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import FloatArray, choice, frozen, number
@@ -152,15 +153,25 @@ def _unpack_shaped(arrays: Arrays, meta: Meta, common: Meta) -> ShapedDesign:
         for mode in range(hardware.modes)
     )
     specifications = tuple(unpacked(spec) for spec in shaped["specifications"])
-    if len(specifications) != hardware.modes:
-        raise ValueError(f"it must have {hardware.modes} specifications, one a mode")
+    if not all(isinstance(spec, Specification) for spec in specifications):
+        raise ValueError("what it holds as specifications are none")
+    for spec in specifications:
+        spec.require_fitting(hardware.frame_rate_hz)
+    objective, long = (
+        tuple(number(v, name, above=0) for v in shaped[name])
+        for name in ("objective_nm", "long_objective_nm")
+    )
+    if {len(specifications), len(objective), len(long)} != {hardware.modes}:
+        raise ValueError(
+            f"it must have {hardware.modes} specifications and claims, one for each mode"
+        )
     return ShapedDesign(
         **common,
         loop_hardware=hardware,
         specifications=specifications,
         parameters=parameters,
-        objective_nm=tuple(float(v) for v in shaped["objective_nm"]),
-        long_objective_nm=tuple(float(v) for v in shaped["long_objective_nm"]),
+        objective_nm=objective,
+        long_objective_nm=long,
         long_functions=int(shaped["long_functions"]),
     )
 

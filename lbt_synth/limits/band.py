@@ -278,7 +278,7 @@ def _prepared(
     inside = (middle > ends[0]) & (middle < ends[1])
     cuts = [np.linspace(*ends, _PANELS + 1), panels.low[inside], panels.high[inside]]
     edges = np.unique(np.clip(np.concatenate(cuts), *ends))
-    edges = edges[np.concatenate([[True], np.diff(edges) > 1e-13])]
+    edges = edges[np.concatenate([[True], np.diff(edges) > 1e-4 * width / _PANELS])]
     x, q = gauss_panels(edges, _ORDER)
     return _Band(
         reach=reach,

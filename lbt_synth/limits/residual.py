@@ -14,7 +14,7 @@ from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import TipTiltPlant
 from lbt_synth.models.truth import Truth, fitted_direction
 from lbt_synth.models.vibration import Vibration
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen, instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,7 +82,8 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     >>> round(float(limit.variance_nm2[0]), 8)                   # 2^2 (1 + 0.5^2)
     5.0
     """
-    return _limit(Reach.of(hardware), truth_modes(hardware, truth))
+    modes = truth_modes(hardware, truth)
+    return _limit(Reach.of(hardware), modes)
 
 
 def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
@@ -123,6 +124,8 @@ def truth_modes(
     hardware: LoopHardware, truth: Truth, directions: tuple[FloatArray, ...] = ()
 ) -> DecoupledModes:
     """Decouple the modes of a truth, its sinusoids left out."""
+    instance(hardware, LoopHardware)
+    instance(truth, Truth)
     lines = []
     for vibration in truth.vibrations:
         along = fitted_direction(vibration, hardware)

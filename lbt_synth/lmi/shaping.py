@@ -20,6 +20,7 @@ import cvxpy as cp
 import numpy as np
 
 from lbt_synth.cones import Bounded, Combined, Constraint, Discs, Fractions, Function, HalfPlanes
+from lbt_synth.errors import NumericalError
 from lbt_synth.lmi.solver import USABLE, solve
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -102,6 +103,11 @@ def least_relaxation(
     -------
     (groups,) ndarray
         The relaxations s of least sum; infinite where the rigid ones alone cannot hold.
+
+    Raises
+    ------
+    NumericalError
+        If the solver fails.
     """
     c, slack = cp.Variable(size), cp.Variable(len(groups), nonneg=True)
     held: list[cp.Constraint] = []
@@ -109,8 +115,14 @@ def least_relaxation(
         for constraint in group:
             held += _held(constraint, c, 0.0 if rigid[i] else slack[i])
     status, _ = solve(cp.Minimize(cp.sum(slack)), held)
-    if status not in USABLE or slack.value is None:
+    if "infeasible" in status:
         return np.full(len(groups), np.inf)
+    if status not in USABLE or slack.value is None:
+        raise NumericalError(
+            f"the search for demands that clash ended as {status!r}. The demands may be close to "
+            "what can be met, or very far from it; relax them, or try another number of functions.",
+            status=status,
+        )
     return np.asarray(np.where(rigid, 0.0, slack.value), dtype=np.float64)
 
 
@@ -156,18 +168,20 @@ def _majorant(
     slopes = np.real(-2 * b0.conj()[:, None] * steering) / np.abs(b0[:, None]) ** 2
     denominators = (1 - slopes @ start) + slopes @ c
     # each fraction in units of its own value, but not of a vanishing one
-    unit = np.sqrt(np.maximum(values, 1e-9 * largest)) * np.abs(b0)
+    sizes = np.maximum(values, max(1e-9 * largest, 1e-12 * scale))
+    largest = float(np.max(sizes))
+    unit = np.sqrt(sizes) * np.abs(b0)
     stacked = _stacked(function.centres / unit[:, None], function.rows / unit[:, None, None], c)
     if function.worst:
         level: cp.Expression = cp.Variable(nonneg=True)
         # in units of the largest value
-        ratio = np.sqrt(np.maximum(values, 1e-9 * largest) / largest)
+        ratio = np.sqrt(sizes / largest)
         stacked = cp.multiply(stacked, np.broadcast_to(ratio, stacked.shape))
         levels: cp.Expression = level * np.ones(len(b0))
         total = level * (largest / scale)
     else:
         levels = cp.Variable(len(b0), nonneg=True)
-        total = (np.maximum(values, 1e-9 * largest) / scale) @ levels
+        total = (sizes / scale) @ levels
     difference = cp.reshape(levels - denominators, (1, len(b0)), order="C")
     held.append(cp.SOC(levels + denominators, cp.vstack([2 * stacked, difference])))
     return total

@@ -60,8 +60,8 @@ def symmetrised(expression: Any) -> Any:
 
 def _unsolved(reason: str) -> NumericalError:
     return NumericalError(
-        f"the semidefinite programme was not solved: {reason} Try a slightly "
-        "different bound or number of taps; for kalman and hinf, the Riccati route.",
+        f"the conic programme was not solved: {reason} Try slightly different bounds, or another "
+        "number of taps or functions; for kalman and hinf, the Riccati route.",
         status="solver error",
     )
 
@@ -85,6 +85,8 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
         except cp.error.SolverError as error:
             if attempt == len(_ATTEMPTS) - 1:
                 raise _unsolved("the solver lost its accuracy on the way.") from error
+        except ValueError as error:  # what cvxpy raises on data that are not finite
+            raise _unsolved("its numbers are not finite.") from error
         except BaseException as error:
             # what the compiled solver raises on numbers out of all range is no Exception
             if type(error).__name__ != "PanicException":

@@ -6,8 +6,7 @@ and into checks of the real loop over all frequencies that know nothing of the p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -16,18 +15,19 @@ from lbt_synth.certify import Check
 from lbt_synth.cones import Bounded, Constraint, Discs, Fractions, HalfPlanes
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop.budget import resonance_edges
+from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.truth import Spectrum
 from lbt_synth.norms import band_norm, hinf_norm, largest_real_part
 from lbt_synth.quadrature import adaptive_integral
+from lbt_synth.shaping.band import Band
 from lbt_synth.shaping.channel import Channel
-from lbt_synth.shaping.grid import Grid
-from lbt_synth.shaping.measured import MeasuredLoop
-from lbt_synth.shaping.terms import ResidualVariance, checked_band
+from lbt_synth.shaping.grid import Grid, spectrum_edges
+from lbt_synth.shaping.measured import MeasuredLoop, through_taps
+from lbt_synth.shaping.terms import ResidualVariance
 from lbt_synth.statespace import StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray, number
 
 ROOM = 1e-3  # part of a bound that the programme leaves unused, for what lies between its points
-_TIGHT = 1e-4  # to which a bound over an interval is made tight, where it could decide
 _LEVEL_SETS = "level sets, all frequencies"
 
 
@@ -131,7 +131,7 @@ class NoisePeak:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Attenuation:
+class Attenuation(Band):
     """Bound on the rejection over a band: one step of a mask.
 
     Exact at any sensor gain g: ``|1 - T| <= a |1 - (1 - g) T|`` is a disc of T for
@@ -158,16 +158,12 @@ class Attenuation:
     'attenuation to 0.01 in 0-2 Hz at sensor gain 1'
     """
 
-    low_hz: float
-    high_hz: float
     at_most: float
     sensor_gain: float = 1.0
 
     def __post_init__(self) -> None:
+        Band.__post_init__(self)
         set_ = object.__setattr__
-        low, high = checked_band(self.low_hz, self.high_hz)
-        set_(self, "low_hz", low)
-        set_(self, "high_hz", high)
         set_(self, "at_most", number(self.at_most, "at_most", above=0))
         set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
         if not self.at_most * abs(1 - self.sensor_gain) < 1:
@@ -180,7 +176,7 @@ class Attenuation:
     def label(self) -> str:
         """What a message calls it."""
         return (
-            f"attenuation to {self.at_most:g} in {self.low_hz:g}-{self.high_hz:g} Hz "
+            f"attenuation to {self.at_most:g} in {self.band_text} "
             f"at sensor gain {self.sensor_gain:g}"
         )
 
@@ -188,7 +184,10 @@ class Attenuation:
         """Return the convex constraints at the points of a grid."""
         f = grid.within(self.low_hz, self.high_hz)
         rows = channel.complementary_rows(f)
-        a, rest = (1 - ROOM) * self.at_most, 1 - self.sensor_gain
+        rest = 1 - self.sensor_gain
+        # near the edge of convexity a small part of the disc's radius is a large one of the bound
+        stretch = (1 + self.at_most * abs(rest)) / (1 - self.at_most * abs(rest))
+        a = (1 - min(ROOM * stretch, 0.05)) * self.at_most
         curvature = 1 - (a * rest) ** 2
         centre = (1 - a**2 * rest) / curvature
         return (_discs(f, -rows, np.full(f.size, centre), a * self.sensor_gain / curvature),)
@@ -198,8 +197,7 @@ class Attenuation:
         rejection = loop.at(self.sensor_gain).rejection()
         return (
             Check(
-                name=f"rejection in {self.low_hz:g}-{self.high_hz:g} Hz at sensor gain "
-                f"{self.sensor_gain:g}",
+                name=f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}",
                 value=band_norm(rejection, self.low_hz, self.high_hz).upper,
                 limit=self.at_most,
                 method="level sets, all of the band",
@@ -280,8 +278,11 @@ class SensorGainRange:
 class DelayError:
     """Guaranteed stability for every error of the delay up to a bound, late or early.
 
-    A delay of e frames turns the loop by ``exp(-i theta e)``; it stays stable while
-    ``|T| 2 sin(theta e / 2) < 1``.
+    Delays, fractions included, are those of :class:`LoopHardware`: with the mirror's response
+    ``M_d`` at a delay d, the loop stays stable at ``d + e`` while
+    ``|M_(d+e) - M_d| |Q| < 1``. The response is piecewise linear in e, so the ends of the
+    interval and the whole delays within it stand for all of it. A delay below one frame does
+    not occur.
 
     Parameters
     ----------
@@ -310,49 +311,46 @@ class DelayError:
         """What a message calls it."""
         return f"stability for delay errors up to {self.frames:g} frames"
 
-    def _turning(self, angles: FloatArray) -> FloatArray:
-        """Largest ``|exp(-i theta e) - 1|`` over the errors."""
-        return np.asarray(2 * np.sin(angles * self.frames / 2))
+    def _differences(self, hardware: LoopHardware) -> list[tuple[float, FloatArray]]:
+        """Delays that stand for all, and the taps of ``M_(d+e) - M_d``."""
+        d = hardware.delay_frames
+        low, high = max(d - self.frames, 1.0), d + self.frames
+        whole = np.arange(np.ceil(low), np.floor(high) + 1)
+        out = []
+        for other in np.unique(np.concatenate([[low, high], whole])):
+            if other != d:
+                there = replace(hardware, delay_frames=float(other)).mirror_taps
+                taps = np.zeros(max(there.size, hardware.mirror_taps.size))
+                taps[: there.size] += there
+                taps[: hardware.mirror_taps.size] -= hardware.mirror_taps
+                out.append((float(other), taps))
+        return out
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.points_hz
-        turning = self._turning(2 * np.pi * f * channel.hardware.dt_s)
-        matters = turning > 1e-3  # below, |T| would have to exceed 1000
-        f, radii = f[matters], (1 - ROOM) / turning[matters]
-        return (_discs(f, channel.complementary_rows(f), np.zeros(f.size), radii),)
+        rows = channel.command_rows(f)
+        powers = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None] ** np.arange(102)
+        return tuple(
+            _discs(f, (powers[:, : taps.size] @ taps)[:, None] * rows, np.zeros(f.size), 1 - ROOM)
+            for _, taps in self._differences(channel.hardware)
+        )
 
     def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
-        """Check the real loop: on short intervals, |T| by level sets and the rest by its end."""
-        T, nyquist = loop.complementary, loop.hardware.frame_rate_hz / 2
-        edges = np.linspace(0, nyquist, 33)
-        reached, bound, peak = 0.0, 0.0, float(hinf_norm(T).upper)
-        stack = list(pairwise(edges))
-        while stack:  # halve the intervals that may hold more than what was reached
-            low, high = stack.pop()
-            turning = self._turning(2 * np.pi * np.array([high]) * T.dt_s)[0]
-            if peak * turning <= bound:
-                continue
-            found = band_norm(T, low, high)
-            at_peak = self._turning(2 * np.pi * np.array([found.peak_frequency_hz]) * T.dt_s)[0]
-            reached = max(reached, float(found.value * at_peak))
-            above = float(found.upper * turning)
-            if above > max(reached * (1 + _TIGHT), 1 - ROOM / 4) and high - low > 1e-6 * nyquist:
-                stack += [(low, (low + high) / 2), ((low + high) / 2, high)]
-            else:
-                bound = max(bound, above)
-        return (
+        """Check the real loop."""
+        return tuple(
             Check(
-                name=f"|T| times the turn of {self.frames:g} frames",
-                value=bound,
+                name=f"loop change by a delay of {other:g} frames",
+                value=hinf_norm(through_taps(loop.parameter, taps)).upper,
                 limit=1.0,
-                method="level sets, interval by interval",
-            ),
+                method=_LEVEL_SETS,
+            )
+            for other, taps in self._differences(loop.hardware)
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MirrorUncertainty:
+class MirrorUncertainty(Band):
     """Guaranteed stability for any unmodelled mirror dynamics below a relative size.
 
     The mirror's response is ``M (1 + delta)`` with ``|delta| <= relative`` in the band (and
@@ -378,23 +376,15 @@ class MirrorUncertainty:
     """
 
     relative: float
-    low_hz: float
-    high_hz: float
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        low, high = checked_band(self.low_hz, self.high_hz)
-        set_(self, "relative", number(self.relative, "relative", above=0))
-        set_(self, "low_hz", low)
-        set_(self, "high_hz", high)
+        Band.__post_init__(self)
+        object.__setattr__(self, "relative", number(self.relative, "relative", above=0))
 
     @property
     def label(self) -> str:
         """What a message calls it."""
-        return (
-            f"stability for mirror errors of {self.relative:g} in "
-            f"{self.low_hz:g}-{self.high_hz:g} Hz"
-        )
+        return f"stability for mirror errors of {self.relative:g} in {self.band_text}"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
@@ -406,7 +396,7 @@ class MirrorUncertainty:
         """Check the real loop."""
         return (
             Check(
-                name=f"|T| in {self.low_hz:g}-{self.high_hz:g} Hz times the mirror's error",
+                name=f"|T| in {self.band_text} times the mirror's error",
                 value=self.relative
                 * band_norm(loop.complementary, self.low_hz, self.high_hz).upper,
                 limit=1.0,
@@ -450,6 +440,8 @@ class CommandRms:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "at_most_nm", number(self.at_most_nm, "at_most_nm", above=0))
+        if not isinstance(self.rate, bool):
+            raise ProblemError(f"rate must be True or False; got {self.rate!r}.")
         # the same disturbances as those of a variance
         disturbance = ResidualVariance(turbulence=self.turbulence, noise_nm=self.noise_nm)
         object.__setattr__(self, "noise_nm", disturbance.noise_nm)
@@ -476,19 +468,19 @@ class CommandRms:
 
     def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        closed = loop.at(1.0)
         nyquist, dt_s = loop.hardware.frame_rate_hz / 2, loop.hardware.dt_s
-        # u = Q (z^-1 phi + w): the response to the noise is Q
-        noise = StateSpace(
-            A=closed.commanding().A, B=closed.commanding().B[:, 1:], C=closed.commanding().C,
-            D=closed.commanding().D[:, 1:], dt_s=dt_s,
-        )  # fmt: skip
+        parameter = loop.parameter
 
         def power(f: FloatArray) -> FloatArray:
-            response = np.abs(noise.frequency_response(f)[:, 0, 0]) ** 2
+            response = np.abs(parameter.frequency_response(f)[:, 0, 0]) ** 2
             return np.asarray((response * self._density(f, nyquist, dt_s))[:, None, None])
 
-        variance = float(adaptive_integral(power, np.asarray(resonance_edges(closed)))[0, 0])
+        edges = [
+            np.asarray(resonance_edges(loop.at(1.0))),
+            spectrum_edges(self.turbulence, nyquist),
+        ]
+        edges_hz = np.unique(np.concatenate(edges))
+        variance = float(adaptive_integral(power, edges_hz)[0, 0])
         return (
             Check(
                 name=f"command {'step' if self.rate else 'stroke'} [nm rms]",

@@ -6,11 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lbt_synth.models.ar import ARModel
+from lbt_synth.models.truth import Spectrum, breakpoints_below
 from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _ORDER = 5
 _BAND_POINTS = 15
+_MOST_EDGES = 400
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,6 +47,7 @@ def first_grid(
     *,
     bands_hz: tuple[tuple[float, float], ...],
     poles: ComplexArray,
+    breakpoints_hz: FloatArray,
     fineness: int = 1,
 ) -> Grid:
     """Panels that are geometric at low frequencies, finer in the bands and at slow poles.
@@ -55,7 +59,9 @@ def first_grid(
     bands_hz : tuple of (low, high)
         Bands that matter [Hz].
     poles : (n,) complex ndarray
-        Poles of the basis.
+        Poles of the basis and of models.
+    breakpoints_hz : (b,) ndarray
+        Frequencies at which spectra have kinks [Hz].
     fineness : int, optional
         Factor on the number of panels.
     """
@@ -65,6 +71,7 @@ def first_grid(
         np.geomspace(6e-5, 0.01, 13 * fineness + 1) * frame_rate_hz,
         np.geomspace(0.0125, 0.5, 24 * fineness + 1) * frame_rate_hz,
     ]
+    edges.append(breakpoints_hz)
     for low, high in bands_hz:
         width = high - low
         edges.append(
@@ -76,7 +83,7 @@ def first_grid(
             offsets = np.array([-4.0, -1.0, 1.0, 4.0]) * width
             edges.append((centre + offsets) / (2 * np.pi) * frame_rate_hz)
     every = np.unique(np.clip(np.concatenate(edges), 0, nyquist))
-    every = every[np.concatenate([[True], np.diff(every) > 1e-6 * nyquist])]
+    every = every[np.concatenate([[True], np.diff(every) > 1e-8 * nyquist])]
     nodes, weights = gauss_panels(every, _ORDER)
     points = np.unique(np.concatenate([np.linspace(0, nyquist, 128 * fineness), every]))
     return Grid(nodes_hz=nodes, weights_hz=weights, points_hz=points)
@@ -90,3 +97,27 @@ def fine_frequencies(frame_rate_hz: float, poles: ComplexArray, count: int) -> F
     offsets = np.linspace(-3, 3, 13)
     near = (centres[:, None] + widths[:, None] * offsets).ravel()
     return np.unique(np.clip(np.concatenate([even, low, near]), 0, 0.5)) * frame_rate_hz
+
+
+def spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
+    """Frequencies at which a spectrum has kinks or lines, for panels of a quadrature [Hz]."""
+    if spectrum is None:
+        return np.zeros(0)
+    if isinstance(spectrum, ARModel):
+        poles = np.linalg.eigvals(spectrum.companion)
+        centres, widths = np.abs(np.angle(poles)), 1 - np.abs(poles)
+        offsets = np.array([-16.0, -4.0, -1.0, 0.0, 1.0, 4.0, 16.0])
+        angles = (centres[:, None] + widths[:, None] * offsets).ravel()
+        return np.asarray(np.clip(angles * spectrum.frame_rate_hz / (2 * np.pi), 0, nyquist_hz))
+    return breakpoints_below(spectrum, nyquist_hz)
+
+
+def thinned(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
+    """Return these edges, but not more than a programme can carry: the highest of many [Hz]."""
+    edges = spectrum_edges(spectrum, nyquist_hz)
+    if spectrum is None or edges.size <= _MOST_EDGES:
+        return edges
+    power = np.asarray(spectrum.psd(edges)) * np.gradient(edges)
+    high = np.argsort(power)[-_MOST_EDGES // 2 :]
+    even = np.arange(0, edges.size, max(edges.size // (_MOST_EDGES // 2), 1))
+    return np.asarray(edges[np.unique(np.concatenate([high, even]))])

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.validation import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,6 +42,19 @@ class MeasuredLoop:
         return self.at(1.0).output_sensitivity()
 
     @property
+    def parameter(self) -> StateSpace:
+        """The Youla parameter: from the noise to the command at unit sensor gain."""
+        commanding = self.at(1.0).commanding()
+        modes = self.hardware.modes
+        return StateSpace(
+            A=commanding.A,
+            B=commanding.B[:, modes:],
+            C=commanding.C,
+            D=commanding.D[:, modes:],
+            dt_s=commanding.dt_s,
+        )
+
+    @property
     def complementary(self) -> StateSpace:
         """``T = 1 - S`` at unit sensor gain."""
         s = self.sensitivity
@@ -56,3 +72,17 @@ def mode_hardware(hardware: LoopHardware) -> LoopHardware:
     return LoopHardware(
         frame_rate_hz=hardware.frame_rate_hz, delay_frames=hardware.delay_frames, modes=1
     )
+
+
+def through_taps(system: StateSpace, taps: FloatArray) -> StateSpace:
+    """Return a system of one output followed by ``taps[0] + taps[1] z^-1 + ...``."""
+    n, m = system.B.shape
+    late = len(taps) - 1
+    A = np.zeros((n + late, n + late))
+    B = np.zeros((n + late, m))
+    A[:n, :n], B[:n] = system.A, system.B
+    if late:
+        A[n, :n], B[n] = system.C[0], system.D[0]
+        A[n + 1 :, n:-1] = np.eye(late - 1)
+    C = np.hstack([taps[0] * system.C, taps[None, 1:]])
+    return StateSpace(A=A, B=B, C=C, D=taps[0] * system.D, dt_s=system.dt_s)

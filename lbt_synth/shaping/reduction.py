@@ -20,7 +20,6 @@ from lbt_synth.validation import ComplexArray, FloatArray
 _FLAT = 0.3  # weight of the whole response in the fit of poles, beside the spectra
 _INTEGRAL = 2e-3  # by which the objective over the grid may miss that of the real loop
 _SLOW_HZ = (0.002, 0.004, 0.008)  # where turbulence meets the noise, of the frame rate: starts
-_LEAST_POLES = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,8 +62,8 @@ def solved(spec: Specification, channel: Channel, *, start: FloatArray | None = 
             return Solved(sequence=sequence, objective_nm=float(np.sqrt(exact)))
     raise NumericalError(
         f"the objective over the frequencies of the programme misses that of the real loop by "
-        f"{miss:.2g}, expected {_INTEGRAL:g}, or a bound is exceeded between them. Try a "
-        "smaller pole, or wider bands.",
+        f"{miss:.2g}, expected {_INTEGRAL:g}, or a bound is exceeded between them. Try "
+        "fewer functions, a smoother spectrum, or wider bands.",
         status="quadrature",
     )
 
@@ -111,7 +110,7 @@ def reduced(
         for slow in _SLOW_HZ
     ]
     candidates = [min(starts, key=lambda start: start[1])[0]]
-    while fewest and np.count_nonzero(candidates[-1].imag) > _LEAST_POLES:
+    while fewest and candidates[-1].size > 2 and np.any(candidates[-1].imag):
         fewer = without_least_pair(
             candidates[-1], leaving_out(angles, target, weight, candidates[-1])
         )

@@ -115,7 +115,7 @@ def solve_sequence(
         c = solution.coefficients
         values.append(function.value(c))
         excess = watch.excess(function, c)
-        settled = convex or (len(values) > 1 and values[-2] - values[-1] < _DECREASE * values[-1])
+        settled = convex or (len(values) > 1 and values[-2] - values[-1] <= _DECREASE * values[-1])
         if excess.size == 0 and settled:
             return SequenceResult(
                 channel=channel,
@@ -243,11 +243,13 @@ def _refusal(
             tuple(groups[j] for j in core), size=size, rigid=tuple(j != i for j in core)
         )
         factor = 1 + float(relaxed[core.index(i)])
-        amount = f"alone it must be relaxed by a factor of {factor:.4g}"
+        size_text = f"{factor:.4g}" if factor > 1.001 else f"1 + {factor - 1:.1g}"
+        amount = f"alone it must be relaxed by a factor of {size_text}"
         listing.append(f"{labels[i]} ({amount if np.isfinite(factor) else 'no relaxation helps'})")
     together = "cannot hold" if len(core) == 1 else "cannot hold together"
     return InfeasibleError(
         f"these demands {together} with {size} functions: {'; '.join(listing)}. Relax one of "
-        "them, or leave one out.",
+        f"them, or leave one out; {100 * ROOM:g} % of each bound is kept for what lies between the "
+        "frequencies.",
         conflict=tuple(labels[i] for i in core),
     )

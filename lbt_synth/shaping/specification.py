@@ -11,15 +11,17 @@ from lbt_synth.certify import Check
 from lbt_synth.cones import Constraint, Function
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar import ARModel
+from lbt_synth.models.truth import Spectrum
 from lbt_synth.shaping.channel import Channel
 from lbt_synth.shaping.demands import (
     DEMANDS,
     Attenuation,
+    CommandRms,
     Demand,
     MirrorUncertainty,
     SensorGainRange,
 )
-from lbt_synth.shaping.grid import Grid, first_grid
+from lbt_synth.shaping.grid import Grid, first_grid, thinned
 from lbt_synth.shaping.measured import MeasuredLoop
 from lbt_synth.shaping.terms import (
     ResidualVariance,
@@ -27,6 +29,7 @@ from lbt_synth.shaping.terms import (
     leaves,
     require_term,
 )
+from lbt_synth.validation import sequence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,7 +65,7 @@ class Specification:
 
     def __post_init__(self) -> None:
         require_term(self.objective)
-        demands: list[Any] = list(self.demands)
+        demands: list[Any] = list(sequence(self.demands, "demands"))
         for demand in demands:
             if not isinstance(demand, DEMANDS):
                 known = ", ".join(kind.__name__ for kind in DEMANDS)
@@ -82,33 +85,46 @@ class Specification:
         named = [*self.objective.bands_hz, *((d.low_hz, d.high_hz) for d in masks)]
         return tuple(dict.fromkeys(named))
 
-    def require_below(self, nyquist_hz: float) -> None:
-        """Refuse bands beyond the Nyquist frequency.
+    @property
+    def spectra(self) -> tuple[Spectrum, ...]:
+        """Spectra of the objective and of the demands."""
+        named = [leaf for leaf in leaves(self.objective) if isinstance(leaf, ResidualVariance)]
+        bounded = [demand for demand in self.demands if isinstance(demand, CommandRms)]
+        found = [*(part.turbulence for part in named), *(part.turbulence for part in bounded)]
+        return tuple(spectrum for spectrum in found if spectrum is not None)
+
+    def require_fitting(self, frame_rate_hz: float) -> None:
+        """Refuse bands beyond the Nyquist frequency, and models of another frame rate.
 
         Raises
         ------
         ProblemError
-            Naming the band.
+            Naming the band or the rate.
         """
         for low, high in self.bands_hz:
-            if high > nyquist_hz:
+            if high > frame_rate_hz / 2:
                 raise ProblemError(
-                    f"a band must lie below the Nyquist frequency {nyquist_hz:.6g} Hz; got "
+                    f"a band must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; got "
                     f"{low:g} to {high:g} Hz."
+                )
+        for spectrum in self.spectra:
+            if isinstance(spectrum, ARModel) and not np.isclose(
+                spectrum.frame_rate_hz, frame_rate_hz, rtol=1e-9
+            ):
+                raise ProblemError(
+                    f"an ARModel must be sampled at the loop's {frame_rate_hz:.6g} Hz; got "
+                    f"{spectrum.frame_rate_hz:.6g} Hz."
                 )
 
     def grid(self, channel: Channel, *, fineness: int = 1) -> Grid:
         """Return the first grid of frequencies for a channel."""
-        models = [
-            leaf.turbulence
-            for leaf in leaves(self.objective)
-            if isinstance(leaf, ResidualVariance) and isinstance(leaf.turbulence, ARModel)
-        ]
-        poles = [channel.basis.poles, *(np.linalg.eigvals(m.companion) for m in models)]
+        nyquist = channel.nyquist_hz
+        edges = [thinned(spectrum, nyquist) for spectrum in self.spectra]
         return first_grid(
             channel.hardware.frame_rate_hz,
             bands_hz=self.bands_hz,
-            poles=np.concatenate(poles),
+            poles=channel.basis.poles,
+            breakpoints_hz=np.unique(np.concatenate([np.zeros(0), *edges])),
             fineness=fineness,
         )
 

@@ -14,10 +14,11 @@ from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
 from lbt_synth.models.truth import Spectrum, TabulatedSpectrum, Truth
 from lbt_synth.norms import band_norm
+from lbt_synth.shaping.band import Band
 from lbt_synth.shaping.channel import Channel
 from lbt_synth.shaping.grid import Grid
 from lbt_synth.shaping.measured import MeasuredLoop
-from lbt_synth.validation import ComplexArray, FloatArray, number
+from lbt_synth.validation import ComplexArray, FloatArray, number, sequence
 
 
 def checked_spectrum(value: object, name: str) -> None:
@@ -33,18 +34,6 @@ def checked_spectrum(value: object, name: str) -> None:
             f"{name} must be an Atmosphere, an ARModel, a TabulatedSpectrum or None; got "
             f"{type(value).__name__}. Sample it into a TabulatedSpectrum."
         )
-
-
-def checked_band(low_hz: float, high_hz: float) -> tuple[float, float]:
-    """Return the ends of a band.
-
-    Raises
-    ------
-    ProblemError
-        If they are no numbers of at least 0 in increasing order.
-    """
-    low = number(low_hz, "low_hz", at_least=0)
-    return low, number(high_hz, "high_hz", above=low)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,7 +111,7 @@ class ResidualVariance:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VibrationBand:
+class VibrationBand(Band):
     """Worst residual of a vibration that may be anywhere in a band of frequencies.
 
     Parameters
@@ -146,25 +135,19 @@ class VibrationBand:
     ((16.5, 23.5),)
     """
 
-    low_hz: float
-    high_hz: float
     rms_nm: float
     sensor_gain: float = 1.0
 
     def __post_init__(self) -> None:
+        Band.__post_init__(self)
         set_ = object.__setattr__
-        low, high = checked_band(self.low_hz, self.high_hz)
-        set_(self, "low_hz", low)
-        set_(self, "high_hz", high)
         set_(self, "rms_nm", number(self.rms_nm, "rms_nm", above=0))
         set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
 
     @property
     def label(self) -> str:
         """What a table calls it."""
-        return (
-            f"vibration in {self.low_hz:g}-{self.high_hz:g} Hz at sensor gain {self.sensor_gain:g}"
-        )
+        return f"vibration in {self.band_text} at sensor gain {self.sensor_gain:g}"
 
     @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:
@@ -195,12 +178,12 @@ class _Several:
     weights: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        terms = tuple(self.terms)
+        terms = sequence(self.terms, "terms")
         for term in terms:
             require_term(term)
         if not terms:
             raise ProblemError("an objective needs at least one term; got none.")
-        given = (1.0,) * len(terms) if self.weights is None else tuple(self.weights)
+        given = (1.0,) * len(terms) if self.weights is None else sequence(self.weights, "weights")
         if len(given) != len(terms):
             raise ProblemError(f"weights must be one a term, {len(terms)}; got {len(given)}.")
         object.__setattr__(self, "terms", terms)
