@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from lbt_synth.design import Design, FilterDesign, ShapedDesign
+from lbt_synth.design import Design, EstimatorDesign, ShapedDesign
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.limits import (
     BandLimit,
@@ -254,7 +254,7 @@ def _limit_or_none(limit: Callable[[], T]) -> T | None:
         return None
 
 
-def model_distance(design: FilterDesign) -> tuple[float, float]:
+def model_distance(design: EstimatorDesign) -> tuple[float, float]:
     """Limit of a filter's own model [nm rms] and how far its error is above it [%].
 
     nan where the limit cannot be computed; the second also for a fractional delay, where a

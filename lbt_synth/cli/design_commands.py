@@ -191,9 +191,6 @@ def _description(made: Design) -> Report:
             ("estimation error, H-infinity norm", made.gamma, unit),
         ]
         data |= {"rms": made.rms, "gamma": made.gamma}
-    if isinstance(made, PolytopicDesign):
-        _describe_interval(made, facts, data)
-    if isinstance(made, FilterDesign):
         if made.hardware is not None:
             limit_nm, above = model_distance(made)
             facts += [
@@ -201,6 +198,9 @@ def _description(made: Design) -> Report:
                 ("estimation error above it", above, "%"),
             ]
             data |= {"limit_nm": limit_nm, "above_limit_percent": above}
+    if isinstance(made, PolytopicDesign):
+        _describe_interval(made, facts, data)
+    if isinstance(made, FilterDesign):
         data |= {
             "gamma_requested": made.gamma_requested,
             "gamma_least": made.gamma_least,

@@ -1,17 +1,10 @@
 """Specifications of a closed loop that are convex in the Youla parameter."""
 
-from lbt_synth.shaping.demands import (
-    Attenuation,
-    CommandRms,
-    DelayError,
-    Demand,
-    MirrorUncertainty,
-    ModulusMargin,
-    NoisePeak,
-    SensorGainRange,
-)
+from lbt_synth.shaping.bounds import Attenuation, CommandRms, ModulusMargin, NoisePeak
+from lbt_synth.shaping.demands import Demand
 from lbt_synth.shaping.specification import Specification
 from lbt_synth.shaping.terms import ResidualVariance, Term, Total, VibrationBand, Worst
+from lbt_synth.shaping.uncertainty import DelayError, MirrorUncertainty, SensorGainRange
 
 __all__ = [
     "Attenuation",

@@ -18,7 +18,7 @@ from lbt_synth.cones import (
 )
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.shaping.channel import Channel
-from lbt_synth.shaping.demands import ROOM
+from lbt_synth.shaping.drawn import ROOM
 from lbt_synth.shaping.grid import Grid, fine_frequencies
 from lbt_synth.shaping.specification import Specification
 from lbt_synth.shaping.terms import noise_level

@@ -12,15 +12,9 @@ from lbt_synth.cones import Constraint, Function
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.truth import Spectrum
+from lbt_synth.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.shaping.channel import Channel
-from lbt_synth.shaping.demands import (
-    DEMANDS,
-    Attenuation,
-    CommandRms,
-    Demand,
-    MirrorUncertainty,
-    SensorGainRange,
-)
+from lbt_synth.shaping.demands import DEMANDS, Demand
 from lbt_synth.shaping.grid import Grid, first_grid, thinned
 from lbt_synth.shaping.measured import MeasuredLoop
 from lbt_synth.shaping.terms import (
@@ -29,6 +23,7 @@ from lbt_synth.shaping.terms import (
     leaves,
     require_term,
 )
+from lbt_synth.shaping.uncertainty import MirrorUncertainty, SensorGainRange
 from lbt_synth.validation import sequence
 
 
