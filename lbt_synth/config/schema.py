@@ -209,7 +209,7 @@ class RobustSection(_Section):
     functions: Annotated[int, Field(ge=1)] = 60
     pole: Annotated[float, Field(ge=0, lt=1)] = 0.7
     states: Annotated[int, Field(ge=2)] | None = 20
-    loss: Annotated[float, Field(ge=0)] = 0.25
+    loss: Annotated[float, Field(ge=0)] = 0.1
 
 
 class DesignSection(_Section):

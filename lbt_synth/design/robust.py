@@ -35,7 +35,7 @@ def robust(
     functions: int = 60,
     pole: float = 0.7,
     states: int | None = 20,
-    loss: float = 0.25,
+    loss: float = 0.1,
 ) -> ShapedDesign:
     """Design one controller for vibrations anywhere in bands and an uncertain sensor gain.
 

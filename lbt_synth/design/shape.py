@@ -32,7 +32,7 @@ def shape(
     functions: int = 60,
     pole: float = 0.7,
     states: int | None = 20,
-    loss: float = 0.25,
+    loss: float = 0.1,
 ) -> ShapedDesign:
     """Design the controller that minimises an objective under demands on the closed loop.
 
