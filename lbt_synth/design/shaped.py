@@ -109,14 +109,8 @@ class ShapedDesign(Design):
                 for check in _mode_checks(hardware, spec, parameter, claimed)
             ]
         whole = assembled(hardware, self.parameters)
-        size = max(float(np.max(np.abs(whole.A))), 1e-300)
-        same = all(getattr(whole, n).shape == getattr(self.controller, n).shape for n in "ABCD")
-        distance = (
-            max(float(np.max(np.abs(getattr(whole, n) - getattr(self.controller, n)), initial=0))
-                for n in "ABCD") / size
-            if same
-            else np.inf
-        )  # fmt: skip
+        pairs = [(getattr(whole, name), getattr(self.controller, name)) for name in "ABCD"]
+        distance = max(_relative_distance(here, there) for here, there in pairs)
         checks += [
             Check(
                 name="controller against its parameters",
@@ -144,6 +138,15 @@ class ShapedDesign(Design):
             limit=1e-6,
             method=f"sensitivity at {f.size} frequencies",
         )
+
+
+def _relative_distance(here: FloatArray, there: FloatArray) -> float:
+    """Largest difference of two matrices over their largest entry; infinite for other sizes."""
+    if here.shape != there.shape:
+        return float("inf")
+    size = float(np.max(np.abs(here), initial=0.0))
+    difference = float(np.max(np.abs(here - there), initial=0.0))
+    return difference / size if size > 0 else difference
 
 
 def _mode_checks(
