@@ -175,5 +175,5 @@ def _mode(result: Solved, long: Solved) -> _Mode:
         objective_nm=result.objective_nm * (1 + _ROUNDED),
         long_objective_nm=long.objective_nm,
         status=result.sequence.status,
-        programmes=len(long.sequence.objectives_nm2),
+        programmes=long.sequence.programmes,
     )

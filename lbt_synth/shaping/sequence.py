@@ -27,6 +27,7 @@ from lbt_synth.validation import FloatArray
 _STEPS = 24
 _DECREASE = 2e-3  # of the objective, below which a step is the last
 _FINE = 2048
+_WORST = 2e-3  # by which a worst case may exceed that of the programme's own frequencies
 _CLOSE = 0.98  # of a bound: the neighbourhood is looked at more closely
 _BETWEEN = 33
 _RELAXED = 1e-6  # relaxations below this are none
@@ -47,7 +48,9 @@ class SequenceResult:
     objective_nm2 : float
         Objective over the grid [nm^2].
     objectives_nm2 : tuple of float
-        Objective after each programme [nm^2].
+        Objective at the optimum for unit gain, and after each programme from there on [nm^2].
+    programmes : int
+        Number of programmes.
     status : str
         The solver's word on the last programme.
     """
@@ -57,6 +60,7 @@ class SequenceResult:
     coefficients: FloatArray
     objective_nm2: float
     objectives_nm2: tuple[float, ...]
+    programmes: int
     status: str
 
 
@@ -70,9 +74,9 @@ def solve_sequence(
     """Minimise the objective of a specification in a basis.
 
     A convex specification takes one programme, and another for each time that a bound is
-    exceeded between its frequencies. One with terms at other sensor gains starts from the
-    optimum at unit gain and goes on with upper bounds that touch the objective; none of
-    these steps makes it larger or leaves the demands.
+    exceeded between its frequencies. One with terms at other sensor gains is solved for unit gain
+    first, until the demands hold at all frequencies, and goes on with upper bounds that touch
+    the objective; none of these steps makes it larger or leaves the demands.
 
     Parameters
     ----------
@@ -104,11 +108,13 @@ def solve_sequence(
     function, groups = specification.compiled(channel, grid)
     convex = is_convex(function)
     scale = _scale(specification, function, channel.basis.size)
-    c = start
+    # the upper bounds need coefficients whose loops are stable at all sensor gains
+    c = start if start is not None and watch.is_stable(start) else None
+    aware = is_convex(function) or c is not None
     values: list[float] = []
-    for _ in range(_STEPS):
+    for programmes in range(1, _STEPS + 1):
         constraints = merged(tuple(x for group in groups for x in group))
-        goal = without_denominators(function) if c is None else function
+        goal = function if aware else without_denominators(function)
         solution = least(goal, constraints, size=channel.basis.size, scale=scale, start=c)
         if solution.coefficients is None:
             raise _refusal(specification, groups, channel.basis.size, solution.status)
@@ -116,6 +122,8 @@ def solve_sequence(
         values.append(function.value(c))
         excess = watch.excess(function, c)
         settled = convex or (len(values) > 1 and values[-2] - values[-1] <= _DECREASE * values[-1])
+        if not aware:
+            aware, settled, values = excess.size == 0, False, values[-1:]
         if excess.size == 0 and settled:
             return SequenceResult(
                 channel=channel,
@@ -123,6 +131,7 @@ def solve_sequence(
                 coefficients=c,
                 objective_nm2=values[-1],
                 objectives_nm2=tuple(values),
+                programmes=programmes,
                 status=solution.status,
             )
         if excess.size:
@@ -171,9 +180,16 @@ class _Watch:
             constraints=merged(tuple(c for group in groups for c in group)),
         )
 
+    def is_stable(self, c: FloatArray) -> bool:
+        """Whether the half-planes of the sensor gains hold, but for the room."""
+        planes = [x for x in self.constraints if isinstance(x, HalfPlanes)]
+        return all(float(np.max(plane.use(c))) * (1 - ROOM) < 1 for plane in planes)
+
     def excess(self, function: Function, c: FloatArray) -> FloatArray:
         """Frequencies at which bounds, or the programme's own worst cases, are exceeded [Hz]."""
-        limits = tuple(leaf.value(c) if leaf.worst else np.inf for leaf in fractions(function))
+        limits = tuple(
+            leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf for leaf in fractions(function)
+        )
         found = self._above(limits, c, 1 + ROOM / 2)
         if found.size:
             return found[:, 1]
