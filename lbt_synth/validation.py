@@ -117,7 +117,7 @@ def semidefinite(
     if np.any(wrong):
         raise DefinitenessError(
             f"{name} must be positive semidefinite; got a least eigenvalue of "
-            f"{least[wrong].min():.6g}."
+            f"{np.min(least[wrong]):.6g}."
         )
     return out
 
@@ -128,7 +128,7 @@ def definite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> F
     least, scale = _extreme_eigenvalues(out)
     if not np.all(least > 1e-14 * scale):
         raise DefinitenessError(
-            f"{name} must be positive definite; got a least eigenvalue of {least.min():.6g}."
+            f"{name} must be positive definite; got a least eigenvalue of {np.min(least):.6g}."
         )
     return out
 

@@ -162,12 +162,24 @@ def test_an_infeasible_file_names_what_clashes(small, tmp_path, capsys):
         ("\n  gamma_ratio: 1.2\n", "the key design.robust is missing"),
         (
             SMALL.replace("high_hz: 21.0", "high_hz: 18.0"),
-            "design.robust: high_hz must be above 19",
+            "design.robust.bands[0]: high_hz must be above 19",
         ),
         (SMALL.replace("high_hz: 21.0", "high_hz: 500.0"), "below the Nyquist frequency 400 Hz"),
         (SMALL.replace("rms_mas: 10.0", "rms_mas: -1.0"), "design.robust.bands[0].rms_mas"),
+        (
+            SMALL + "    attenuation:\n      - {low_hz: 3.0, high_hz: 2.0, at_most: 0.5}\n",
+            "small.yaml: design.robust.attenuation[0]: high_hz must be above 3",
+        ),
+        (
+            SMALL
+            + "    mirror_uncertainty:\n      - {low_hz: 3.0, high_hz: 600.0, relative: 0.5}\n",
+            "design.robust.mirror_uncertainty[0]: must lie below the Nyquist",
+        ),
         (SMALL.replace("rms_mas: 10.0", "rms: 10.0"), "unknown key design.robust.bands[0].rms"),
-        (SMALL + "    sensor_gain: [1.1, 1.3]\n", "design.robust: low must be at most 1"),
+        (
+            SMALL + "    sensor_gain: [1.1, 1.3]\n",
+            "design.robust.sensor_gain: must hold model.sensor_gain, 1; got 1.1 to 1.3",
+        ),
         (SMALL + "    modulus_margin: 1.5\n", "design.robust.modulus_margin"),
         (SMALL.replace("functions: 16", "functions: 1000"), "functions must be at most 400"),
     ],

@@ -374,7 +374,7 @@ def test_the_relaxation_that_is_named_suffices():
 def test_too_few_states_for_the_loss_are_refused():
     objective = lbt.Total(terms=(BASIC, lbt.VibrationBand(low_hz=15, high_hz=25, rms_nm=500)))
     with pytest.raises(
-        lbt.InfeasibleError, match="no controller with 4 poles a mode came within 1 %"
+        lbt.InfeasibleError, match="no controller of 5 states a mode came within 1 %"
     ):
         lbt.shape(ONE, spec(objective=objective), functions=30, states=5, loss=0.01)
 

@@ -30,6 +30,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain, require_gain_name, save_gain
 from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.validation import FloatArray
 
 _SMALL_MODULUS = 0.3
 _ROUTES = {
@@ -220,19 +221,20 @@ def _description(made: Design) -> Report:
         facts.append(("gain", made.gain, ""))
         data["gain"] = made.gain
     if isinstance(made, ShapedDesign):
-        facts += [
-            ("states of one mode, past commands included", made.states_per_mode, ""),
-            ("loss by having few states", 100 * made.loss, "%"),
-        ]
+        facts.append(("states of one mode, past commands included", made.states_per_mode, ""))
+        if made.is_reduced:
+            facts.append(("objective above the long parameter's", 100 * made.loss, "%"))
         limit_nm, above = shaped_distance(made)
-        facts += [
-            ("least residual of any linear controller", limit_nm, unit),
-            ("residual at unit sensor gain above it", above, "%"),
-        ]
+        if not np.isnan(limit_nm):
+            facts += [
+                ("least worst residual over its bands, all modes", limit_nm, unit),
+                ("residual at unit sensor gain above it", above, "%"),
+            ]
         terms = made.terms_nm()
         data |= {
             "states_per_mode": made.states_per_mode,
             "loss": made.loss,
+            "demands": [{"mode": m + 1, "demand": label} for m, label in made.demanded()],
             "limit_nm": limit_nm,
             "above_limit_percent": above,
             "objective_nm": made.objective_nm,
@@ -261,6 +263,13 @@ def _description(made: Design) -> Report:
     if isinstance(made, ShapedDesign):
         tables.append(
             TableText(
+                title="Demands",
+                headings=("demand", "mode"),
+                rows=[(label, mode + 1) for mode, label in made.demanded()],
+            )
+        )
+        tables.append(
+            TableText(
                 title="Residual of each term",
                 headings=("term", "mode", "residual [nm rms]"),
                 rows=[(text, mode + 1, rms) for mode, text, rms in terms],
@@ -272,6 +281,16 @@ def _description(made: Design) -> Report:
         notes.append(
             f"note: the modulus margin {margins.modulus:.3g} is small; a loop is usually asked for "
             f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
+        )
+    if made.hardware is not None and not is_identity(made.hardware.sensor):
+        notes.append(
+            "note: sensor gains here are factors on the gain that the design assumes, which is in "
+            "its sensor matrix."
+        )
+    if isinstance(made, ShapedDesign) and made.is_reduced and made.loss < 0:
+        notes.append(
+            f"note: the long parameter is not long enough: one of {made.states_per_mode} states is "
+            "better. Try more functions, or another pole."
         )
     if made.hardware is not None and alone > 1:
         notes.append(
@@ -305,6 +324,11 @@ def _describe_interval(
         "bound_programme": made.bound_programme,
         "guaranteed_over_found": ratio,
     }
+
+
+def is_identity(matrix: FloatArray) -> bool:
+    """Whether a matrix is the identity."""
+    return matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, np.eye(len(matrix)))
 
 
 def _digits(level: float | None) -> str:

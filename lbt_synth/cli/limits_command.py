@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.loop_commands import named_designs
+from lbt_synth.cli.loop_commands import foreign_notes, named_designs
 from lbt_synth.cli.output import Report, TableText, working
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
@@ -48,7 +48,7 @@ def limits(arguments: Namespace) -> Report:
                 rows=[_cells(record)[: len(headings)] for record in records],
             )
         ],
-        notes=_notes(study),
+        notes=[*_notes(study), *_design_notes(config, designs, study)],
     )
     write_outputs(report, arguments.output, records=records, figure=lambda: limits_figure(study))
     return report
@@ -71,7 +71,7 @@ def _record(row: dict[str, Any], *, banded: bool) -> dict[str, Any]:
 def _cells(record: dict[str, Any]) -> list[str]:
     return [
         record["design"],
-        _fixed(record["residual_nm"], 2),
+        _fixed(record["residual_nm"], 2) if record["stable"] else "unstable",
         _fixed(100 * record["strehl"], 2),
         _fixed(record["above_limit_percent"], 2),
         _fixed(record["worst_nm"], 2),
@@ -114,4 +114,19 @@ def _notes(study: LimitStudy) -> list[str]:
             f"{study.band.rms_nm:.6g} nm rms (a filter of infinite order achieves "
             f"{study.band.achieved_nm:.6g})"
         )
+    return notes
+
+
+def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy) -> list[str]:
+    """Say what makes a row another comparison than it seems."""
+    notes = []
+    if config.truth.vibrations and not config.plant.vibrations:
+        notes.append(
+            "note: kalman and hinf are designed without a vibration, as model.vibrations is "
+            "missing; the truth has one."
+        )
+    if study.band is None and len(config.truth.vibrations) > 1:
+        notes.append("note: the limit over a range of frequencies is that of a single sinusoid.")
+    for name, design in designs.items():
+        notes += [f"{note[:-1]} ({name})." for note in foreign_notes(config, design)]
     return notes

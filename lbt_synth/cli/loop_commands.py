@@ -177,6 +177,12 @@ def _simulation_notes(config: Config, design: Design, scatter: float, settle: in
             f"note: this loop settles for {settle} frames, not {usual}; its random series are not "
             "those of a faster loop with the same seed. Raise simulation.settle_frames."
         )
+    return notes + foreign_notes(config, design)
+
+
+def foreign_notes(config: Config, design: Design) -> list[str]:
+    """Say where a design was made for another loop than the configuration's."""
+    notes = []
     own, here = design.hardware, config.hardware
     if own is not None and own.delay_frames != here.delay_frames:
         notes.append(

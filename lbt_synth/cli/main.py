@@ -100,7 +100,12 @@ def build_parser() -> argparse.ArgumentParser:
 
     sigma = command("sigma", "Plot singular values of one or several designs")
     sigma.add_argument("gains", nargs="+", metavar="gain", help=gain_help)
-    sigma.add_argument("--sensor-gain", type=float, default=1.0, help="real sensor gain")
+    sigma.add_argument(
+        "--sensor-gain",
+        type=float,
+        default=1.0,
+        help="real sensor gain, as a factor on the one that each design assumes (default 1)",
+    )
     sigma.add_argument("-o", "--output", required=True, help="figure (.png, .pdf or .svg)")
 
     simulate = command("simulate", "Close the loop in the time domain, beside the exact answer")

@@ -152,7 +152,8 @@ def _maps(config: Config, arguments: Namespace) -> Report:
 def _refined(values: Sequence[float]) -> FloatArray:
     """Return values in increasing order, with three more between any two of them."""
     known = np.unique(values)
-    return np.interp(np.arange(4 * known.size - 3) / 4, np.arange(known.size), known)
+    places = np.arange(4 * known.size - 3) / 4
+    return np.asarray(np.interp(places, np.arange(known.size), known))
 
 
 def _values(
@@ -243,8 +244,8 @@ def _summary(name: str, found: StrehlMap) -> TableText:
                 )
             )
     return TableText(
-        title=f"{name}: Strehl ratio over frequency errors of {found.errors_hz.min():+g} to "
-        f"{found.errors_hz.max():+g} Hz",
+        title=f"{name}: Strehl ratio over frequency errors of {np.min(found.errors_hz):+g} to "
+        f"{np.max(found.errors_hz):+g} Hz",
         headings=(
             "sensor gain", "delay error", "stable", "Strehl at 0 Hz [%]", "worst Strehl [%]",
             "at [Hz]",

@@ -53,6 +53,8 @@ class Config:
         Turbulence and telescope.
     noise_nm : float
         Measurement noise per frame [nm].
+    source : pathlib.Path
+        The file.
     """
 
     settings: FileSection
@@ -61,6 +63,7 @@ class Config:
     imaging: Imaging
     atmosphere: Atmosphere
     noise_nm: float
+    source: Path
 
     @property
     def hardware(self) -> LoopHardware:
@@ -210,6 +213,7 @@ def _build(settings: FileSection, source: Path) -> Config:
         imaging=imaging,
         atmosphere=atmosphere,
         noise_nm=noise_nm,
+        source=source,
     )
 
 

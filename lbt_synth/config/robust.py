@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from lbt_synth.config.load import Config, rms_nm
 from lbt_synth.design import ShapedDesign, robust
@@ -48,18 +49,32 @@ def robust_design(config: Config) -> ShapedDesign:
     section = config.settings.design.robust
     if section is None:
         raise ConfigError(
-            f"the key {_KEY} is missing: the robust design needs its bands at least. Try "
-            "examples/lbt_robust.yaml.",
+            f"{config.source}: the key {_KEY} is missing: the robust design needs its bands at "
+            "least. Try examples/lbt_robust.yaml.",
             path=_KEY,
         )
     believed = config.settings.model.sensor_gain
+    if section.sensor_gain is not None:
+        low, high = section.sensor_gain
+        if not low <= believed <= high:
+            key = f"{_KEY}.sensor_gain"
+            raise ConfigError(
+                f"{config.source}: {key}: must hold model.sensor_gain, {believed:g}; got "
+                f"{low:g} to {high:g}.",
+                path=key,
+            )
     spectrum: Spectrum | None = config.atmosphere if section.turbulence == "frozen_flow" else None
     try:
         bands = [
-            VibrationBand(
-                low_hz=band.low_hz, high_hz=band.high_hz, rms_nm=rms_nm(band, config.settings)
+            _entry(
+                config,
+                f"bands[{i}]",
+                VibrationBand,
+                low_hz=band.low_hz,
+                high_hz=band.high_hz,
+                rms_nm=rms_nm(band, config.settings),
             )
-            for band in section.bands
+            for i, band in enumerate(section.bands)
         ]
         arguments: dict[str, Any] = {
             "bands": bands,
@@ -76,8 +91,29 @@ def robust_design(config: Config) -> ShapedDesign:
         if section.scenarios is not None:
             arguments["scenarios"] = tuple(gain / believed for gain in section.scenarios)
         return robust(config.plant, **arguments)
+    except ConfigError:
+        raise
     except ProblemError as error:
-        raise ConfigError(f"{_KEY}: {error}", path=_KEY) from error
+        raise ConfigError(f"{config.source}: {_KEY}: {error}", path=_KEY) from error
+
+
+T = TypeVar("T")
+
+
+def _entry(config: Config, name: str, kind: Callable[..., T], **values: float) -> T:
+    """Make one entry of a list; what is wrong with it is said with its key."""
+    key = f"{_KEY}.{name}"
+    nyquist_hz = config.settings.loop.frame_rate_hz / 2
+    if values["high_hz"] > nyquist_hz:
+        raise ConfigError(
+            f"{config.source}: {key}: must lie below the Nyquist frequency {nyquist_hz:.6g} Hz; "
+            f"got up to {values['high_hz']:g} Hz.",
+            path=key,
+        )
+    try:
+        return kind(**values)
+    except ProblemError as error:
+        raise ConfigError(f"{config.source}: {key}: {error}", path=key) from error
 
 
 def _demands(config: Config, spectrum: Spectrum | None) -> list[Demand]:
@@ -90,17 +126,27 @@ def _demands(config: Config, spectrum: Spectrum | None) -> list[Demand]:
     if section.delay_error_frames is not None:
         out.append(DelayError(frames=section.delay_error_frames))
     out += [
-        Attenuation(
+        _entry(
+            config,
+            f"attenuation[{i}]",
+            Attenuation,
             low_hz=step.low_hz,
             high_hz=step.high_hz,
             at_most=step.at_most,
             sensor_gain=1.0 if step.sensor_gain is None else step.sensor_gain / believed,
         )
-        for step in section.attenuation
+        for i, step in enumerate(section.attenuation)
     ]
     out += [
-        MirrorUncertainty(relative=part.relative, low_hz=part.low_hz, high_hz=part.high_hz)
-        for part in section.mirror_uncertainty
+        _entry(
+            config,
+            f"mirror_uncertainty[{i}]",
+            MirrorUncertainty,
+            relative=part.relative,
+            low_hz=part.low_hz,
+            high_hz=part.high_hz,
+        )
+        for i, part in enumerate(section.mirror_uncertainty)
     ]
     noise = float(max(noise_of_modes(config.hardware, config.plant.R)))
     turbulence = config.plant.turbulence[0] if spectrum is None else spectrum

@@ -287,7 +287,7 @@ def _synthesised(interval: FrequencyInterval, norm: str) -> tuple[Controller, fl
         status=inaccurate[0] if inaccurate else "optimal",
         iterations=sum(filtered.iterations for _, filtered in solved),
     )
-    return predictor, float(bounds.max() if norm == "hinf" else np.hypot.reduce(bounds)), report
+    return predictor, float(np.max(bounds) if norm == "hinf" else np.linalg.norm(bounds)), report
 
 
 def _axes(plant: TipTiltPlant) -> list[TipTiltPlant]:

@@ -22,7 +22,7 @@ _RMS_TOLERANCE = 1e-6
 _TEST_HZ = (0.0, 0.003, 0.02, 0.11, 0.37)  # parts of the frame rate
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class ShapedDesign(Design):
     """A controller shaped in the closed loop, mode by mode.
 
@@ -70,6 +70,27 @@ class ShapedDesign(Design):
         """Largest relative increase of a mode's objective by the reduction, of its root."""
         pairs = zip(self.objective_nm, self.long_objective_nm, strict=True)
         return max(short / long - 1 for short, long in pairs)
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether the parameters have fewer poles than the long one."""
+        return any(p.n_states < self.long_functions for p in self.parameters)
+
+    def demanded(self) -> tuple[tuple[int, str], ...]:
+        """Demands in words: mode, demand."""
+        return tuple(
+            (mode, demand.label)
+            for mode, spec in enumerate(self.specifications)
+            for demand in spec.demands
+        )
+
+    def __repr__(self) -> str:
+        """Return one line: what it is, not its matrices."""
+        return (
+            f"ShapedDesign(method={self.method!r}, modes={len(self.parameters)}, "
+            f"states_per_mode={self.states_per_mode}, objective_nm={self.objective_nm}, "
+            f"passed={self.certificate.passed})"
+        )
 
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
         """Residual of each term in the real loop: mode, what it is, [nm rms]."""

@@ -119,7 +119,9 @@ class Prediction:
     def error_power(self, x: FloatArray) -> FloatArray:
         """``|P|^2 / sigma^2`` at frequencies x: the rejection is ``|P / F|^2``."""
         shift = np.exp(-1j * np.pi * x)
-        part: ComplexArray = np.polynomial.polynomial.polyval(shift, self.coefficients)
+        part: ComplexArray = np.asarray(
+            np.polynomial.polynomial.polyval(shift, self.coefficients), dtype=np.complex128
+        )
         a = self.reach.zero
         if a != 0:
             part = part + self.tail * (1 - a**2) * shift**self.reach.whole / (1 - a * shift)

@@ -201,7 +201,8 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
     spread, most = jitter_spread_nm(covariance, lines), widest_jitter_nm(imaging)
     if np.any(spread > most):
         raise ProblemError(
-            f"the jitter must stay below {most:.3g} nm; got {spread.max():.3g} nm. Check the units."
+            f"the jitter must stay below {most:.3g} nm; got {np.max(spread):.3g} nm. Check "
+            "the units."
         )
     if count == 0:
         return np.empty(0)

@@ -102,6 +102,8 @@ def _panel(panel: Any, found: StrehlMap, row: int, low: float, high: float) -> A
     height = y[-1] - y[0]
     for bottom, top in _bands(~found.stable[row][up], y):
         panel.axhspan(bottom, top, facecolor="0.85", edgecolor="0.55", hatch="////", linewidth=0)
+        if top - bottom < 0.08 * height:  # no room for a word
+            continue
         panel.text(
             (x[0] + x[-1]) / 2,
             np.clip((bottom + top) / 2, y[0] + 0.05 * height, y[-1] - 0.05 * height),
