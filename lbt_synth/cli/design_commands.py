@@ -196,7 +196,7 @@ def _description(made: Design) -> Report:
             limit_nm, above = model_distance(made)
             facts += [
                 ("least residual of any linear controller", limit_nm, unit),
-                ("estimation error above it", above, "%"),
+                ("estimation error above it", round(above, 6), "%"),
             ]
             data |= {"limit_nm": limit_nm, "above_limit_percent": above}
     if isinstance(made, PolytopicDesign):
