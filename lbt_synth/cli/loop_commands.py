@@ -212,8 +212,8 @@ def _require_figure(output: str) -> None:
 
 def named_designs(paths: list[str]) -> dict[str, Design]:
     """Designs by the stems of their files, by the paths where stems repeat."""
+    if len({Path(path).resolve() for path in paths}) != len(paths):
+        raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
     stems = [Path(path).stem for path in paths]
     names = stems if len(set(stems)) == len(stems) else paths
-    if len(set(names)) != len(names):
-        raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
     return {name: load_gain(path) for name, path in zip(names, paths, strict=True)}

@@ -61,7 +61,7 @@ class FrequencyInterval:
                     "one uncertain frequency at a time: the vibrations must share frequency and "
                     f"damping; got {first.frequency_hz:.6g} Hz with {first.damping:.6g} and "
                     f"{line.frequency_hz:.6g} Hz with {line.damping:.6g}. Try a plant with one of "
-                    "them, or spread_plant."
+                    "them (without spread_hz in a configuration), or kalman with spread_plant."
                 )
         half = number(self.half_width_hz, "half_width_hz", at_least=0)
         object.__setattr__(self, "half_width_hz", half)
