@@ -198,3 +198,11 @@ def test_options_of_other_methods_are_refused(small, tmp_path, capsys, option):
     argv = ["design", small(), "--method", "robust", *option, "-o", str(tmp_path / "x.fits")]
     assert main(argv) == 2
     assert option[0] in capsys.readouterr().err
+
+
+def test_one_file_under_two_spellings_is_refused(small, tmp_path, capsys, monkeypatch):
+    config = small()
+    monkeypatch.chdir(tmp_path)
+    assert main(["design", config, "--method", "robust", "-o", "one.fits"]) == 0
+    assert main(["robustness", config, "one.fits", "./one.fits", "-o", "map.png"]) == 2
+    assert "must be given once" in capsys.readouterr().err
