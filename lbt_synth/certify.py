@@ -334,3 +334,19 @@ def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
 
 def _stability(name: str, radius: float) -> Check:
     return Check(name=name, value=radius, limit=1 - STABILITY_MARGIN, method="eigenvalues")
+
+
+def controller_distance(one: Controller, other: Controller) -> float:
+    """Largest difference of two controllers' matrices, over the largest entry of each.
+
+    Infinite where their sizes differ.
+    """
+    worst = 0.0
+    for name in "ABCD":
+        a, b = getattr(one, name), getattr(other, name)
+        if a.shape != b.shape:
+            return float("inf")
+        size = float(np.max(np.abs(b), initial=0.0))
+        difference = float(np.max(np.abs(a - b), initial=0.0))
+        worst = max(worst, difference / size if size > 0 else difference)
+    return worst

@@ -6,10 +6,8 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
 from lbt_synth.cli.loop_commands import foreign_notes, named_designs
-from lbt_synth.cli.output import Report, TableText, working
+from lbt_synth.cli.output import Report, TableText, fixed, working
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, hinf, kalman, optimal_integrator
@@ -71,16 +69,12 @@ def _record(row: dict[str, Any], *, banded: bool) -> dict[str, Any]:
 def _cells(record: dict[str, Any]) -> list[str]:
     return [
         record["design"],
-        _fixed(record["residual_nm"], 2) if record["stable"] else "unstable",
-        _fixed(100 * record["strehl"], 2),
-        _fixed(record["above_limit_percent"], 2),
-        _fixed(record["worst_nm"], 2),
-        _fixed(record.get("above_band_limit_percent", float("nan")), 2),
+        fixed(record["residual_nm"], 2) if record["stable"] else "unstable",
+        fixed(100 * record["strehl"], 2),
+        fixed(record["above_limit_percent"], 2),
+        fixed(record["worst_nm"], 2),
+        fixed(record.get("above_band_limit_percent", float("nan")), 2),
     ]
-
-
-def _fixed(value: float, digits: int) -> str:
-    return "-" if np.isnan(value) else f"{value:.{digits}f}"
 
 
 def _data(study: LimitStudy, records: list[dict[str, Any]]) -> dict[str, Any]:

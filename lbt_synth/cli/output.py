@@ -88,6 +88,11 @@ def cell(value: Any) -> str:
     return str(value)
 
 
+def fixed(value: float, digits: int) -> str:
+    """Return a number with a fixed count of decimals, a dash where there is none."""
+    return "-" if np.isnan(value) else f"{value:.{digits}f}"
+
+
 def plain(value: Any) -> Any:
     """Value made of what JSON knows."""
     if isinstance(value, dict):

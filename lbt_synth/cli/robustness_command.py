@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.cli.loop_commands import named_designs, real_truth
-from lbt_synth.cli.output import Report, TableText, counting, progress
+from lbt_synth.cli.output import Report, TableText, counting, fixed, progress
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
@@ -82,9 +82,9 @@ def _designed_anew(config: Config, arguments: Namespace) -> Report:
                 ),
                 rows=[
                     (
-                        f"{row.error_hz:+.2f}", row.method, _fixed(100 * row.strehl, 2),
-                        _fixed(row.residual_nm, 1), _fixed(row.vibration_nm, 1),
-                        _fixed(row.turbulence_nm, 1), _fixed(row.noise_nm, 1), row.stable,
+                        f"{row.error_hz:+.2f}", row.method, fixed(100 * row.strehl, 2),
+                        fixed(row.residual_nm, 1), fixed(row.vibration_nm, 1),
+                        fixed(row.turbulence_nm, 1), fixed(row.noise_nm, 1), row.stable,
                     )
                     for row in rows
                 ],
@@ -98,11 +98,6 @@ def _designed_anew(config: Config, arguments: Namespace) -> Report:
         figure=lambda: robustness_figure(rows),
     )
     return report
-
-
-def _fixed(value: float, digits: int) -> str:
-    """Return a number with a fixed count of decimals, a dash where there is none."""
-    return "-" if np.isnan(value) else f"{value:.{digits}f}"
 
 
 def _maps(config: Config, arguments: Namespace) -> Report:
@@ -238,8 +233,8 @@ def _summary(name: str, found: StrehlMap) -> TableText:
                     f"{gains[j]:.3f}",
                     f"{delay:+g}",
                     stable,
-                    _fixed(strehls[centre[0]], 2) if centre.size else None,
-                    _fixed(strehls[worst], 2),
+                    fixed(strehls[centre[0]], 2) if centre.size else None,
+                    fixed(strehls[worst], 2),
                     f"{found.errors_hz[worst]:+.2f}" if stable else None,
                 )
             )

@@ -7,7 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.certify import NORM_TOLERANCE, Certificate, Check, certify_error, certify_loop
+from lbt_synth.certify import (
+    NORM_TOLERANCE,
+    Certificate,
+    Check,
+    certify_error,
+    certify_loop,
+    controller_distance,
+)
 from lbt_synth.design.result import EstimatorDesign, SolverReport
 from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
 from lbt_synth.loop import youla_controller
@@ -231,25 +238,13 @@ def _certified(design: PolytopicDesign) -> Certificate:
         ),
         Check(
             name="controller, against the one made of the filter",
-            value=_distance(design.controller, made),
+            value=controller_distance(design.controller, made),
             limit=NORM_TOLERANCE,
             method="relative, largest entry",
         ),
         certify_loop(interval.plant.hardware, design.controller),
     ]
     return replace(certificate, checks=(*certificate.checks, *checks))
-
-
-def _distance(one: Controller, other: Controller) -> float:
-    """Largest difference of the matrices, relative to the largest entry of each."""
-    worst = 0.0
-    for name in "ABCD":
-        a, b = getattr(one, name), getattr(other, name)
-        if a.shape != b.shape:
-            return np.inf
-        size = float(np.abs(b).max(initial=0.0))
-        worst = max(worst, float(np.abs(a - b).max(initial=0.0)) / (size if size > 0 else 1.0))
-    return worst
 
 
 def _synthesised(interval: FrequencyInterval, norm: str) -> tuple[Controller, float, SolverReport]:

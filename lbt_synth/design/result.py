@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, TypedDict, Unpack
 
@@ -92,7 +93,7 @@ class Design:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EstimatorDesign(Design):
+class EstimatorDesign(Design, ABC):
     """A controller made of an estimator of z.
 
     Attributes
@@ -120,6 +121,7 @@ class EstimatorDesign(Design):
             return self.problem.hardware
         return None
 
+    @abstractmethod
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
         """System from w to the estimation error.
 
@@ -128,7 +130,6 @@ class EstimatorDesign(Design):
         problem : EstimationProblem, optional
             Problem with other disturbances; the design's own by default.
         """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

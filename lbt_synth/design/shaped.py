@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.certify import Certificate, Check, certify_loop
+from lbt_synth.certify import Certificate, Check, certify_loop, controller_distance
 from lbt_synth.design.result import Design
 from lbt_synth.errors import DimensionError, UnstableLoopError
 from lbt_synth.loop import close_loop, youla_controller
@@ -130,12 +130,10 @@ class ShapedDesign(Design):
                 for check in _mode_checks(hardware, spec, parameter, claimed)
             ]
         whole = assembled(hardware, self.parameters)
-        pairs = [(getattr(whole, name), getattr(self.controller, name)) for name in "ABCD"]
-        distance = max(_relative_distance(here, there) for here, there in pairs)
         checks += [
             Check(
                 name="controller against its parameters",
-                value=distance,
+                value=controller_distance(self.controller, whole),
                 limit=_SAME,
                 method="matrices assembled anew",
             ),
@@ -159,15 +157,6 @@ class ShapedDesign(Design):
             limit=1e-6,
             method=f"sensitivity at {f.size} frequencies",
         )
-
-
-def _relative_distance(here: FloatArray, there: FloatArray) -> float:
-    """Largest difference of two matrices over their largest entry; infinite for other sizes."""
-    if here.shape != there.shape:
-        return float("inf")
-    size = float(np.max(np.abs(here), initial=0.0))
-    difference = float(np.max(np.abs(here - there), initial=0.0))
-    return difference / size if size > 0 else difference
 
 
 def _mode_checks(

@@ -43,15 +43,12 @@ def fitted_poles(
     z = np.exp(1j * angles)
     pairs = start[start.imag > 0]
     real = start[start.imag == 0].real
-    goal = np.concatenate([(weight * target).real, (weight * target).imag])
+    goal = weight * target
     size = float(np.linalg.norm(goal))
 
     def misfit(x: FloatArray) -> FloatArray:
         upper, single = _unpacked(x, pairs.size)
-        columns = weight[:, None] * _functions(z, upper, single)
-        stacked = np.vstack([columns.real, columns.imag])
-        q, _ = np.linalg.qr(stacked)
-        return np.asarray((goal - q @ (q.T @ goal)) / size)
+        return _unfitted(goal, weight, _functions(z, upper, single)) / size
 
     x0 = np.concatenate(
         [np.log(np.abs(pairs) / (1 - np.abs(pairs))), np.angle(pairs), np.arctanh(real)]
@@ -121,13 +118,20 @@ def leaving_out(
     """Misfit of the response when each pair of poles is left out, (pairs,)."""
     z = np.exp(1j * angles)
     upper, single = poles[poles.imag > 0], poles[poles.imag == 0].real
-    goal = np.concatenate([(weight * target).real, (weight * target).imag])
-    out = []
-    for i in range(upper.size):
-        columns = weight[:, None] * _functions(z, np.delete(upper, i), single)
-        q, _ = np.linalg.qr(np.vstack([columns.real, columns.imag]))
-        out.append(float(np.linalg.norm(goal - q @ (q.T @ goal))))
+    goal = weight * target
+    out = [
+        float(np.linalg.norm(_unfitted(goal, weight, _functions(z, np.delete(upper, i), single))))
+        for i in range(upper.size)
+    ]
     return np.array(out)
+
+
+def _unfitted(goal: ComplexArray, weight: FloatArray, functions: ComplexArray) -> FloatArray:
+    """Return what real multiples of weighted functions leave of a goal, real parts first."""
+    columns = weight[:, None] * functions
+    q, _ = np.linalg.qr(np.vstack([columns.real, columns.imag]))
+    stacked = np.concatenate([goal.real, goal.imag])
+    return np.asarray(stacked - q @ (q.T @ stacked))
 
 
 def _unpacked(x: FloatArray, pairs: int) -> tuple[ComplexArray, FloatArray]:

@@ -45,8 +45,6 @@ class SequenceResult:
         Frequencies of the last programme.
     coefficients : (n,) ndarray
         The coefficients.
-    objective_nm2 : float
-        Objective over the grid [nm^2].
     objectives_nm2 : tuple of float
         Objective at the optimum for unit gain, and after each programme from there on [nm^2].
     programmes : int
@@ -58,10 +56,14 @@ class SequenceResult:
     channel: Channel
     grid: Grid
     coefficients: FloatArray
-    objective_nm2: float
     objectives_nm2: tuple[float, ...]
     programmes: int
     status: str
+
+    @property
+    def objective_nm2(self) -> float:
+        """Objective over the grid [nm^2]."""
+        return self.objectives_nm2[-1]
 
 
 def solve_sequence(
@@ -110,7 +112,7 @@ def solve_sequence(
     scale = _scale(specification, function, channel.basis.size)
     # the upper bounds need coefficients whose loops are stable at all sensor gains
     c = start if start is not None and watch.is_stable(start) else None
-    aware = is_convex(function) or c is not None
+    aware = convex or c is not None
     values: list[float] = []
     for programmes in range(1, _STEPS + 1):
         constraints = merged(tuple(x for group in groups for x in group))
@@ -129,7 +131,6 @@ def solve_sequence(
                 channel=channel,
                 grid=grid,
                 coefficients=c,
-                objective_nm2=values[-1],
                 objectives_nm2=tuple(values),
                 programmes=programmes,
                 status=solution.status,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
@@ -174,6 +174,8 @@ class VibrationBand(Band):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Several:
+    largest: ClassVar[bool] = False  # of the terms, instead of their sum
+
     terms: tuple[Term, ...]
     weights: tuple[float, ...] | None = None
 
@@ -205,7 +207,7 @@ class _Several:
         return Combined(
             parts=tuple(term.function(channel, grid) for term in self.terms),
             weights=self.factors,
-            worst=isinstance(self, Worst),
+            worst=self.largest,
         )
 
     def measured_nm2(self, loop: MeasuredLoop) -> float:
@@ -214,7 +216,7 @@ class _Several:
             weight * term.measured_nm2(loop)
             for weight, term in zip(self.factors, self.terms, strict=True)
         ]
-        return max(values) if isinstance(self, Worst) else sum(values)
+        return max(values) if self.largest else sum(values)
 
 
 class Total(_Several):
@@ -269,6 +271,7 @@ class Worst(_Several):
     """
 
     __slots__ = ()
+    largest = True
 
 
 Leaf: TypeAlias = ResidualVariance | VibrationBand
