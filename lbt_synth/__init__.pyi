@@ -61,6 +61,10 @@ from .loop import stable_sensor_gains as stable_sensor_gains
 from .loop import strehl as strehl
 from .loop import strehl_of_series as strehl_of_series
 from .loop import youla_controller as youla_controller
+from .modal import MixedController as MixedController
+from .modal import Reconstructor as Reconstructor
+from .modal import project_out as project_out
+from .modal import reconstructor as reconstructor
 from .models import ARModel as ARModel
 from .models import Atmosphere as Atmosphere
 from .models import EstimationProblem as EstimationProblem
