@@ -6,76 +6,35 @@ are not its format; the caller turns that into a GainFileError.
 
 from __future__ import annotations
 
-import io
 import json
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from lbt_synth.archive import fits_bytes, npz_bytes, read_fits, read_npz
 from lbt_synth.validation import FloatArray
 
+__all__ = ["read_fits", "read_json", "read_npz", "write_fits", "write_json", "write_npz"]
+
 FITS_LAYOUT_VERSION = 1  # of SPECULA's state-space filter file
-_TEXT = "META"
 
 
 def write_fits(arrays: Mapping[str, FloatArray], text: str, header: Mapping[str, Any]) -> bytes:
     """Write HDUs A, B, C, D first, as SPECULA's SsrFilterData wants them, then the others."""
-    from astropy.io import fits
-
-    primary = fits.PrimaryHDU()
-    primary.header["VERSION"] = (FITS_LAYOUT_VERSION, "layout of the HDUs A, B, C, D")
-    primary.header["NFILTER"] = (arrays["B"].shape[1], "inputs of the controller")
-    primary.header["NSTATES"] = (arrays["A"].shape[0], "states of the controller")
-    for key, (value, comment) in header.items():
-        primary.header[key] = (value, comment)
-    units = [primary]
-    units += [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
-    units.append(fits.ImageHDU(data=np.frombuffer(text.encode(), dtype=np.uint8), name=_TEXT))
-    for unit in units:
-        unit.add_checksum(when="of this unit")  # not the time: the same design is the same file
-    buffer = io.BytesIO()
-    fits.HDUList(units).writeto(buffer)
-    return buffer.getvalue()
-
-
-def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
-    """Read the arrays and the text of :func:`write_fits`."""
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", AstropyWarning)
-        try:
-            with fits.open(
-                io.BytesIO(content), memmap=False, lazy_load_hdus=False, checksum=True
-            ) as units:
-                data = {unit.name: np.array(unit.data) for unit in units[1:]}
-        except Exception as error:  # astropy has no common class for what damage makes it raise
-            raise ValueError("its FITS structure or a checksum is broken") from error
-    text = data.pop(_TEXT).astype(np.uint8).tobytes().decode()
-    return {name: array.astype(np.float64) for name, array in data.items()}, text
+    cards = {
+        "VERSION": (FITS_LAYOUT_VERSION, "layout of the HDUs A, B, C, D"),
+        "NFILTER": (arrays["B"].shape[1], "inputs of the controller"),
+        "NSTATES": (arrays["A"].shape[0], "states of the controller"),
+        **header,
+    }
+    return fits_bytes(arrays, text, cards)
 
 
 def write_npz(arrays: Mapping[str, FloatArray], text: str, header: Mapping[str, Any]) -> bytes:
-    """Write a NumPy archive; the text is an array of bytes, so nothing is pickled."""
+    """Write a NumPy archive, without the header."""
     del header
-    buffer = io.BytesIO()
-    everything: dict[str, Any] = {**arrays, _TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
-    np.savez(buffer, **everything)
-    return buffer.getvalue()
-
-
-def read_npz(content: bytes) -> tuple[dict[str, FloatArray], str]:
-    """Read the arrays and the text of :func:`write_npz`."""
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            data = {name: np.array(archive[name]) for name in archive.files}
-    except Exception as error:  # zip, zlib and NumPy each raise their own
-        raise ValueError("it is not a NumPy archive") from error
-    text = data.pop(_TEXT).astype(np.uint8).tobytes().decode()
-    return {name: array.astype(np.float64) for name, array in data.items()}, text
+    return npz_bytes(arrays, text)
 
 
 def write_json(arrays: Mapping[str, FloatArray], text: str, header: Mapping[str, Any]) -> bytes:

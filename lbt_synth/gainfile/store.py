@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -10,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.archive import digest as _digest
 from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files import write_atomically
 from lbt_synth.gainfile import formats
-from lbt_synth.gainfile.record import Arrays, Meta, from_record, to_record
+from lbt_synth.gainfile.record import Meta, from_record, to_record
 from lbt_synth.validation import frozen
 
 SCHEMA = "lbt_synth gain file"
@@ -173,17 +173,6 @@ def _check_schema(meta: Any, source: Path) -> None:
             "Read it with the version that wrote it.",
             path=source,
         )
-
-
-def _digest(arrays: Arrays, meta: Meta) -> str:
-    """SHA-256 over all arrays and all metadata but the digest itself."""
-    plain = {key: value for key, value in meta.items() if key != "digest"}
-    total = hashlib.sha256(json.dumps(plain, sort_keys=True, allow_nan=False).encode())
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name], dtype="<f8")
-        total.update(f"|{name}|{array.shape}|".encode())
-        total.update(array.tobytes())
-    return total.hexdigest()
 
 
 def _header(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
