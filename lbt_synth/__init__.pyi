@@ -25,6 +25,12 @@ from .design import shape as shape
 from .distance import LimitRow as LimitRow
 from .distance import LimitStudy as LimitStudy
 from .distance import limit_study as limit_study
+from .endtoend import Calibration as Calibration
+from .endtoend import EndToEndRun as EndToEndRun
+from .endtoend import EndToEndSetup as EndToEndSetup
+from .endtoend import EndToEndSystem as EndToEndSystem
+from .endtoend import calibrate as calibrate
+from .endtoend import run_end_to_end as run_end_to_end
 from .errors import CertificateError as CertificateError
 from .errors import ConfigError as ConfigError
 from .errors import DefinitenessError as DefinitenessError
@@ -34,6 +40,7 @@ from .errors import FileError as FileError
 from .errors import GainFileError as GainFileError
 from .errors import InfeasibleError as InfeasibleError
 from .errors import LbtSynthError as LbtSynthError
+from .errors import MissingExtraError as MissingExtraError
 from .errors import NonFiniteError as NonFiniteError
 from .errors import NumericalError as NumericalError
 from .errors import OutputError as OutputError
@@ -88,6 +95,7 @@ from .models import tip_tilt_plant as tip_tilt_plant
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
+from .plotting import end_to_end_figure as end_to_end_figure
 from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure
 from .plotting import map_figure as map_figure

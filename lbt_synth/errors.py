@@ -139,6 +139,20 @@ class UnstableLoopError(SynthesisError):
         self.spectral_radius = spectral_radius
 
 
+class MissingExtraError(LbtSynthError, ImportError):
+    """An optional package is not installed, or not in a version that works here.
+
+    Attributes
+    ----------
+    extra : str
+        The extra that brings it: ``pip install "lbt-synth[extra]"``.
+    """
+
+    def __init__(self, message: str, *, extra: str) -> None:
+        super().__init__(message)
+        self.extra = extra
+
+
 # --------------------------------------------------------------------------
 # Files.
 # --------------------------------------------------------------------------

@@ -13,7 +13,9 @@ from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from lbt_synth.config.end_to_end import end_to_end_setup
 from lbt_synth.config.schema import BandSection, FileSection, TrueVibrationSection, VibrationSection
+from lbt_synth.endtoend import EndToEndSetup
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.loop import Imaging
 from lbt_synth.models import (
@@ -69,6 +71,14 @@ class Config:
     def hardware(self) -> LoopHardware:
         """The loop."""
         return self.plant.hardware
+
+    @property
+    def end_to_end(self) -> EndToEndSetup:
+        """The end-to-end simulation; raises ConfigError if the file cannot describe one."""
+        try:
+            return end_to_end_setup(self.settings, self.hardware, self.truth)
+        except ConfigError as error:
+            raise ConfigError(f"{self.source}: {error}", path=error.path) from error
 
 
 def load_config(path: str | os.PathLike[str]) -> Config:

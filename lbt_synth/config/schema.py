@@ -237,6 +237,20 @@ class RobustnessSection(_Section):
     delay_errors_frames: Annotated[list[float], Field(min_length=1)] = [0.0]
 
 
+class EndToEndSection(_Section):
+    """The end-to-end simulation; the other sections say what it is of."""
+
+    pixels: Annotated[int, Field(ge=8)] = 60
+    frames: Annotated[int, Field(ge=2)] = 1600
+    settle_frames: Annotated[int, Field(ge=200)] = 400
+    gain: Annotated[float, Field(ge=0)] = 0.5
+    leak: Annotated[float, Field(ge=0, le=1)] = 0.99
+    leak_from_mode: Annotated[int, Field(ge=2)] = 50
+    actuators_across: Annotated[int, Field(ge=3)] = 31
+    wind_direction_deg: float = 0.0
+    calibration_nm: Positive = 20.0
+
+
 class FileSection(_Section):
     """A whole configuration file."""
 
@@ -252,3 +266,4 @@ class FileSection(_Section):
     design: DesignSection = DesignSection()
     simulation: SimulationSection = SimulationSection()
     robustness: RobustnessSection = RobustnessSection()
+    end_to_end: EndToEndSection = EndToEndSection()

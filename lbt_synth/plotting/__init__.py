@@ -1,5 +1,6 @@
 """Figures of designs, loops and studies."""
 
+from lbt_synth.plotting.end_to_end import end_to_end_figure
 from lbt_synth.plotting.figures import (
     loop_figure,
     robustness_figure,
@@ -13,6 +14,7 @@ from lbt_synth.plotting.style import FIGURE_ENDINGS, require_figure_name, save_f
 
 __all__ = [
     "FIGURE_ENDINGS",
+    "end_to_end_figure",
     "limits_figure",
     "loop_figure",
     "map_figure",

@@ -1,0 +1,244 @@
+"""Many independent cases, one file each: killed at any moment, a campaign goes on where it was.
+
+A case is a name and arguments that JSON can hold. Its result is written, whole or
+not at all, as soon as it is there, with a digest of what was asked; the process that
+started the campaign is the only one that writes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import multiprocessing
+import os
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.files import write_atomically
+from lbt_synth.validation import integer
+
+Case = Mapping[str, Any]
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*\Z")
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_ORPHAN_SECONDS = 1.0
+
+
+def run_cases(
+    function: Callable[[Case], Mapping[str, Any]],
+    cases: Mapping[str, Case],
+    directory: str | os.PathLike[str],
+    *,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Run what is missing of some cases, and return the results of all.
+
+    Parameters
+    ----------
+    function : callable
+        Maps a case to its result, a mapping that JSON can hold; importable by name where
+        other processes run it. What it returns must depend on the case only.
+    cases : mapping of str to mapping
+        Arguments of each case by its name, which is that of its file.
+    directory : path-like
+        An existing directory; results go into ``NAME.json``.
+    jobs : int, optional
+        Processes; 1 runs in this one.
+    executor : concurrent.futures.Executor, optional
+        Runs the cases instead of ``jobs`` processes, and is left open.
+    progress : callable, optional
+        Called with the number of cases that were found or finished since its last call.
+
+    Returns
+    -------
+    dict of str to dict
+        Results in the order of the cases.
+
+    Raises
+    ------
+    OutputError
+        If the directory holds results of other arguments under these names, is in use by
+        another campaign, or cannot be written.
+    ProblemError
+        If a name is no file name, or a case or a result does not fit into JSON.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from lbt_synth.campaign import run_cases
+    >>> def double(case):
+    ...     return {"twice": 2 * case["x"]}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     first = run_cases(double, {"a": {"x": 1}}, folder)
+    ...     both = run_cases(double, {"a": {"x": 1}, "b": {"x": 2}}, folder)  # only b is run
+    >>> both
+    {'a': {'twice': 2}, 'b': {'twice': 4}}
+    """
+    folder = Path(directory)
+    jobs = integer(jobs, "jobs", at_least=1)
+    digests = {name: _digest(name, case) for name, case in cases.items()}
+    with _alone_in(folder):
+        results = {}
+        for name, expected in digests.items():
+            found = _read(folder / f"{name}.json", expected)
+            if found is not None:
+                results[name] = found
+        if progress is not None and results:
+            progress(len(results))
+        missing = {name: case for name, case in cases.items() if name not in results}
+        for name, result in _results(function, missing, jobs, executor):
+            results[name] = _write(folder, name, digests[name], cases[name], result)
+            if progress is not None:
+                progress(1)
+    return {name: results[name] for name in cases}
+
+
+def _results(
+    function: Callable[[Case], Mapping[str, Any]],
+    cases: Mapping[str, Case],
+    jobs: int,
+    executor: Executor | None,
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield results as they come; if a case fails, those that run are still waited for."""
+    if not cases:
+        return
+    if executor is None and (jobs == 1 or len(cases) == 1):
+        for name, case in cases.items():
+            yield name, function(case)
+        return
+    with contextlib.ExitStack() as stack:
+        if executor is None:
+            executor = stack.enter_context(_pool(min(jobs, len(cases))))
+        futures = {executor.submit(function, dict(case)): name for name, case in cases.items()}
+        failure: BaseException | None = None
+        try:
+            pending: set[Future[Mapping[str, Any]]] = set(futures)
+            while pending:
+                done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                for future in done:
+                    if future.cancelled():
+                        continue
+                    error = future.exception()
+                    if error is None:
+                        yield futures[future], future.result()
+                    elif failure is None:
+                        failure = error
+                        for other in pending:
+                            other.cancel()
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+        if failure is not None:
+            raise failure
+
+
+@contextlib.contextmanager
+def _pool(workers: int) -> Iterator[Executor]:
+    """Fresh processes with one thread of linear algebra each, gone when their parent is."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
+    try:
+        with ProcessPoolExecutor(
+            workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_watch_parent,
+            initargs=(os.getpid(),),
+        ) as pool:
+            try:
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+
+
+def _watch_parent(parent: int) -> None:
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_ORPHAN_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _digest(name: str, case: Case) -> str:
+    if not _NAME.match(name):
+        raise ProblemError(
+            f"the name of a case must be letters, digits and . _ + -; got {name!r}."
+        )
+    try:
+        text = json.dumps(case, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"the case {name} must fit into JSON: {error}.") from error
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _read(path: Path, expected: str) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        asked, result = content["asked"], content["result"]
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise OutputError(
+            f"{path} is no result of a campaign: {error}. Delete it, or name another directory.",
+            path=path,
+        ) from error
+    if asked != expected:
+        raise OutputError(
+            f"{path} is of other settings than those asked for. Name another directory, or delete "
+            "the results of the old settings.",
+            path=path,
+        )
+    return dict(result)
+
+
+def _write(
+    folder: Path, name: str, asked: str, case: Case, result: Mapping[str, Any]
+) -> dict[str, Any]:
+    try:
+        text = json.dumps(
+            {"asked": asked, "case": case, "result": result}, indent=1, allow_nan=False
+        )
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"the result of {name} must fit into JSON: {error}.") from error
+    write_atomically(folder / f"{name}.json", text.encode())
+    return dict(json.loads(text)["result"])
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold a lock that the system lets go of when this process ends, however it ends."""
+    try:
+        import fcntl
+    except ImportError:  # Windows: two campaigns in one directory are not noticed
+        yield
+        return
+    try:
+        stream = (folder / ".lock").open("w")
+    except OSError as error:
+        raise OutputError(
+            f"cannot write into {folder}: {error.strerror}.", path=folder
+        ) from error
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise OutputError(
+                f"another campaign is running in {folder}. Wait for it, or name another directory.",
+                path=folder,
+            ) from error
+        yield

@@ -1,0 +1,224 @@
+"""Commands of the end-to-end simulation: e2e, e2e-table."""
+
+from __future__ import annotations
+
+import functools
+import json
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.campaign import run_cases
+from lbt_synth.cli.loop_commands import named_designs
+from lbt_synth.cli.output import Report, TableText, counting, fixed, plain
+from lbt_synth.cli.writing import made_directory
+from lbt_synth.config import load_config
+from lbt_synth.design import Design
+from lbt_synth.endtoend import EndToEndRun, EndToEndSetup, calibrate
+from lbt_synth.endtoend.cases import run_case, summary, with_pixels
+from lbt_synth.endtoend.optics import specula_version
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import write_atomically
+from lbt_synth.gainfile import load_gain
+from lbt_synth.paper.end_to_end import (
+    EndToEndEntry,
+    all_cases,
+    entries,
+    modal_distance,
+    plan_tables,
+)
+from lbt_synth.paper.end_to_end_figure import table_figure
+from lbt_synth.plotting import end_to_end_figure, save_figure
+from lbt_synth.tables import csv_bytes
+
+
+def end_to_end(arguments: Namespace) -> Report:
+    """Close the loop of a gain file end to end, and write what came of it."""
+    setup = _setup(arguments)
+    design = load_gain(arguments.gain)
+    setup.controller(design)  # refuses a filter of another loop before any work
+    folder = made_directory(arguments.output)
+    version = specula_version()
+    calibration = _calibrated(setup, arguments)
+    total = setup.frames + setup.settle_frames
+    with counting(total=total, what="frames", quiet=arguments.json) as count:
+        run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
+    figures = summary(run)
+    inverse = calibration.reconstructor
+    data: dict[str, Any] = {
+        "gain": str(arguments.gain),
+        "method": design.method,
+        "specula": version,
+        "pixels": setup.system.pixels,
+        "frames": run.frames,
+        "settle_frames": run.settle_frames,
+        "seed": run.seed,
+        **figures,
+        "condition_number": inverse.condition_number,
+        "milliseconds_a_frame": 1e3 * run.seconds / total,
+    }
+    files = [
+        save_figure(end_to_end_figure(run), folder / "run.png"),
+        save_telemetry(folder / "telemetry.fits", _telemetry(run, design, calibration, arguments)),
+        write_atomically(
+            folder / "summary.json", json.dumps(plain(data), indent=1).encode() + b"\n"
+        ),
+    ]
+    data["files"] = [str(path) for path in files]
+    return Report(
+        data=data,
+        tables=[
+            TableText(
+                title=f"End to end: {run.system.modes} modes, {run.frames} frames after "
+                f"{run.settle_frames}, seed {run.seed}",
+                headings=("figure", "value", "unit"),
+                rows=[*_figures(run, figures), ("condition of the reconstructor",
+                      f"{inverse.condition_number:.1f}", ""),
+                      ("time a frame", f"{data['milliseconds_a_frame']:.1f}", "ms")],
+            )
+        ],
+        notes=[f"written: {path}" for path in files],
+    )  # fmt: skip
+
+
+def _figures(run: EndToEndRun, figures: dict[str, Any]) -> list[tuple[str, str, str]]:
+    wavelength = run.system.imaging_wavelength_um
+    return [
+        (f"Strehl ratio at {wavelength:g} um",
+         f"{100 * run.strehl:.2f} +- {fixed(100 * run.strehl_error, 2)}", "%"),
+        ("the same without tip and tilt", f"{100 * run.other_modes_strehl:.2f}", "%"),
+        ("tip", f"{figures['tip_rms_nm']:.1f}", "nm rms"),
+        ("tilt", f"{figures['tilt_rms_nm']:.1f}", "nm rms"),
+        ("all other modes", f"{figures['other_modes_rms_nm']:.1f}", "nm rms"),
+        ("optical gain of tip and tilt",
+         f"{run.tip_tilt_gain:.3f} +- {run.tip_tilt_gain_error:.3f}", ""),
+        ("what it leaves of their measurements", f"{run.tip_tilt_noise_nm:.1f}", "nm rms"),
+    ]  # fmt: skip
+
+
+def end_to_end_table(arguments: Namespace) -> Report:
+    """Run Tables II and III of the paper end to end, or what is missing of them."""
+    setup = _setup(arguments)
+    designs = named_designs(arguments.gains)
+    if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:
+        raise ProblemError("--seeds, --row-seeds and --jobs must be at least 1.")
+    rows = plan_tables(
+        setup,
+        {_case_name(name): design for name, design in designs.items()},
+        seeds=range(setup.seed, setup.seed + arguments.seeds),
+        row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
+        tables=arguments.tables,
+    )
+    cases = all_cases(rows)
+    folder = made_directory(arguments.output)
+    made_directory(folder / "cases")
+    _calibrated(setup, arguments)
+    with counting(total=len(cases), what="runs", quiet=arguments.json) as count:
+        results = run_cases(
+            functools.partial(run_case, cache=arguments.cache),
+            cases,
+            folder / "cases",
+            jobs=arguments.jobs,
+            progress=count,
+        )
+    table = entries(rows, results, setup)
+    files = [
+        write_atomically(folder / f"table_{number.lower()}.csv", _csv(table, number))
+        for number in arguments.tables
+    ]
+    distances: dict[str, float] = {}
+    if "III" in arguments.tables:
+        figure = table_figure(table)
+        files += [save_figure(figure, folder / f"table_iii.{ending}") for ending in ("png", "pdf")]
+        methods = dict.fromkeys(e.method for e in table if e.table == "III")
+        distances = {method: modal_distance(table, method) for method in methods}
+    return Report(
+        data={
+            "entries": [_record(entry) for entry in table],
+            "modal_distance_points": distances,
+            "runs": len(cases),
+            "files": [str(path) for path in files],
+        },
+        tables=[_table(table, number) for number in arguments.tables],
+        notes=[
+            *(
+                f"Table III, {method}: end to end less modal {points:.1f} points rms"
+                for method, points in distances.items()
+            ),
+            *(f"written: {path}" for path in files),
+        ],
+    )
+
+
+def _setup(arguments: Namespace) -> EndToEndSetup:
+    setup = with_pixels(load_config(arguments.config).end_to_end, arguments.pixels)
+    changes = {
+        name: getattr(arguments, name)
+        for name in ("frames", "settle_frames", "seed")
+        if getattr(arguments, name) is not None
+    }
+    return replace(setup, **changes)
+
+
+def _calibrated(setup: EndToEndSetup, arguments: Namespace) -> Any:
+    with counting(
+        total=setup.system.modes, what="calibration", quiet=arguments.json
+    ) as count:
+        return calibrate(setup.system, cache=arguments.cache, progress=count)
+
+
+def _case_name(name: str) -> str:
+    return "".join(letter if letter.isalnum() else "_" for letter in Path(name).stem)
+
+
+def _record(entry: EndToEndEntry) -> dict[str, Any]:
+    return {
+        "table": entry.table,
+        "row": entry.label,
+        "method": entry.method,
+        "error_hz": entry.error_hz,
+        "strehl_percent": entry.strehl,
+        "scatter_points": entry.scatter,
+        "seeds": len(entry.strehls),
+        "paper_strehl_percent": entry.paper,
+        "modal_strehl_percent": entry.modal,
+        "optical_gain": entry.optical_gain,
+        "tip_rms_nm": entry.tip_rms_nm,
+        "tilt_rms_nm": entry.tilt_rms_nm,
+        "other_modes_strehl_percent": entry.other_modes,
+    }
+
+
+def _csv(table: Sequence[EndToEndEntry], number: str) -> bytes:
+    records = [_record(entry) for entry in table if entry.table == number]
+    return csv_bytes(
+        list(records[0]), [["" if v is None or v != v else v for v in r.values()] for r in records]
+    )
+
+
+def _table(table: Sequence[EndToEndEntry], number: str) -> TableText:
+    return TableText(
+        title=f"Table {number} end to end: Strehl ratio [%] at 2.2 um",
+        headings=(
+            "row", "method", "end to end", "scatter", "seeds", "paper", "modal", "optical gain",
+            "tip [nm]", "tilt [nm]", "other modes [%]",
+        ),
+        rows=[
+            (
+                entry.label, entry.method, f"{entry.strehl:.1f}", fixed(entry.scatter, 1),
+                len(entry.strehls), fixed(entry.paper, 1), f"{entry.modal:.1f}",
+                f"{entry.optical_gain:.3f}", f"{entry.tip_rms_nm:.0f}",
+                f"{entry.tilt_rms_nm:.0f}", f"{entry.other_modes:.1f}",
+            )
+            for entry in table
+            if entry.table == number
+        ],
+    )  # fmt: skip
+
+
+def _telemetry(
+    run: EndToEndRun, design: Design, calibration: Any, arguments: Namespace
+) -> Telemetry:
+    raise NotImplementedError

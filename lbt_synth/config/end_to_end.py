@@ -1,0 +1,81 @@
+"""From a configuration to an end-to-end simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lbt_synth.config.schema import FileSection
+from lbt_synth.endtoend import EndToEndSetup, EndToEndSystem
+from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.models import LoopHardware, Truth
+
+_HINT = "an end-to-end simulation needs it"
+
+
+def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth) -> EndToEndSetup:
+    """Build the simulation that a configuration describes.
+
+    Raises
+    ------
+    ConfigError
+        If a section is missing that is needed, or says what optics cannot follow.
+    """
+    pyramid, air, asked = settings.sensor.pyramid, settings.atmosphere, settings.end_to_end
+    if pyramid is None:
+        raise ConfigError(f"the key sensor.pyramid is missing; {_HINT}.", path="sensor.pyramid")
+    if air.outer_scale_m is None:
+        raise ConfigError(
+            "atmosphere.outer_scale_m must be a length: phase screens have an end. Try 25.",
+            path="atmosphere.outer_scale_m",
+        )
+    if settings.truth.turbulence != "frozen_flow":
+        raise ConfigError(
+            "truth.turbulence must be frozen_flow for an end-to-end simulation; got "
+            f"{settings.truth.turbulence}.",
+            path="truth.turbulence",
+        )
+    if settings.mirror.modes is None:
+        raise ConfigError(f"the key mirror.modes is missing; {_HINT}.", path="mirror.modes")
+    for key in ("sensor.matrix", "mirror.influence_matrix"):
+        section, name = key.split(".")
+        if getattr(getattr(settings, section), name) is not None:
+            raise ConfigError(
+                f"{key} must be left out for an end-to-end simulation: its sensor and mirror are "
+                "calibrated in nanometres of each mode.",
+                path=key,
+            )
+    # what the design assumes of the sensor's gain is no part of the optics
+    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=2)
+    try:
+        system = EndToEndSystem(
+            hardware=modal,
+            diameter_m=settings.telescope.diameter_m,
+            obstruction=settings.telescope.obstruction,
+            seeing_arcsec=air.seeing_arcsec,
+            seeing_wavelength_um=air.seeing_wavelength_um,
+            outer_scale_m=air.outer_scale_m,
+            wind_speed_m_s=air.wind_speed_m_s,
+            wind_direction_deg=asked.wind_direction_deg,
+            sensing_wavelength_um=pyramid.wavelength_um,
+            modulation_lambda_over_d=pyramid.modulation_lambda_over_d,
+            subapertures_across=pyramid.subapertures_across,
+            photons=pyramid.photons,
+            read_noise_electrons=pyramid.read_noise_electrons,
+            modes=settings.mirror.modes,
+            actuators_across=asked.actuators_across,
+            imaging_wavelength_um=settings.imaging.wavelength_um,
+            pixels=asked.pixels,
+            calibration_nm=asked.calibration_nm,
+        )
+        return EndToEndSetup(
+            system=system,
+            vibrations=truth.vibrations,
+            frames=asked.frames,
+            settle_frames=asked.settle_frames,
+            seed=settings.simulation.seed,
+            gain=asked.gain,
+            leak=asked.leak,
+            leak_from_mode=asked.leak_from_mode,
+        )
+    except ProblemError as error:
+        raise ConfigError(f"end_to_end: {error}", path="end_to_end") from error

@@ -1,0 +1,140 @@
+"""End-to-end runs as cases of a campaign: all that decides a run, in what JSON can hold."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+from lbt_synth.endtoend.result import EndToEndRun
+from lbt_synth.endtoend.setup import EndToEndSetup
+from lbt_synth.endtoend.system import EndToEndSystem
+from lbt_synth.models import LoopHardware, SinusoidalVibration, Vibration
+from lbt_synth.statespace import Controller
+
+_SETUP = ("frames", "settle_frames", "seed", "gain", "leak", "leak_from_mode")
+_MATRICES = ("A", "B", "C", "D")
+
+
+def case_of(
+    setup: EndToEndSetup,
+    controller: Controller | None,
+    *,
+    vibrations: Sequence[Vibration | SinusoidalVibration] = (),
+    tip_tilt_gain: float | None = None,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Return the case of one run: other vibrations and another seed than the set-up's.
+
+    Parameters
+    ----------
+    setup : EndToEndSetup
+        System, length and integrators.
+    controller : Controller or None
+        Controller of tip and tilt; None for integrators.
+    vibrations : sequence of Vibration or SinusoidalVibration, optional
+        Vibrations of tip and tilt.
+    tip_tilt_gain : float, optional
+        Gain of tip and tilt where there is no controller.
+    seed : int, optional
+        Seed of the run.
+
+    Returns
+    -------
+    dict
+        Two cases that are equal give equal runs.
+    """
+    system = {
+        field.name: getattr(setup.system, field.name)
+        for field in fields(EndToEndSystem)
+        if field.name != "hardware"
+    }
+    hardware = setup.system.hardware
+    return {
+        "system": system,
+        "hardware": {
+            "frame_rate_hz": hardware.frame_rate_hz,
+            "delay_frames": hardware.delay_frames,
+        },
+        "setup": {**{name: getattr(setup, name) for name in _SETUP}, "seed": seed},
+        "vibrations": [asdict(line) for line in vibrations],
+        "tip_tilt_gain": tip_tilt_gain,
+        "controller": None
+        if controller is None
+        else {name: getattr(controller, name).tolist() for name in _MATRICES}
+        | {"dt_s": controller.dt_s},
+    }
+
+
+def run_case(
+    case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
+) -> dict[str, Any]:
+    """Run one case of :func:`case_of`.
+
+    Parameters
+    ----------
+    case : mapping
+        The case.
+    cache : path-like, optional
+        Directory for calibrations and phase screens.
+
+    Returns
+    -------
+    dict
+        Strehl ratios, residuals and optical gains of the run.
+
+    Raises
+    ------
+    LbtSynthError
+        As :func:`run_end_to_end`.
+    """
+    system = EndToEndSystem(hardware=LoopHardware(**case["hardware"]), **case["system"])
+    lines = tuple(_vibration(line) for line in case["vibrations"])
+    setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
+    matrices = case["controller"]
+    run = setup.run(
+        None if matrices is None else Controller(**matrices),
+        tip_tilt_gain=case["tip_tilt_gain"],
+        cache=cache,
+    )
+    return summary(run)
+
+
+def summary(run: EndToEndRun) -> dict[str, Any]:
+    """Return the figures of a run.
+
+    Parameters
+    ----------
+    run : EndToEndRun
+        The run.
+
+    Returns
+    -------
+    dict
+        Strehl ratios with their error, residuals [nm rms], optical gain of tip and tilt.
+    """
+    rms = run.rms_nm
+    return {
+        "strehl": run.strehl,
+        "strehl_error": run.strehl_error,
+        "other_modes_strehl": run.other_modes_strehl,
+        "tip_rms_nm": float(rms[0]),
+        "tilt_rms_nm": float(rms[1]),
+        "other_modes_rms_nm": float((rms[2:] ** 2).sum() ** 0.5),
+        "tip_tilt_gain": run.tip_tilt_gain,
+        "tip_tilt_gain_error": run.tip_tilt_gain_error,
+        "tip_tilt_noise_nm": run.tip_tilt_noise_nm,
+    }
+
+
+def _vibration(line: Mapping[str, Any]) -> Vibration | SinusoidalVibration:
+    kind = Vibration if "damping" in line else SinusoidalVibration
+    return kind(**{**line, "direction": tuple(line["direction"])})
+
+
+def with_pixels(setup: EndToEndSetup, pixels: int | None) -> EndToEndSetup:
+    """Return a set-up with another number of pixels across the pupil, or the same."""
+    if pixels is None:
+        return setup
+    return replace(setup, system=replace(setup.system, pixels=pixels))

@@ -1,0 +1,172 @@
+"""Close the loop around the optics."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lbt_synth.endtoend.calibration import Calibration, cache_directory, calibrate
+from lbt_synth.endtoend.optics import Modes, Optics
+from lbt_synth.endtoend.result import EndToEndRun
+from lbt_synth.endtoend.system import EndToEndSystem
+from lbt_synth.errors import ProblemError
+from lbt_synth.models import SinusoidalVibration, Truth, Vibration
+from lbt_synth.simulation import draw_disturbance
+from lbt_synth.simulation.run import SteppedController
+from lbt_synth.validation import FloatArray, instance, integer
+
+_SCREENS = "screens"
+_RAMP_FRAMES = 200
+
+
+def run_end_to_end(
+    system: EndToEndSystem,
+    controller: SteppedController,
+    *,
+    vibrations: Sequence[Vibration | SinusoidalVibration] = (),
+    frames: int = 1600,
+    settle_frames: int = 400,
+    seed: int = 0,
+    calibration: Calibration | None = None,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> EndToEndRun:
+    """Close the loop with a pyramid, a mirror and moving air, all of SPECULA.
+
+    In frame k, as in :class:`LoopHardware`: the controller is given y(k), the modal
+    coefficients of the slopes of exposure k-1, and returns u(k); the mirror of exposure k
+    has the shape of ``system.hardware.mirror_taps`` times u(k), u(k-1), ...; a fractional
+    delay and a moving mirror enter as their mean over the exposure. The seeing rises
+    from zero in the first 200 frames, so that the sensor does not lose the phase by whole
+    turns before the loop is closed.
+
+    The random parts depend on the seed, the vibrations and the number of frames only:
+    controllers that are given the same ones meet the same air, vibrations and noise.
+
+    Parameters
+    ----------
+    system : EndToEndSystem
+        Telescope, air, pyramid, mirror and camera.
+    controller : object with ``step(y)`` and ``reset()``
+        From modal measurements to modal commands, (modes,), such as :class:`MixedController`.
+    vibrations : sequence of Vibration or SinusoidalVibration, optional
+        Vibrations of tip and tilt; their direction has two components.
+    frames : int, optional
+        Frames of the exposure.
+    settle_frames : int, optional
+        Frames run before and dropped, at least 200.
+    seed : int, optional
+        Seed of turbulence, vibrations and noise.
+    calibration : Calibration, optional
+        That of the system; by default from the cache, or measured.
+    cache : path-like, optional
+        Directory for calibrations and phase screens.
+    progress : callable, optional
+        Called with the number of frames that were run since its last call.
+
+    Returns
+    -------
+    EndToEndRun
+        Strehl ratio, series, images, optical gains.
+
+    Raises
+    ------
+    MissingExtraError
+        If SPECULA is missing.
+    ProblemError
+        If a value is out of range, or the controller returns something else than one
+        finite command a mode.
+    OutputError
+        If the cache cannot be written.
+    """
+    instance(system, EndToEndSystem)
+    if not isinstance(controller, SteppedController):
+        raise ProblemError(
+            "controller must have step(y) and reset(), as MixedController has; "
+            f"got {type(controller).__name__}."
+        )
+    frames = integer(frames, "frames", at_least=2)
+    settle = integer(settle_frames, "settle_frames", at_least=_RAMP_FRAMES)
+    seed = integer(seed, "seed", at_least=0)
+    shaken = Truth(turbulence=None, vibrations=tuple(vibrations))
+    total = settle + frames
+    tilts = draw_disturbance(
+        shaken, system.hardware, frames=total, cases=1, rng=np.random.default_rng(seed)
+    )[0]
+    if calibration is None:
+        calibration = calibrate(system, cache=cache)
+    screens = cache_directory(cache) / _SCREENS
+    optics = Optics(system, calibration.modes, screens=screens, frames=total, seed=seed)
+    started = time.perf_counter()
+    recorded = _close(optics, calibration, controller, tilts, settle, progress)
+    return EndToEndRun(
+        system=system,
+        **recorded,
+        psf_pixel_mas=optics.psf_pixel_mas,
+        seed=seed,
+        settle_frames=settle,
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _close(
+    optics: Optics,
+    calibration: Calibration,
+    controller: SteppedController,
+    tilts: FloatArray,
+    settle: int,
+    progress: Callable[[int], None] | None,
+) -> dict[str, FloatArray]:
+    modes, system = calibration.modes, optics.system
+    inverse, n = calibration.reconstructor.matrix, len(calibration.modes.shapes)
+    taps = system.hardware.mirror_taps
+    kept = len(tilts) - settle
+    out = {
+        name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")
+    }  # fmt: skip
+    strehl, others, image = np.empty(kept), np.empty(kept), 0.0
+    past = np.zeros((len(taps), n))  # u(k), u(k-1), ...
+    slopes = calibration.reference
+    controller.reset()
+    for k in range(len(tilts)):
+        y = inverse @ (slopes - calibration.reference)
+        past = np.vstack([_command(controller, y, k), past[:-1]])
+        slopes = optics.expose(taps @ past, tilts[k], seeing=min(1.0, (k + 1) / _RAMP_FRAMES))
+        row = k - settle
+        if row >= 0:
+            strehl[row], frame = optics.image()
+            image = image + frame.astype(np.float64)
+            residual, others[row] = _residual(modes, optics)
+            for name, value in zip(out, (y, past[0], residual), strict=True):
+                out[name][row] = value
+        if progress is not None:
+            progress(1)
+    return {
+        **out,
+        "strehl_series": strehl,
+        "other_modes_series": others,
+        "psf": np.asarray(image / kept),
+    }
+
+
+def _command(controller: SteppedController, y: FloatArray, frame: int) -> FloatArray:
+    u = np.asarray(controller.step(y), dtype=np.float64)
+    if u.shape != y.shape or not np.all(np.isfinite(u)):
+        raise ProblemError(
+            f"the controller must return {y.size} finite commands; got {u.shape} "
+            f"{'' if np.all(np.isfinite(u)) else 'with values that are not finite '}"
+            f"in frame {frame}."
+        )
+    return u
+
+
+def _residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:
+    """Modal coefficients of the residual, and the Strehl ratio of all but tip and tilt."""
+    phase = optics.phase_nm()
+    coefficients = modes.coefficients(phase)
+    rest = phase - coefficients[:2].astype(np.float32) @ modes.shapes[:2]
+    turn = 2 * np.pi / (1e3 * optics.system.imaging_wavelength_um)
+    return coefficients, float(np.abs(np.mean(np.exp(1j * turn * rest))) ** 2)

@@ -1,0 +1,333 @@
+"""Tables II and III end to end: cases of a campaign, and what comes out beside the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.design import Design, hinf, kalman
+from lbt_synth.endtoend import EndToEndSetup
+from lbt_synth.endtoend.cases import case_of
+from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
+from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, retuned_plant
+from lbt_synth.paper import parameters as given
+from lbt_synth.paper.published import TABLE_II, TABLE_III
+from lbt_synth.statespace import Controller
+
+CLASSICAL_GAIN = 0.5
+# "by increasing the integrator's gain"; this times the optical gain of the loop, 0.55, is the
+# effective gain that fits Table II (parameters.CLASSICAL_EFFECTIVE_GAIN)
+CLASSICAL_GAIN_VIBRATION = 0.56
+_FILTERS = ("kalman", "hinf")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Planned:
+    """One row of a table for one controller: cases that differ in their seed only.
+
+    Attributes
+    ----------
+    table : str
+        "II" or "III".
+    label, method : str
+        Row and controller.
+    error_hz : float or None
+        Frequency of the model less that of the vibration; None without vibration.
+    paper : float
+        The paper's Strehl ratio [%]; nan where it has none.
+    controller : Controller
+        Controller of tip and tilt.
+    truth : Truth
+        Vibrations that are there.
+    cases : dict of str to dict
+        Cases by name.
+    """
+
+    table: str
+    label: str
+    method: str
+    error_hz: float | None
+    paper: float
+    controller: Controller
+    truth: Truth
+    cases: dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndToEndEntry:
+    """One row of a table for one controller, simulated.
+
+    Attributes
+    ----------
+    table, label, method : str
+        As planned.
+    error_hz : float or None
+        Frequency of the model less that of the vibration [Hz].
+    strehls : tuple of float
+        Strehl ratio of each seed [%].
+    paper : float
+        The paper's [%], or nan.
+    modal : float
+        Prediction of the modal analysis with the measured optical gain and the measured
+        Strehl ratio of the other modes, mean over seeds [%]; 0 where the loop is unstable.
+    optical_gain : float
+        Optical gain of tip and tilt, mean over seeds.
+    tip_rms_nm, tilt_rms_nm : float
+        Residuals, root mean square over seeds [nm].
+    other_modes : float
+        Strehl ratio without tip and tilt, mean over seeds [%].
+    """
+
+    table: str
+    label: str
+    method: str
+    error_hz: float | None
+    strehls: tuple[float, ...]
+    paper: float
+    modal: float
+    optical_gain: float
+    tip_rms_nm: float
+    tilt_rms_nm: float
+    other_modes: float
+
+    @property
+    def strehl(self) -> float:
+        """Mean over seeds [%]."""
+        return float(np.mean(self.strehls))
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation over seeds [points]; nan for one."""
+        return float(np.std(self.strehls, ddof=1)) if len(self.strehls) > 1 else float("nan")
+
+
+def plan_tables(
+    setup: EndToEndSetup,
+    designs: Mapping[str, Design] | None = None,
+    *,
+    seeds: Sequence[int] = (0, 1, 2),
+    row_seeds: Sequence[int] = (0,),
+    tables: Iterable[str] = ("II", "III"),
+) -> list[Planned]:
+    """Lay out both tables for a system.
+
+    The filters are those of :func:`~lbt_synth.paper.compute.paper_filters`, designed anew
+    at each frequency of Table III. Further designs are fixed: for them the vibration moves
+    instead of the model, by the same error.
+
+    Parameters
+    ----------
+    setup : EndToEndSetup
+        The system, for the paper's frame rate and delay.
+    designs : mapping of str to Design, optional
+        Further designs by name.
+    seeds : sequence of int, optional
+        Seeds of Table II, and of the row of Table III without an error.
+    row_seeds : sequence of int, optional
+        Seeds of the other rows of Table III.
+    tables : iterable of str, optional
+        Which of "II" and "III".
+
+    Returns
+    -------
+    list of Planned
+        Rows, table by table; a case that two rows share has one name.
+
+    Raises
+    ------
+    ProblemError
+        If the loop is not that of the paper, or a design is for another.
+    """
+    hardware = setup.system.hardware
+    if (hardware.frame_rate_hz, hardware.delay_frames) != (given.FRAME_RATE_HZ, given.DELAY_FRAMES):
+        raise ProblemError(
+            f"the paper's loop runs at {given.FRAME_RATE_HZ:g} Hz with a delay of "
+            f"{given.DELAY_FRAMES:g} frames; got {hardware.frame_rate_hz:g} Hz and "
+            f"{hardware.delay_frames:g} frames."
+        )
+    rows: list[Planned] = []
+    fixed = dict(designs or {})
+    for name, design in fixed.items():
+        setup.controller(design)  # refuses a filter of another loop or of other sizes
+        if name in ("classical", *_FILTERS):
+            raise ProblemError(f"the name {name} is taken by the paper's own; rename the file.")
+    if "II" in tables:
+        rows += _table_ii(setup, fixed, seeds)
+    if "III" in tables:
+        rows += _table_iii(setup, fixed, seeds, row_seeds)
+    return rows
+
+
+def _table_ii(
+    setup: EndToEndSetup, fixed: Mapping[str, Design], seeds: Sequence[int]
+) -> Iterator[Planned]:
+    for row in TABLE_II:
+        label = "vibration" if row.vibration else "no vibration"
+        frequency = given.VIBRATION_HZ if row.vibration else None
+        gain = CLASSICAL_GAIN_VIBRATION if row.vibration else CLASSICAL_GAIN
+        common = {"table": "II", "label": label, "seeds": seeds, "true_hz": frequency}
+        error = 0.0 if row.vibration else None
+        yield _planned(
+            setup, "classical", _integrators(gain), error, row.classical, gain=gain, **common
+        )
+        for method in _FILTERS:
+            controller = _paper_filter(method, given.VIBRATION_HZ)
+            yield _planned(setup, method, controller, error, getattr(row, method), **common)
+        for name, design in fixed.items():
+            yield _planned(setup, name, design.controller, error, float("nan"), **common)
+
+
+def _table_iii(
+    setup: EndToEndSetup,
+    fixed: Mapping[str, Design],
+    seeds: Sequence[int],
+    row_seeds: Sequence[int],
+) -> Iterator[Planned]:
+    for row in TABLE_III:
+        error = row.model_hz - given.VIBRATION_HZ
+        common = {
+            "table": "III",
+            "label": f"{row.model_hz:.1f} Hz",
+            "seeds": seeds if error == 0 else row_seeds,
+        }
+        for method in _FILTERS:
+            controller = _paper_filter(method, row.model_hz)
+            yield _planned(
+                setup, method, controller, error, getattr(row, method),
+                true_hz=given.VIBRATION_HZ, model_hz=row.model_hz, **common,
+            )  # fmt: skip
+        for name, design in fixed.items():
+            yield _planned(
+                setup, name, design.controller, error, float("nan"),
+                true_hz=given.VIBRATION_HZ - error, **common,
+            )  # fmt: skip
+
+
+def _planned(
+    setup: EndToEndSetup,
+    method: str,
+    controller: Controller,
+    error_hz: float | None,
+    paper: float,
+    *,
+    table: str,
+    label: str,
+    seeds: Sequence[int],
+    true_hz: float | None,
+    model_hz: float = given.VIBRATION_HZ,
+    gain: float | None = None,
+) -> Planned:
+    lines: tuple[SinusoidalVibration, ...] = ()
+    if true_hz is not None:
+        shake = given.PAPER_TRUTH.vibrations[0]
+        assert isinstance(shake, SinusoidalVibration)
+        lines = (replace(shake, frequency_hz=true_hz),)
+    met = "none" if true_hz is None else f"{true_hz:g}hz"
+    tuned = f"{model_hz:g}hz-" if method in _FILTERS else ""
+    cases = {
+        f"{method}-{tuned}vibration-{met}-seed-{seed}": case_of(
+            setup, None if gain is not None else controller, vibrations=lines,
+            tip_tilt_gain=gain, seed=seed,
+        )
+        for seed in seeds
+    }  # fmt: skip
+    return Planned(
+        table=table, label=label, method=method, error_hz=error_hz, paper=paper,
+        controller=controller, truth=replace(given.PAPER_TRUTH, vibrations=lines), cases=cases,
+    )  # fmt: skip
+
+
+def _integrators(gain: float) -> Controller:
+    return Controller(
+        A=np.eye(2), B=gain * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)),
+        dt_s=1 / given.FRAME_RATE_HZ,
+    )  # fmt: skip
+
+
+def _paper_filter(method: str, model_hz: float) -> Controller:
+    plant = given.kalman_plant() if method == "kalman" else given.hinf_plant()
+    plant = retuned_plant(plant, model_hz - given.VIBRATION_HZ, hold="driving")
+    if method == "kalman":
+        return kalman(plant).controller
+    return hinf(plant, gamma=given.HINF_GAMMA * given.NOISE_NM, route="riccati").controller
+
+
+def all_cases(rows: Iterable[Planned]) -> dict[str, dict[str, Any]]:
+    """Return the cases of all rows, each once."""
+    return {name: case for row in rows for name, case in row.cases.items()}
+
+
+def entries(
+    rows: Iterable[Planned], results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
+) -> list[EndToEndEntry]:
+    """Return the tables from the results of their cases.
+
+    Parameters
+    ----------
+    rows : iterable of Planned
+        Of :func:`plan_tables`.
+    results : mapping of str to mapping
+        Results of :func:`~lbt_synth.endtoend.cases.run_case` by the case's name.
+    setup : EndToEndSetup
+        The system.
+
+    Returns
+    -------
+    list of EndToEndEntry
+        One a row and controller.
+    """
+    out = []
+    for row in rows:
+        found = [results[name] for name in row.cases]
+        out.append(
+            EndToEndEntry(
+                table=row.table,
+                label=row.label,
+                method=row.method,
+                error_hz=row.error_hz,
+                paper=row.paper,
+                strehls=tuple(100 * one["strehl"] for one in found),
+                modal=_mean([_predicted(row, one, setup) for one in found]),
+                optical_gain=_mean([one["tip_tilt_gain"] for one in found]),
+                tip_rms_nm=_mean([one["tip_rms_nm"] ** 2 for one in found]) ** 0.5,
+                tilt_rms_nm=_mean([one["tilt_rms_nm"] ** 2 for one in found]) ** 0.5,
+                other_modes=100 * _mean([one["other_modes_strehl"] for one in found]),
+            )
+        )
+    return out
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values))
+
+
+def _predicted(row: Planned, result: Mapping[str, Any], setup: EndToEndSetup) -> float:
+    system = setup.system
+    hardware = LoopHardware(
+        frame_rate_hz=system.frame_rate_hz, delay_frames=system.hardware.delay_frames
+    )
+    gain = result["tip_tilt_gain"]
+    if gain <= 0:
+        return 0.0
+    truth = replace(row.truth, sensor_gain=gain)
+    imaging = Imaging(
+        diameter_m=system.diameter_m,
+        obstruction=system.obstruction,
+        wavelength_um=system.imaging_wavelength_um,
+        other_modes=result["other_modes_strehl"],
+    )
+    try:
+        loop = close_loop(hardware, row.controller, sensor_gain=gain)
+        return 100 * strehl(residual_budget(loop, truth), imaging)
+    except UnstableLoopError:
+        return 0.0
+
+
+def modal_distance(table: Iterable[EndToEndEntry], method: str) -> float:
+    """Root mean square of end-to-end less modal over Table III, for one controller [points]."""
+    apart = [e.strehl - e.modal for e in table if e.table == "III" and e.method == method]
+    return float(np.sqrt(np.mean(np.square(apart))))
