@@ -12,6 +12,7 @@ from lbt_synth.cli.loop_commands import sigma, simulate
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.paper_command import paper
 from lbt_synth.cli.robustness_command import robustness
+from lbt_synth.cli.telemetry_command import telemetry
 
 COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "design": design,
@@ -21,6 +22,7 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "show": show,
     "sigma": sigma,
     "simulate": simulate,
+    "telemetry": telemetry,
     "tradeoff": tradeoff_command,
     "verify": verify,
 }

@@ -116,6 +116,27 @@ def build_parser() -> argparse.ArgumentParser:
     simulate.add_argument("--seed", type=int, help="seed of the random series")
     simulate.add_argument("--sensor-gain", type=float, help="real sensor gain")
     simulate.add_argument("-o", "--output", help="figure (.png, .pdf or .svg)")
+    simulate.add_argument(
+        "--telemetry",
+        metavar="FILE",
+        help="write the series of the first run (.fits, .npz or .aot.fits)",
+    )
+
+    telemetry = command(
+        "telemetry", "Show what a telemetry file holds, and write it in another format"
+    )
+    telemetry.add_argument("file", help="telemetry (.fits or .npz; FITS of the AOT standard, too)")
+    telemetry.add_argument("-o", "--output", help="file to write (.fits, .npz or .aot.fits)")
+    telemetry.add_argument(
+        "--format",
+        choices=("fits", "npz", "aot"),
+        help="of the file to write (default: its ending)",
+    )
+    telemetry.add_argument(
+        "--precision",
+        choices=("float64", "float32"),
+        help="of the series written (default float64)",
+    )
 
     robustness = command(
         "robustness",
