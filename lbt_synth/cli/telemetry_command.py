@@ -54,7 +54,8 @@ def telemetry(arguments: Namespace) -> Report:
     seen = load_telemetry(arguments.file)
     report = _description(seen)
     report.data["file"] = arguments.file
-    report.notes.append(CONVENTION)
+    if "timing" not in seen.metadata:  # of another program
+        report.notes.append(CONVENTION)
     if kind is not None:
         precision = arguments.precision or "float64"
         path = save_telemetry(output, seen, format=kind, precision=precision)

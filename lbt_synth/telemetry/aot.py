@@ -1,6 +1,6 @@
 """Telemetry in the layout of the Adaptive Optics Telemetry standard, through ``aotpy``.
 
-Standard: T. Gomes et al. 2024, A&A 686, A68 (DOI 10.1051/0004-6361/202348486), version 2.0.0.
+Standard: T. Gomes et al., A&A (2024), DOI 10.1051/0004-6361/202348486; version 2.0.0.
 It wants commands in metres, has no field for the true phase, and describes a controller by a
 control matrix and one transfer function a mode, not by a state space. What of a telemetry
 is lost, :func:`losses` tells.
@@ -8,7 +8,6 @@ is lost, :func:`losses` tells.
 
 from __future__ import annotations
 
-import importlib
 import io
 import json
 import warnings
@@ -30,6 +29,7 @@ _CARD_OF_OURS = "LBTSYNTH"  # one card with what the standard has no field for, 
 _IN_OURS = ("seed", "name", "controller_name", "controller_digest", "metadata")
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
 _RAD_PER_MAS = np.pi / 180 / 3600e3
+_FOREIGN = "that of another program: which exposure a row is of, the AOT standard does not say"
 _INSTALL = 'it needs aotpy: pip install "lbt-synth[aot]"'
 
 
@@ -52,6 +52,12 @@ def losses(telemetry: Telemetry) -> tuple[str, ...]:
     return tuple(name for name in without if getattr(telemetry, name) is not None)
 
 
+def _aotpy() -> Any:
+    import aotpy
+
+    return aotpy
+
+
 def require_aotpy(target: Path) -> Any:
     """Return the module; refuse to write a file where it is missing.
 
@@ -61,7 +67,7 @@ def require_aotpy(target: Path) -> Any:
         That says what to install.
     """
     try:
-        return importlib.import_module("aotpy")
+        return _aotpy()
     except ImportError as error:
         raise OutputError(f"cannot write {target}: {_INSTALL}.", path=target) from error
 
@@ -254,7 +260,7 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
         If what it holds does not fit together.
     """
     try:
-        aotpy = importlib.import_module("aotpy")
+        aotpy = _aotpy()
     except ImportError as error:
         raise TelemetryError(f"cannot read {source}: {_INSTALL}.", path=source) from error
     with warnings.catch_warnings():
@@ -284,13 +290,14 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
         )
     fields = _series(loops[0]) | _facts(system)
     if len(loops) > 1:
-        fields["metadata"] = {**fields.get("metadata", {}), "aot_loop": loops[0].uid}
+        fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
     return Telemetry(**fields)
 
 
 def _facts(system: Any) -> dict[str, Any]:
     """Fields that belong to the whole system."""
     facts: dict[str, Any] = {"name": system.name or "", "strehl": system.strehl_ratio}
+    facts["metadata"] = {"timing": _FOREIGN}
     for datum in system.metadata:
         if datum.key == _CARD_OF_OURS:
             ours = json.loads(datum.value)
@@ -361,8 +368,8 @@ def _rate(loop: Any, times: list[float] | None) -> float:
     detector = loop.input_sensor.detector
     if detector is not None and detector.frame_rate is not None:
         return float(detector.frame_rate)
-    if times is not None and len(times) > 1:
-        return (len(times) - 1) / (times[-1] - times[0])
+    if times is not None and len(times) > 1 and times[-1] > times[0]:
+        return float((len(times) - 1) / (times[-1] - times[0]))
     raise KeyError("the frame rate")
 
 

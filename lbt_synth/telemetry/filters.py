@@ -81,13 +81,14 @@ def _constant_row(response: ComplexArray) -> FloatArray | None:
     """Row k of a response ``f(z) k`` over frequencies, (f, q); None if it turns."""
     size = np.linalg.norm(response, axis=1)
     if not np.any(size):
-        return np.eye(1, response.shape[1])[0]
+        return np.asarray(np.eye(1, response.shape[1])[0])
     shape = response[size > 0] / size[size > 0, None]
-    values, directions = np.linalg.svd(np.vstack([shape.real, shape.imag]))[1:]
+    _, values, directions = np.linalg.svd(np.vstack([shape.real, shape.imag]), full_matrices=False)
     if len(values) > 1 and values[1] > _SAME * values[0]:
         return None
-    row = directions[0] / directions[0][np.argmax(np.abs(directions[0]))]
-    return np.asarray(np.where(np.abs(row) > _SAME, row, 0.0))
+    row = np.array(directions[0] / directions[0][np.argmax(np.abs(directions[0]))])
+    row[np.abs(row) <= _SAME] = 0.0
+    return row
 
 
 def _transfer_function(
@@ -103,8 +104,7 @@ def _transfer_function(
         return np.array([d]), np.array([1.0])
     denominator = np.real(np.poly(A))
     numerator = np.real(np.poly(A - np.outer(b, c))) + (d - 1) * denominator
-    if d == 0:
-        numerator[0] = 0.0
+    numerator[~_counts(numerator)] = 0.0
     return numerator, denominator
 
 
