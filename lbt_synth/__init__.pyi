@@ -47,6 +47,7 @@ from .errors import OutputError as OutputError
 from .errors import ProblemError as ProblemError
 from .errors import SchemaVersionError as SchemaVersionError
 from .errors import SynthesisError as SynthesisError
+from .errors import TelemetryError as TelemetryError
 from .errors import UnstableLoopError as UnstableLoopError
 from .front import TradeoffPoint as TradeoffPoint
 from .front import tradeoff as tradeoff
@@ -128,6 +129,10 @@ from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace
 from .sweep import RobustnessRow as RobustnessRow
 from .sweep import frequency_robustness as frequency_robustness
+from .telemetry import Telemetry as Telemetry
+from .telemetry import load_telemetry as load_telemetry
+from .telemetry import save_telemetry as save_telemetry
+from .telemetry import telemetry_of as telemetry_of
 from .witness import Witness as Witness
 from .witness import infeasible_level as infeasible_level
 

@@ -94,3 +94,10 @@ def read_npz(content: bytes) -> tuple[dict[str, FloatArray], str]:
 def _parted(data: dict[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], str]:
     text = data.pop(TEXT).astype(np.uint8).tobytes().decode()
     return {name: array.astype(np.float64) for name, array in data.items()}, text
+
+
+def reason(error: Exception) -> str:
+    """Return what an error says, in one line without its full stop."""
+    if isinstance(error, KeyError):
+        return f"{error.args[0]} is missing".rstrip(".")
+    return str(error).split("\n")[0].rstrip(".") or type(error).__name__

@@ -176,9 +176,7 @@ def _watch_parent(parent: int) -> None:
 
 def _digest(name: str, case: Case) -> str:
     if not _NAME.match(name):
-        raise ProblemError(
-            f"the name of a case must be letters, digits and . _ + -; got {name!r}."
-        )
+        raise ProblemError(f"the name of a case must be letters, digits and . _ + -; got {name!r}.")
     try:
         text = json.dumps(case, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -230,9 +228,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
     try:
         stream = (folder / ".lock").open("w")
     except OSError as error:
-        raise OutputError(
-            f"cannot write into {folder}: {error.strerror}.", path=folder
-        ) from error
+        raise OutputError(f"cannot write into {folder}: {error.strerror}.", path=folder) from error
     with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -178,5 +178,9 @@ class SchemaVersionError(GainFileError):
     """A gain file was written with a layout that this version does not know."""
 
 
+class TelemetryError(FileError):
+    """A telemetry file cannot be read: it is missing, damaged, foreign or of a later layout."""
+
+
 class OutputError(FileError):
     """A result cannot be written."""

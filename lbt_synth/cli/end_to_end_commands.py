@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
 from argparse import Namespace
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from lbt_synth.cli.output import Report, TableText, counting, fixed, plain
 from lbt_synth.cli.writing import made_directory
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
-from lbt_synth.endtoend import EndToEndRun, EndToEndSetup, calibrate
+from lbt_synth.endtoend import Calibration, EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.endtoend.cases import run_case, summary, with_pixels
 from lbt_synth.endtoend.optics import specula_version
 from lbt_synth.errors import ProblemError
@@ -32,6 +33,7 @@ from lbt_synth.paper.end_to_end import (
 from lbt_synth.paper.end_to_end_figure import table_figure
 from lbt_synth.plotting import end_to_end_figure, save_figure
 from lbt_synth.tables import csv_bytes
+from lbt_synth.telemetry import Telemetry, save_telemetry
 
 
 def end_to_end(arguments: Namespace) -> Report:
@@ -162,10 +164,8 @@ def _setup(arguments: Namespace) -> EndToEndSetup:
     return replace(setup, **changes)
 
 
-def _calibrated(setup: EndToEndSetup, arguments: Namespace) -> Any:
-    with counting(
-        total=setup.system.modes, what="calibration", quiet=arguments.json
-    ) as count:
+def _calibrated(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
+    with counting(total=setup.system.modes, what="calibration", quiet=arguments.json) as count:
         return calibrate(setup.system, cache=arguments.cache, progress=count)
 
 
@@ -219,6 +219,32 @@ def _table(table: Sequence[EndToEndEntry], number: str) -> TableText:
 
 
 def _telemetry(
-    run: EndToEndRun, design: Design, calibration: Any, arguments: Namespace
+    run: EndToEndRun, design: Design, calibration: Calibration, arguments: Namespace
 ) -> Telemetry:
-    raise NotImplementedError
+    system = run.system
+    return Telemetry(
+        name=f"end to end, {system.modes} modes",
+        frame_rate_hz=system.frame_rate_hz,
+        delay_frames=system.hardware.delay_frames,
+        commands=run.commands,
+        measurements=run.measurements,
+        residual_nm=run.residual_nm,
+        psf=run.psf,
+        psf_pixel_mas=run.psf_pixel_mas,
+        imaging_wavelength_um=system.imaging_wavelength_um,
+        strehl=min(run.strehl, 1.0),
+        sensor_gain=run.tip_tilt_gain if run.tip_tilt_gain > 0 else None,
+        controller_name=f"mixed: tip and tilt by {design.method}, integrators for the rest",
+        controller_digest=hashlib.sha256(Path(arguments.gain).read_bytes()).hexdigest(),
+        diameter_m=system.diameter_m,
+        obstruction=system.obstruction,
+        seed=run.seed,
+        metadata={
+            "simulator": f"SPECULA {specula_version()}",
+            "gain_file": Path(arguments.gain).name,
+            "pixels": system.pixels,
+            "settle_frames": run.settle_frames,
+            "calibration": calibration.key,
+            "sensor_gain_is": "optical gain of tip and tilt, measured in the loop",
+        },
+    )

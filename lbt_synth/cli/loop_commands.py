@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.cli.output import Report, TableText, working
+from lbt_synth.cli.telemetry_command import write_first_case
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.distance import above_percent, limit_or_nan
@@ -21,6 +22,7 @@ from lbt_synth.models import Truth
 from lbt_synth.plotting import require_figure_name, save_figure, sigma_figure, simulation_figure
 from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
+from lbt_synth.telemetry import require_telemetry_name
 
 
 def sigma(arguments: Namespace) -> Report:
@@ -75,6 +77,9 @@ def simulate(arguments: Namespace) -> Report:
     """Close the loop in the time domain, beside the exact answer."""
     if arguments.output is not None:
         _require_figure(arguments.output)
+    if arguments.telemetry is not None:
+        require_telemetry_name(arguments.telemetry)
+        require_writable(arguments.telemetry)
     config = load_config(arguments.config)
     design = load_gain(arguments.gain)
     truth = real_truth(config, arguments)
@@ -151,6 +156,10 @@ def simulate(arguments: Namespace) -> Report:
         )
         report.data["file"] = str(path)
         report.notes.append(f"written: {path}")
+    if arguments.telemetry is not None:
+        write_first_case(
+            report, arguments.telemetry, run, replace(config, truth=truth), design, arguments.gain
+        )
     return report
 
 

@@ -116,6 +116,27 @@ def build_parser() -> argparse.ArgumentParser:
     simulate.add_argument("--seed", type=int, help="seed of the random series")
     simulate.add_argument("--sensor-gain", type=float, help="real sensor gain")
     simulate.add_argument("-o", "--output", help="figure (.png, .pdf or .svg)")
+    simulate.add_argument(
+        "--telemetry",
+        metavar="FILE",
+        help="write the series of the first run (.fits, .npz or .aot.fits)",
+    )
+
+    telemetry = command(
+        "telemetry", "Show what a telemetry file holds, and write it in another format"
+    )
+    telemetry.add_argument("file", help="telemetry (.fits or .npz; FITS of the AOT standard, too)")
+    telemetry.add_argument("-o", "--output", help="file to write (.fits, .npz or .aot.fits)")
+    telemetry.add_argument(
+        "--format",
+        choices=("fits", "npz", "aot"),
+        help="of the file to write (default: its ending)",
+    )
+    telemetry.add_argument(
+        "--precision",
+        choices=("float64", "float32"),
+        help="of the series written (default float64)",
+    )
 
     robustness = command(
         "robustness",
@@ -193,6 +214,31 @@ def build_parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
+    )
+
+    end_to_end = command("e2e", "Close the loop end to end: pyramid, mirror and moving air")
+    table = command("e2e-table", "Tables II and III of Agapito et al. 2008 end to end")
+    for sub in (end_to_end, table):
+        sub.add_argument("config", help=config_help)
+        sub.add_argument("--pixels", type=int, help="pixels across the pupil, even")
+        sub.add_argument("--frames", type=int, help="frames of an exposure")
+        sub.add_argument("--settle-frames", type=int, help="frames before, at least 200")
+        sub.add_argument("--seed", type=int, help="seed of the random parts, the first of several")
+        sub.add_argument("--cache", help="directory for calibrations and phase screens")
+        sub.add_argument("-o", "--output", required=True, help="directory to write into")
+    end_to_end.add_argument("gain", help=gain_help)
+    table.add_argument(
+        "gains", nargs="*", metavar="gain", help="gain files to run beside the paper's filters"
+    )
+    table.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
+    table.add_argument(
+        "--seeds", type=int, default=3, help="seeds of Table II and of 20 Hz (default 3)"
+    )
+    table.add_argument(
+        "--row-seeds", type=int, default=1, help="seeds of the other rows (default 1)"
+    )
+    table.add_argument(
+        "--tables", nargs="+", choices=("II", "III"), default=["II", "III"], help="default both"
     )
 
     paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")

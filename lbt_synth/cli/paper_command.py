@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 from lbt_synth.cli.output import Report, TableText, progress
-from lbt_synth.errors import OutputError
+from lbt_synth.cli.writing import made_directory
 from lbt_synth.paper.compute import Comparison, rms_difference, table_iii
 from lbt_synth.paper.parameters import PARAMETERS
 from lbt_synth.paper.published import TABLE_III
@@ -18,13 +17,7 @@ _NAMES = {"classical": "classical", "kalman": "mixed Kalman", "hinf": "mixed H-i
 
 def paper(arguments: Namespace) -> Report:
     """Compute and write the tables and figures of the paper."""
-    folder = Path(arguments.output)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the directory {folder}: {error.strerror}.", path=folder
-        ) from error
+    folder = made_directory(arguments.output)
     rows = list(
         progress(table_iii(), total=2 * len(TABLE_III), what="Table III", quiet=arguments.json)
     )

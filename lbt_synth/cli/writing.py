@@ -8,10 +8,28 @@ from pathlib import Path
 from typing import Any
 
 from lbt_synth.cli.output import Report
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import require_writable, write_atomically
 from lbt_synth.plotting import FIGURE_ENDINGS, save_figure
 from lbt_synth.tables import csv_bytes
+
+
+def made_directory(path: str | Path) -> Path:
+    """Return a directory, made if it was not there.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the directory {folder}: {error.strerror}.", path=folder
+        ) from error
+    return folder
 
 
 def require_outputs(outputs: Sequence[str]) -> None:

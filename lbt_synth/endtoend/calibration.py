@@ -9,8 +9,10 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lbt_synth.archive import digest, npz_bytes, read_npz
 from lbt_synth.endtoend.optics import Modes, Optics, make_modes, specula_version
@@ -130,7 +132,7 @@ def calibrate(
         return found
     modes = make_modes(system)
     reference, matrix = _measure(system, modes, progress)
-    arrays = {
+    arrays: dict[str, npt.NDArray[Any]] = {
         "MASK": modes.mask.astype(np.uint8),
         "SHAPES": modes.shapes,
         "REFERENCE": reference,
@@ -165,9 +167,7 @@ def _load(path: Path, key: str) -> Calibration | None:
         meta = json.loads(text)
         if meta["key"] == key and meta["digest"] == digest(arrays, meta):
             modes = Modes(mask=arrays["MASK"] > 0, shapes=arrays["SHAPES"].astype(np.float32))
-            return _calibration(
-                modes, arrays["REFERENCE"], arrays["INTERACTION"], key, cached=True
-            )
+            return _calibration(modes, arrays["REFERENCE"], arrays["INTERACTION"], key, cached=True)
     return None
 
 

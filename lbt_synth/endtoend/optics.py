@@ -81,8 +81,9 @@ class Modes:
     shapes: npt.NDArray[np.float32]
 
     def coefficients(self, phase_nm: npt.NDArray[np.float32]) -> FloatArray:
-        """Return the modal coefficients of phases (..., illuminated) [nm]."""
-        return np.asarray(phase_nm @ self.shapes.T, dtype=np.float64) / self.shapes.shape[1]
+        """Return the modal coefficients of a phase (illuminated,) [nm]."""
+        projected = np.asarray(self.shapes @ phase_nm, dtype=np.float64)
+        return np.asarray(projected / self.shapes.shape[1])
 
 
 def make_modes(system: EndToEndSystem) -> Modes:
@@ -220,10 +221,10 @@ class Optics:
         self._trigger(self._train)
         return np.array(self._slopes.outputs["out_slopes"].slopes, dtype=np.float64)
 
-    def image(self) -> tuple[float, npt.NDArray[np.float32]]:
+    def image(self) -> tuple[float, FloatArray]:
         """Return the Strehl ratio and the image of the frame that was exposed last."""
         self._trigger([self._camera])
-        return float(self._camera.sr.value), np.array(self._camera.psf.value)
+        return float(self._camera.sr.value), np.array(self._camera.psf.value, dtype=np.float64)
 
     def phase_nm(self) -> npt.NDArray[np.float32]:
         """Return the residual phase of the last frame over the illuminated pixels [nm]."""

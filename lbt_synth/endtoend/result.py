@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lbt_synth.endtoend.system import EndToEndSystem
 from lbt_synth.validation import FloatArray
@@ -48,7 +47,7 @@ class EndToEndRun:
     measurements: FloatArray
     commands: FloatArray
     residual_nm: FloatArray
-    psf: npt.NDArray[np.float32]
+    psf: FloatArray
     psf_pixel_mas: float
     seed: int
     settle_frames: int

@@ -127,7 +127,8 @@ def _close(
     out = {
         name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")
     }  # fmt: skip
-    strehl, others, image = np.empty(kept), np.empty(kept), 0.0
+    strehl, others = np.empty(kept), np.empty(kept)
+    images: list[FloatArray] = []
     past = np.zeros((len(taps), n))  # u(k), u(k-1), ...
     slopes = calibration.reference
     controller.reset()
@@ -138,7 +139,7 @@ def _close(
         row = k - settle
         if row >= 0:
             strehl[row], frame = optics.image()
-            image = image + frame.astype(np.float64)
+            images = [images[0] + frame] if images else [frame]
             residual, others[row] = _residual(modes, optics)
             for name, value in zip(out, (y, past[0], residual), strict=True):
                 out[name][row] = value
@@ -148,7 +149,7 @@ def _close(
         **out,
         "strehl_series": strehl,
         "other_modes_series": others,
-        "psf": np.asarray(image / kept),
+        "psf": images[0] / kept,
     }
 
 

@@ -109,12 +109,15 @@ class EndToEndSystem:
             "imaging_wavelength_um", "calibration_nm",
         ):  # fmt: skip
             object.__setattr__(self, name, number(getattr(self, name), name, above=0))
-        for name, bounds in (
-            ("obstruction", {"at_least": 0, "below": 1}),
-            ("read_noise_electrons", {"at_least": 0}),
-            ("wind_direction_deg", {}),
-        ):
-            object.__setattr__(self, name, number(getattr(self, name), name, **bounds))
+        checked = {
+            "obstruction": number(self.obstruction, "obstruction", at_least=0, below=1),
+            "read_noise_electrons": number(
+                self.read_noise_electrons, "read_noise_electrons", at_least=0
+            ),
+            "wind_direction_deg": number(self.wind_direction_deg, "wind_direction_deg"),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
         for name, least in (
             ("subapertures_across", 2), ("modes", 3), ("actuators_across", 3), ("pixels", 8)
         ):  # fmt: skip

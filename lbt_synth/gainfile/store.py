@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.archive import digest as _digest
+from lbt_synth.archive import reason
 from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files import write_atomically
@@ -132,7 +133,7 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
         digest = _digest(arrays, meta) if isinstance(meta, dict) else ""
     except Exception as error:  # foreign bytes: three decoders raise whatever they like
         raise GainFileError(
-            f"{source} is no gain file, or it is damaged: {_reason(error)}. "
+            f"{source} is no gain file, or it is damaged: {reason(error)}. "
             "Write it again with lbt-synth design.",
             path=source,
         ) from error
@@ -152,15 +153,9 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
         return from_record({name: frozen(array) for name, array in arrays.items()}, meta)
     except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise GainFileError(
-            f"{source} is inconsistent: {_reason(error)}. Write it again with lbt-synth design.",
+            f"{source} is inconsistent: {reason(error)}. Write it again with lbt-synth design.",
             path=source,
         ) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, KeyError):
-        return f"{error.args[0]} is missing".rstrip(".")
-    return str(error).split("\n")[0].rstrip(".") or type(error).__name__
 
 
 def _check_schema(meta: Any, source: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -162,23 +162,42 @@ def plan_tables(
     return rows
 
 
+class _Row(NamedTuple):
+    """What the controllers of one row have in common."""
+
+    table: str
+    label: str
+    error_hz: float | None
+    model_hz: float
+    seeds: Sequence[int]
+
+    @property
+    def truth_hz(self) -> float | None:
+        """Frequency of the vibration where the model moves; None without vibration."""
+        return None if self.error_hz is None else given.VIBRATION_HZ
+
+    @property
+    def moved_hz(self) -> float | None:
+        """Frequency of the vibration where the design stays; None without vibration."""
+        return None if self.error_hz is None else given.VIBRATION_HZ - self.error_hz
+
+
 def _table_ii(
     setup: EndToEndSetup, fixed: Mapping[str, Design], seeds: Sequence[int]
 ) -> Iterator[Planned]:
-    for row in TABLE_II:
-        label = "vibration" if row.vibration else "no vibration"
-        frequency = given.VIBRATION_HZ if row.vibration else None
-        gain = CLASSICAL_GAIN_VIBRATION if row.vibration else CLASSICAL_GAIN
-        common = {"table": "II", "label": label, "seeds": seeds, "true_hz": frequency}
-        error = 0.0 if row.vibration else None
-        yield _planned(
-            setup, "classical", _integrators(gain), error, row.classical, gain=gain, **common
+    for published in TABLE_II:
+        shaken = published.vibration
+        row = _Row(
+            table="II",
+            label="vibration" if shaken else "no vibration",
+            error_hz=0.0 if shaken else None,
+            model_hz=given.VIBRATION_HZ,
+            seeds=seeds,
         )
-        for method in _FILTERS:
-            controller = _paper_filter(method, given.VIBRATION_HZ)
-            yield _planned(setup, method, controller, error, getattr(row, method), **common)
-        for name, design in fixed.items():
-            yield _planned(setup, name, design.controller, error, float("nan"), **common)
+        gain = CLASSICAL_GAIN_VIBRATION if shaken else CLASSICAL_GAIN
+        yield _planned(setup, row, "classical", _integrators(gain), published.classical, gain=gain)
+        yield from _filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
+        yield from _fixed(setup, row, fixed)
 
 
 def _table_iii(
@@ -187,58 +206,67 @@ def _table_iii(
     seeds: Sequence[int],
     row_seeds: Sequence[int],
 ) -> Iterator[Planned]:
-    for row in TABLE_III:
-        error = row.model_hz - given.VIBRATION_HZ
-        common = {
-            "table": "III",
-            "label": f"{row.model_hz:.1f} Hz",
-            "seeds": seeds if error == 0 else row_seeds,
-        }
-        for method in _FILTERS:
-            controller = _paper_filter(method, row.model_hz)
-            yield _planned(
-                setup, method, controller, error, getattr(row, method),
-                true_hz=given.VIBRATION_HZ, model_hz=row.model_hz, **common,
-            )  # fmt: skip
-        for name, design in fixed.items():
-            yield _planned(
-                setup, name, design.controller, error, float("nan"),
-                true_hz=given.VIBRATION_HZ - error, **common,
-            )  # fmt: skip
+    for published in TABLE_III:
+        error = published.model_hz - given.VIBRATION_HZ
+        row = _Row(
+            table="III",
+            label=f"{published.model_hz:.1f} Hz",
+            error_hz=error,
+            model_hz=published.model_hz,
+            seeds=seeds if error == 0 else row_seeds,
+        )
+        yield from _filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
+        yield from _fixed(setup, row, fixed)
+
+
+def _filters(setup: EndToEndSetup, row: _Row, published: Mapping[str, float]) -> Iterator[Planned]:
+    for method, paper in published.items():
+        controller = _paper_filter(method, row.model_hz)
+        yield _planned(setup, row, method, controller, paper)
+
+
+def _fixed(setup: EndToEndSetup, row: _Row, designs: Mapping[str, Design]) -> Iterator[Planned]:
+    for name, design in designs.items():
+        yield _planned(setup, row, name, design.controller, float("nan"))
 
 
 def _planned(
     setup: EndToEndSetup,
+    row: _Row,
     method: str,
     controller: Controller,
-    error_hz: float | None,
     paper: float,
     *,
-    table: str,
-    label: str,
-    seeds: Sequence[int],
-    true_hz: float | None,
-    model_hz: float = given.VIBRATION_HZ,
     gain: float | None = None,
 ) -> Planned:
+    tuned = method in _FILTERS
+    true_hz = row.truth_hz if tuned else row.moved_hz
     lines: tuple[SinusoidalVibration, ...] = ()
     if true_hz is not None:
         shake = given.PAPER_TRUTH.vibrations[0]
         assert isinstance(shake, SinusoidalVibration)
         lines = (replace(shake, frequency_hz=true_hz),)
     met = "none" if true_hz is None else f"{true_hz:g}hz"
-    tuned = f"{model_hz:g}hz-" if method in _FILTERS else ""
-    cases = {
-        f"{method}-{tuned}vibration-{met}-seed-{seed}": case_of(
-            setup, None if gain is not None else controller, vibrations=lines,
-            tip_tilt_gain=gain, seed=seed,
-        )
-        for seed in seeds
-    }  # fmt: skip
+    name = f"{method}-{row.model_hz:g}hz" if tuned else method
     return Planned(
-        table=table, label=label, method=method, error_hz=error_hz, paper=paper,
-        controller=controller, truth=replace(given.PAPER_TRUTH, vibrations=lines), cases=cases,
-    )  # fmt: skip
+        table=row.table,
+        label=row.label,
+        method=method,
+        error_hz=row.error_hz,
+        paper=paper,
+        controller=controller,
+        truth=replace(given.PAPER_TRUTH, vibrations=lines),
+        cases={
+            f"{name}-vibration-{met}-seed-{seed}": case_of(
+                setup,
+                None if gain is not None else controller,
+                vibrations=lines,
+                tip_tilt_gain=gain,
+                seed=seed,
+            )
+            for seed in row.seeds
+        },
+    )
 
 
 def _integrators(gain: float) -> Controller:
@@ -253,7 +281,7 @@ def _paper_filter(method: str, model_hz: float) -> Controller:
     plant = retuned_plant(plant, model_hz - given.VIBRATION_HZ, hold="driving")
     if method == "kalman":
         return kalman(plant).controller
-    return hinf(plant, gamma=given.HINF_GAMMA * given.NOISE_NM, route="riccati").controller
+    return hinf(plant, gamma=given.HINF_GAMMA * given.NOISE_NM, method="riccati").controller
 
 
 def all_cases(rows: Iterable[Planned]) -> dict[str, dict[str, Any]]:

@@ -1,0 +1,383 @@
+"""Telemetry in the AOT standard, judged by the standard's own package."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import io
+import json
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from test_telemetry import full, same, telemetries
+
+import lbt_synth as lbt
+from lbt_synth.telemetry import losses
+
+pytestmark = pytest.mark.e2e
+
+
+class Later:
+    """The package, imported when a test uses it: without it these tests fail, not the collection."""
+
+    def __getattr__(self, name):
+        return getattr(importlib.import_module("aotpy"), name)
+
+
+aotpy = Later()
+
+# Lengths change their unit on the way, so that they come back to rounding.
+ROUNDING = 1e-14
+
+
+def strictly_read(path):
+    """Read as aotpy reads, any deviation but our one card an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return aotpy.AOTFITSReader(
+            path,
+            exception_level=aotpy.io.fits.AOTFITSErrorLevel.WARNING,
+            externals="disallow",
+            memmap=False,
+        ).get_system()
+
+
+@pytest.mark.parametrize("with_slopes", [True, False])
+def test_what_the_standard_carries_comes_back(tmp_path, with_slopes):
+    seen = full(with_slopes=with_slopes, slope_unit="pixel" if with_slopes else "")
+    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    lost = losses(seen)
+    assert lost == ("residual_nm", "total_nm", "controller")
+    assert same(seen, back, but=lost, rtol=ROUNDING)
+    assert all(getattr(back, name) is None for name in lost)
+    assert not losses(back)
+    again = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "u.aot.fits", back))
+    assert same(back, again, rtol=ROUNDING)
+
+
+def test_the_file_says_what_the_telemetry_says(tmp_path):
+    """Field by field, through aotpy alone."""
+    seen = full()
+    system = strictly_read(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    assert (system.ao_mode, system.name) == ("SCAO", "LBT, c?t? gauche")
+    assert system.strehl_ratio == 0.83
+    assert system.strehl_wavelength == pytest.approx(2.2e-6)
+    assert "y(k) = sensor_gain S phi_res(k-1) + noise(k)" in system.config
+    telescope = system.main_telescope
+    assert telescope.enclosing_diameter == telescope.inscribed_diameter == 8.22
+    assert telescope.obstruction_diameter == pytest.approx(0.11 * 8.22)
+    (star,) = system.sources
+    assert isinstance(star, aotpy.NaturalGuideStar)
+    (sensor,) = system.wavefront_sensors
+    assert isinstance(sensor, aotpy.Pyramid)
+    assert sensor.source is star
+    assert (sensor.n_sides, sensor.dimensions, sensor.n_valid_subapertures) == (4, 2, 4)
+    assert np.array_equal(sensor.measurements.data, seen.slopes.reshape(6, 2, 4))
+    assert sensor.measurements.unit == "pixel"
+    assert sensor.optical_gain.data.tolist() == [0.358]
+    (mirror,) = system.wavefront_correctors
+    assert isinstance(mirror, aotpy.TipTiltMirror)
+    assert mirror.telescope is telescope
+    (loop,) = system.loops
+    assert isinstance(loop, aotpy.ControlLoop)
+    assert loop.input_sensor is sensor
+    assert loop.commanded_corrector is mirror
+    assert (loop.framerate, loop.delay, loop.closed) == (800, 2.25, True)
+    assert np.allclose(loop.commands.data, 1e-9 * seen.commands, rtol=1e-15, atol=0)
+    assert loop.commands.unit == "m"
+    assert np.array_equal(loop.modal_coefficients.data, seen.measurements)
+    assert loop.modal_coefficients.unit == "nm"
+    assert np.array_equal(loop.modes.data, seen.mode_maps)
+    assert np.array_equal(loop.commands_to_modes.data, seen.influence_matrix)
+    assert loop.modes_to_measurements.data.shape == (4, 2, 2)
+    for subaperture in range(4):
+        for axis in range(2):
+            assert np.array_equal(
+                loop.modes_to_measurements.data[subaperture, axis],
+                seen.interaction_matrix[axis * 4 + subaperture],
+            )
+    assert np.array_equal(loop.measurements_to_modes.data, seen.reconstructor.reshape(2, 2, 4))
+    assert np.allclose(loop.control_matrix.data, seen.reconstructor.reshape(2, 2, 4))
+    assert np.allclose(loop.time_filter_num.data, [[0, 0.4]] * 2)
+    assert np.allclose(loop.time_filter_den.data, [[-1, 1]] * 2)
+    assert np.allclose(loop.residual_commands.data, 1e-9 * seen.measurements)
+    assert np.allclose(loop.time.timestamps, seen.times_s, rtol=0, atol=0)
+    assert loop.time.frame_numbers == list(range(6))
+    (camera,) = system.scoring_cameras
+    assert np.array_equal(camera.detector.pixel_intensities.data, seen.psf[None])
+    assert camera.detector.pixel_scale == pytest.approx(13.5e-3 / 206264.80624709636)
+    assert camera.wavelength == pytest.approx(2.2e-6)
+    (card,) = system.metadata
+    assert card.key == "LBTSYNTH"
+    ours = json.loads(card.value)
+    assert ours["controller_digest"] == seen.controller_digest
+    assert ours["controller_states"] == 2
+    assert ours["metadata"] == dict(seen.metadata)
+
+
+def test_aotpy_finds_nothing_wrong(tmp_path, capsys):
+    for name, seen in (
+        ("full", full()),
+        ("least", lbt.Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])),
+        ("wide", full(commands=np.ones((6, 5)), influence_matrix=np.ones((2, 5)),
+                      controller=None, integrator_gains=None)),
+    ):  # fmt: skip
+        path = lbt.save_telemetry(tmp_path / f"{name}.aot.fits", seen)
+        strictly_read(path)
+        aotpy.verify_file(path)
+        said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("[")]
+        assert said == [
+            "[Primary Header] Found non-AOT keywords: ['LBTSYNTH']. (Error level: PEDANTIC)"
+        ]
+        with warnings.catch_warnings(), fits.open(path, checksum=True) as units:
+            warnings.simplefilter("error")
+            assert all("DATASUM" in unit.header and unit.verify_datasum() == 1 for unit in units)
+    wide = strictly_read(tmp_path / "wide.aot.fits").wavefront_correctors[0]
+    assert isinstance(wide, aotpy.DeformableMirror)
+    assert wide.n_valid_actuators == 5
+
+
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seen=telemetries())
+def test_any_telemetry_comes_back_as_far_as_it_goes(tmp_path, seen):
+    rounded = ("commands", "measurements", "total_nm", "obstruction")
+    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    # below, a command in metres is denormal
+    assert np.allclose(back.commands, seen.commands, rtol=ROUNDING, atol=1e-290)
+    assert np.array_equal(back.measurements, seen.measurements)
+    assert same(seen, back, but=rounded, rtol=ROUNDING)
+
+
+def test_the_loop_equation_holds_in_the_aot_file(tmp_path):
+    """An integrator, from the standard's fields alone: its matrix, its filter, its delay."""
+    path = lbt.LoopHardware(frame_rate_hz=500, sensor_matrix=[[1.0, 0.2], [0.0, 0.9], [0.3, 0.1]])
+    design = lbt.integrator(path, gain=0.3)
+    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
+    run = lbt.simulate(design.controller, truth, hardware=path, frames=50)
+    seen = lbt.telemetry_of(run, path, design=design, sensor_gain=1.0)
+    system = strictly_read(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    loop = system.loops[0]
+    y = loop.input_sensor.measurements.data.reshape(50, -1)
+    inside = y @ loop.control_matrix.data.reshape(2, -1).T
+    num, den = loop.time_filter_num.data, loop.time_filter_den.data
+    # den[1] u(k+1) + den[0] u(k) = num[1] e(k+1) + num[0] e(k)
+    u = 1e9 * loop.commands.data
+    left, right = (
+        den[:, 1] * u[1:] + den[:, 0] * u[:-1],
+        num[:, 1] * inside[1:] + num[:, 0] * inside[:-1],
+    )
+    assert np.allclose(left, right, atol=1e-9 * np.abs(u).max())
+    assert np.abs(right).max() > 1
+    assert np.allclose(1e9 * loop.residual_commands.data, inside)
+    assert loop.delay == 2
+    assert lbt.load_telemetry(tmp_path / "t.aot.fits").integrator_gains == pytest.approx([0.3] * 2)
+
+
+def test_an_obstruction_needs_a_diameter(tmp_path):
+    seen = full(diameter_m=None)
+    assert losses(seen) == ("residual_nm", "total_nm", "controller", "obstruction")
+    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    assert (back.diameter_m, back.obstruction) == (None, None)
+
+
+def test_gains_alone_make_a_time_filter(tmp_path):
+    """Of a loop whose controller is told by its gains only."""
+    seen = full(controller=None, integrator_gains=[0.2, 0.7])
+    path = lbt.save_telemetry(tmp_path / "t.aot.fits", seen)
+    loop = strictly_read(path).loops[0]
+    assert loop.time_filter_num.data.tolist() == [[0.0, 0.2], [0.0, 0.7]]
+    assert np.array_equal(loop.control_matrix.data, seen.reconstructor.reshape(2, 2, 4))
+    none = full(controller=None, integrator_gains=None)
+    loop = strictly_read(lbt.save_telemetry(path, none)).loops[0]
+    assert loop.time_filter_num is loop.control_matrix is loop.residual_commands is None
+
+
+def test_float32(tmp_path):
+    seen = full()
+    path = lbt.save_telemetry(tmp_path / "t.aot.fits", seen, precision="float32")
+    loop = strictly_read(path).loops[0]
+    assert loop.commands.data.dtype.itemsize == 4
+    assert loop.commands_to_modes.data.dtype.itemsize == 8
+    assert np.allclose(lbt.load_telemetry(path).commands, seen.commands, rtol=1e-7)
+
+
+def test_the_header_says_which_layout_it_is(tmp_path):
+    """Not the name: an AOT file may be called anything that ends in .fits."""
+    seen = full()
+    aot = lbt.save_telemetry(tmp_path / "t.fits", seen, format="aot")
+    assert lbt.load_telemetry(aot).residual_nm is None
+    own = lbt.save_telemetry(tmp_path / "own.fits", seen)
+    own.rename(tmp_path / "own.aot.fits")
+    assert same(seen, lbt.load_telemetry(tmp_path / "own.aot.fits"))
+
+
+# ---------------------------------------------------------------- files of others
+def foreign(tmp_path, *, edit=lambda system: None, second=False):
+    """Write a Shack-Hartmann loop, as an observatory might, and with no card of ours."""
+    rng = np.random.default_rng(0)
+    system = aotpy.AOSystem(ao_mode="SCAO", name="NAOMI")
+    system.main_telescope = aotpy.MainTelescope("AT", inscribed_diameter=1.8)
+    star = aotpy.NaturalGuideStar("NGS")
+    system.sources = [star]
+    clock = aotpy.Time("t", timestamps=[1.5e9, 1.5e9 + 0.002, 1.5e9 + 0.004])
+    sensor = aotpy.ShackHartmann(
+        "WFS",
+        source=star,
+        n_valid_subapertures=3,
+        measurements=aotpy.Image("slopes", rng.standard_normal((3, 2, 3)), unit="pix", time=clock),
+        optical_gain=aotpy.Image("og", np.array([0.5, 0.6, 0.7])),
+    )
+    mirror = aotpy.DeformableMirror("DM", telescope=system.main_telescope, n_valid_actuators=4)
+    commands = aotpy.Image("commands", 1e-6 * rng.standard_normal((3, 4)), time=clock)
+    loop = aotpy.ControlLoop(
+        "HO loop", input_sensor=sensor, commanded_corrector=mirror, time=clock, commands=commands
+    )
+    loop.time_filter_num = aotpy.Image("num", np.array([[0.0, 0.4]]))
+    loop.time_filter_den = aotpy.Image("den", np.array([[-1.0, 1.0]]))
+    system.wavefront_sensors, system.wavefront_correctors = [sensor], [mirror]
+    system.loops = [loop]
+    if second:
+        system.loops.append(
+            aotpy.ControlLoop("TT loop", input_sensor=sensor, commanded_corrector=mirror)
+        )
+        offload = aotpy.OffloadLoop("offload", input_corrector=mirror, commanded_corrector=mirror)
+        system.loops.insert(0, offload)
+        twin = dataclasses.replace(loop, uid="twin")
+        system.loops.append(twin)
+    edit(system)
+    path = tmp_path / "foreign.fits"
+    system.write_to_file(path, overwrite=True)
+    return path, system
+
+
+def test_a_file_of_somebody_else(tmp_path):
+    path, system = foreign(tmp_path)
+    seen = lbt.load_telemetry(path)
+    loop = system.loops[0]
+    assert np.allclose(seen.commands, 1e9 * loop.commands.data)  # metres are the standard's unit
+    assert np.array_equal(seen.measurements, loop.input_sensor.measurements.data.reshape(3, 6))
+    assert (seen.measurement_unit, seen.command_unit, seen.subaperture_axes) == ("pix", "nm", 2)
+    assert seen.slopes is None
+    assert seen.frame_rate_hz == pytest.approx(500, rel=1e-4)  # of the time stamps
+    assert (seen.delay_frames, seen.diameter_m, seen.obstruction) == (None, 1.8, None)
+    assert seen.sensor_gain == pytest.approx(0.6)
+    assert seen.integrator_gains.tolist() == [0.4] * 4
+    assert seen.name == "NAOMI"
+    assert "another program" in seen.metadata["timing"]
+
+
+def test_the_first_loop_with_series_is_taken(tmp_path):
+    seen = lbt.load_telemetry(foreign(tmp_path, second=True)[0])
+    assert seen.metadata["aot_loop"] == "HO loop"
+
+
+def test_the_rate_of_the_detector(tmp_path):
+    def edit(system):
+        system.wavefront_sensors[0].detector = aotpy.Detector("D", frame_rate=640.0)
+
+    assert lbt.load_telemetry(foreign(tmp_path, edit=edit)[0]).frame_rate_hz == 640
+
+
+def drop(name):
+    return lambda system: setattr(system.loops[0], name, None)
+
+
+def no_clock(system):
+    sensor, loop = system.wavefront_sensors[0], system.loops[0]
+    loop.time = loop.commands.time = sensor.measurements.time = None
+
+
+def with_nan(system):
+    system.loops[0].commands.data[1, 2] = np.nan
+
+
+def short(system):
+    system.loops[0].commands.data = system.loops[0].commands.data[:2]
+
+
+def still(system):
+    system.loops[0].time.timestamps = [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("edit", "text"),
+    [
+        (drop("commands"), "has no control loop with commands and measurements"),
+        (no_clock, "the frame rate is missing"),
+        (with_nan, "commands must be finite"),
+        (short, "measurements must have 2 rows to match commands"),
+        (still, "the frame rate is missing"),
+        (lambda s: s.metadata.append(aotpy.Metadatum("LBTSYNTH", "{")), "inconsistent"),
+        (lambda s: s.metadata.append(aotpy.Metadatum("LBTSYNTH", "{}")), "seed is missing"),
+        (lambda s: s.metadata.append(aotpy.Metadatum("LBTSYNTH", 3)), "inconsistent"),
+    ],
+)
+def test_files_that_do_not_fit(tmp_path, edit, text):
+    with pytest.raises(lbt.TelemetryError, match=text) as caught:
+        lbt.load_telemetry(foreign(tmp_path, edit=edit)[0])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_refers_to_others_is_not_followed(tmp_path):
+    """aotpy would open the file, the address, or a window that asks for it."""
+
+    def edit(system):
+        fits.ImageHDU(np.ones((3, 4))).writeto(tmp_path / "else.fits")
+        system.loops[0].commands = aotpy.io.FITSFileImage(tmp_path / "else.fits", 1)
+        system.loops[0].commands.time = None
+
+    with pytest.raises(lbt.TelemetryError, match="External image"):
+        lbt.load_telemetry(foreign(tmp_path, edit=edit)[0])
+
+
+def test_damage_is_refused(tmp_path):
+    seen = full()
+    path = lbt.save_telemetry(tmp_path / "t.aot.fits", seen)
+    content = path.read_bytes()
+    for length in np.linspace(2880, len(content) - 40, 12).astype(int):
+        path.write_bytes(content[:length])
+        with pytest.raises(lbt.TelemetryError) as caught:
+            lbt.load_telemetry(path)
+        assert "\n" not in str(caught.value)
+    rng = np.random.default_rng(1)
+    found = 0
+    for _ in range(25):
+        damaged = bytearray(content)
+        damaged[rng.integers(len(content))] ^= 1 << rng.integers(8)
+        path.write_bytes(bytes(damaged))
+        try:
+            back = lbt.load_telemetry(path)
+        except lbt.TelemetryError:
+            found += 1
+        else:
+            assert same(seen, back, but=losses(seen), rtol=ROUNDING)
+    assert found > 5
+
+
+def test_only_the_mark_is_aot(tmp_path):
+    path = tmp_path / "t.fits"
+    buffer = io.BytesIO()
+    units = fits.HDUList([fits.PrimaryHDU()])
+    units[0].header["AOT-VERS"] = "9.0.0"
+    units.writeto(buffer)
+    path.write_bytes(buffer.getvalue())
+    with pytest.raises(lbt.TelemetryError, match="Unknown version '9.0.0'"):
+        lbt.load_telemetry(path)
+
+
+# ---------------------------------------------------------------- without the extra
+def test_without_aotpy_it_says_what_to_install(tmp_path, monkeypatch):
+    path = lbt.save_telemetry(tmp_path / "t.aot.fits", full())
+    monkeypatch.setitem(sys.modules, "aotpy", None)
+    with pytest.raises(lbt.TelemetryError, match=r'pip install "lbt-synth\[aot\]"'):
+        lbt.load_telemetry(path)
+    with pytest.raises(lbt.OutputError, match=r'pip install "lbt-synth\[aot\]"'):
+        lbt.save_telemetry(tmp_path / "u.aot.fits", full())
+    assert not (tmp_path / "u.aot.fits").exists()
+    own = lbt.save_telemetry(tmp_path / "t.fits", full())  # needs no extra
+    assert lbt.load_telemetry(own).seed == 7

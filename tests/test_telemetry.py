@@ -1,0 +1,544 @@
+"""Telemetry: what it takes, what its files keep, and damage of every kind."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from plants import lbt_axis_plant
+
+import lbt_synth as lbt
+from lbt_synth import archive
+from lbt_synth.telemetry import CONVENTION, LAYERS, layout
+from lbt_synth.telemetry.filters import integrator_gains, time_filters
+
+ENDINGS = ("fits", "npz")
+
+
+def full(*, frames=6, with_slopes=True, random=0, **changes):
+    """Telemetry with everything in it: 2 modes, 2 commands, 8 slopes."""
+    rng = np.random.default_rng(random)
+    sensed = 8 if with_slopes else 2
+    fields = {
+        "frame_rate_hz": 800.0,
+        "delay_frames": 2.25,
+        "commands": rng.standard_normal((frames, 2)),
+        "measurements": rng.standard_normal((frames, 2)),
+        "residual_nm": rng.standard_normal((frames, 2)),
+        "total_nm": rng.standard_normal((frames, 2)),
+        "slopes": rng.standard_normal((frames, sensed)) if with_slopes else None,
+        "interaction_matrix": rng.standard_normal((sensed, 2)),
+        "reconstructor": rng.standard_normal((2, sensed)),
+        "influence_matrix": rng.standard_normal((2, 2)),
+        "mode_maps": rng.standard_normal((2, 5, 4)),
+        "psf": rng.random((7, 9)),
+        "psf_pixel_mas": 13.5,
+        "imaging_wavelength_um": 2.2,
+        "strehl": 0.83,
+        "times_s": 1.7e9 + np.cumsum(rng.uniform(0.001, 0.002, frames)),
+        "subaperture_axes": 2,
+        "slope_unit": "pixel",
+        "sensor_gain": 0.358,
+        "controller": lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4).controller,
+        "controller_name": "integrator",
+        "controller_digest": "ab" * 32,
+        "integrator_gains": [0.4, 0.4],
+        "diameter_m": 8.22,
+        "obstruction": 0.11,
+        "seed": 7,
+        "name": "LBT, côté gauche",
+        "metadata": {"target": "HD 1'0\n", "airmass": 1.2, "binning": 1, "night": True, "é": ""},
+    }
+    return lbt.Telemetry(**{**fields, **changes})
+
+
+def same(one, other, *, but=(), rtol=0.0):
+    """Whether two telemetries hold the same, field by field."""
+    for field in dataclasses.fields(lbt.Telemetry):
+        if field.name in but:
+            continue
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(a, lbt.Controller):
+            for name in "ABCD":
+                assert np.array_equal(getattr(a, name), getattr(b, name))
+            assert a.dt_s == b.dt_s
+        elif isinstance(a, np.ndarray):
+            assert a.shape == b.shape, field.name
+            assert np.allclose(a, b, rtol=rtol, atol=0), field.name
+            assert not b.flags.writeable
+        elif isinstance(a, float) and rtol:
+            assert b == pytest.approx(a, rel=rtol), field.name
+        else:
+            assert a == b, field.name
+            assert type(a) is type(b), field.name
+    return True
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("slopes", [True, False])
+def test_round_trip_keeps_every_bit(tmp_path, ending, slopes):
+    seen = full(with_slopes=slopes)
+    assert same(seen, lbt.load_telemetry(lbt.save_telemetry(tmp_path / f"t.{ending}", seen)))
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_least_telemetry(tmp_path, ending):
+    seen = lbt.Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])
+    assert same(seen, lbt.load_telemetry(lbt.save_telemetry(tmp_path / f"t.{ending}", seen)))
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
+words = st.text(max_size=30)
+
+
+@st.composite
+def telemetries(draw):
+    frames, m, q = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 3))
+
+    def series(columns):
+        values = draw(st.lists(finite, min_size=frames * columns, max_size=frames * columns))
+        return np.reshape(values, (frames, columns))
+
+    optional = {
+        "delay_frames": st.floats(0, 1000),
+        "strehl": st.floats(0, 1),
+        "sensor_gain": st.floats(1e-300, 1e300),
+        "seed": st.integers(0, 2**70),
+        "controller_name": words,
+        "diameter_m": st.floats(0.1, 50),
+    }
+    fields = {k: draw(s) for k, s in optional.items() if draw(st.booleans())}
+    metadata = st.dictionaries(
+        st.text(min_size=1, max_size=20),
+        st.one_of(words, st.booleans(), st.integers(-(2**70), 2**70), finite),
+        max_size=4,
+    )
+    return lbt.Telemetry(
+        frame_rate_hz=draw(st.floats(1e-3, 1e6)),
+        commands=series(m),
+        measurements=series(q),
+        total_nm=series(2) if draw(st.booleans()) else None,
+        name=draw(words),
+        metadata=draw(metadata),
+        **fields,
+    )
+
+
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seen=telemetries(), ending=st.sampled_from(ENDINGS))
+def test_any_telemetry_comes_back(tmp_path, seen, ending):
+    assert same(seen, lbt.load_telemetry(lbt.save_telemetry(tmp_path / f"t.{ending}", seen)))
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_float32_rounds_series_and_nothing_else(tmp_path, ending):
+    seen = full(frames=5000)
+    path = lbt.save_telemetry(tmp_path / f"t.{ending}", seen, precision="float32")
+    back = lbt.load_telemetry(path)
+    series = [layer.field for layer in LAYERS.values() if layer.series and layer.field != "times_s"]
+    assert same(seen, back, but=series)
+    for name in series:
+        assert np.array_equal(getattr(back, name), getattr(seen, name).astype(np.float32))
+    exact = lbt.save_telemetry(tmp_path / f"exact.{ending}", seen)
+    assert path.stat().st_size < 0.75 * exact.stat().st_size
+
+
+def test_float32_refuses_what_it_cannot_hold(tmp_path):
+    seen = lbt.Telemetry(frame_rate_hz=1.0, commands=[[1e39]], measurements=[[2.0]])
+    with pytest.raises(lbt.ProblemError, match="commands has values beyond the range of float32"):
+        lbt.save_telemetry(tmp_path / "t.fits", seen, precision="float32")
+    with pytest.raises(lbt.ProblemError, match="precision must be one of float64, float32"):
+        lbt.save_telemetry(tmp_path / "t.fits", seen, precision="half")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_fits_file_explains_itself(tmp_path):
+    """Read with astropy alone: names, units, axes, timing."""
+    seen = full()
+    with fits.open(lbt.save_telemetry(tmp_path / "t.fits", seen)) as units:
+        header = units[0].header
+        assert units[0].data is None
+        assert header["LBTTELEM"] == 1
+        assert (header["RATE_HZ"], header["DELAY"], header["SENSGAIN"]) == (800, 2.25, 0.358)
+        assert (header["DIAMETER"], header["STREHL"], header["WAVELEN"]) == (8.22, 0.83, 2.2)
+        assert header["TIMING"] == CONVENTION
+        assert np.array_equal(units["COMMANDS"].data, seen.commands)
+        assert np.array_equal(units["CTRL_A"].data, seen.controller.A)
+        assert units["COMMANDS"].header["BUNIT"] == "nm"
+        assert units["SLOPES"].header["BUNIT"] == "pixel"
+        axes = units["SLOPES"].header
+        assert (axes["CTYPE2"], axes["NAXIS2"]) == ("FRAME", 6)
+        assert (axes["CTYPE1"], axes["NAXIS1"]) == ("SLOPE", 8)
+        names = [unit.name for unit in units[1:]]
+        assert set(LAYERS) <= set(names)
+        assert names[-1] == "META"
+
+
+def test_the_same_telemetry_is_the_same_file(tmp_path):
+    for ending in ENDINGS:
+        one = lbt.save_telemetry(tmp_path / f"a.{ending}", full()).read_bytes()
+        assert lbt.save_telemetry(tmp_path / f"b.{ending}", full()).read_bytes() == one
+
+
+# ---------------------------------------------------------------- timing
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.25, 3.5])
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
+    """What the file says of timing, checked on a simulation without noise."""
+    rng = np.random.default_rng(3)
+    path = lbt.LoopHardware(
+        frame_rate_hz=500.0,
+        delay_frames=delay,
+        sensor_matrix=rng.standard_normal((3, 2)),
+        influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
+    )
+    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    truth = lbt.Truth(turbulence=slow, noise_nm=0.0, sensor_gain=0.6)
+    design = lbt.integrator(path, gain=0.2)
+    run = lbt.simulate(design.controller, truth, hardware=path, frames=60, cases=2, seed=5)
+    lbt.save_telemetry(
+        tmp_path / f"t.{ending}",
+        lbt.telemetry_of(run, path, case=1, sensor_gain=0.6, design=design),
+    )
+    seen = lbt.load_telemetry(tmp_path / f"t.{ending}")
+    # y(k) = g S phi_res(k-1)
+    expected = seen.sensor_gain * seen.residual_nm[:-1] @ seen.interaction_matrix.T
+    assert np.allclose(seen.measurements[1:], expected, atol=1e-9)
+    # phi_res(k) = phi_tot(k) - N ((1-f) u(k-j) + f u(k-j-1)), d = j + 1 + f
+    j, f = int(delay - 1), delay - 1 - int(delay - 1)
+    u = seen.commands
+    applied = (1 - f) * u[1 : len(u) - j] + f * u[: len(u) - j - 1]
+    assert np.allclose(
+        seen.residual_nm[j + 1 :],
+        seen.total_nm[j + 1 :] - applied @ seen.influence_matrix.T,
+        atol=1e-9,
+    )
+    # u(k) from y up to k: an integrator is u(k) = u(k-1) + gain R y(k)
+    inverse = np.linalg.pinv(seen.interaction_matrix @ seen.influence_matrix)
+    steps = seen.integrator_gains * (seen.measurements[1:] @ inverse.T)
+    assert np.allclose(np.diff(u, axis=0), steps, atol=1e-9)
+    assert (seen.seed, seen.delay_frames, seen.controller_name) == (5, delay, "integrator")
+    hardware = seen.hardware
+    assert np.array_equal(hardware.sensor, path.sensor)
+    assert np.array_equal(hardware.influence, path.influence)
+    assert np.array_equal(run.commands[1], u)
+
+
+def test_the_camera_gives_telescope_and_strehl_ratio():
+    path = lbt.LoopHardware(frame_rate_hz=800)
+    design = lbt.integrator(path, gain=0.5)
+    shake = lbt.SinusoidalVibration(frequency_hz=20, rms_nm=200)
+    truth = lbt.Truth(turbulence=None, vibrations=(shake,))
+    run = lbt.simulate(design.controller, truth, hardware=path, frames=200, cases=2)
+    camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
+    seen = lbt.telemetry_of(run, path, case=1, imaging=camera, name="a", metadata={"b": 1})
+    assert seen.strehl == run.strehl(camera)[1]
+    assert (seen.diameter_m, seen.obstruction, seen.imaging_wavelength_um) == (8.22, 0.11, 2.2)
+    assert (seen.name, dict(seen.metadata), seen.controller) == ("a", {"b": 1}, None)
+    three = lbt.LoopHardware(frame_rate_hz=800, modes=3)
+    slow = lbt.integrator(three, gain=0.5).controller
+    wide = lbt.simulate(slow, lbt.Truth(turbulence=None), hardware=three, frames=5)
+    assert lbt.telemetry_of(wide, three, imaging=camera).strehl is None
+
+
+def test_telemetry_of_refuses(axis_plant):
+    path = axis_plant.hardware
+    design = lbt.kalman(axis_plant)
+    run = lbt.simulate(design.controller, lbt.Truth(turbulence=None), hardware=path, frames=5)
+    with pytest.raises(lbt.ProblemError, match="case must be below the number of cases, 1; got 1"):
+        lbt.telemetry_of(run, path, case=1)
+    with pytest.raises(lbt.ProblemError, match="must be that of the simulation, at 800 Hz"):
+        lbt.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=500, modes=1))
+    with pytest.raises(lbt.ProblemError, match="expected a Simulation; got int"):
+        lbt.telemetry_of(3, path)
+    with pytest.raises(lbt.ProblemError, match="expected a LoopHardware; got int"):
+        lbt.telemetry_of(run, 3)
+    with pytest.raises(lbt.ProblemError, match="expected a Design; got Controller"):
+        lbt.telemetry_of(run, path, design=design.controller)
+    with pytest.raises(lbt.DimensionError, match="interaction_matrix must have 1 row"):
+        lbt.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))
+
+
+def test_hardware_of_slopes_is_seen_through_the_reconstructor():
+    seen = full()
+    expected = seen.reconstructor @ seen.interaction_matrix
+    assert np.allclose(seen.hardware.sensor, expected)
+    bare = full(reconstructor=None)
+    assert np.array_equal(bare.hardware.sensor, np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"delay_frames": None}, "does not tell the delay"),
+        ({"influence_matrix": None, "commands": np.ones((6, 3)), "controller": None,
+          "integrator_gains": None}, "3 commands of 2 modes, and no influence_matrix"),
+    ],
+)  # fmt: skip
+def test_hardware_that_is_not_told(changes, text):
+    with pytest.raises(lbt.ProblemError, match=text):
+        _ = full(**changes).hardware
+
+
+# ---------------------------------------------------------------- what is refused
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"frame_rate_hz": 0}, "frame_rate_hz must be above 0"),
+        ({"delay_frames": -1}, "delay_frames must be at least 0"),
+        ({"strehl": 1.1}, "strehl must be at most 1"),
+        ({"sensor_gain": 0}, "sensor_gain must be above 0"),
+        ({"obstruction": 1}, "obstruction must be below 1"),
+        ({"diameter_m": float("nan")}, "diameter_m must be finite"),
+        ({"psf_pixel_mas": 0}, "psf_pixel_mas must be above 0"),
+        ({"imaging_wavelength_um": -1}, "imaging_wavelength_um must be above 0"),
+        ({"seed": 1.5}, "seed must be an integer"),
+        ({"commands": [1.0, 2.0]}, "commands must be a matrix"),
+        ({"commands": np.zeros((0, 2))}, "commands must have a frame and a command at least"),
+        ({"commands": None}, "commands must be an array of numbers"),
+        ({"measurements": None}, "measurements must be an array of numbers"),
+        ({"measurements": np.zeros((5, 2))}, "measurements must have 6 rows to match commands"),
+        ({"measurements": np.zeros((6, 0))}, "measurements must have a column at least"),
+        ({"residual_nm": np.full((6, 2), np.nan)}, "residual_nm must be finite; got nan at index"),
+        ({"slopes": np.zeros((6, 8), dtype=complex)}, "slopes must be real"),
+        ({"times_s": np.zeros(6)}, "times_s must rise"),
+        ({"times_s": np.zeros(5)}, "times_s must have shape"),
+        ({"subaperture_axes": 3}, "subaperture_axes must divide the 8 values"),
+        ({"interaction_matrix": np.ones((7, 2))}, "interaction_matrix must have 8 rows to match"),
+        ({"reconstructor": np.ones((2, 7))}, "reconstructor must have 8 columns to match"),
+        ({"influence_matrix": np.ones((2, 3))}, "influence_matrix must have 2 columns to match"),
+        ({"influence_matrix": np.ones((3, 2))}, "number of modes must be the same everywhere"),
+        ({"mode_maps": np.ones((3, 5, 4))}, "number of modes .* 3 in mode_maps"),
+        ({"mode_maps": np.ones((2, 5))}, "mode_maps must be 3-D"),
+        ({"psf": np.ones(4)}, "psf must be 2-D"),
+        ({"psf": np.ones((0, 4))}, "psf must be 2-D and not empty"),
+        ({"slope_unit": "µm"}, "slope_unit must be a word"),
+        ({"slope_unit": " pixel"}, "slope_unit must be a word"),
+        ({"command_unit": "x" * 30}, "command_unit must be a word"),
+        ({"command_unit": ""}, "command_unit must not be empty"),
+        ({"measurement_unit": "m"}, "measurement_unit must be nm for lengths; got 'm'"),
+        ({"measurement_unit": 3}, "measurement_unit must be a word"),
+        ({"name": None}, "name must be a text"),
+        ({"controller_name": 3}, "controller_name must be a text"),
+        ({"metadata": [1]}, "metadata must be a mapping; got list"),
+        ({"metadata": {1: 2}}, "keys of metadata must be words; got 1"),
+        ({"metadata": {"": 2}}, "keys of metadata must be words; got ''"),
+        ({"metadata": {"a": [1]}}, "metadata must hold texts, numbers and truth values; got list"),
+        ({"metadata": {"a": float("inf")}}, "metadata must be finite; got inf for 'a'"),
+        ({"integrator_gains": [0.4]}, "integrator_gains must have shape"),
+        ({"controller": 3}, "controller must be a Controller; got int"),
+        ({"frame_rate_hz": 801.0}, "controller must run at 801 Hz; got one for 800 Hz"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused(changes, text):
+    with pytest.raises(lbt.ProblemError, match=text):
+        full(**changes)
+
+
+def test_a_controller_of_other_sizes_is_refused():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    one = lbt.integrator(path, gain=0.4).controller
+    with pytest.raises(
+        lbt.DimensionError, match="must map 2 measurements to 2 commands; got 1 to 1"
+    ):
+        full(controller=one)
+
+
+def test_telemetry_cannot_be_changed():
+    series = np.ones((6, 2))
+    metadata = {"a": np.int64(3)}
+    seen = full(commands=series, metadata=metadata)
+    series[0, 0] = 5
+    metadata["b"] = 1
+    assert seen.commands[0, 0] == 1
+    assert dict(seen.metadata) == {"a": 3}
+    assert type(seen.metadata["a"]) is int
+    with pytest.raises(ValueError):
+        seen.commands[0, 0] = 2
+    with pytest.raises(TypeError):
+        seen.metadata["a"] = 4
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        seen.seed = 3
+
+
+# ---------------------------------------------------------------- files that are no good
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_truncated_files_are_refused(tmp_path, ending):
+    path = lbt.save_telemetry(tmp_path / f"t.{ending}", full())
+    content = path.read_bytes()
+    for length in np.linspace(0, len(content) - 40, 30).astype(int):
+        path.write_bytes(content[:length])
+        with pytest.raises(lbt.TelemetryError) as caught:
+            lbt.load_telemetry(path)
+        assert "\n" not in str(caught.value)
+        assert caught.value.path == path
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    ending=st.sampled_from(ENDINGS), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7)
+)
+def test_a_flipped_bit_is_found_or_harmless(tmp_path, ending, place, bit):
+    seen = full()
+    path = lbt.save_telemetry(tmp_path / f"t.{ending}", seen)
+    content = bytearray(path.read_bytes())
+    content[int(place * len(content))] ^= 1 << bit
+    path.write_bytes(bytes(content))
+    try:
+        back = lbt.load_telemetry(path)
+    except lbt.TelemetryError:
+        return
+    assert same(seen, back)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    picture = tmp_path / "image.fits"
+    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
+    other = tmp_path / "other.npz"
+    np.savez(other, a=np.ones(3))
+    gain = lbt.save_gain(tmp_path / "gain.fits", lbt.kalman(lbt_axis_plant()))
+    pickled = tmp_path / "pickled.npz"
+    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    for path in (picture, other, gain, pickled):
+        with pytest.raises(lbt.TelemetryError, match=f"{path.name} is "):
+            lbt.load_telemetry(path)
+    with pytest.raises(lbt.GainFileError, match="is not a gain file"):
+        lbt.load_gain(lbt.save_telemetry(tmp_path / "t.fits", full()))
+
+
+def edited(tmp_path, change, *, resign=True):
+    """Write a file whose arrays and metadata somebody changed."""
+    arrays, meta = layout.pack(full(), "float64")
+    arrays = {name: np.array(array) for name, array in arrays.items()}
+    meta["digest"] = archive.digest(arrays, meta)
+    change(arrays, meta)
+    if resign:
+        meta["digest"] = archive.digest(arrays, meta)
+    path = tmp_path / "t.npz"
+    path.write_bytes(archive.npz_bytes(arrays, json.dumps(meta)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "resign", "text"),
+    [
+        (lambda a, m: m.update(schema="recipes"), True, "is not a telemetry file of lbt_synth"),
+        (lambda a, m: m.update(schema_version=9), True, "layout version 9; this lbt_synth reads 1"),
+        (lambda a, m: a["COMMANDS"].__setitem__(0, 3.0), False, "does not match its digest"),
+        (lambda a, m: m.update(seed=8), False, "does not match its digest"),
+        (lambda a, m: a.pop("COMMANDS"), True, "inconsistent: COMMANDS is missing"),
+        (lambda a, m: a.pop("CTRL_B"), True, "inconsistent: CTRL_B is missing"),
+        (lambda a, m: m.pop("seed"), True, "inconsistent: seed is missing"),
+        (lambda a, m: a.update(EXTRA=np.ones(2)), True, "arrays that no telemetry has: EXTRA"),
+        (lambda a, m: a.update(MEASURE=np.ones((2, 2))), True, "measurements must have 6 rows"),
+        (lambda a, m: a["SLOPES"].fill(np.nan), True, "slopes must be finite"),
+        (lambda a, m: m.update(frame_rate_hz="fast"), True, "frame_rate_hz must be a number"),
+        (lambda a, m: m.update(metadata=3), True, "inconsistent"),
+        (lambda a, m: m.update(metadata={"a": [1]}), True, "metadata must hold"),
+    ],
+)  # fmt: skip
+def test_edited_files_are_refused(tmp_path, change, resign, text):
+    with pytest.raises(lbt.TelemetryError, match=text):
+        lbt.load_telemetry(edited(tmp_path, change, resign=resign))
+
+
+def test_names_and_formats(tmp_path):
+    seen = full()
+    for name, kind, text in (
+        ("t.txt", None, "telemetry must end in .fits, .npz or .aot.fits; got 't.txt'"),
+        ("t.fits", "npz", "does not fit the format 'npz'"),
+        ("t.npz", "fits", "does not fit the format 'fits'"),
+        ("t.aot.fits", "fits", "does not fit the format 'fits'"),
+        ("t.fits", "hdf5", "must be one of fits, npz, aot; got 'hdf5'"),
+    ):
+        with pytest.raises(lbt.OutputError, match=text):
+            lbt.save_telemetry(tmp_path / name, seen, format=kind)
+    with pytest.raises(lbt.OutputError, match="holds a Telemetry; got int"):
+        lbt.save_telemetry(tmp_path / "t.fits", 3)
+    with pytest.raises(lbt.OutputError, match="No such file or directory"):
+        lbt.save_telemetry(tmp_path / "nowhere" / "t.fits", seen)
+    with pytest.raises(lbt.TelemetryError, match="must end in"):
+        lbt.load_telemetry(tmp_path / "t.txt")
+    (tmp_path / "folder.fits").mkdir()
+    with pytest.raises(lbt.TelemetryError, match="cannot read"):
+        lbt.load_telemetry(tmp_path / "folder.fits")
+    with pytest.raises(lbt.TelemetryError, match="null"):
+        lbt.load_telemetry("x\0y.npz")
+
+
+def test_nothing_half_written_stays(tmp_path, monkeypatch):
+    path = lbt.save_telemetry(tmp_path / "t.fits", full())
+    before = path.read_bytes()
+
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(lbt.OutputError, match="No space left on device"):
+        lbt.save_telemetry(path, full(random=1))
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["t.fits"]
+
+
+# ---------------------------------------------------------------- controllers as time filters
+def filtered(filters, series):
+    """Run the difference equations of time filters, channel after channel."""
+    projected = series @ filters.matrix.T
+    out = np.zeros_like(projected)
+    order = filters.denominators.shape[1] - 1
+    for i, (b, a) in enumerate(zip(filters.numerators, filters.denominators, strict=True)):
+        top = np.flatnonzero(a)[-1]  # divide by z^top: powers of the delay
+        for k in range(len(series)):
+            past = [(k - top + power) for power in range(order + 1)]
+            total = sum(b[p] * projected[j, i] for p, j in enumerate(past) if 0 <= j <= k)
+            total -= sum(a[p] * out[j, i] for p, j in enumerate(past) if 0 <= j < k and p != top)
+            out[k, i] = total / a[top]
+    return out
+
+
+@pytest.mark.parametrize("kind", ["integrator", "kalman", "hinf", "projected", "delayed"])
+def test_time_filters_give_the_commands_of_the_controller(kind):
+    plant = lbt_axis_plant(modes=2, delay_frames=3.0 if kind == "delayed" else 2.0)
+    skew = lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0, 0.3], [0.2, 0.9], [0.4, -1.0]])
+    controller = {
+        "integrator": lambda: lbt.integrator(plant.hardware, gain=0.3),
+        "projected": lambda: lbt.integrator(skew, gain=0.3),
+        "hinf": lambda: lbt.hinf(plant, gamma_ratio=1.2, method="riccati"),
+    }.get(kind, lambda: lbt.kalman(plant))().controller
+    filters = time_filters(controller)
+    y = np.random.default_rng(0).standard_normal((120, controller.B.shape[1]))
+    run = controller.start()
+    u = np.array([run.step(row) for row in y])
+    assert np.allclose(filtered(filters, y), u, atol=1e-7 * np.abs(u).max())
+    gains = integrator_gains(filters.numerators, filters.denominators)
+    assert (gains is not None) == (kind in ("integrator", "projected"))
+    if kind == "integrator":
+        assert gains == pytest.approx([0.3, 0.3], rel=1e-12)
+
+
+def test_a_coupled_controller_has_no_time_filters():
+    mixed = lbt.Controller(
+        A=np.diag([0.5, 0.9]), B=np.eye(2), C=[[1.0, 1.0], [0.0, 1.0]], D=np.zeros((2, 2))
+    )
+    assert time_filters(mixed) is None
+
+
+def test_controllers_without_states_or_answer():
+    nothing = lbt.Controller(A=0.5, B=[[0.0, 0.0]], C=[[1.0], [0.0]], D=[[0.0, 0.0], [0.0, 3.0]])
+    filters = time_filters(nothing)
+    assert filters.numerators[0].any() == np.False_
+    assert filters.numerators[1, 0] / filters.denominators[1, 0] == pytest.approx(3)
+    assert filters.matrix[1].tolist() == [0.0, 1.0]
+
+
+def test_what_is_no_integrator():
+    assert integrator_gains(np.array([[0.0, 0.4]]), np.array([[-1.0, 1.0]])).tolist() == [0.4]
+    assert integrator_gains(np.array([[0.0, 0.4]]), np.array([[-0.99, 1.0]])) is None
+    assert integrator_gains(np.array([[0.4, 0.0]]), np.array([[-1.0, 1.0]])) is None
+    assert integrator_gains(np.array([[0.0, 0.4]]), np.array([[1.0, 0.0]])) is None

@@ -1,0 +1,143 @@
+"""Telemetry at the command line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+
+import numpy as np
+import pytest
+from plants import LBT_YAML
+from test_cli import run
+from test_telemetry import full, same
+
+import lbt_synth as lbt
+from lbt_synth.telemetry import CONVENTION, losses
+
+
+@pytest.fixture(scope="module")
+def gain(tmp_path_factory):
+    hardware = lbt.load_config(LBT_YAML).hardware
+    folder = tmp_path_factory.mktemp("gain")
+    return lbt.save_gain(folder / "slow.fits", lbt.integrator(hardware, gain=0.4))
+
+
+@pytest.fixture
+def night(tmp_path):
+    return lbt.save_telemetry(tmp_path / "night.fits", full(name="LBT"))
+
+
+def test_simulate_writes_its_first_case(tmp_path, capsys, gain):
+    out = tmp_path / "t.npz"
+    options = ("--frames", 300, "--cases", 2, "--seed", 3, "--sensor-gain", 0.7)
+    status, text, error = run(
+        capsys, "simulate", LBT_YAML, gain, *options, "--telemetry", out, "--json"
+    )
+    assert (status, error) == (0, "")
+    data = json.loads(text)
+    assert data["telemetry"] == str(out)
+    seen = lbt.load_telemetry(out)
+    assert seen.commands.shape == (300, 2)
+    rms = np.sqrt(np.sum(np.mean(seen.residual_nm**2, axis=0)))
+    assert rms == pytest.approx(data["residual_nm"][0])
+    assert seen.strehl == pytest.approx(data["strehl"][0])
+    assert (seen.seed, seen.controller_name, seen.sensor_gain) == (3, "integrator", 0.7)
+    assert seen.controller_digest == hashlib.sha256(gain.read_bytes()).hexdigest()
+    assert (seen.metadata["case"], seen.metadata["cases"]) == (0, 2)
+    # y(k) - g phi_res(k-1) is the noise: white, and of the size that the file gives
+    noise = seen.measurements[1:] - 0.7 * seen.residual_nm[:-1]
+    assert np.std(noise) == pytest.approx(seen.metadata["noise_nm"], rel=0.1)
+    status, text, _ = run(
+        capsys, "simulate", LBT_YAML, gain, "--frames", 50, "--telemetry", tmp_path / "u.fits"
+    )
+    assert status == 0
+    assert "u.fits (telemetry of case 0)" in text
+
+
+def test_what_is_in_a_file(capsys, night):
+    status, text, error = run(capsys, "telemetry", night)
+    assert (status, error) == (0, "")
+    seen = full(name="LBT")
+    for words in (
+        "6 frames",
+        "2 modes",
+        "slopes",
+        "6 x 8",
+        "pixel",
+        "frame rate",
+        "2.25",
+        CONVENTION,
+    ):
+        assert words in text
+    status, text, _ = run(capsys, "telemetry", night, "--json")
+    data = json.loads(text)
+    assert status == 0
+    assert data["arrays"]["slopes"] == [6, 8]
+    assert data["units"]["slopes"] == "pixel"
+    assert data["rms"]["commands"] == pytest.approx(np.sqrt(np.sum(seen.commands**2) / 6))
+    assert "times_s" not in data["rms"]
+    assert "psf" not in data["rms"]
+    assert (data["frame_rate_hz"], data["delay_frames"], data["seed"]) == (800, 2.25, 7)
+    assert data["metadata"] == dict(seen.metadata)
+    assert data["integrator_gains"] == [0.4, 0.4]
+
+
+def test_conversion_between_formats(tmp_path, capsys, night):
+    out = tmp_path / "copy.npz"
+    status, text, _ = run(capsys, "telemetry", night, "-o", out)
+    assert status == 0
+    assert f"written: {out} (telemetry)" in text
+    assert same(lbt.load_telemetry(night), lbt.load_telemetry(out))
+    short = tmp_path / "short.fits"
+    assert run(capsys, "telemetry", out, "-o", short, "--precision", "float32")[0] == 0
+    assert np.allclose(lbt.load_telemetry(short).commands, full().commands, rtol=1e-6)
+
+
+@pytest.mark.e2e
+def test_conversion_to_the_standard_says_what_is_lost(tmp_path, capsys, night):
+    out = tmp_path / "night_aot.fits"
+    status, text, _ = run(capsys, "telemetry", night, "-o", out, "--format", "aot")
+    assert status == 0
+    assert "the AOT standard has no place for residual_nm, total_nm, controller" in text
+    seen = lbt.load_telemetry(night)
+    assert same(seen, lbt.load_telemetry(out), but=losses(seen), rtol=1e-14)
+    status, text, _ = run(capsys, "telemetry", out, "--json", "-o", tmp_path / "b.aot.fits")
+    assert status == 0
+    assert json.loads(text)["lost"] == []
+
+
+def test_bad_input_is_one_line(tmp_path, capsys, night, gain):
+    damaged = tmp_path / "damaged.fits"
+    damaged.write_bytes(night.read_bytes()[:-2880])
+    for arguments, words in (
+        (("telemetry", tmp_path / "none.fits"), "No such file or directory"),
+        (("telemetry", damaged), "is no telemetry file, or it is damaged"),
+        (("telemetry", gain), "is not a telemetry file of lbt_synth"),
+        (("telemetry", night, "--format", "npz"), "--format and --precision are of what -o writes"),
+        (("telemetry", night, "--precision", "float32"), "--format and --precision"),
+        (("telemetry", night, "-o", tmp_path / "t.txt"), "must end in .fits, .npz or .aot.fits"),
+        (("telemetry", night, "-o", tmp_path / "t.fits", "--format", "npz"), "does not fit"),
+        (("telemetry", night, "-o", tmp_path / "no" / "t.fits"), "no directory"),
+        (("simulate", LBT_YAML, gain, "--telemetry", "t.txt"), "telemetry must end in"),
+        (("simulate", LBT_YAML, gain, "--telemetry", tmp_path / "no" / "t.fits"), "no directory"),
+    ):
+        status, text, error = run(capsys, *arguments)
+        assert (status, text) == (2, "")
+        assert error.startswith("lbt-synth: error: ")
+        assert words in error
+        assert error.count("\n") == 1
+
+
+def test_without_aotpy_nothing_is_begun(tmp_path, capsys, monkeypatch, night, gain):
+    monkeypatch.setitem(sys.modules, "aotpy", None)
+    out = tmp_path / "t.aot.fits"
+    for arguments in (
+        ("telemetry", night, "-o", out),
+        ("simulate", LBT_YAML, gain, "--telemetry", out),
+    ):
+        status, _, error = run(capsys, *arguments)
+        assert status == 2
+        assert 'pip install "lbt-synth[aot]"' in error
+        assert error.count("\n") == 1
+    assert not out.exists()
