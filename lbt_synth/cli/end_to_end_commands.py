@@ -41,8 +41,8 @@ def end_to_end(arguments: Namespace) -> Report:
     setup = _setup(arguments)
     design = load_gain(arguments.gain)
     setup.controller(design)  # refuses a filter of another loop before any work
-    folder = made_directory(arguments.output)
     version = specula_version()
+    folder = made_directory(arguments.output)
     calibration = _calibrated(setup, arguments)
     total = setup.frames + setup.settle_frames
     with counting(total=total, what="frames", quiet=arguments.json) as count:
@@ -106,6 +106,7 @@ def end_to_end_table(arguments: Namespace) -> Report:
     designs = named_designs(arguments.gains)
     if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:
         raise ProblemError("--seeds, --row-seeds and --jobs must be at least 1.")
+    specula_version()
     rows = plan_tables(
         setup,
         {_case_name(name): design for name, design in designs.items()},

@@ -19,7 +19,7 @@ from lbt_synth.simulation.run import SteppedController
 from lbt_synth.validation import FloatArray, instance, integer
 
 _SCREENS = "screens"
-_RAMP_FRAMES = 200
+RAMP_FRAMES = 200
 
 
 def run_end_to_end(
@@ -89,7 +89,7 @@ def run_end_to_end(
             f"got {type(controller).__name__}."
         )
     frames = integer(frames, "frames", at_least=2)
-    settle = integer(settle_frames, "settle_frames", at_least=_RAMP_FRAMES)
+    settle = integer(settle_frames, "settle_frames", at_least=RAMP_FRAMES)
     seed = integer(seed, "seed", at_least=0)
     shaken = Truth(turbulence=None, vibrations=tuple(vibrations))
     total = settle + frames
@@ -135,7 +135,7 @@ def _close(
     for k in range(len(tilts)):
         y = inverse @ (slopes - calibration.reference)
         past = np.vstack([_command(controller, y, k), past[:-1]])
-        slopes = optics.expose(taps @ past, tilts[k], seeing=min(1.0, (k + 1) / _RAMP_FRAMES))
+        slopes = optics.expose(taps @ past, tilts[k], seeing=min(1.0, (k + 1) / RAMP_FRAMES))
         row = k - settle
         if row >= 0:
             strehl[row], frame = optics.image()

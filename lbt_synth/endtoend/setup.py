@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.endtoend.calibration import Calibration
 from lbt_synth.endtoend.result import EndToEndRun
-from lbt_synth.endtoend.run import run_end_to_end
+from lbt_synth.endtoend.run import RAMP_FRAMES, run_end_to_end
 from lbt_synth.endtoend.system import EndToEndSystem
 from lbt_synth.errors import ProblemError
 from lbt_synth.modal import MixedController
@@ -64,7 +64,11 @@ class EndToEndSetup:
     def __post_init__(self) -> None:
         instance(self.system, EndToEndSystem)
         object.__setattr__(self, "vibrations", tuple(self.vibrations))
-        for name, least in (("frames", 2), ("settle_frames", 0), ("seed", 0)):
+        for name, least in (
+            ("frames", 2),
+            ("settle_frames", RAMP_FRAMES),
+            ("seed", 0),
+        ):
             object.__setattr__(self, name, integer(getattr(self, name), name, at_least=least))
         object.__setattr__(self, "gain", number(self.gain, "gain", at_least=0))
         object.__setattr__(self, "leak", number(self.leak, "leak", at_least=0, at_most=1))

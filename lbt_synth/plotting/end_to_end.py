@@ -45,11 +45,11 @@ def end_to_end_figure(run: EndToEndRun) -> Any:
         image, time, modes = figure.subplots(1, 3)
         size = run.psf.shape[0]
         reach = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
-        extent = np.array([-size / 2, size / 2, -size / 2, size / 2]) * run.psf_pixel_mas
+        low, high = (np.array([-0.5, size - 0.5]) - size // 2) * run.psf_pixel_mas
         peak = float(run.psf.max())
         shown = image.imshow(
             np.maximum(run.psf / peak, 1e-5), norm=LogNorm(1e-5, 1), cmap="magma",
-            origin="lower", extent=extent, interpolation="nearest",
+            origin="lower", extent=(low, high, low, high), interpolation="nearest",
         )  # fmt: skip
         image.set(
             xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x [mas]", ylabel="y [mas]",
