@@ -8,6 +8,7 @@ import sys
 import textwrap
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -128,7 +129,7 @@ SCRIPT = """
     from lbt_synth.campaign import run_cases
 
     def slow(case):
-        with open(os.environ["RUNS"], "a") as stream:   # one line a run that ended
+        with pathlib.Path(os.environ["RUNS"]).open("a") as stream:   # one line a run that ended
             time.sleep(0.3)
             stream.write(f"{case['x']} {os.getpid()}\\n")
         return {"x": case["x"]}
@@ -168,8 +169,7 @@ def alive(pid):
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    with open(f"/proc/{pid}/stat") as stream:
-        return stream.read().rpartition(")")[2].split()[0] != "Z"
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -283,7 +283,7 @@ def test_a_loop_that_is_unstable_at_the_measured_gain_predicts_nothing(setup, ro
 def test_the_figure_has_a_panel_a_controller(table):
     figure = table_figure(table)
     assert [axis.get_title() for axis in figure.axes] == ["Kalman", r"H$_\infty$", "slow"]
-    assert [line.get_label() for line in figure.axes[0].lines][0] == "Agapito et al. 2008"
+    assert figure.axes[0].lines[0].get_label() == "Agapito et al. 2008"
 
 
 def test_tables_of_another_loop_are_refused(setup):
