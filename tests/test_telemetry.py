@@ -321,6 +321,7 @@ def test_hardware_that_is_not_told(changes, text):
         ({"slope_unit": "µm"}, "slope_unit must be a word"),
         ({"slope_unit": " pixel"}, "slope_unit must be a word"),
         ({"command_unit": "x" * 30}, "command_unit must be a word"),
+        ({"slope_unit": "'/"}, "slope_unit must be a word of at most 24 ASCII signs without a quote"),
         ({"command_unit": ""}, "command_unit must not be empty"),
         ({"measurement_unit": "m"}, "measurement_unit must be nm for lengths; got 'm'"),
         ({"measurement_unit": 3}, "measurement_unit must be a word"),
