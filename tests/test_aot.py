@@ -152,6 +152,16 @@ def test_any_telemetry_comes_back_as_far_as_it_goes(tmp_path, seen):
     assert same(seen, back, but=rounded, rtol=ROUNDING)
 
 
+@pytest.mark.parametrize(
+    "text", ["'/", "''/ '&", "a" * 60 + "'" * 9 + " / & ", "&" * 200, '\\"' * 90]
+)
+def test_texts_that_fits_cards_mangle(tmp_path, text):
+    """Astropy loses "'/" in a text that goes over several cards."""
+    seen = full(name=text, metadata={text: text, "&/'": "'/", "long": "x' /" * 60})
+    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    assert (back.name, dict(back.metadata)) == (text, dict(seen.metadata))
+
+
 def test_the_loop_equation_holds_in_the_aot_file(tmp_path):
     """An integrator, from the standard's fields alone: its matrix, its filter, its delay."""
     path = lbt.LoopHardware(frame_rate_hz=500, sensor_matrix=[[1.0, 0.2], [0.0, 0.9], [0.3, 0.1]])

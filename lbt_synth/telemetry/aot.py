@@ -30,6 +30,7 @@ _IN_OURS = ("seed", "name", "controller_name", "controller_digest", "metadata")
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
 _RAD_PER_MAS = np.pi / 180 / 3600e3
 _FOREIGN = "that of another program: which exposure a row is of, the AOT standard does not say"
+_UNSAFE = "'&/"  # signs that a FITS text over several cards does not keep in every place
 _INSTALL = 'it needs aotpy: pip install "lbt-synth[aot]"'
 
 
@@ -215,7 +216,10 @@ def _cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     ours["psf_pixel_mas"] = seen.psf_pixel_mas if seen.psf is None else None
     if seen.controller is not None:
         ours["controller_states"] = seen.controller.n_states
-    cards = [aotpy.Metadatum(_CARD_OF_OURS, json.dumps(ours, allow_nan=False))]
+    text = json.dumps(ours, allow_nan=False)
+    for sign in _UNSAFE:  # they are in texts only, where JSON may write them by their number
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    cards = [aotpy.Metadatum(_CARD_OF_OURS, text)]
     if (wavelength := _metres(seen)) is not None:
         # aotpy 3.2.1 writes its strehl_wavelength over the Strehl ratio
         cards.append(aotpy.Metadatum("STREHL-L", wavelength))
@@ -246,7 +250,8 @@ def _metres(seen: Telemetry) -> float | None:
 
 
 def _ascii(text: str) -> str:
-    return "".join(c if c.isascii() and c.isprintable() else "?" for c in text).strip()
+    safe = (c if c.isascii() and c.isprintable() and c not in _UNSAFE else "?" for c in text)
+    return "".join(safe).strip()
 
 
 def from_bytes(content: bytes, source: Path) -> Telemetry:

@@ -257,9 +257,11 @@ class Telemetry:
                 not isinstance(unit, str)
                 or not (unit.isascii() and (unit.isprintable() and unit.strip() == unit))
                 or len(unit) > _LONGEST_UNIT
+                or "'" in unit  # a FITS card does not keep it in every place
             ):
                 raise ProblemError(
-                    f"{name} must be a word of at most {_LONGEST_UNIT} ASCII letters; got {unit!r}."
+                    f"{name} must be a word of at most {_LONGEST_UNIT} ASCII signs without a "
+                    f"quote; got {unit!r}."
                 )
             if name != "slope_unit" and unit in _LENGTHS:
                 raise ProblemError(f"{name} must be nm for lengths; got {unit!r}. Convert them.")

@@ -1,0 +1,67 @@
+"""Controllers as a matrix and scalar filters, against the controllers step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import lbt_axis_plant
+
+import lbt_synth as lbt
+from lbt_synth.telemetry.filters import integrator_gains, time_filters
+
+
+def filtered(filters, series):
+    """Run the difference equations of time filters, channel after channel."""
+    projected = series @ filters.matrix.T
+    out = np.zeros_like(projected)
+    order = filters.denominators.shape[1] - 1
+    for i, (b, a) in enumerate(zip(filters.numerators, filters.denominators, strict=True)):
+        top = np.flatnonzero(a)[-1]  # divide by z^top: powers of the delay
+        for k in range(len(series)):
+            past = [(k - top + power) for power in range(order + 1)]
+            total = sum(b[p] * projected[j, i] for p, j in enumerate(past) if 0 <= j <= k)
+            total -= sum(a[p] * out[j, i] for p, j in enumerate(past) if 0 <= j < k and p != top)
+            out[k, i] = total / a[top]
+    return out
+
+
+@pytest.mark.parametrize("kind", ["integrator", "kalman", "hinf", "projected", "delayed"])
+def test_time_filters_give_the_commands_of_the_controller(kind):
+    plant = lbt_axis_plant(modes=2, delay_frames=3.0 if kind == "delayed" else 2.0)
+    skew = lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0, 0.3], [0.2, 0.9], [0.4, -1.0]])
+    controller = {
+        "integrator": lambda: lbt.integrator(plant.hardware, gain=0.3),
+        "projected": lambda: lbt.integrator(skew, gain=0.3),
+        "hinf": lambda: lbt.hinf(plant, gamma_ratio=1.2, method="riccati"),
+    }.get(kind, lambda: lbt.kalman(plant))().controller
+    filters = time_filters(controller)
+    y = np.random.default_rng(0).standard_normal((120, controller.B.shape[1]))
+    run = controller.start()
+    u = np.array([run.step(row) for row in y])
+    assert np.allclose(filtered(filters, y), u, atol=1e-7 * np.abs(u).max())
+    gains = integrator_gains(filters.numerators, filters.denominators)
+    assert (gains is not None) == (kind in ("integrator", "projected"))
+    if kind == "integrator":
+        assert gains == pytest.approx([0.3, 0.3], rel=1e-12)
+
+
+def test_a_coupled_controller_has_no_time_filters():
+    mixed = lbt.Controller(
+        A=np.diag([0.5, 0.9]), B=np.eye(2), C=[[1.0, 1.0], [0.0, 1.0]], D=np.zeros((2, 2))
+    )
+    assert time_filters(mixed) is None
+
+
+def test_controllers_without_states_or_answer():
+    nothing = lbt.Controller(A=0.5, B=[[0.0, 0.0]], C=[[1.0], [0.0]], D=[[0.0, 0.0], [0.0, 3.0]])
+    filters = time_filters(nothing)
+    assert filters.numerators[0].any() == np.False_
+    assert filters.numerators[1, 0] / filters.denominators[1, 0] == pytest.approx(3)
+    assert filters.matrix[1].tolist() == [0.0, 1.0]
+
+
+def test_what_is_no_integrator():
+    assert integrator_gains(np.array([[0.0, 0.4]]), np.array([[-1.0, 1.0]])).tolist() == [0.4]
+    assert integrator_gains(np.array([[0.0, 0.4]]), np.array([[-0.99, 1.0]])) is None
+    assert integrator_gains(np.array([[0.4, 0.0]]), np.array([[-1.0, 1.0]])) is None
+    assert integrator_gains(np.array([[0.0, 0.4]]), np.array([[1.0, 0.0]])) is None
