@@ -1,3 +1,4 @@
+from .campaign import run_cases as run_cases
 from .certify import Certificate as Certificate
 from .certify import Check as Check
 from .certify import certify_filter as certify_filter
@@ -96,6 +97,8 @@ from .models import tip_tilt_plant as tip_tilt_plant
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
+from .paper.end_to_end import EndToEndEntry as EndToEndEntry
+from .paper.end_to_end import end_to_end_tables as end_to_end_tables
 from .plotting import end_to_end_figure as end_to_end_figure
 from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure

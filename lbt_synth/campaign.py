@@ -73,12 +73,12 @@ def run_cases(
     Examples
     --------
     >>> import tempfile
-    >>> from lbt_synth.campaign import run_cases
+    >>> import lbt_synth as lbt
     >>> def double(case):
     ...     return {"twice": 2 * case["x"]}
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     first = run_cases(double, {"a": {"x": 1}}, folder)
-    ...     both = run_cases(double, {"a": {"x": 1}, "b": {"x": 2}}, folder)  # only b is run
+    ...     first = lbt.run_cases(double, {"a": {"x": 1}}, folder)
+    ...     both = lbt.run_cases(double, {"a": {"x": 1}, "b": {"x": 2}}, folder)  # only b is run
     >>> both
     {'a': {'twice': 2}, 'b': {'twice': 4}}
     """

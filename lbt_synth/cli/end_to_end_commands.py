@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 from argparse import Namespace
@@ -11,14 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.campaign import run_cases
 from lbt_synth.cli.loop_commands import named_designs
 from lbt_synth.cli.output import Report, TableText, counting, fixed, plain
 from lbt_synth.cli.writing import made_directory
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
 from lbt_synth.endtoend import Calibration, EndToEndRun, EndToEndSetup, calibrate
-from lbt_synth.endtoend.cases import run_case, summary, with_pixels
+from lbt_synth.endtoend.cases import summary, with_pixels
 from lbt_synth.endtoend.optics import specula_version
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import write_atomically
@@ -26,7 +24,7 @@ from lbt_synth.gainfile import load_gain
 from lbt_synth.paper.end_to_end import (
     EndToEndEntry,
     all_cases,
-    entries,
+    end_to_end_tables,
     modal_distance,
     plan_tables,
 )
@@ -63,7 +61,11 @@ def end_to_end(arguments: Namespace) -> Report:
     }
     files = [
         save_figure(end_to_end_figure(run), folder / "run.png"),
-        save_telemetry(folder / "telemetry.fits", _telemetry(run, design, calibration, arguments)),
+        save_telemetry(
+            folder / "telemetry.fits",
+            _telemetry(run, design, calibration, arguments),
+            precision="float32",
+        ),
         write_atomically(
             folder / "summary.json", json.dumps(plain(data), indent=1).encode() + b"\n"
         ),
@@ -107,26 +109,20 @@ def end_to_end_table(arguments: Namespace) -> Report:
     if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:
         raise ProblemError("--seeds, --row-seeds and --jobs must be at least 1.")
     specula_version()
-    rows = plan_tables(
-        setup,
-        {_case_name(name): design for name, design in designs.items()},
-        seeds=range(setup.seed, setup.seed + arguments.seeds),
-        row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
-        tables=arguments.tables,
-    )
-    cases = all_cases(rows)
+    plan: dict[str, Any] = {
+        "designs": {_case_name(name): design for name, design in designs.items()},
+        "seeds": range(setup.seed, setup.seed + arguments.seeds),
+        "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
+        "tables": arguments.tables,
+    }
+    total = len(all_cases(plan_tables(setup, **plan)))
     folder = made_directory(arguments.output)
-    made_directory(folder / "cases")
+    results = made_directory(folder / "cases")
     _calibrated(setup, arguments)
-    with counting(total=len(cases), what="runs", quiet=arguments.json) as count:
-        results = run_cases(
-            functools.partial(run_case, cache=arguments.cache),
-            cases,
-            folder / "cases",
-            jobs=arguments.jobs,
-            progress=count,
+    with counting(total=total, what="runs", quiet=arguments.json) as count:
+        table = end_to_end_tables(
+            setup, results, **plan, jobs=arguments.jobs, cache=arguments.cache, progress=count
         )
-    table = entries(rows, results, setup)
     files = [
         write_atomically(folder / f"table_{number.lower()}.csv", _csv(table, number))
         for number in arguments.tables
@@ -141,7 +137,7 @@ def end_to_end_table(arguments: Namespace) -> Report:
         data={
             "entries": [_record(entry) for entry in table],
             "modal_distance_points": distances,
-            "runs": len(cases),
+            "runs": total,
             "files": [str(path) for path in files],
         },
         tables=[_table(table, number) for number in arguments.tables],
