@@ -58,7 +58,7 @@ class SensorSection(_Section):
 
 
 class MirrorSection(_Section):
-    """Deformable mirror; ``modes`` counts all its modes and is for the record."""
+    """Deformable mirror; ``modes`` counts those that an end-to-end simulation controls."""
 
     modes: Annotated[int, Field(ge=1)] | None = None
     influence_matrix: list[list[float]] | None = None
@@ -244,7 +244,7 @@ class EndToEndSection(_Section):
     frames: Annotated[int, Field(ge=2)] = 1600
     settle_frames: Annotated[int, Field(ge=200)] = 400
     gain: Annotated[float, Field(ge=0)] = 0.5
-    leak: Annotated[float, Field(ge=0, le=1)] = 0.99
+    leak: Annotated[float, Field(ge=0, le=1)] = 0.97
     leak_from_mode: Annotated[int, Field(ge=2)] = 50
     actuators_across: Annotated[int, Field(ge=3)] = 31
     wind_direction_deg: float = 0.0

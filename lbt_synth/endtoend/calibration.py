@@ -118,6 +118,18 @@ def calibrate(
         If the mirror cannot carry the modes, or the sensor cannot tell them apart.
     OutputError
         If the cache cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> system = lbt.load_config("examples/lbt.yaml").end_to_end.system
+    >>> found = lbt.calibrate(system)                          # doctest: +SKIP
+    >>> found.reconstructor.condition_number < 12              # doctest: +SKIP
+    True
+    >>> lbt.calibrate("examples/lbt.yaml")
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: expected an EndToEndSystem; got str.
     """
     instance(system, EndToEndSystem)
     facts = {

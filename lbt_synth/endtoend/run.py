@@ -81,6 +81,22 @@ def run_end_to_end(
         finite command a mode.
     OutputError
         If the cache cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> setup, design = config.end_to_end, lbt.kalman(config.plant)
+    >>> control = setup.controller(design)
+    >>> run = lbt.run_end_to_end(setup.system, control)        # doctest: +SKIP
+
+    It takes half a minute; what cannot run is refused before:
+
+    >>> lbt.run_end_to_end(setup.system, design)
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: controller must have step(y) and reset(), as MixedController \
+has; got FilterDesign.
     """
     instance(system, EndToEndSystem)
     if not isinstance(controller, SteppedController):

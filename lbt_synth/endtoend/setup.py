@@ -58,7 +58,7 @@ class EndToEndSetup:
     settle_frames: int = 400
     seed: int = 0
     gain: float = 0.5
-    leak: float = 0.99
+    leak: float = 0.97
     leak_from_mode: int = 50
 
     def __post_init__(self) -> None:

@@ -352,7 +352,7 @@ def end_to_end_tables(
     >>> lbt.end_to_end_tables(setup, "nowhere/at/all", tables=["IV"])
     Traceback (most recent call last):
         ...
-    lbt_synth.errors.ProblemError: tables must be one of 'II', 'III'; got 'IV'.
+    lbt_synth.errors.ProblemError: tables must be one of II, III; got 'IV'.
     """
     rows = plan_tables(setup, designs, seeds=seeds, row_seeds=row_seeds, tables=tables)
     calibrate(setup.system, cache=cache)  # once, and not in each process
