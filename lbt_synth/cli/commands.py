@@ -6,6 +6,7 @@ from argparse import Namespace
 from collections.abc import Callable
 
 from lbt_synth.cli.design_commands import design, show, verify
+from lbt_synth.cli.export_command import export
 from lbt_synth.cli.front_command import tradeoff_command
 from lbt_synth.cli.limits_command import limits
 from lbt_synth.cli.loop_commands import sigma, simulate
@@ -15,6 +16,7 @@ from lbt_synth.cli.robustness_command import robustness
 
 COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "design": design,
+    "export": export,
     "limits": limits,
     "paper": paper,
     "robustness": robustness,

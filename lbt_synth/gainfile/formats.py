@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.fitsfile import fits_bytes
 from lbt_synth.validation import FloatArray
 
 FITS_LAYOUT_VERSION = 1  # of SPECULA's state-space filter file
@@ -22,22 +23,14 @@ _TEXT = "META"
 
 def write_fits(arrays: Mapping[str, FloatArray], text: str, header: Mapping[str, Any]) -> bytes:
     """Write HDUs A, B, C, D first, as SPECULA's SsrFilterData wants them, then the others."""
-    from astropy.io import fits
-
-    primary = fits.PrimaryHDU()
-    primary.header["VERSION"] = (FITS_LAYOUT_VERSION, "layout of the HDUs A, B, C, D")
-    primary.header["NFILTER"] = (arrays["B"].shape[1], "inputs of the controller")
-    primary.header["NSTATES"] = (arrays["A"].shape[0], "states of the controller")
-    for key, (value, comment) in header.items():
-        primary.header[key] = (value, comment)
-    units = [primary]
-    units += [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
-    units.append(fits.ImageHDU(data=np.frombuffer(text.encode(), dtype=np.uint8), name=_TEXT))
-    for unit in units:
-        unit.add_checksum(when="of this unit")  # not the time: the same design is the same file
-    buffer = io.BytesIO()
-    fits.HDUList(units).writeto(buffer)
-    return buffer.getvalue()
+    cards = {
+        "VERSION": (FITS_LAYOUT_VERSION, "layout of the HDUs A, B, C, D"),
+        "NFILTER": (arrays["B"].shape[1], "inputs of the controller"),
+        "NSTATES": (arrays["A"].shape[0], "states of the controller"),
+        **header,
+    }
+    everything: dict[str, Any] = {**arrays, _TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
+    return fits_bytes(cards, everything)
 
 
 def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
