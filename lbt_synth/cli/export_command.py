@@ -75,7 +75,12 @@ def _written(design: Design, digest: str, arguments: Namespace) -> Exported:
 
 def _notes(arguments: Namespace, written: Exported) -> list[str]:
     if arguments.format == "iir" and not written.error_single <= _SINGLE_SUFFICES:
-        effect = "the loop is unstable" if math.isinf(written.error_single) else "commands differ"
+        unstable = math.isinf(written.error_single)
+        effect = (
+            "the loop is unstable"
+            if unstable
+            else f"commands are off by {written.error_single:.2g} of the largest one"
+        )
         return [
             f"note: in single precision, SPECULA's default, {effect} with this transfer function. "
             "Run it with precision 0, or use the gain file itself with SsrFilter."

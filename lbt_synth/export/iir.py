@@ -19,7 +19,7 @@ from lbt_synth.export.result import Exported
 from lbt_synth.files import write_atomically
 from lbt_synth.fitsfile import fits_bytes
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import FloatArray, frozen, number
 
 _LAYOUT_VERSION = 1  # of SPECULA's IirFilterData
 
@@ -146,13 +146,14 @@ def _aligned(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, Fl
 def _error(design: Design, num: FloatArray, den: FloatArray, dtype: Any) -> float:
     """Error of the rehearsal; inf where the loop is unstable, however slowly it grows."""
     if design.hardware is not None:
-        rounded = (part.astype(dtype).astype(np.float64) for part in (num, den))
-        if not certify_loop(design.hardware, _as_controller(*rounded, design)).passed:
+        top, bottom = (frozen(part.astype(dtype)) for part in (num, den))
+        written = _as_controller(top, bottom, design.controller.dt_s)
+        if not certify_loop(design.hardware, written).passed:
             return float("inf")
     return rehearsed_error(design, DirectForm(num, den, dtype))
 
 
-def _as_controller(num: FloatArray, den: FloatArray, design: Design) -> Controller:
+def _as_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
     """Return the controller of these coefficients; each axis ends with its command as a state."""
     axes = []
     for top, bottom in zip(num, den, strict=True):
@@ -168,7 +169,7 @@ def _as_controller(num: FloatArray, den: FloatArray, design: Design) -> Controll
     return Controller(
         A=block_diag(*(A for A, _ in axes)),
         B=block_diag(*(B for _, B in axes)),
-        C=np.kron(np.eye(m), np.eye(size)[-1:]),
+        C=frozen(np.kron(np.eye(m), np.eye(size)[-1:])),
         D=np.zeros((m, m)),
-        dt_s=design.controller.dt_s,
+        dt_s=dt_s,
     )
