@@ -52,32 +52,44 @@ class Triggered:
         return np.array(command.value, dtype=np.float64)
 
 
-def main(precision, output, config, *named):
+def commands(precision, config, named):
+    """Commands of each CLASS:FILE, in the loop of a configuration and on given measurements."""
     import specula
 
-    specula.init(-1, precision=int(precision))
+    specula.init(-1, precision=precision)
     from specula.data_objects.iir_filter_data import IirFilterData
     from specula.data_objects.ssr_filter_data import SsrFilterData
     from specula.processing_objects.iir_filter import IirFilter
     from specula.processing_objects.ssr_filter import SsrFilter
 
     classes = {"ssr": (SsrFilterData, SsrFilter), "iir": (IirFilterData, IirFilter)}
-    loaded = lbt.load_config(config)
-    results = {}
-    for i, text in enumerate(named):
+    results = []
+    for text in named:
         kind, file = text.split(":", 1)
         data_class, filter_class = classes[kind]
         data = data_class.restore(file)
-        assert data.dtype == (np.float64, np.float32)[int(precision)]
+        assert data.dtype == (np.float64, np.float32)[precision]
         theirs = Triggered(lambda f=filter_class, d=data: f(d), data.nfilter)
-        run = lbt.simulate(
-            theirs, loaded.truth, hardware=loaded.hardware, frames=FRAMES, seed=SEED,
-            settle_frames=0,
-        )  # fmt: skip
-        results[f"loop{i}"] = run.commands[0]
+        loop = simulated(theirs, config)
         theirs.reset()
-        results[f"noise{i}"] = [theirs.step(y) for y in noise_series(data.nfilter)]
-    np.savez(output, **results)
+        results.append((loop, [theirs.step(y) for y in noise_series(data.nfilter)]))
+    return results
+
+
+def simulated(controller, config):
+    """Commands in the loop of a configuration, from the first frame on."""
+    loaded = lbt.load_config(config)
+    return lbt.simulate(
+        controller, loaded.truth, hardware=loaded.hardware, frames=FRAMES, seed=SEED,
+        settle_frames=0,
+    ).commands[0]  # fmt: skip
+
+
+def main(precision, output, config, *named):
+    series = commands(int(precision), config, named)
+    keyed = {f"loop{i}": loop for i, (loop, _) in enumerate(series)}
+    keyed |= {f"noise{i}": noise for i, (_, noise) in enumerate(series)}
+    np.savez(output, **keyed)
 
 
 if __name__ == "__main__":

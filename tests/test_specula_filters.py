@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exports import relative
 from plants import LBT_YAML, ROOT
+from specula_filters import noise_series, simulated
 
 import lbt_synth as lbt
 
@@ -57,10 +59,6 @@ def run(request, files, tmp_path_factory):
     return request.param, series
 
 
-def relative(found, expected):
-    return np.max(np.abs(found - expected)) / np.max(np.abs(expected))
-
-
 # what the loop of each file is held to, in double and in single precision; the state-space
 # file has the controller's own numbers. The LMI leaves couplings of 1e-11 between the axes,
 # which one transfer function an axis cannot have.
@@ -77,23 +75,15 @@ LIMITS = {
 @pytest.mark.parametrize("key", LIMITS, ids="-".join)
 def test_the_closed_loop_is_that_of_our_simulator(designs, run, key):
     """Same disturbance and noise: SPECULA's filter in the loop, and our simulator."""
-    from specula_filters import FRAMES, SEED
-
     precision, series = run
-    loaded = lbt.load_config(LBT_YAML)
-    expected = lbt.simulate(
-        designs[key[0]].controller, loaded.truth, hardware=loaded.hardware, frames=FRAMES,
-        seed=SEED, settle_frames=0,
-    )  # fmt: skip
-    assert np.max(np.abs(expected.commands)) > 100  # nm: there is something to correct
-    assert relative(series[key][0], expected.commands[0]) < LIMITS[key][precision]
+    expected = simulated(designs[key[0]].controller, LBT_YAML)
+    assert np.max(np.abs(expected)) > 100  # nm: there is something to correct
+    assert relative(series[key][0], expected) < LIMITS[key][precision]
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
 def test_the_same_measurements_give_the_same_commands(designs, run, name):
     """The gain file untouched, against the stepped controller, on measurements of no loop."""
-    from specula_filters import noise_series
-
     precision, series = run
     ours = designs[name].controller.start()
     expected = np.array([ours.step(y) for y in noise_series(2)])
