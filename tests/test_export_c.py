@@ -80,7 +80,7 @@ def controllers(draw):
     return lbt.Controller(A=A, B=matrix(n, q), C=matrix(m, n), D=D, dt_s=0.002)
 
 
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(controller=controllers(), precision=st.sampled_from(list(LIMITS)))
 def test_any_stable_controller(tmp_path, controller, precision):
     written = lbt.export_c(tmp_path / "any.c", bare_design(controller), precision=precision)
