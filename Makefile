@@ -8,7 +8,7 @@ OUT    ?= out
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-all study bench docs lint clean
+.PHONY: demo test test-all e2e study bench docs lint clean
 
 $(VENV)/.ready: pyproject.toml
 ifdef UV
@@ -18,6 +18,15 @@ else
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	$(BIN)/python -m pip install --quiet -e . --group dev
+endif
+	@touch $@
+
+# the packages of the runs in other programs come after the default check, into the same place
+$(VENV)/.ready-e2e: $(VENV)/.ready
+ifdef UV
+	$(UV) pip install --quiet --python $(BIN)/python -e ".[e2e,aot]"
+else
+	$(BIN)/python -m pip install --quiet -e ".[e2e,aot]"
 endif
 	@touch $@
 
@@ -38,10 +47,13 @@ lint: $(VENV)/.ready     ## style, types, import layers
 	$(BIN)/lint-imports
 
 test: lint               ## the whole default check
-	$(BIN)/pytest -n 2 -m "not study" --doctest-modules lbt_synth tests
+	$(BIN)/pytest -n 2 -m "not study and not e2e" --doctest-modules lbt_synth tests
 
 test-all:                ## the check on each supported Python that is found
 	PYTHON=$(PYTHON) .ci/each-python $(MAKE) test
+
+e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT; a test that is skipped, or none at all, fails
+	$(BIN)/pytest -n 2 -m e2e --no-skips tests
 
 study: $(VENV)/.ready    ## the long numerical studies
 	$(BIN)/pytest -m study tests

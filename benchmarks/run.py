@@ -21,6 +21,7 @@ import control
 import numpy as np
 from engine import SIZED
 from harness import Row, machine, paired, seconds
+from realtime import REALTIME
 
 import lbt_synth as lbt
 
@@ -126,19 +127,26 @@ def maps() -> dict[str, Row]:
     }
 
 
-def cells(name: str, row: Row) -> list[str]:
+def unit(rows: dict[str, Row]) -> tuple[str, float]:
+    """Unit of a table's times and how many of it are a second."""
+    return ("ns", 1e9) if all(row["ours_s"] < 1e-5 for row in rows.values()) else ("ms", 1e3)
+
+
+def cells(name: str, row: Row, per_second: float) -> list[str]:
     """One line of a table: name, ours, peer, ratio, bar, growth."""
 
-    def shown(key: str, factor: float, form: str) -> str:
-        return f"{factor * row[key]:{form}}" if key in row else ""
+    def shown(key: str, factor: float, digits: str) -> str:
+        return f"{factor * row[key]:{digits}}" if key in row else ""
 
+    form = ".3f" if per_second == 1e3 else ".1f"
     bar = shown("bar", 1, "g")
     if "bar_s" in row:
         bar = f"{1e3 * row['bar_s']:g} ms"
     return [
         name,
-        shown("ours_s", 1e3, ".3f") + (f" ({row['status']})" if "status" in row else ""),
-        shown("peer_s", 1e3, ".3f") + (f" ({row['peer_status']})" if "peer_status" in row else ""),
+        shown("ours_s", per_second, form) + (f" ({row['status']})" if "status" in row else ""),
+        shown("peer_s", per_second, form)
+        + (f" ({row['peer_status']})" if "peer_status" in row else ""),
         shown("ratio", 1, ".2f"),
         bar,
         shown("growth", 1, ".2f"),
@@ -146,11 +154,19 @@ def cells(name: str, row: Row) -> list[str]:
     ]
 
 
-HEADINGS = ["", "ours [ms]", "peer [ms]", "ratio", "bar", "growth", "peer's growth"]
+def headings(time_unit: str) -> list[str]:
+    return [
+        "",
+        f"ours [{time_unit}]",
+        f"peer [{time_unit}]",
+        "ratio",
+        "bar",
+        "growth",
+        "peer's growth",
+    ]
 
 
-def page(title: str, first: str, lines: list[list[str]]) -> str:
-    head = [first, *HEADINGS[1:]]
+def page(title: str, head: list[str], lines: list[list[str]]) -> str:
     rule = "|---|" + "---:|" * (len(head) - 1)
     body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     return f"## {title}\n\n| {' | '.join(head)} |\n{rule}\n{body}\n"
@@ -162,17 +178,19 @@ def main() -> None:
     pages = []
     everyday = {**imports(), **time_domain(), **synthesis(), **maps()}
     tables = [("everyday operations", "operation", everyday)]
-    for title, first, case in SIZED:
+    for title, first, case in (*SIZED, *REALTIME):
         print(f"... {title}", file=sys.stderr)
         tables.append((title, first, {str(size): row for size, row in case().items()}))
     for title, first, rows in tables:
-        lines = [cells(name, row) for name, row in rows.items()]
-        widths = [max(len(line[i]) for line in [*lines, HEADINGS]) for i in range(len(HEADINGS))]
-        print(f"\n{title}\n" + "  ".join(h.rjust(w) for h, w in zip(HEADINGS, widths, strict=True)))
+        time_unit, per_second = unit(rows)
+        head = headings(time_unit)
+        lines = [cells(name, row, per_second) for name, row in rows.items()]
+        widths = [max(len(line[i]) for line in [*lines, head]) for i in range(len(head))]
+        print(f"\n{title}\n" + "  ".join(h.rjust(w) for h, w in zip(head, widths, strict=True)))
         for line in lines:
             print("  ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)))
         results[title] = rows
-        pages.append(page(title[0].upper() + title[1:], first, lines))
+        pages.append(page(title[0].upper() + title[1:], [first, *head[1:]], lines))
     target = Path(__file__).with_name("results.json")
     target.write_text(json.dumps({"machine": here, "results": results}, indent=1) + "\n")
     listing = "\n".join(f"- {key.replace('_', ' ')}: {value}" for key, value in here.items())

@@ -50,6 +50,12 @@ from .errors import SchemaVersionError as SchemaVersionError
 from .errors import SynthesisError as SynthesisError
 from .errors import TelemetryError as TelemetryError
 from .errors import UnstableLoopError as UnstableLoopError
+from .export import Exported as Exported
+from .export import FrameCost as FrameCost
+from .export import export_c as export_c
+from .export import export_iir as export_iir
+from .export import export_mat as export_mat
+from .export import frame_cost as frame_cost
 from .front import TradeoffPoint as TradeoffPoint
 from .front import tradeoff as tradeoff
 from .gainfile import load_gain as load_gain

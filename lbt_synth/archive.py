@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lbt_synth import fitsfile
 from lbt_synth.validation import FloatArray
 
 Cards = Mapping[str, tuple[Any, str]]
@@ -40,20 +41,8 @@ def fits_bytes(
     cards: Mapping[str, Cards] | None = None,
 ) -> bytes:
     """Write a primary HDU without data, one image HDU an array in their order, then the text."""
-    from astropy.io import fits
-
-    first = fits.PrimaryHDU()
-    units = [first]
-    units += [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
-    units.append(fits.ImageHDU(data=np.frombuffer(text.encode(), dtype=np.uint8), name=TEXT))
-    for unit in units:
-        own = primary if unit is first else (cards or {}).get(unit.name, {})
-        for key, (value, comment) in own.items():
-            unit.header[key] = (value, comment)
-        unit.add_checksum(when="of this unit")  # not the time: the same content is the same file
-    buffer = io.BytesIO()
-    fits.HDUList(units).writeto(buffer)
-    return buffer.getvalue()
+    everything: dict[str, Any] = {**arrays, TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
+    return fitsfile.fits_bytes(primary, everything, headers=cards)
 
 
 def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:

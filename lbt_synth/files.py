@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from lbt_synth.errors import OutputError
@@ -78,27 +79,86 @@ def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
     ...     write_atomically(pathlib.Path(folder) / "a.txt", b"whole").read_bytes()
     b'whole'
     """
-    target = Path(path)
-    temporary = None
-    if target.is_dir():
-        raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+    return write_together({path: content})[0]
+
+
+def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Path, ...]:
+    """Write files that belong together: all of them, or none.
+
+    Every file is written in full under a temporary name before the first is renamed.
+
+    Parameters
+    ----------
+    contents : mapping of path-like to bytes
+        Where to write, and the whole file.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The files, in the order given.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be written; nothing is left behind, and older files of
+        these names stay as they were.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> from lbt_synth.files import write_together
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     at = pathlib.Path(folder)
+    ...     [p.name for p in write_together({at / "a.c": b"code", at / "a.h": b"names"})]
+    ['a.c', 'a.h']
+    """
+    targets = {Path(path): content for path, content in contents.items()}
+    for target in targets:
+        if target.is_dir():
+            raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+    staged: dict[Path, Path] = {}
+    older: dict[Path, bytes | None] = {}
+    target = next(iter(targets))
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        for target, content in targets.items():
+            staged[target] = _stage(target, content)
+        for target, temporary in staged.items():
+            # what a later failure has to put back; a single file is replaced in one step
+            older[target] = target.read_bytes() if len(targets) > 1 and target.exists() else None
+            temporary.replace(target)
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        for temporary in staged.values():
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+        older.pop(target, None)  # this one was not replaced
+        for done, content_before in older.items():
+            with contextlib.suppress(OSError):
+                if content_before is None:
+                    done.unlink()
+                else:
+                    _stage(done, content_before).replace(done)
+        reason = getattr(error, "strerror", None) or error
+        raise OutputError(
+            f"cannot write {target}: {reason}. Check the directory and its free space.",
+            path=target,
+        ) from error
+    return tuple(targets)
+
+
+def _stage(target: Path, content: bytes) -> Path:
+    """Write a whole file under a temporary name beside its target; none is left if that fails."""
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    temporary = Path(name)
+    try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         umask = os.umask(0)
         os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)
-        Path(temporary).replace(target)
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                Path(temporary).unlink()
-        reason = getattr(error, "strerror", None) or error
-        raise OutputError(
-            f"cannot write {target}: {reason}. Check the directory and its free space.",
-            path=target,
-        ) from error
-    return target
+        temporary.chmod(0o666 & ~umask)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    return temporary

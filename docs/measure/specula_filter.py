@@ -1,31 +1,34 @@
-"""Load a gain file into SPECULA's state-space filter and step both side by side.
+"""Load files into SPECULA's own filters and step them beside our controller.
 
-Needs ``pip install specula``; run with ``python docs/measure/specula_filter.py gain.fits``.
+Needs the extra ``e2e`` (``make e2e`` installs it); from the repository::
+
+    python docs/measure/specula_filter.py {double,single} GAIN.fits [TRANSFER_FUNCTIONS.fits]
+
+The gain file is given to SsrFilter, the transfer functions (``lbt-synth export --format iir``)
+to IirFilter. Printed: the largest difference of the commands over the largest command, in the
+closed loop of examples/lbt.yaml and on 150 random measurements.
 """
 
 import sys
 
 import numpy as np
-import specula
+
+sys.path.insert(0, "tests")  # what drives SPECULA is what the tests use
+
+from specula_filters import commands, noise_series, relative, simulated
 
 import lbt_synth as lbt
 
-specula.init(-1, precision=0)  # the CPU, double precision
-
-from specula.data_objects.ssr_filter_data import SsrFilterData  # noqa: E402
-from specula.processing_objects.ssr_filter import SsrFilter  # noqa: E402
+CONFIG = "examples/lbt.yaml"
 
 if __name__ == "__main__":
-    data = SsrFilterData.restore(sys.argv[1])
-    theirs = SsrFilter(data)
-    theirs._gain_mod = 1.0
-    ours = lbt.load_gain(sys.argv[1]).controller.start()
-    rng = np.random.default_rng(0)
-    worst = 0.0
-    for _ in range(1000):
-        theirs.delta_comm = rng.normal(size=data.nfilter)
-        theirs.trigger_code()
-        apart = theirs.output_buffer[:, 0] - ours.step(theirs.delta_comm)
-        worst = max(worst, float(np.max(np.abs(apart))))
-    print(f"{data.nfilter} inputs, {data.total_states} states, new state "
-          f"{theirs.output_uses_new_state}: commands differ by {worst:.1e}")  # fmt: skip
+    precision, gain, *transfer = sys.argv[1:]
+    controller = lbt.load_gain(gain).controller
+    run = controller.start()
+    loop = simulated(controller, CONFIG)
+    noise = np.array([run.step(y) for y in noise_series(controller.B.shape[1])])
+    named = [f"ssr:{gain}", *(f"iir:{file}" for file in transfer)]
+    found = commands(("double", "single").index(precision), CONFIG, named)
+    for text, (their_loop, their_noise) in zip(named, found, strict=True):
+        print(f"{text}, {precision}: loop {relative(their_loop, loop):.1e}, "
+              f"random measurements {relative(their_noise, noise):.1e}")  # fmt: skip

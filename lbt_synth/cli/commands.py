@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from lbt_synth.cli.design_commands import design, show, verify
 from lbt_synth.cli.end_to_end_commands import end_to_end, end_to_end_table
+from lbt_synth.cli.export_command import export
 from lbt_synth.cli.front_command import tradeoff_command
 from lbt_synth.cli.limits_command import limits
 from lbt_synth.cli.loop_commands import sigma, simulate
@@ -19,6 +20,7 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "design": design,
     "e2e": end_to_end,
     "e2e-table": end_to_end_table,
+    "export": export,
     "limits": limits,
     "paper": paper,
     "robustness": robustness,

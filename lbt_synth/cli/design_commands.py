@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.certify import Certificate
+from lbt_synth.cli.export_command import cost_data, cost_facts
 from lbt_synth.cli.output import Report, TableText, working
 from lbt_synth.config import Config, load_config, robust_design
 from lbt_synth.design import (
@@ -27,6 +28,7 @@ from lbt_synth.design import (
 )
 from lbt_synth.distance import model_distance, shaped_distance
 from lbt_synth.errors import ProblemError
+from lbt_synth.export import frame_cost
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain, require_gain_name, save_gain
 from lbt_synth.loop import close_loop, loop_margins
@@ -137,6 +139,15 @@ def show(arguments: Namespace) -> Report:
     loaded = load_gain(arguments.gain)
     report = _description(loaded)
     report.data["file"] = arguments.gain
+    cost = frame_cost(loaded)
+    report.data["frame_cost"] = cost_data(cost)
+    report.tables.append(
+        TableText(
+            title="Cost of one frame, as exported to C",
+            headings=("quantity", "value", "unit"),
+            rows=cost_facts(cost),
+        )
+    )
     if arguments.matrices:
         matrices = {name: getattr(loaded.controller, name) for name in "ABCD"}
         if isinstance(loaded, FilterDesign):

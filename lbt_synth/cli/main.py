@@ -98,6 +98,32 @@ def build_parser() -> argparse.ArgumentParser:
     verify = command("verify", "Compute the certificate of a gain file anew")
     verify.add_argument("gain", help=gain_help)
 
+    export = command(
+        "export", "Write the controller of a gain file for a real-time computer or another program"
+    )
+    export.add_argument("gain", help=gain_help)
+    export.add_argument(
+        "--format",
+        choices=("c", "mat", "iir"),
+        required=True,
+        help="c: C99 source and header; mat: MATLAB; iir: transfer functions for SPECULA's "
+        "IirFilter (axes that decouple)",
+    )
+    export.add_argument(
+        "--precision",
+        choices=("double", "single"),
+        help="c: type of all numbers (default double)",
+    )
+    export.add_argument(
+        "--name", help="c: prefix of the C names (default: the output's name without its ending)"
+    )
+    export.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        help="file to write: .c (the .h goes beside it), .mat or .fits",
+    )
+
     sigma = command("sigma", "Plot singular values of one or several designs")
     sigma.add_argument("gains", nargs="+", metavar="gain", help=gain_help)
     sigma.add_argument(

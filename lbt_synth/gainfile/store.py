@@ -115,6 +115,11 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
         ...
     lbt_synth.errors.GainFileError: cannot read nowhere.fits: No such file or directory.
     """
+    return load_with_digest(path)[0]
+
+
+def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
+    """Read a gain file as :func:`load_gain` does, and return its digest beside the design."""
     source = Path(path)
     if source.suffix.lower() not in _FORMATS:
         raise GainFileError(
@@ -150,12 +155,13 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
                 f"{source} is damaged: {name} holds values that are not finite.", path=source
             )
     try:
-        return from_record({name: frozen(array) for name, array in arrays.items()}, meta)
+        design = from_record({name: frozen(array) for name, array in arrays.items()}, meta)
     except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise GainFileError(
             f"{source} is inconsistent: {reason(error)}. Write it again with lbt-synth design.",
             path=source,
         ) from error
+    return design, digest
 
 
 def _check_schema(meta: Any, source: Path) -> None:

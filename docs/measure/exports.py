@@ -1,0 +1,85 @@
+"""What exports lose: run with ``python docs/measure/exports.py`` from the repository."""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import lbt_synth as lbt
+from lbt_synth.export import c_text
+
+sys.path.insert(0, "benchmarks")  # the timing is that of the benchmark
+
+from realtime import frame
+
+CONFIG = lbt.load_config("examples/lbt.yaml")
+
+
+def transfer_functions(folder: Path) -> None:
+    """Transfer functions over the number of lines that the filter knows."""
+    for lines in (1, 2, 3, 4, 5):
+        plant = CONFIG.plant
+        if lines > 1:
+            plant = lbt.spread_plant(plant, half_width_hz=3.5, lines=lines)
+        design = lbt.kalman(plant)
+        try:
+            written = lbt.export_iir(folder / "iir.fits", design)
+            said = f"double {written.error:.1e}, single {written.error_single:.1e}"
+        except lbt.NumericalError as error:
+            said = f"double {error.residual:.1e}: refused"
+        print(f"{lines} lines an axis, {design.controller.n_states} states: {said}")
+
+
+def source(folder: Path) -> None:
+    """Operations, and what single precision changes."""
+    prior = lbt.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)
+    for name, design in (
+        ("kalman", lbt.kalman(CONFIG.plant)),
+        ("hinf", lbt.hinf(CONFIG.plant, gamma_ratio=1.2)),
+        ("integrator", lbt.optimal_integrator(CONFIG.hardware, CONFIG.truth)),
+        ("15 lines an axis", lbt.kalman(prior)),
+    ):
+        cost = lbt.frame_cost(design)
+        written = lbt.export_c(folder / "c.c", design, precision="single")
+        print(
+            f"{name}: {cost.states} states, {cost.multiplications} multiplications "
+            f"({cost.dense_multiplications} dense), single precision {written.error:.1e}"
+        )
+
+
+def forms() -> None:
+    """Nanoseconds a frame of both forms of the source, whichever would be chosen."""
+    kalman = lbt.kalman(CONFIG.plant)
+    designs = {
+        "kalman": kalman,
+        "15 lines an axis": lbt.kalman(lbt.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)),
+    }
+    rng = np.random.default_rng(0)
+    for n in (10, 24, 44, 80):
+        A = rng.standard_normal((n, n))
+        A *= 0.9 / np.max(np.abs(np.linalg.eigvals(A)))
+        full = lbt.Controller(
+            A=A, B=rng.standard_normal((n, 2)), C=rng.standard_normal((2, n)),
+            D=rng.standard_normal((2, 2)),
+        )  # fmt: skip
+        # the loop of the design is not what is timed
+        designs[f"no zeros, {n} states"] = lbt.Design(
+            method="random", controller=full, certificate=kalman.certificate,
+            solver=kalman.solver,
+        )  # fmt: skip
+    chosen = c_text.written_out
+    for name, design in designs.items():
+        times = []
+        for written in (True, False):
+            c_text.written_out = lambda _, w=written: w
+            times.append(1e9 * frame(design, single=False)["ours_s"])
+        c_text.written_out = chosen
+        print(f"{name}: written out {times[0]:.0f} ns, loops {times[1]:.0f} ns")
+
+
+if __name__ == "__main__":
+    forms()
+    with tempfile.TemporaryDirectory() as place:
+        transfer_functions(Path(place))
+        source(Path(place))

@@ -1,0 +1,27 @@
+"""What an export is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exported:
+    """Files that were written, and how far they are from the controller.
+
+    Attributes
+    ----------
+    files : tuple of pathlib.Path
+        The files.
+    error : float
+        Largest difference of the commands from those of the controller, over the largest
+        command, with the arithmetic of the file: in the closed loop where the design is of one,
+        on white noise elsewhere. 0 where the file holds the controller's own numbers.
+    error_single : float
+        The same in single precision; inf if the loop is then unstable.
+    """
+
+    files: tuple[Path, ...]
+    error: float
+    error_single: float

@@ -1,0 +1,62 @@
+"""Arrays as FITS bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+
+def fits_bytes(
+    cards: Mapping[str, Any],
+    arrays: Mapping[str, Any],
+    *,
+    headers: Mapping[str, Mapping[str, Any]] | None = None,
+    comments: Sequence[str] = (),
+) -> bytes:
+    """Return a primary HDU of cards and one image HDU an array, each with its checksums.
+
+    The same content gives the same bytes: no date is written.
+
+    Parameters
+    ----------
+    cards : mapping
+        Values of the primary header, or pairs of value and comment.
+    arrays : mapping of str to ndarray
+        Names of the HDUs and their data, in this order.
+    headers : mapping of str to mapping, optional
+        Cards of the image HDUs, by name.
+    comments : sequence of str, optional
+        Lines of comment for the primary header.
+
+    Returns
+    -------
+    bytes
+        The file.
+
+    Examples
+    --------
+    >>> import io
+    >>> from astropy.io import fits
+    >>> from lbt_synth.fitsfile import fits_bytes
+    >>> with fits.open(io.BytesIO(fits_bytes({"VERSION": 1}, {"A": [[1.0, 2.0]]}))) as units:
+    ...     units["A"].data.tolist()
+    [[1.0, 2.0]]
+    """
+    from astropy.io import fits
+
+    primary = fits.PrimaryHDU()
+    units = [primary]
+    units += [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
+    for unit in units:
+        own = cards if unit is primary else (headers or {}).get(unit.name, {})
+        for key, value in own.items():
+            unit.header[key] = value
+        for line in comments if unit is primary else ():
+            unit.header.add_comment(line)
+        unit.add_checksum(when="of this unit")  # not the time: the same content is the same file
+    buffer = io.BytesIO()
+    fits.HDUList(units).writeto(buffer)
+    return buffer.getvalue()

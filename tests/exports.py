@@ -1,0 +1,71 @@
+"""Designs that the tests of the exports share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from astropy.io import fits
+from plants import LBT_YAML
+
+import lbt_synth as lbt
+
+
+def relative(found, expected):
+    return np.max(np.abs(np.asarray(found) - expected)) / np.max(np.abs(expected))
+
+
+def bare_design(controller, **changes):
+    """A design of any controller, without a loop."""
+    return lbt.Design(
+        **{
+            "method": "kalman",
+            "controller": controller,
+            "certificate": lbt.Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
+            "solver": lbt.SolverReport(route="riccati", status="made", iterations=0),
+            **changes,
+        }
+    )
+
+
+@cache
+def lbt_config():
+    return lbt.load_config(LBT_YAML)
+
+
+@cache
+def lbt_designs():
+    config = lbt_config()
+
+    def prior(lines):
+        return lbt.kalman(lbt.spread_plant(config.plant, half_width_hz=3.5, lines=lines))
+
+    return {
+        "kalman": lbt.kalman(config.plant),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
+        "integrator": lbt.optimal_integrator(config.hardware, config.truth),
+        "prior": prior(15),
+        "turned": turned(prior(3)),
+    }
+
+
+def turned(design):
+    """The same controller in other coordinates, without a zero: loops over whole matrices."""
+    own = design.controller
+    T, _ = np.linalg.qr(np.random.default_rng(8).standard_normal(own.A.shape))
+    other = lbt.Controller(A=T @ own.A @ T.T, B=T @ own.B, C=own.C @ T.T, D=own.D, dt_s=own.dt_s)
+    return replace(design, controller=other)
+
+
+def transfer_functions(path):
+    """Read as SPECULA does: HDUs by position, coefficients ascending in z, right-aligned."""
+    with fits.open(path, checksum=True) as units:
+        assert units[0].header["VERSION"] == 1
+        assert units[0].data is None
+        assert [unit.name for unit in units[1:]] == ["ORDNUM", "ORDDEN", "NUM", "DEN"]
+        ordnum, ordden, num, den = (np.array(units[i].data) for i in range(1, 5))
+    assert num.shape == den.shape
+    assert ordnum.tolist() == ordden.tolist() == [num.shape[1]] * len(num)
+    assert np.all(den[:, -1] == 1)
+    return num, den

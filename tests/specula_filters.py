@@ -1,0 +1,96 @@
+"""SPECULA's filters, driven as its simulation drives them; run by ``test_specula_filters.py``.
+
+The precision of SPECULA is one for a process and is chosen before its classes are imported,
+so each precision is a process of its own::
+
+    python tests/specula_filters.py PRECISION OUTPUT.npz CONFIG CLASS:FILE ...
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+import lbt_synth as lbt
+
+FRAMES, SEED, NOISE_FRAMES = 2000, 5, 150
+_STEP_S = 1 / 800
+
+
+def noise_series(inputs: int) -> np.ndarray:
+    """Measurements that no loop gave; an unstable controller grows on them."""
+    return 100 * np.random.default_rng(7).standard_normal((NOISE_FRAMES, inputs))
+
+
+class Triggered:
+    """A filter of SPECULA behind ``step`` and ``reset``: inputs set, checked, triggered."""
+
+    def __init__(self, make, inputs):
+        from specula.base_value import BaseValue
+
+        self.make, self.inputs, self.value = make, inputs, BaseValue
+        self.reset()
+
+    def reset(self):
+        self.filter = self.make()
+        self.measured = self.value(value=np.zeros(self.inputs))
+        self.filter.inputs["delta_comm"].set(self.measured)
+        self.filter.setup()
+        self.frame = 0
+
+    def step(self, y):
+        t = self.filter.seconds_to_t(self.frame * _STEP_S)
+        self.frame += 1
+        self.measured.set_value(y)
+        self.measured.generation_time = t
+        assert self.filter.check_ready(t)
+        self.filter.trigger()
+        self.filter.post_trigger()
+        command = self.filter.outputs["out_comm"]
+        assert command.generation_time == t
+        return np.array(command.value, dtype=np.float64)
+
+
+def commands(precision, config, named):
+    """Commands of each CLASS:FILE, in the loop of a configuration and on given measurements."""
+    import specula
+
+    specula.init(-1, precision=precision)
+    from specula.data_objects.iir_filter_data import IirFilterData
+    from specula.data_objects.ssr_filter_data import SsrFilterData
+    from specula.processing_objects.iir_filter import IirFilter
+    from specula.processing_objects.ssr_filter import SsrFilter
+
+    classes = {"ssr": (SsrFilterData, SsrFilter), "iir": (IirFilterData, IirFilter)}
+    results = []
+    for text in named:
+        kind, file = text.split(":", 1)
+        data_class, filter_class = classes[kind]
+        data = data_class.restore(file)
+        assert data.dtype == (np.float64, np.float32)[precision]
+        theirs = Triggered(lambda f=filter_class, d=data: f(d), data.nfilter)
+        loop = simulated(theirs, config)
+        theirs.reset()
+        results.append((loop, [theirs.step(y) for y in noise_series(data.nfilter)]))
+    return results
+
+
+def simulated(controller, config):
+    """Commands in the loop of a configuration, from the first frame on."""
+    loaded = lbt.load_config(config)
+    return lbt.simulate(
+        controller, loaded.truth, hardware=loaded.hardware, frames=FRAMES, seed=SEED,
+        settle_frames=0,
+    ).commands[0]  # fmt: skip
+
+
+def main(precision, output, config, *named):
+    series = commands(int(precision), config, named)
+    keyed = {f"loop{i}": loop for i, (loop, _) in enumerate(series)}
+    keyed |= {f"noise{i}": noise for i, (_, noise) in enumerate(series)}
+    np.savez(output, **keyed)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

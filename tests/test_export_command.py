@@ -1,0 +1,138 @@
+"""``lbt-synth export``, and the cost that ``show`` prints."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from compiled import Compiled
+from exports import lbt_config, lbt_designs, transfer_functions
+from scipy.io import loadmat
+
+import lbt_synth as lbt
+from lbt_synth.cli.main import main
+
+
+@pytest.fixture
+def loaded():
+    return lbt_config()
+
+
+@pytest.fixture
+def designs():
+    return lbt_designs()
+
+
+def run(capsys, *arguments):
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as stop:  # argparse
+        status = stop.code
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def gains(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("gains")
+    return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in lbt_designs().items()}
+
+
+def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
+    out = tmp_path / "ctl.c"
+    status, text, error = run(
+        capsys, "export", gains["kalman"], "--format", "c", "-o", out, "--precision", "single"
+    )
+    assert (status, error) == (0, "")
+    assert f"written: {out}" in text
+    assert f"written: {out.with_suffix('.h')}" in text
+    assert fits.getheader(gains["kalman"])["SHA256"] in out.read_text()
+    ours = designs["kalman"].controller.start()
+    assert np.allclose(Compiled(out, single=True).step([1, 2]), ours.step([1, 2]), rtol=1e-6)
+    status, text, _ = run(
+        capsys, "export", gains["kalman"], "--format", "c", "-o", out, "--name", "tip", "--json"
+    )
+    data = json.loads(text)
+    assert status == 0
+    assert data["files"] == [str(out), str(out.with_suffix(".h"))]
+    assert data["frame_cost"]["multiplications"] == 30
+    assert data["gain_digest"] in out.read_text()
+    Compiled(out, name="tip")
+
+
+def test_export_mat_and_iir_at_the_terminal(tmp_path, capsys, designs, gains):
+    out = tmp_path / "k.mat"
+    assert run(capsys, "export", gains["hinf"], "--format", "mat", "-o", out)[0] == 0
+    assert loadmat(out, simplify_cells=True)["new_state"]["A"].shape == (10, 10)
+    out = tmp_path / "k.fits"
+    status, text, _ = run(capsys, "export", gains["kalman"], "--format", "iir", "-o", out)
+    assert status == 0
+    assert "difference from the controller" in text
+    assert "note:" not in text
+    assert transfer_functions(out)[0].shape == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("half_width_hz", "effect"), [(1.0, "the loop is unstable"), (3.5, "commands are off by 0.")]
+)
+def test_a_transfer_function_that_single_precision_breaks_gets_a_note(
+    tmp_path, capsys, loaded, half_width_hz, effect
+):
+    prior = lbt.kalman(lbt.spread_plant(loaded.plant, half_width_hz=half_width_hz, lines=3))
+    gain = lbt.save_gain(tmp_path / "g.fits", prior)
+    arguments = ("export", gain, "--format", "iir", "-o", tmp_path / "k.fits")
+    status, text, _ = run(capsys, *arguments)
+    assert status == 0
+    assert f"note: in single precision, SPECULA's default, {effect}" in text
+    data = json.loads(run(capsys, *arguments, "--json")[1])
+    assert data["stable_single"] is ("unstable" not in effect)
+    assert data["error"] < 1e-6
+
+
+@pytest.mark.parametrize("name", ["kalman", "turned"])
+def test_show_prints_the_cost(capsys, designs, gains, name):
+    cost = lbt.frame_cost(designs[name])
+    status, text, _ = run(capsys, "show", gains[name])
+    assert status == 0
+    assert re.search(rf"multiplications a frame +{cost.multiplications} +\({cost.form}\)", text)
+    assert re.search(rf"coefficients, single +{cost.coefficient_bytes_single} +bytes", text)
+    data = json.loads(run(capsys, "show", gains[name], "--json")[1])["frame_cost"]
+    assert data["dense_additions"] == cost.dense_additions
+    assert data["state_bytes_double"] == cost.state_bytes_double
+
+
+BAD = [
+    (("KALMAN", "--format", "mat", "-o", "k.mat", "--name", "x"), 2, "--name goes with --format c"),
+    (("KALMAN", "--format", "iir", "-o", "k.fits", "--precision", "single"), 2, "--precision goes with"),
+    (("KALMAN", "--format", "c", "-o", "k.c", "--precision", "half"), 2, "invalid choice"),
+    (("KALMAN", "--format", "c", "-o", "k.c", "--name", "2x"), 2, "prefix of the C names"),
+    (("KALMAN", "--format", "c", "-o", "kal man.c"), 2, "must end in .c"),
+    (("KALMAN", "--format", "c", "-o", "k.mat"), 2, "must end in .c"),
+    (("KALMAN", "--format", "mat", "-o", "k.c"), 2, "must end in .mat"),
+    (("KALMAN", "--format", "iir", "-o", "k.mat"), 2, "must end in .fits"),
+    (("KALMAN", "--format", "iir", "-o", "KALMAN"), 2, "must not replace the gain file"),
+    (("KALMAN", "--format", "c", "-o", "none/k.c"), 2, "no directory none"),
+    (("KALMAN", "--format", "pdf", "-o", "k.pdf"), 2, "invalid choice"),
+    (("KALMAN", "-o", "k.c"), 2, "required"),
+    (("none.fits", "--format", "c", "-o", "k.c"), 2, "cannot read none.fits"),
+    (("DAMAGED.fits", "--format", "c", "-o", "k.c"), 2, "damaged"),
+    (("PRIOR", "--format", "iir", "-o", "k.fits"), 1, "do not hold the poles"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "expected", "text"), BAD)
+def test_bad_input(tmp_path, capsys, monkeypatch, gains, arguments, expected, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DAMAGED.fits").write_bytes(gains["kalman"].read_bytes()[:4000])
+    before = gains["kalman"].read_bytes()
+    files = sorted(tmp_path.iterdir())
+    names = {"KALMAN": gains["kalman"], "PRIOR": gains["prior"]}
+    status, out, error = run(capsys, "export", *(names.get(a, a) for a in arguments))
+    assert (status, out) == (expected, "")
+    assert text in error
+    assert "Traceback" not in error
+    assert sorted(tmp_path.iterdir()) == files
+    assert gains["kalman"].read_bytes() == before
