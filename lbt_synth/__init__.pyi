@@ -66,8 +66,10 @@ from .models import Atmosphere as Atmosphere
 from .models import EstimationProblem as EstimationProblem
 from .models import FullStatePlant as FullStatePlant
 from .models import LoopHardware as LoopHardware
+from .models import PositionLoop as PositionLoop
 from .models import SinusoidalVibration as SinusoidalVibration
 from .models import Spectrum as Spectrum
+from .models import StepResponse as StepResponse
 from .models import TabulatedSpectrum as TabulatedSpectrum
 from .models import TipTiltPlant as TipTiltPlant
 from .models import Truth as Truth
