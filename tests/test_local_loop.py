@@ -155,7 +155,8 @@ def test_taps_are_an_impulse_response_of_unit_gain(natural, damping, ratio, dela
             bandwidth_damping=0.8, delay_samples=late, ramp_samples=ramp,
         )  # fmt: skip
     except lbt.ProblemError as error:
-        assert "stable" in str(error)
+        if "must be stable" not in str(error):
+            raise
         return
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, mirror=mirror)
     system = path.mirror_system

@@ -46,6 +46,10 @@ class Response:
     C: FloatArray
     D: float
 
+    def __post_init__(self) -> None:
+        for name in "ABC":  # systems are kept, and shared
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
     @property
     def n_states(self) -> int:
         """Number of states."""
@@ -169,7 +173,7 @@ def _lifted(
 
 
 def samples_a_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
-    """Samples of a local loop in a frame.
+    """Return the samples of a local loop in a frame.
 
     Raises
     ------
@@ -271,6 +275,4 @@ def _balanced(core: Response) -> Response:
     n = core.n_states
     scaling = bordered_scaling(core.A, np.abs(core.B), np.abs(core.C))
     units = scaling[:n] / scaling[n]
-    return Response(
-        A=core.A * units / units[:, None], B=core.B / units, C=core.C * units, D=core.D
-    )
+    return Response(A=core.A * units / units[:, None], B=core.B / units, C=core.C * units, D=core.D)

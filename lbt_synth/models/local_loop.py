@@ -146,11 +146,12 @@ class PositionLoop:
         radius = self.closed_loop().spectral_radius
         if not radius < _STABLE:
             raise ProblemError(
-                f"the local loop of the mirror must be stable; got a spectral radius of "
-                f"{radius:.9g} a sample, with a proportional gain of {self.proportional_per_s2:.6g} "
-                f"1/s^2, a derivative gain of {self.derivative_per_s:.6g} 1/s and a delay of "
-                f"{self.delay_samples} samples at {self.sampling_hz:.6g} Hz. Lower the bandwidth, "
-                "raise the damping, or sample faster."
+                "the local loop of the mirror must be stable; got a spectral radius of "
+                f"{radius:.9g} a sample, with a proportional gain of "
+                f"{self.proportional_per_s2:.6g} 1/s^2, a derivative gain of "
+                f"{self.derivative_per_s:.6g} 1/s and a delay of {self.delay_samples} samples at "
+                f"{self.sampling_hz:.6g} Hz. Lower the bandwidth, raise the damping, or sample "
+                "faster."
             )
 
     @classmethod
@@ -259,7 +260,7 @@ class PositionLoop:
         (n + 1,) ndarray
             Row over the states at its beginning and the command.
         """
-        return self._motion(samples)[2]
+        return np.asarray(self._motion(samples)[2])
 
     def step_response(self, tolerance: float = 0.1) -> StepResponse:
         """Answer to a unit step of the command, at rest before.
