@@ -61,7 +61,7 @@ class LoopHardware:
     ...                                       bandwidth_hz=500)
     >>> moving = lbt.LoopHardware(frame_rate_hz=800, mirror=shell)
     >>> moving.mirror_taps[:3].round(3).tolist()
-    [0.0, 0.642, 0.371]
+    [0.0, 0.631, 0.387]
     """
 
     frame_rate_hz: float

@@ -100,7 +100,7 @@ class PositionLoop:
     ...                                       bandwidth_hz=500, bandwidth_damping=0.7)
     >>> step = shell.step_response()
     >>> f"{1e3 * step.settling_s:.2f} ms, overshoot {100 * step.overshoot:.0f} %"
-    '0.74 ms, overshoot 5 %'
+    '0.81 ms, overshoot 4 %'
     """
 
     natural_frequency_hz: float

@@ -12,6 +12,7 @@ from lbt_synth.plotting.style import COLOURS, house_style, new_figure
 from lbt_synth.validation import instance
 
 _MOST_POINTS = 4000
+_SHOWN = 5e-3  # taps beyond the last one of this size are not drawn
 
 
 def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
@@ -44,6 +45,8 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
     >>> len(lbt.mirror_figure(lbt.LoopHardware(frame_rate_hz=800, mirror=shell)).axes)
     2
     """
+    from matplotlib.ticker import MaxNLocator
+
     instance(hardware, LoopHardware)
     if hardware.mirror is None:
         raise ProblemError(
@@ -80,7 +83,7 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
         left.set(xlabel="time since the command arrived [ms]", ylabel="position / final position")
         left.set_xlim(0, end_ms)
         left.legend(loc="lower right")
-        count = max(int(np.sum(np.cumsum(taps[::-1])[::-1] > 1e-3)), settled.size) + 1
+        count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN)[-1]) + 1, settled.size)
         index = np.arange(count)
         for shift, name, values, colour in (
             (-0.2, "settled at once", settled, "0.7"),
@@ -89,6 +92,7 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
             heights = np.zeros(count)
             heights[: min(count, values.size)] = values[:count]
             right.bar(index + shift, heights, width=0.4, color=colour, label=name)
-        right.set(xlabel="frames since the command was computed", ylabel="weight in the exposure")
+        right.set(xlabel="frames after the command", ylabel="weight in the exposure")
+        right.xaxis.set_major_locator(MaxNLocator(integer=True))
         right.legend(loc="upper right")
     return figure
