@@ -50,6 +50,17 @@ def test_the_lag_converges_with_the_sampling():
     assert errors[1] / errors[2] == pytest.approx(2, rel=0.05)
 
 
+@pytest.mark.parametrize("changes", [{}, {"ramp_samples": 37, "delay_samples": 0}, SLOW])
+def test_a_step_response_in_blocks_is_that_sample_by_sample(changes):
+    mirror = shell(**changes)
+    loop, step = mirror.closed_loop(), mirror.step_response()
+    state = np.zeros(loop.n_states)
+    for i in range(300):
+        assert step.position[8 * i] == pytest.approx(state[0], abs=1e-12)
+        r = min(1.0, (i + 1) / mirror.ramp_samples)
+        state = loop.A @ state + loop.B[:, 0] * r
+
+
 @pytest.mark.parametrize("damping", [1.2, 3.0, 8.0])
 def test_two_lags_without_feedback_have_taps_in_closed_form(damping):
     """A held force on an overdamped mode: steps of ``1 - (p2 e^-p1 t - p1 e^-p2 t)/(p2 - p1)``."""

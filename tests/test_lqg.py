@@ -407,6 +407,14 @@ def test_commands(tmp_path, capsys):
     assert run(capsys, "sigma", gain, "-o", tmp_path / "s.png")[0] == 0
 
 
+def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
+    from lbt_synth.cli.main import main
+
+    gain = str(tmp_path / "kalman.npz")
+    assert main(["design", str(SLOW_YAML), "--method", "kalman", "-o", gain]) == 0
+    assert "as if the mirror settled at once" in capsys.readouterr().out
+
+
 def test_wrong_commands(tmp_path, capsys):
     settled = ROOT / "examples" / "lbt.yaml"
     gain = tmp_path / "kalman.fits"

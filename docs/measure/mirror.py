@@ -7,6 +7,8 @@ directory as its argument it writes the figures there.
 import sys
 from dataclasses import replace
 
+import numpy as np
+
 import lbt_synth as lbt
 from lbt_synth.plotting import save_figure
 
@@ -87,8 +89,16 @@ def errors() -> None:
     """How wrong the mirror may be: ends of stability, residual with a wrong bandwidth."""
     settled = lbt.kalman(CONFIG.plant)
     edge = stable_to(CONFIG.hardware, settled, 500, 250)
-    settling = lbt.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=edge).step_response().settling_s
-    print(f"kalman, settled: stable down to {edge:.0f} Hz, settling in {1e3 * settling:.2f} ms")
+    mirror = lbt.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=edge)
+    real = replace(CONFIG.hardware, mirror=mirror)
+    poles = lbt.close_loop(real, settled.controller).system.poles
+    fails_hz = abs(np.angle(poles[np.argmax(np.abs(poles))])) * real.frame_rate_hz / (2 * np.pi)
+    there = np.sum(real.mirror_taps * (-1.0) ** np.arange(real.mirror_taps.size))
+    print(
+        f"kalman, settled: stable down to {edge:.0f} Hz, settling in "
+        f"{1e3 * mirror.step_response().settling_s:.2f} ms; fails at {fails_hz:.0f} Hz, where the "
+        f"amplitude of the mirror is {abs(there):.3f}"
+    )
     for believed in (500, 100):
         here = moving(CONFIG.plant, MIRRORS[f"{believed} Hz"])
         design = lbt.lqg(here)

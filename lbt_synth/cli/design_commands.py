@@ -292,6 +292,12 @@ def _description(made: Design) -> Report:
         )
     tables.append(_check_table(made.certificate))
     notes = []
+    moving = made.hardware is not None and made.hardware.mirror is not None
+    if moving and isinstance(made, EstimatorDesign) and not isinstance(made, LqgDesign):
+        notes.append(
+            "note: this filter commands its estimate as if the mirror settled at once, so that its "
+            "estimation error is not the residual; --method lqg commands for the mirror's dynamics."
+        )
     if made.hardware is not None and margins.modulus < _SMALL_MODULUS:
         notes.append(
             f"note: the modulus margin {margins.modulus:.3g} is small; a loop is usually asked for "

@@ -22,9 +22,10 @@ from lbt_synth.statespace import StateSpace
 from lbt_synth.validation import FloatArray, frozen, integer, number
 
 _STABLE = 1 - 1e-9
-_MOST_SAMPLES = 2_000_000
+_MOST_SAMPLES = 500_000
 _POINTS = 8  # of a step response, a sample
 _LONGEST_DELAY = 64  # samples
+_BLOCK = 64  # samples of a step response that are computed at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -292,12 +293,9 @@ class PositionLoop:
             )
         parts = [self._motion(p / _POINTS)[0] for p in range(_POINTS)]
         rows = np.stack(parts) / self.static_gain
-        state, out = np.zeros(loop.n_states), np.empty((samples, _POINTS))
-        for i in range(samples):
-            r = min(1.0, (i + 1) / self.ramp_samples)
-            out[i] = rows[:, :-1] @ state + rows[:, -1] * r
-            state = loop.A @ state + loop.B[:, 0] * r
-        x = out.ravel()
+        r = np.minimum(1.0, np.arange(1, samples + 1) / self.ramp_samples)
+        states = _driven(loop, r)
+        x = (states @ rows[:, :-1].T + r[:, None] * rows[:, -1]).ravel()
         time = np.arange(x.size) / (_POINTS * self.sampling_hz)
         return StepResponse(
             time_s=frozen(time),
@@ -349,6 +347,25 @@ class PositionLoop:
         out = moved[:3, 3:] * acting
         out[:, :2] += moved[:3, :2]
         return np.asarray(out)
+
+
+def _driven(loop: StateSpace, command: FloatArray) -> FloatArray:
+    """States at each sample from rest, (samples, n), many samples at once."""
+    n, blocks = loop.n_states, -(-command.size // _BLOCK)
+    powers = [np.eye(n)]
+    for _ in range(_BLOCK):
+        powers.append(powers[-1] @ loop.A)
+    reached = np.stack([power @ loop.B[:, 0] for power in powers[:-1]])
+    given = np.zeros((blocks, _BLOCK))
+    given.ravel()[: command.size] = command
+    lag = np.arange(_BLOCK + 1)[:, None] - 1 - np.arange(_BLOCK)  # after sample j, of sample i
+    kernel = np.where((lag >= 0)[..., None], reached[np.maximum(lag, 0)], 0.0)
+    inside = np.einsum("bi,jin->bjn", given, kernel)
+    observe, out, state = np.stack(powers), np.empty((blocks, _BLOCK, n)), np.zeros(n)
+    for block in range(blocks):
+        path = observe @ state + inside[block]
+        out[block], state = path[:-1], path[-1]
+    return out.reshape(-1, n)[: command.size]
 
 
 @lru_cache(maxsize=256)
