@@ -10,6 +10,7 @@ from .design import Design as Design
 from .design import EstimatorDesign as EstimatorDesign
 from .design import FilterDesign as FilterDesign
 from .design import IntegratorDesign as IntegratorDesign
+from .design import LqgDesign as LqgDesign
 from .design import PolytopicDesign as PolytopicDesign
 from .design import ShapedDesign as ShapedDesign
 from .design import SolverReport as SolverReport
@@ -18,6 +19,7 @@ from .design import hinf as hinf
 from .design import integrator as integrator
 from .design import integrator_gain_limit as integrator_gain_limit
 from .design import kalman as kalman
+from .design import lqg as lqg
 from .design import mixed as mixed
 from .design import optimal_integrator as optimal_integrator
 from .design import polytopic as polytopic
@@ -26,6 +28,8 @@ from .design import shape as shape
 from .distance import LimitRow as LimitRow
 from .distance import LimitStudy as LimitStudy
 from .distance import limit_study as limit_study
+from .dynamics import MirrorRow as MirrorRow
+from .dynamics import mirror_study as mirror_study
 from .endtoend import Calibration as Calibration
 from .endtoend import EndToEndRun as EndToEndRun
 from .endtoend import EndToEndSetup as EndToEndSetup
@@ -72,6 +76,7 @@ from .loop import close_loop as close_loop
 from .loop import jitter_strehl as jitter_strehl
 from .loop import loop_margins as loop_margins
 from .loop import residual_budget as residual_budget
+from .loop import settling_error as settling_error
 from .loop import stable_sensor_gains as stable_sensor_gains
 from .loop import strehl as strehl
 from .loop import strehl_of_series as strehl_of_series
@@ -85,8 +90,10 @@ from .models import Atmosphere as Atmosphere
 from .models import EstimationProblem as EstimationProblem
 from .models import FullStatePlant as FullStatePlant
 from .models import LoopHardware as LoopHardware
+from .models import PositionLoop as PositionLoop
 from .models import SinusoidalVibration as SinusoidalVibration
 from .models import Spectrum as Spectrum
+from .models import StepResponse as StepResponse
 from .models import TabulatedSpectrum as TabulatedSpectrum
 from .models import TipTiltPlant as TipTiltPlant
 from .models import Truth as Truth
@@ -109,6 +116,7 @@ from .plotting import end_to_end_figure as end_to_end_figure
 from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure
 from .plotting import map_figure as map_figure
+from .plotting import mirror_figure as mirror_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from lbt_synth.design import Design, EstimatorDesign, ShapedDesign
+from lbt_synth.design import Design, EstimatorDesign, LqgDesign, ShapedDesign
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.limits import (
     BandLimit,
@@ -257,15 +257,17 @@ def _limit_or_none(limit: Callable[[], T]) -> T | None:
 def model_distance(design: EstimatorDesign) -> tuple[float, float]:
     """Limit of a filter's own model [nm rms] and how far its error is above it [%].
 
-    nan where the limit cannot be computed; the second also for a fractional delay, where a
-    filter's estimation error is not its residual.
+    nan where the limit cannot be computed; the second also for a fractional delay or a mirror
+    with dynamics, where a filter's estimation error is not its residual (it is that of an LQG).
     """
     plant = design.problem
     if not isinstance(plant, TipTiltPlant | FullStatePlant):
         return float("nan"), float("nan")
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     delay = plant.hardware.delay_frames
-    return limit_nm, above_percent(design.rms, limit_nm) if delay == round(delay) else float("nan")
+    settled = delay == round(delay) and plant.hardware.mirror is None
+    exact = settled or isinstance(design, LqgDesign)
+    return limit_nm, above_percent(design.rms, limit_nm) if exact else float("nan")
 
 
 def shaped_distance(design: ShapedDesign) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from lbt_synth.cli.export_command import export
 from lbt_synth.cli.front_command import tradeoff_command
 from lbt_synth.cli.limits_command import limits
 from lbt_synth.cli.loop_commands import sigma, simulate
+from lbt_synth.cli.mirror_command import mirror
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.paper_command import paper
 from lbt_synth.cli.robustness_command import robustness
@@ -22,6 +23,7 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "e2e-table": end_to_end_table,
     "export": export,
     "limits": limits,
+    "mirror": mirror,
     "paper": paper,
     "robustness": robustness,
     "show": show,

@@ -17,11 +17,13 @@ from lbt_synth.design import (
     EstimatorDesign,
     FilterDesign,
     IntegratorDesign,
+    LqgDesign,
     PolytopicDesign,
     ShapedDesign,
     hinf,
     integrator,
     kalman,
+    lqg,
     mixed,
     optimal_integrator,
     polytopic,
@@ -32,6 +34,7 @@ from lbt_synth.export import frame_cost
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain, require_gain_name, save_gain
 from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
 _SMALL_MODULUS = 0.3
@@ -39,6 +42,7 @@ _ROUTES = {
     "kalman": ("riccati", "sdp"),
     "hinf": ("lmi", "riccati"),
     "mixed": (),
+    "lqg": (),
     "polytopic": (),
     "integrator": (),
     "robust": (),
@@ -51,6 +55,7 @@ _OWNERS = {
     "norm": ("polytopic",),
     "half_width_hz": ("polytopic",),
     "gain": ("integrator",),
+    "command_weight": ("lqg",),
 }
 
 
@@ -90,7 +95,7 @@ def _refuse_foreign_options(arguments: Namespace) -> None:
             "--method polytopic needs the half width of the interval of frequencies; try "
             "--half-width-hz 1."
         )
-    if method in ("integrator", "robust") and arguments.horizon != 1:
+    if method in ("integrator", "robust", "lqg") and arguments.horizon != 1:
         raise ProblemError(
             f"--method {method} takes no horizon; set loop.delay_frames in the configuration "
             f"instead. Got --horizon {arguments.horizon}."
@@ -106,6 +111,11 @@ def _synthesise(config: Config, arguments: Namespace) -> Design:
         return optimal_integrator(config.hardware, config.truth)
     if arguments.method == "robust":
         return robust_design(config)
+    if arguments.method == "lqg":
+        weight = arguments.command_weight
+        if weight is None:
+            weight = config.settings.design.command_weight
+        return lqg(config.plant, command_weight=weight)
     if arguments.method == "polytopic":
         return polytopic(
             config.plant,
@@ -198,16 +208,17 @@ def _description(made: Design) -> Report:
     }
     unit = "nm" if made.hardware is not None else ""
     if isinstance(made, EstimatorDesign):
+        error = "residual" if isinstance(made, LqgDesign) else "estimation error"
         facts += [
-            ("estimation error, rms", made.rms, unit),
-            ("estimation error, H-infinity norm", made.gamma, unit),
+            (f"{error}, rms", made.rms, unit),
+            (f"{error}, H-infinity norm", made.gamma, unit),
         ]
         data |= {"rms": made.rms, "gamma": made.gamma}
         if made.hardware is not None:
             limit_nm, above = model_distance(made)
             facts += [
                 ("least residual of any linear controller", limit_nm, unit),
-                ("estimation error above it", round(above, 6), "%"),
+                (f"{error} above it", round(above, 6), "%"),
             ]
             data |= {"limit_nm": limit_nm, "above_limit_percent": above}
     if isinstance(made, PolytopicDesign):
@@ -228,6 +239,9 @@ def _description(made: Design) -> Report:
                 ("least norm of any filter, upper bound", f"{made.gamma_least:.9g}", unit),
                 ("least norm of any filter, lower bound", _digits(made.gamma_infeasible), unit),
             ]
+    if isinstance(made, LqgDesign):
+        facts.append(("weight of the command", made.command_weight, ""))
+        data["command_weight"] = made.command_weight
     if isinstance(made, IntegratorDesign):
         facts.append(("gain", made.gain, ""))
         data["gain"] = made.gain
@@ -263,6 +277,7 @@ def _description(made: Design) -> Report:
         facts += [
             ("frame rate", made.hardware.frame_rate_hz, "Hz"),
             ("total delay", made.hardware.delay_frames, "frames"),
+            *_mirror_facts(made.hardware, data),
             ("modulus margin", margins.modulus, ""),
             ("stable sensor gains, from", margins.gain_low, ""),
             ("stable sensor gains, to", margins.gain_high, ""),
@@ -288,6 +303,12 @@ def _description(made: Design) -> Report:
         )
     tables.append(_check_table(made.certificate))
     notes = []
+    moving = made.hardware is not None and made.hardware.mirror is not None
+    if moving and isinstance(made, EstimatorDesign) and not isinstance(made, LqgDesign):
+        notes.append(
+            "note: this filter commands its estimate as if the mirror settled at once, so that its "
+            "estimation error is not the residual; --method lqg commands for the mirror's dynamics."
+        )
     if made.hardware is not None and margins.modulus < _SMALL_MODULUS:
         notes.append(
             f"note: the modulus margin {margins.modulus:.3g} is small; a loop is usually asked for "
@@ -309,6 +330,15 @@ def _description(made: Design) -> Report:
             "commands grow. Reset it whenever the loop opens."
         )
     return Report(data=data, tables=tables, notes=notes)
+
+
+def _mirror_facts(hardware: LoopHardware, data: dict[str, Any]) -> list[tuple[str, Any, str]]:
+    """Say what a design believes of the mirror, if it does not settle at once."""
+    if hardware.mirror is None:
+        return []
+    settling_s = hardware.mirror.step_response().settling_s
+    data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
+    return [("settling time of the mirror, to 10 %", 1e3 * settling_s, "ms")]
 
 
 def _describe_interval(

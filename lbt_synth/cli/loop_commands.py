@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
 from lbt_synth.limits import least_residual
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
-from lbt_synth.models import Truth
+from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.plotting import require_figure_name, save_figure, sigma_figure, simulation_figure
 from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
@@ -90,7 +90,7 @@ def simulate(arguments: Namespace) -> Report:
         return int(getattr(settings, name) if given is None else given)
 
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
-    _require_fitting_delay(loop, design)
+    _require_fitting_loop(loop, design)
     budget = residual_budget(loop, truth)
     # the same settling for all controllers, so that one seed is one weather
     settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
@@ -163,10 +163,19 @@ def simulate(arguments: Namespace) -> Report:
     return report
 
 
-def _require_fitting_delay(loop: ClosedLoop, design: Design) -> None:
-    """Refuse an unstable loop of another delay than the file's, naming both."""
+def _require_fitting_loop(loop: ClosedLoop, design: Design) -> None:
+    """Refuse an unstable loop of another delay or mirror than the file's, saying so."""
     own, here = design.hardware, loop.hardware
-    if loop.is_stable or own is None or own.delay_frames == here.delay_frames:
+    if loop.is_stable or own is None:
+        return
+    if not same_mirror(own, here):
+        raise UnstableLoopError(
+            "the closed loop is unstable: the file was designed for another mirror than that of "
+            "the configuration. Design for mirror.local_loop of the configuration, best with "
+            "--method lqg.",
+            spectral_radius=loop.spectral_radius,
+        )
+    if own.delay_frames == here.delay_frames:
         return
     raise UnstableLoopError(
         f"the closed loop is unstable: the file was designed for a delay of {own.delay_frames:g} "
@@ -202,7 +211,24 @@ def foreign_notes(config: Config, design: Design) -> list[str]:
         np.array_equal(own.sensor, here.sensor) and np.array_equal(own.influence, here.influence)
     ):
         notes.append("note: designed for another sensor or influence matrix than it is run with.")
+    if own is not None and not same_mirror(own, here):
+        kinds = [
+            "a mirror that settles at once" if h.mirror is None else "a mirror with dynamics"
+            for h in (own, here)
+        ]
+        notes.append(
+            f"note: designed for {kinds[0]}, run with {kinds[1]}."
+            if kinds[0] != kinds[1]
+            else "note: designed for other dynamics of the mirror than it is run with."
+        )
     return notes
+
+
+def same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
+    """Whether two loops have the same dynamics of the mirror."""
+    if one.mirror is None or other.mirror is None:
+        return one.mirror is other.mirror
+    return astuple(one.mirror) == astuple(other.mirror)
 
 
 def real_truth(config: Config, arguments: Namespace) -> Truth:

@@ -42,7 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
     design.add_argument("config", help=config_help)
     design.add_argument(
         "--method",
-        choices=("kalman", "hinf", "mixed", "robust", "polytopic", "integrator"),
+        choices=("kalman", "hinf", "mixed", "lqg", "robust", "polytopic", "integrator"),
         required=True,
     )
     design.add_argument(
@@ -78,6 +78,12 @@ def build_parser() -> argparse.ArgumentParser:
         "--half-width-hz",
         type=float,
         help="polytopic: half width of the interval of vibration frequencies [Hz]",
+    )
+    design.add_argument(
+        "--command-weight",
+        type=float,
+        help="lqg: weight of the squared command beside the squared residual (default: the "
+        "configuration's, else 0)",
     )
     design.add_argument(
         "--horizon",
@@ -265,6 +271,24 @@ def build_parser() -> argparse.ArgumentParser:
     )
     table.add_argument(
         "--tables", nargs="+", choices=("II", "III"), default=["II", "III"], help="default both"
+    )
+
+    mirror = command(
+        "mirror", "The mirror's local loop: its step, and what ignoring its dynamics costs"
+    )
+    mirror.add_argument("config", help=config_help)
+    mirror.add_argument(
+        "--tolerance",
+        type=float,
+        default=0.1,
+        help="half width of the band in which the mirror counts as settled (default 0.1)",
+    )
+    mirror.add_argument(
+        "-o",
+        "--output",
+        action="append",
+        default=[],
+        help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
     )
 
     paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")

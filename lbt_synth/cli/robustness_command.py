@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.loop_commands import named_designs, real_truth
+from lbt_synth.cli.loop_commands import named_designs, real_truth, same_mirror
 from lbt_synth.cli.output import Report, TableText, counting, fixed, progress
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
@@ -267,6 +267,11 @@ def _map_notes(
             notes.append(
                 f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
                 f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
+            )
+        if not same_mirror(own, config.hardware):
+            notes.append(
+                f"note: {name} was designed for another mirror than the configuration's, and its "
+                "map is that of its own."
             )
     return notes
 

@@ -14,7 +14,13 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from lbt_synth.config.end_to_end import end_to_end_setup
-from lbt_synth.config.schema import BandSection, FileSection, TrueVibrationSection, VibrationSection
+from lbt_synth.config.schema import (
+    BandSection,
+    FileSection,
+    LocalLoopSection,
+    TrueVibrationSection,
+    VibrationSection,
+)
 from lbt_synth.endtoend import EndToEndSetup
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.loop import Imaging
@@ -22,6 +28,7 @@ from lbt_synth.models import (
     ARModel,
     Atmosphere,
     LoopHardware,
+    PositionLoop,
     SinusoidalVibration,
     Spectrum,
     TipTiltPlant,
@@ -285,7 +292,21 @@ def _plant(settings: FileSection, atmosphere: Atmosphere, noise_nm: float) -> Ti
         sensor_matrix=settings.sensor.matrix,
         influence_matrix=settings.mirror.influence_matrix,
         sensor_gain=model.sensor_gain,
+        mirror=_mirror(settings.mirror.local_loop),
     )
+
+
+def _mirror(section: LocalLoopSection | None) -> PositionLoop | None:
+    """Return the mirror's local loop, None for a mirror that settles at once."""
+    if section is None:
+        return None
+    given: dict[str, Any] = {k: v for k, v in section.model_dump().items() if v is not None}
+    make = PositionLoop if section.bandwidth_hz is None else PositionLoop.of_bandwidth
+    try:
+        return make(**given)
+    except ProblemError as error:
+        key = "mirror.local_loop"
+        raise ConfigError(f"{key}: {error}", path=key) from error
 
 
 def _spread(

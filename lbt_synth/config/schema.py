@@ -57,11 +57,39 @@ class SensorSection(_Section):
         return self
 
 
+class LocalLoopSection(_Section):
+    """The mirror's local position loop: its gains, or the frequency and damping they make."""
+
+    natural_frequency_hz: Positive
+    damping: Annotated[float, Field(ge=0)]
+    bandwidth_hz: Positive | None = None
+    bandwidth_damping: Positive | None = None
+    proportional_per_s2: Annotated[float, Field(ge=0)] | None = None
+    derivative_per_s: Annotated[float, Field(ge=0)] | None = None
+    feed_forward: Annotated[float, Field(ge=0)] = 1.0
+    sampling_hz: Positive = 72_000.0
+    delay_samples: Annotated[int, Field(ge=0)] = 1
+    ramp_samples: Annotated[int, Field(ge=1)] = 1
+
+    @model_validator(mode="after")
+    def _one_kind_of_gains(self) -> LocalLoopSection:
+        gains = (self.proportional_per_s2 is not None, self.derivative_per_s is not None)
+        if gains[0] != gains[1] or gains[0] == (self.bandwidth_hz is not None):
+            raise ValueError(
+                "expected either bandwidth_hz (and bandwidth_damping), or both of "
+                "proportional_per_s2 and derivative_per_s"
+            )
+        if self.bandwidth_damping is not None and self.bandwidth_hz is None:
+            raise ValueError("bandwidth_damping goes with bandwidth_hz, and only with it")
+        return self
+
+
 class MirrorSection(_Section):
     """Deformable mirror; ``modes`` counts those that an end-to-end simulation controls."""
 
     modes: Annotated[int, Field(ge=1)] | None = None
     influence_matrix: list[list[float]] | None = None
+    local_loop: LocalLoopSection | None = None
 
 
 class LoopSection(_Section):
@@ -216,6 +244,7 @@ class DesignSection(_Section):
     """Defaults of the synthesis."""
 
     gamma_ratio: Annotated[float, Field(ge=1)] = 1.2
+    command_weight: Annotated[float, Field(ge=0)] = 0.0
     robust: RobustSection | None = None
 
 

@@ -4,6 +4,8 @@ from lbt_synth.design.central import central
 from lbt_synth.design.hinf import hinf
 from lbt_synth.design.integrator import integrator, integrator_gain_limit, optimal_integrator
 from lbt_synth.design.kalman import kalman
+from lbt_synth.design.lqg import lqg
+from lbt_synth.design.lqg_result import LqgDesign
 from lbt_synth.design.mixed import mixed
 from lbt_synth.design.polytopic import PolytopicDesign, polytopic
 from lbt_synth.design.result import (
@@ -22,6 +24,7 @@ __all__ = [
     "EstimatorDesign",
     "FilterDesign",
     "IntegratorDesign",
+    "LqgDesign",
     "PolytopicDesign",
     "ShapedDesign",
     "SolverReport",
@@ -30,6 +33,7 @@ __all__ = [
     "integrator",
     "integrator_gain_limit",
     "kalman",
+    "lqg",
     "mixed",
     "optimal_integrator",
     "polytopic",

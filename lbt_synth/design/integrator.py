@@ -98,6 +98,23 @@ def integrator_gain_limit(delay_frames: float) -> float:
     return start * stable_sensor_gains(hardware, _controller(hardware, start))[1]
 
 
+def _gain_limit(hardware: LoopHardware) -> float:
+    """Gain at which an integrator becomes unstable, whatever the mirror."""
+    if hardware.mirror is None:
+        return integrator_gain_limit(hardware.delay_frames)
+    single = LoopHardware(
+        frame_rate_hz=hardware.frame_rate_hz,
+        delay_frames=hardware.delay_frames,
+        modes=1,
+        mirror=hardware.mirror,
+    )
+    taps = single.mirror_taps
+    start = 0.5 / (1 + float(np.abs(np.arange(taps.size) @ taps)))  # over the mean delay
+    while not close_loop(single, _controller(single, start)).is_stable:
+        start /= 2
+    return start * stable_sensor_gains(single, _controller(single, start))[1]
+
+
 def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign:
     """Integrator whose gain leaves the least residual for a given truth.
 
@@ -129,7 +146,7 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     >>> 0.2 < design.gain < 0.6
     True
     """
-    limit = integrator_gain_limit(hardware.delay_frames) / max(1.0, truth.sensor_gain)
+    limit = _gain_limit(hardware) / max(1.0, truth.sensor_gain)
 
     def variance(log_gain: float) -> float:
         controller = _controller(hardware, float(np.exp(log_gain)))

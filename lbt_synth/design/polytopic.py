@@ -312,6 +312,7 @@ def _axes(plant: TipTiltPlant) -> list[TipTiltPlant]:
                 noise_nm=plant.R[i : i + 1, i : i + 1],
                 delay_frames=hw.delay_frames,
                 sensor_matrix=hw.sensor[i : i + 1, i : i + 1],
+                mirror=hw.mirror,
             )
         )
     return axes
@@ -340,6 +341,7 @@ def _expected(plant: TipTiltPlant, half_width_hz: float, norm: str) -> tuple[Flo
             delay_frames=hw.delay_frames,
             sensor_matrix=hw.sensor,
             influence_matrix=hw.influence,
+            mirror=hw.mirror,
         )
     solution = kalman_riccati(plant)
     return solution.P, error_size(plant.error_system(solution.gain_predictor), norm)

@@ -53,7 +53,8 @@ class Design:
     Attributes
     ----------
     method : str
-        "kalman", "hinf", "mixed", "polytopic-hinf", "polytopic-h2" or "integrator".
+        "kalman", "hinf", "mixed", "lqg", "polytopic-hinf", "polytopic-h2", "shaped" or
+        "integrator".
     controller : Controller
         From y(k) to u(k), the known input included (new-state form).
     certificate : Certificate

@@ -103,7 +103,7 @@ def shape(
     tolerance = number(loss, "loss", at_least=0)
     require_separable(hardware)
     single = mode_hardware(hardware)
-    stored = len(single.mirror_taps) - 1
+    stored = single.mirror_system.whole.n_states
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
     for spec in specifications:
         spec.require_fitting(hardware.frame_rate_hz)

@@ -10,7 +10,7 @@ from typing import Any
 from lbt_synth.endtoend.result import EndToEndRun
 from lbt_synth.endtoend.setup import EndToEndSetup
 from lbt_synth.endtoend.system import EndToEndSystem
-from lbt_synth.models import LoopHardware, SinusoidalVibration, Vibration
+from lbt_synth.models import LoopHardware, PositionLoop, SinusoidalVibration, Vibration
 from lbt_synth.statespace import Controller
 
 _SETUP = ("frames", "settle_frames", "seed", "gain", "leak", "leak_from_mode")
@@ -56,6 +56,7 @@ def case_of(
         "hardware": {
             "frame_rate_hz": hardware.frame_rate_hz,
             "delay_frames": hardware.delay_frames,
+            "mirror": None if hardware.mirror is None else asdict(hardware.mirror),
         },
         "setup": {**{name: getattr(setup, name) for name in _SETUP}, "seed": seed},
         "vibrations": [asdict(line) for line in vibrations],
@@ -89,7 +90,7 @@ def run_case(
     LbtSynthError
         As :func:`run_end_to_end`.
     """
-    system = EndToEndSystem(hardware=LoopHardware(**case["hardware"]), **case["system"])
+    system = EndToEndSystem(hardware=_hardware(case["hardware"]), **case["system"])
     lines = tuple(_vibration(line) for line in case["vibrations"])
     setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
     matrices = case["controller"]
@@ -126,6 +127,11 @@ def summary(run: EndToEndRun) -> dict[str, Any]:
         "tip_tilt_gain_error": run.tip_tilt_gain_error,
         "tip_tilt_noise_nm": run.tip_tilt_noise_nm,
     }
+
+
+def _hardware(path: Mapping[str, Any]) -> LoopHardware:
+    mirror = path["mirror"]
+    return LoopHardware(**{**path, "mirror": None if mirror is None else PositionLoop(**mirror)})
 
 
 def _vibration(line: Mapping[str, Any]) -> Vibration | SinusoidalVibration:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from lbt_synth.design import (
     EstimatorDesign,
     FilterDesign,
     IntegratorDesign,
+    LqgDesign,
     PolytopicDesign,
     ShapedDesign,
     SolverReport,
@@ -23,6 +25,7 @@ from lbt_synth.models import (
     EstimationProblem,
     FullStatePlant,
     LoopHardware,
+    PositionLoop,
     TipTiltPlant,
     Vibration,
 )
@@ -34,7 +37,8 @@ from lbt_synth.witness import Witness
 
 CONVENTION = (
     "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
-    "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1). "
+    "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1), or the "
+    "mirror's exposure-averaged answer to these commands where META holds a mirror. "
     "GAIN_PREDICTOR: x(k+1|k) = A x(k|k-1) + G (y - C x(k|k-1)); "
     "GAIN_FILTER: x(k|k) = x(k|k-1) + G (y - C x(k|k-1)); A, B, C, D, L of the plant in PLANT_*."
 )
@@ -69,6 +73,8 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
         arrays |= {"SENSOR": design.hardware.sensor, "INFLUENCE": design.hardware.influence}
         meta["frame_rate_hz"] = design.hardware.frame_rate_hz
         meta["delay_frames"] = design.hardware.delay_frames
+        if design.hardware.mirror is not None:
+            meta["mirror"] = asdict(design.hardware.mirror)
         meta["units"] = {
             "commands": "nm rms wavefront where INFLUENCE is the identity",
             "measurements": "nm rms wavefront where SENSOR is the identity",
@@ -101,6 +107,14 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
         meta["interval"] = {
             name: getattr(design, name) for name in ("half_width_hz", "norm", *_SIZES)
         }
+    if isinstance(design, LqgDesign):
+        arrays |= {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_STATE": design.gain_state}
+        if design.gain_mirror.size:
+            arrays["GAIN_MIRROR"] = design.gain_mirror[None]
+        meta["lqg"] = {
+            "command_weight": design.command_weight,
+            "objective_nm": design.objective_nm,
+        }
     if isinstance(design, EstimatorDesign):
         _pack_problem(design.problem, arrays, meta)
     return arrays, meta
@@ -123,6 +137,8 @@ def from_record(arrays: Arrays, meta: Meta) -> Design:
     problem = _unpack_problem(arrays, meta)
     if "interval" in meta:
         return _unpack_polytopic(common, problem, arrays, meta["interval"])
+    if "lqg" in meta:
+        return _unpack_lqg(common, problem, arrays, meta["lqg"])
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
     for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
         if arrays[name].shape != rows_cols:
@@ -201,6 +217,32 @@ def _unpack_polytopic(
     return design
 
 
+def _unpack_lqg(
+    common: dict[str, Any], problem: EstimationProblem, arrays: Arrays, lqg: Meta
+) -> LqgDesign:
+    if not isinstance(problem, TipTiltPlant):
+        raise TypeError("a design that knows the mirror needs a plant")
+    design = LqgDesign(
+        **common,
+        problem=problem,
+        gain_predictor=arrays["GAIN_PREDICTOR"],
+        gain_state=arrays["GAIN_STATE"],
+        gain_mirror=frozen(np.ravel(arrays.get("GAIN_MIRROR", []))),
+        command_weight=number(lqg["command_weight"], "command_weight", at_least=0),
+        objective_nm=number(lqg["objective_nm"], "objective_nm", at_least=0),
+    )
+    estimation, mirror = design.estimation, problem.hardware.mirror_system.core
+    shapes = {
+        "GAIN_PREDICTOR": (design.gain_predictor.shape, estimation.C.T.shape),
+        "GAIN_STATE": (design.gain_state.shape, estimation.L.shape),
+        "GAIN_MIRROR": (design.gain_mirror.shape, (mirror.n_states,)),
+    }
+    for name, (found, expected) in shapes.items():
+        if found != expected:
+            raise ValueError(f"{name} must be {expected} to match the plant and the mirror")
+    return design
+
+
 def _pack_problem(problem: EstimationProblem, arrays: Arrays, meta: Meta) -> None:
     for name in "ABCDL":
         arrays[f"PLANT_{name}"] = getattr(problem, name)
@@ -251,6 +293,7 @@ def _unpack_hardware(arrays: Arrays, meta: Meta) -> LoopHardware:
         delay_frames=meta["delay_frames"],
         sensor_matrix=arrays["SENSOR"],
         influence_matrix=arrays["INFLUENCE"],
+        mirror=PositionLoop(**meta["mirror"]) if "mirror" in meta else None,
     )
 
 

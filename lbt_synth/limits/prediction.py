@@ -3,8 +3,9 @@
 With the measured spectrum ``Phi = S + R = |F|^2``, F outer, and the path ``z^-1 M`` from a
 filter's output to the residual written as an inner factor times an outer one, the least
 variance is that of the part of F which the inner factor makes unreachable, less R. The
-inner factor is ``z^-whole``, and for a fraction of a frame above one half also an all-pass
-factor with one zero; the unreachable part has as many coefficients as these have zeros.
+inner factor is ``z^-whole`` times an all-pass factor with the mirror's zeros outside the unit
+circle: one for a settled mirror and a fraction of a frame above one half, one or two for a
+mirror that moves slowly. The unreachable part has as many coefficients as these have zeros.
 All that is needed of F are integrals of ``log Phi`` times smooth weights.
 """
 
@@ -14,10 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.errors import ProblemError
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _FEW_DIGITS = 1e-2  # a quotient by less than this would lose more than two digits
+_REAL = 1e-7  # relative imaginary part of what counts as a real zero
+_ALIKE = 1e9  # condition of the zeros' Gram matrix beyond which they cannot be told apart
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,43 +32,71 @@ class Reach:
     ----------
     whole : int
         Frames of pure delay from the measured sample to the one that is corrected.
-    zero : float
-        Zero of the all-pass factor in the backward shift, in (-1, 0); 0 where there is none.
+    zeros : tuple of float
+        Zeros of the all-pass factor in the backward shift, in (-1, 1).
     terms : int
         Cosine integrals that are needed, the mean included.
     """
 
     whole: int
-    zero: float
+    zeros: tuple[float, ...]
     terms: int
 
     @staticmethod
     def of(hardware: LoopHardware) -> Reach:
-        """Inner factor of a loop's path."""
-        taps = hardware.mirror_taps
-        fraction = float(taps[-1]) if taps.size > 1 and taps[-2] > 0 else 0.0
-        whole = taps.size - (1 if fraction > 0 else 0)
-        if fraction <= 0.5:  # (1 - f) + f z^-1 has a stable inverse, at one half in the limit
-            return Reach(whole=whole, zero=0.0, terms=whole)
-        zero = -(1 - fraction) / fraction
-        if abs(zero) ** whole > _FEW_DIGITS:
-            return Reach(whole=whole, zero=zero, terms=whole)
-        # the quotient (F - f_0 - ...) / zero^whole as a series
-        more = int(np.ceil(np.log(1e-17) / np.log(max(abs(zero), 1e-300))))
-        return Reach(whole=whole, zero=zero, terms=whole + 1 + more)
+        """Inner factor of a loop's path.
+
+        Raises
+        ------
+        ProblemError
+            If the mirror has zeros outside the unit circle that are complex, or all but alike.
+        """
+        mirror = hardware.mirror_system
+        found = mirror.core.zeros
+        late = found[np.abs(found) > 1]  # on the circle: a stable inverse, in the limit
+        whole = mirror.lead + 1
+        if np.any(np.abs(late.imag) > _REAL * np.abs(late)):
+            raise ProblemError(
+                "the limit of a mirror is known for real zeros outside the unit circle; got "
+                f"complex ones at {late[np.argmax(np.abs(late.imag))]:.6g}. Try another delay "
+                "or frame rate, or the residual of lqg."
+            )
+        zeros = tuple(sorted(float(a) for a in 1 / late.real))
+        if len(zeros) > 1 and np.linalg.cond(_gram(zeros)) > _ALIKE:
+            raise ProblemError(
+                "the limit of a mirror needs zeros outside the unit circle that differ; got "
+                f"{', '.join(f'{1 / a:.9g}' for a in zeros)}. Try another delay or frame rate."
+            )
+        # for small zeros, the quotient (F - f_0 - ...) / zero^whole is summed as a series
+        small = [abs(a) for a in zeros if abs(a) ** whole <= _FEW_DIGITS]
+        if not small:
+            return Reach(whole=whole, zeros=zeros, terms=whole)
+        more = int(np.ceil(np.log(1e-17) / np.log(max(*small, 1e-300))))
+        return Reach(whole=whole, zeros=zeros, terms=whole + 1 + more)
 
     @property
     def by_series(self) -> bool:
-        """Whether the value at the zero is summed from its series."""
+        """Whether the value at a zero is summed from its series."""
         return self.terms > self.whole
+
+    @property
+    def by_weight(self) -> tuple[float, ...]:
+        """Zeros at which the value is an integral with a weight of its own."""
+        return tuple(a for a in self.zeros if abs(a) ** self.whole > _FEW_DIGITS)
 
     def weights(self, x: FloatArray) -> FloatArray:
         """Weights (f, k) of the logarithm at frequencies x, in units of Nyquist."""
         columns = [np.cos(np.pi * n * x) for n in range(self.terms)]
-        if self.zero != 0 and not self.by_series:
-            shifted = self.zero * np.exp(-1j * np.pi * x)
+        for a in self.by_weight:
+            shifted = a * np.exp(-1j * np.pi * x)
             columns.append(np.real(shifted / (1 - shifted)))
         return np.stack(columns, axis=-1)
+
+
+def _gram(zeros: tuple[float, ...]) -> FloatArray:
+    """Inner products of the kernels ``1 / (1 - a z^-1)``."""
+    a = np.array(zeros)
+    return np.asarray(1 / (1 - np.outer(a, a)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,35 +111,43 @@ class Prediction:
         Mean of ``log(Phi / reference)``.
     coefficients : (whole,) ndarray
         ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``.
-    tail : float
-        Value at the zero of the all-pass factor of what follows them.
+    tails : (zeros,) ndarray
+        Values at the zeros of the all-pass factor of what follows them.
     """
 
     reach: Reach
     mean_log: float
     coefficients: FloatArray
-    tail: float
+    tails: FloatArray
 
     @staticmethod
     def of(reach: Reach, moments: FloatArray) -> Prediction:
         """From the integrals of the logarithm times the weights of a reach."""
+        polynomial = np.polynomial.polynomial.polyval
         f = _exponential(moments[: reach.terms])
-        a, whole = reach.zero, reach.whole
-        tail = 0.0
-        if a != 0 and reach.by_series:
-            tail = float(np.polynomial.polynomial.polyval(a, f[whole:]))
-        elif a != 0:
-            known = float(np.polynomial.polynomial.polyval(a, f[:whole]))
-            tail = (float(np.exp(moments[-1])) - known) / a**whole
+        whole, tails = reach.whole, np.zeros(len(reach.zeros))
+        for i, a in enumerate(reach.zeros):
+            if a in reach.by_weight:
+                value = float(np.exp(moments[reach.terms + reach.by_weight.index(a)]))
+                tails[i] = (value - float(polynomial(a, f[:whole]))) / a**whole
+            else:
+                tails[i] = float(polynomial(a, f[whole:]))
         return Prediction(
-            reach=reach, mean_log=float(moments[0]), coefficients=f[:whole], tail=tail
+            reach=reach, mean_log=float(moments[0]), coefficients=f[:whole], tails=tails
         )
+
+    @property
+    def _kernels(self) -> FloatArray:
+        """Weights of the kernels ``1 / (1 - a z^-1)`` that the unreachable part is made of."""
+        if not self.reach.zeros:
+            return np.zeros(0)
+        return np.asarray(np.linalg.solve(_gram(self.reach.zeros), self.tails))
 
     @property
     def later_power(self) -> float:
         """Sum of squares of all unreachable coefficients but the first, over sigma^2."""
         later = float(np.sum(self.coefficients[1:] ** 2))
-        return later + (1 - self.reach.zero**2) * self.tail**2
+        return later + max(float(self.tails @ self._kernels), 0.0)
 
     def variance(self, reference: float, noise: float) -> float:
         """Least variance of the residual; the reference is the noise unless that is zero."""
@@ -122,9 +162,8 @@ class Prediction:
         part: ComplexArray = np.asarray(
             np.polynomial.polynomial.polyval(shift, self.coefficients), dtype=np.complex128
         )
-        a = self.reach.zero
-        if a != 0:
-            part = part + self.tail * (1 - a**2) * shift**self.reach.whole / (1 - a * shift)
+        for a, weight in zip(self.reach.zeros, self._kernels, strict=True):
+            part = part + weight * shift**self.reach.whole / (1 - a * shift)
         return np.asarray(np.abs(part) ** 2)
 
 

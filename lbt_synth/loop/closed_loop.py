@@ -182,7 +182,7 @@ def spectral_radii(
 def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:
     """Parts of the loop, each affine in the sensor gain g: ``A = A0 + g A1``, ``C = C0 + g C1``.
 
-    State: controller, past commands u(k-1) ... u(k-I), last residual phi_res(k-1).
+    State: controller, mirror (its past commands, if it settles), last residual phi_res(k-1).
     """
     k = controller.to_statespace()
     n, m, q = hardware.modes, hardware.n_commands, hardware.n_measurements
@@ -196,33 +196,28 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
             f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
             f"designed for {1 / k.dt_s:.6g} Hz. Design it for this frame rate."
         )
-    taps = hardware.mirror_taps
-    past = len(taps) - 1
-    states = k.n_states + past * m + n
-    x = slice(0, k.n_states)
-    u = slice(k.n_states, k.n_states + past * m)
+    mirror, each = hardware.mirror_system.whole, np.eye(m)
+    states = k.n_states + mirror.n_states * m + n
+    x, u = slice(0, k.n_states), slice(k.n_states, states - n)
     r = slice(states - n, states)
-    mirror = hardware.influence
+    entry, direct = np.kron(mirror.B[:, None], each), mirror.D * hardware.influence
 
     measured = np.zeros((q, states))  # y = g measured x + noise
     measured[:, r] = hardware.sensor
     command0 = np.zeros((m, states))  # u = (command0 + g command1) x + D noise
     command0[:, x] = k.C
     command1 = k.D @ measured
-    residual0 = -taps[0] * mirror @ command0  # phi_res = (...) x + phi_tot - tap D noise
-    for i in range(past):
-        residual0[:, u.start + i * m : u.start + (i + 1) * m] -= taps[i + 1] * mirror
-    residual1 = -taps[0] * mirror @ command1
+    residual0 = -direct @ command0  # phi_res = (...) x + phi_tot - direct D noise
+    residual0[:, u] -= hardware.influence @ np.kron(mirror.C, each)
+    residual1 = -direct @ command1
 
     A0, A1 = np.zeros((states, states)), np.zeros((states, states))
     B = np.zeros((states, n + q))
     A0[x, x], A1[x], B[x, n:] = k.A, k.B @ measured, k.B
-    if past:
-        first = slice(u.start, u.start + m)
-        A0[first], A1[first], B[first, n:] = command0, command1, k.D
-        A0[u.start + m : u.stop, u.start : u.stop - m] = np.eye((past - 1) * m)
+    A0[u], A1[u], B[u, n:] = entry @ command0, entry @ command1, entry @ k.D
+    A0[u, u] += np.kron(mirror.A, each)
     A0[r], A1[r] = residual0, residual1
-    B[r, :n], B[r, n:] = np.eye(n), -taps[0] * mirror @ k.D
+    B[r, :n], B[r, n:] = np.eye(n), -direct @ k.D
     C0 = np.vstack([residual0, command0, np.zeros((q, states))])
     C1 = np.vstack([residual1, command1, measured])
     D = np.zeros((n + m + q, n + q))

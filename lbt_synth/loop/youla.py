@@ -5,6 +5,8 @@ be without any correction is known to the controller::
 
     ybar(k) = y(k) + sensor_matrix influence_matrix (c[0] u(k-1) + c[1] u(k-2) + ...)
 
+with the mirror's taps c, or the same by the states of its dynamics.
+
 Every controller that stabilises the loop is a stable filter from ybar to u, and the closed
 loop is affine in that filter (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom.
 Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223).
@@ -32,7 +34,7 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
     Returns
     -------
     Controller
-        In new-state form, with the past commands as further states.
+        In new-state form, with the mirror (its past commands, if it settles) as further states.
 
     Raises
     ------
@@ -55,30 +57,32 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
             f"{parameter.B.shape[1]} to {len(parameter.C)}."
         )
     A, B, C, D = parameter.A, parameter.B, parameter.C, parameter.D
-    n, taps = len(A), hardware.mirror_taps
-    response = hardware.sensor @ hardware.influence
-    # without feedthrough the newest past command is read from the state: u(k-1) = C x(k)
-    strict = not np.any(D)
-    stored = len(taps) - 1 if strict else len(taps)
-    size = n + stored * m
-    past = np.zeros((len(taps) * m, size))  # u(k-1), u(k-2), ... from the state
-    if strict:
-        past[:m, :n] = C
-        past[m:, n:] = np.eye(stored * m)
+    mirror, each, n = hardware.mirror_system.whole, np.eye(m), len(A)
+    # without feedthrough the last command is read from the state: u(k-1) = C x(k)
+    stored = m if np.any(D) else 0
+    size = n + stored + mirror.n_states * m
+    last = np.zeros((m, size))  # u(k-1) from the state [x, u(k-1) if stored, mirror]
+    if stored:
+        last[:, n : n + m] = each
     else:
-        past[:, n:] = np.eye(stored * m)
-    believed = np.hstack([tap * response for tap in taps]) @ past  # ybar = y + believed s
+        last[:, :n] = C
+    seen = mirror.D * last
+    seen[:, n + stored :] += np.kron(mirror.C, each)
+    believed = hardware.sensor @ hardware.influence @ seen  # ybar = y + believed s
+    moved = np.kron(mirror.B[:, None], each) @ last
+    moved[:, n + stored :] += np.kron(mirror.A, each)
     new_state = np.hstack([A, np.zeros((n, size - n))]) + B @ believed
-    command = C @ new_state + D @ believed
-    entry = np.vstack([B, np.zeros((size - n, q))])
-    older = past[: stored * m] if strict else np.vstack([command, past[: (stored - 1) * m]])
-    read = np.hstack([C, np.zeros((m, size - n))])
-    if not strict:
+    rows, entry = [new_state], np.zeros((size, q))
+    entry[:n] = B
+    read = np.zeros((m, size))
+    if stored:
+        rows.append(C @ new_state + D @ believed)
         entry[n : n + m] = C @ B + D
-        read = np.zeros((m, size))
-        read[:, n : n + m] = np.eye(m)
+        read[:, n : n + m] = each
+    else:
+        read[:, :n] = C
     return Controller(
-        A=np.vstack([new_state, older]),
+        A=np.vstack([*rows, moved]),
         B=entry,
         C=read,
         D=np.zeros((m, q)),

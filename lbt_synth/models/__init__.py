@@ -4,6 +4,7 @@ from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.local_loop import PositionLoop, StepResponse
 from lbt_synth.models.plant import TipTiltPlant, retuned_plant, tip_tilt_plant
 from lbt_synth.models.prior import spread_plant
 from lbt_synth.models.problem import EstimationProblem
@@ -19,8 +20,10 @@ __all__ = [
     "EstimationProblem",
     "FullStatePlant",
     "LoopHardware",
+    "PositionLoop",
     "SinusoidalVibration",
     "Spectrum",
+    "StepResponse",
     "TabulatedSpectrum",
     "TipTiltPlant",
     "Truth",

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.validation import FloatArray, frozen, matrix, number
+from lbt_synth.models.lifting import MirrorSystem, lifted_mirror, settled_mirror
+from lbt_synth.models.local_loop import PositionLoop
+from lbt_synth.validation import FloatArray, frozen, instance, matrix, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -23,6 +25,10 @@ class LoopHardware:
     A fractional delay ``d = j + 1 + f`` holds the command of two frames within
     one exposure: ``phi_cor(k) = influence_matrix ((1-f) u(k-j) + f u(k-j-1))``.
 
+    With a ``mirror`` the position follows each command as its local loop lets it, and the
+    delay is that at which the command arrives: ``phi_cor(k) = influence_matrix (c[0] u(k) +
+    c[1] u(k-1) + ...)`` with the exposure-averaged taps c of :attr:`mirror_taps`.
+
     Parameters
     ----------
     frame_rate_hz : float
@@ -35,11 +41,15 @@ class LoopHardware:
         Mirror response to the m commands; the identity by default.
     modes : int, optional
         Number of modes n when neither matrix is given.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror, the same for all commands; a mirror that settles at once by
+        default.
 
     Raises
     ------
     ProblemError
-        If a value is not finite, out of range, or the sizes clash.
+        If a value is not finite, out of range, or the sizes clash; or if the local loop does
+        not run a whole number of samples a frame.
 
     Examples
     --------
@@ -47,6 +57,11 @@ class LoopHardware:
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.25)
     >>> [float(tap) for tap in path.mirror_taps]       # of u(k), u(k-1), u(k-2)
     [0.0, 0.75, 0.25]
+    >>> shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5,
+    ...                                       bandwidth_hz=500)
+    >>> moving = lbt.LoopHardware(frame_rate_hz=800, mirror=shell)
+    >>> moving.mirror_taps[:3].round(3).tolist()
+    [0.0, 0.631, 0.387]
     """
 
     frame_rate_hz: float
@@ -54,6 +69,7 @@ class LoopHardware:
     sensor_matrix: FloatArray | None = None
     influence_matrix: FloatArray | None = None
     modes: int = 2
+    mirror: PositionLoop | None = None
 
     def __post_init__(self) -> None:
         sensor, influence, n = self.sensor_matrix, self.influence_matrix, self.modes
@@ -88,6 +104,9 @@ class LoopHardware:
                 hint="One frame is the exposure itself: no loop is faster.",
             ),
         )
+        if self.mirror is not None:
+            instance(self.mirror, PositionLoop)
+            lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
 
     @property
     def sensor(self) -> FloatArray:
@@ -122,12 +141,13 @@ class LoopHardware:
         return 1 / self.frame_rate_hz
 
     @property
+    def mirror_system(self) -> MirrorSystem:
+        """Mirror and delay as a system at the frame rate, of one command."""
+        if self.mirror is None:
+            return settled_mirror(self.delay_frames)
+        return lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
+
+    @property
     def mirror_taps(self) -> FloatArray:
-        """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``."""
-        whole = int(np.floor(self.delay_frames - 1))
-        fraction = self.delay_frames - 1 - whole
-        taps = np.zeros(whole + (2 if fraction > 0 else 1))
-        taps[whole] = 1 - fraction
-        if fraction > 0:
-            taps[whole + 1] = fraction
-        return frozen(taps)
+        """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``, to rounding."""
+        return self.mirror_system.taps

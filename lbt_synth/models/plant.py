@@ -23,6 +23,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.local_loop import PositionLoop
 from lbt_synth.models.parts import checked_vibrations, noise_factor, per_mode
 from lbt_synth.models.problem import LONGEST_HORIZON, EstimationProblem
 from lbt_synth.models.vibration import Vibration
@@ -52,7 +53,7 @@ class TipTiltPlant(EstimationProblem):
     vibrations: tuple[Vibration, ...]
 
     def full(self) -> FullStatePlant:
-        """Return the same plant with the past commands as states.
+        """Return the same plant with the mirror's states: the past commands, if it settles.
 
         Returns
         -------
@@ -70,26 +71,23 @@ class TipTiltPlant(EstimationProblem):
         (8, 8)
         """
         hw = self.hardware
-        taps = hw.mirror_taps
-        n, m = self.A.shape[0], hw.n_commands
-        past = len(taps) - 1  # states u(k-2), u(k-3), ... ; u(k-1) is the input
-        A = np.zeros((n + past * m, n + past * m))
-        A[:n, :n] = self.A
-        B_known = np.zeros((n + past * m, m))
-        if past:
-            B_known[n : n + m] = np.eye(m)
-            A[n + m :, n:-m] = np.eye((past - 1) * m)
+        mirror, each = hw.mirror_system.whole, np.eye(hw.n_commands)
+        n, past = self.A.shape[0], mirror.n_states * hw.n_commands
+        A = np.zeros((n + past, n + past))
+        A[:n, :n], A[n:, n:] = self.A, np.kron(mirror.A, each)
+        B_known = np.zeros((n + past, hw.n_commands))  # u(k-1) is the input
+        B_known[n:] = np.kron(mirror.B[:, None], each)
         response = -hw.sensor @ hw.influence
-        C = np.hstack([self.C, *(tap * response for tap in taps[1:])])
-        pad = np.zeros((past * m, self.B.shape[1]))
+        C = np.hstack([self.C, response @ np.kron(mirror.C, each)])
+        pad = np.zeros((past, self.B.shape[1]))
         return FullStatePlant(
             A=A,
             B=np.vstack([self.B, pad]),
             C=C,
             D=self.D,
-            L=np.hstack([self.L, np.zeros((self.L.shape[0], past * m))]),
+            L=np.hstack([self.L, np.zeros((self.L.shape[0], past))]),
             B_known=frozen(B_known),
-            D_known=frozen(taps[0] * response),
+            D_known=frozen(mirror.D * response),
             hardware=hw,
             dt_s=self.dt_s,
         )
@@ -105,7 +103,7 @@ class TipTiltPlant(EstimationProblem):
         Returns
         -------
         Controller
-            In new-state form: the reduced estimator, and the past commands.
+            In new-state form: the reduced estimator, and the mirror's states.
 
         Raises
         ------
@@ -186,6 +184,7 @@ class TipTiltPlant(EstimationProblem):
             delay_frames=delay,
             sensor_matrix=hw.sensor,
             influence_matrix=hw.influence,
+            mirror=hw.mirror,
         )
 
     def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
@@ -207,6 +206,7 @@ def tip_tilt_plant(
     influence_matrix: Any = None,
     sensor_gain: float = 1.0,
     modes: int = 2,
+    mirror: PositionLoop | None = None,
 ) -> TipTiltPlant:
     """Assemble the plant of a tip/tilt loop from its parts.
 
@@ -231,6 +231,9 @@ def tip_tilt_plant(
         Sensor (optical) gain that the design assumes; multiplies the sensor matrix.
     modes : int, optional
         Number of modes n when no matrix gives it.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror. The estimated signal is the one for a mirror that settles at
+        once; :func:`lqg` commands the mirror so that it gets there.
 
     Returns
     -------
@@ -259,6 +262,7 @@ def tip_tilt_plant(
         sensor_matrix=sensor_matrix,
         influence_matrix=influence_matrix,
         modes=modes,
+        mirror=mirror,
     )
     if gain != 1:
         hardware = LoopHardware(
@@ -266,6 +270,7 @@ def tip_tilt_plant(
             delay_frames=hardware.delay_frames,
             sensor_matrix=gain * hardware.sensor,
             influence_matrix=hardware.influence,
+            mirror=hardware.mirror,
         )
     models = per_mode(turbulence, hardware)
     lines = checked_vibrations(vibrations, hardware)
@@ -376,4 +381,5 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
         delay_frames=hw.delay_frames,
         sensor_matrix=hw.sensor,
         influence_matrix=hw.influence,
+        mirror=hw.mirror,
     )

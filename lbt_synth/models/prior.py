@@ -100,6 +100,7 @@ def spread_plant(
         delay_frames=hw.delay_frames,
         sensor_matrix=hw.sensor,
         influence_matrix=hw.influence,
+        mirror=hw.mirror,
     )
 
 

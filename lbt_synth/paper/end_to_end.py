@@ -17,7 +17,7 @@ from lbt_synth.endtoend import EndToEndSetup, calibrate
 from lbt_synth.endtoend.cases import case_of, run_case
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
-from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, retuned_plant
+from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
 from lbt_synth.paper import parameters as given
 from lbt_synth.paper.published import TABLE_II, TABLE_III
 from lbt_synth.statespace import Controller
@@ -418,9 +418,6 @@ def _mean(values: Sequence[float]) -> float:
 
 def _predicted(row: Planned, result: Mapping[str, Any], setup: EndToEndSetup) -> float:
     system = setup.system
-    hardware = LoopHardware(
-        frame_rate_hz=system.frame_rate_hz, delay_frames=system.hardware.delay_frames
-    )
     gain = result["tip_tilt_gain"]
     if gain <= 0:
         return 0.0
@@ -432,7 +429,7 @@ def _predicted(row: Planned, result: Mapping[str, Any], setup: EndToEndSetup) ->
         other_modes=result["other_modes_strehl"],
     )
     try:
-        loop = close_loop(hardware, row.controller, sensor_gain=gain)
+        loop = close_loop(system.hardware, row.controller, sensor_gain=gain)
         return 100 * strehl(residual_budget(loop, truth), imaging)
     except UnstableLoopError:
         return 0.0

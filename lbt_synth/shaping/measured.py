@@ -70,7 +70,10 @@ def mode_loop(hardware: LoopHardware, parameter: Controller) -> MeasuredLoop:
 def mode_hardware(hardware: LoopHardware) -> LoopHardware:
     """Return the loop of one mode, with unit sensor and mirror."""
     return LoopHardware(
-        frame_rate_hz=hardware.frame_rate_hz, delay_frames=hardware.delay_frames, modes=1
+        frame_rate_hz=hardware.frame_rate_hz,
+        delay_frames=hardware.delay_frames,
+        modes=1,
+        mirror=hardware.mirror,
     )
 
 

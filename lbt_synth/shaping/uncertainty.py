@@ -8,6 +8,7 @@ import numpy as np
 
 from lbt_synth.certify import Check
 from lbt_synth.cones import Constraint, HalfPlanes
+from lbt_synth.errors import ProblemError
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.norms import band_norm, hinf_norm, largest_real_part
 from lbt_synth.shaping.band import Band
@@ -106,7 +107,7 @@ class DelayError:
     Raises
     ------
     ProblemError
-        If it is out of its range.
+        If it is out of its range; in a design, if the mirror has dynamics.
 
     Examples
     --------
@@ -127,6 +128,12 @@ class DelayError:
 
     def _differences(self, hardware: LoopHardware) -> list[tuple[float, FloatArray]]:
         """Delays that stand for all, and the taps of ``M_(d+e) - M_d``."""
+        if hardware.mirror is not None:
+            raise ProblemError(
+                "a bound for all delay errors needs a mirror that settles at once, whose response "
+                "is piecewise linear in the delay; got one with dynamics. Try MirrorUncertainty, "
+                "or a design for mirror=None and its map at delay errors."
+            )
         d = hardware.delay_frames
         low, high = max(d - self.frames, 1.0), d + self.frames
         whole = np.arange(np.ceil(low), np.floor(high) + 1)

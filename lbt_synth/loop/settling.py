@@ -1,0 +1,84 @@
+"""What is left of the assumption that the mirror has settled: phi_cor(k-1) = N u(k-2)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lbt_synth.loop.budget import ResidualBudget, residual_budget
+from lbt_synth.loop.closed_loop import ClosedLoop
+from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.truth import Truth
+from lbt_synth.statespace import StateSpace
+
+
+def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
+    """Position of a settled mirror less the real one, for the commands that a loop gives.
+
+    The paper's equation 1, ``phi_cor(k-1) = N u(k-2)`` (at its delay of two frames), is exact
+    for a mirror that settles at once; this is by how much it misses the position averaged
+    over the exposure. It is no residual: the loop corrects for part of it.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The loop, with the real mirror in its hardware.
+    truth : Truth
+        Disturbances; its sensor gain must be the loop's.
+
+    Returns
+    -------
+    ResidualBudget
+        Covariances of the difference, by origin; ``rms_nm`` is its size.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is unstable or marginally stable.
+    ProblemError
+        If a vibration does not fit the loop, or the sensor gains differ.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5,
+    ...                                       bandwidth_hz=500)
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell)
+    >>> shake = lbt.Truth(turbulence=None, noise_nm=1.0, vibrations=(
+    ...     lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),))
+    >>> loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
+    >>> missed = lbt.settling_error(loop, shake)
+    >>> 0 < missed.rms_nm < lbt.residual_budget(loop, shake).rms_nm
+    True
+    """
+    real = loop.hardware
+    settled = replace(real, mirror=None)
+    return residual_budget(replace(loop, system=_missed(loop, settled)), truth)
+
+
+def _missed(loop: ClosedLoop, settled: LoopHardware) -> StateSpace:
+    """Loop whose first outputs are the difference of the two positions."""
+    s, n, m = loop.system, loop.hardware.modes, loop.hardware.n_commands
+    each, command = np.eye(m), slice(n, n + m)
+    ideal, real = settled.mirror_system.whole, loop.hardware.mirror_system.whole
+    sizes = [s.n_states, ideal.n_states * m, real.n_states * m]
+    A = np.zeros((sum(sizes), sum(sizes)))
+    B = np.zeros((len(A), s.B.shape[1]))
+    C = np.zeros((len(s.C), len(A)))
+    A[: sizes[0], : sizes[0]], B[: sizes[0]], C[:, : sizes[0]] = s.A, s.B, s.C
+    D = s.D.copy()
+    start = sizes[0]
+    rows, direct = np.zeros((n, len(A))), np.zeros((n, s.B.shape[1]))
+    for sign, mirror, size in zip((1, -1), (ideal, real), sizes[1:], strict=True):
+        own, entry = slice(start, start + size), np.kron(mirror.B[:, None], each)
+        A[own, : sizes[0]], B[own] = entry @ s.C[command], entry @ s.D[command]
+        A[own, own] = np.kron(mirror.A, each)
+        shape = sign * loop.hardware.influence
+        rows[:, own] = shape @ np.kron(mirror.C, each)
+        rows[:, : sizes[0]] += mirror.D * shape @ s.C[command]
+        direct += mirror.D * shape @ s.D[command]
+        start += size
+    # of a mirror that settles at once nothing is left, not even rounding
+    C[:n], D[:n] = (0.0, 0.0) if loop.hardware.mirror is None else (rows, direct)
+    return StateSpace(A=A, B=B, C=C, D=D, dt_s=s.dt_s)

@@ -1,0 +1,440 @@
+"""LQG for a mirror with dynamics: the limit, generic Riccati solvers, the loop itself."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import ROOT, lbt_axis_plant
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import minimize
+
+import lbt_synth as lbt
+from lbt_synth.design.lqg_result import estimation_plant, loop_powers
+from lbt_synth.limits import least_model_residual
+
+SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
+
+
+def shell(bandwidth_hz=100.0, **changes):
+    return lbt.PositionLoop.of_bandwidth(
+        **{"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": bandwidth_hz, **changes}
+    )
+
+
+def slow_plant(delay=2.0, mirror=None, modes=1, **changes):
+    base = lbt_axis_plant(modes=modes)
+    return lbt.tip_tilt_plant(
+        **{
+            "frame_rate_hz": 800, "delay_frames": delay, "turbulence": base.turbulence,
+            "vibrations": base.vibrations, "noise_nm": 15.5, "modes": modes, "mirror": mirror,
+            **changes,
+        }
+    )  # fmt: skip
+
+
+def model_rms(plant, controller):
+    """Residual of a controller where the plant's model is the truth [nm]."""
+    return np.sqrt(loop_powers(plant, estimation_plant(plant), controller)[0])
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 3.0, 4.0])
+@pytest.mark.parametrize("modes", [1, 2])
+def test_a_settled_mirror_gives_the_kalman_controller(delay, modes):
+    plant = slow_plant(delay, modes=modes)
+    design, kalman = lbt.lqg(plant), lbt.kalman(plant)
+    for name in "ABCD":
+        np.testing.assert_array_equal(
+            getattr(design.controller, name), getattr(kalman.controller, name)
+        )
+    assert design.rms == pytest.approx(kalman.rms, rel=1e-12)
+
+
+@pytest.mark.parametrize("delay", [1.0, 1.35, 2.0, 2.25, 2.5, 2.75, 2.999, 3.0])
+@pytest.mark.parametrize("bandwidth", [None, 60.0, 100.0, 500.0])
+def test_it_reaches_the_limit_of_any_linear_controller(delay, bandwidth):
+    if bandwidth is None and delay == 2.5:
+        return  # a zero on the circle: the limit is only approached
+    plant = slow_plant(delay, None if bandwidth is None else shell(bandwidth))
+    design = lbt.lqg(plant)
+    limit = least_model_residual(plant).rms_nm
+    assert design.rms == pytest.approx(limit, rel=1e-9)
+    assert design.objective_nm == pytest.approx(limit, rel=1e-9)
+    assert model_rms(plant, design.controller) == pytest.approx(limit, rel=1e-9)
+    # not worse than the interpolated target, nor than one that forgets the mirror in between
+    assert design.rms <= model_rms(plant, lbt.kalman(plant).controller) * (1 + 1e-9)
+
+
+def test_a_zero_on_the_circle_is_approached_with_a_small_weight():
+    plant = slow_plant(2.5)
+    with pytest.raises(lbt.InfeasibleError, match="no zero on the unit circle"):
+        lbt.lqg(plant)
+    limit = least_model_residual(plant).rms_nm
+    excess = [lbt.lqg(plant, command_weight=w).rms / limit - 1 for w in (1e-2, 1e-3, 1e-4)]
+    assert excess[0] > excess[1] > excess[2] > 0
+    assert excess[2] < 1e-3
+
+
+@given(
+    bandwidth=st.floats(50, 600),
+    delay=st.floats(1, 3.5),
+    weight=st.floats(0, 0.3),
+    late=st.integers(0, 5),
+)
+@settings(max_examples=25)
+def test_against_a_generic_riccati_equation_of_all_states(bandwidth, delay, weight, late):
+    """One equation over [disturbance, mirror], for scipy, in place of one of the mirror alone."""
+    plant = slow_plant(delay, shell(bandwidth, delay_samples=late))
+    weight += 1e-3
+    design = lbt.lqg(plant, command_weight=weight)
+    own, core = design.estimation, plant.hardware.mirror_system.core
+    n, c = own.n_states, core.n_states
+    A = np.zeros((n + c, n + c))
+    A[:n, :n], A[n:, n:] = own.A, core.A
+    B = np.concatenate([np.zeros(n), core.B])[:, None]
+    row = np.concatenate([own.L[0], -core.C])
+    R, S = np.array([[core.D**2 + weight]]), -core.D * row[:, None]
+    X = solve_discrete_are(A, B, np.outer(row, row), R, s=S)
+    gain = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)[0]
+    law = np.concatenate([design.gain_state[0], -design.gain_mirror])
+    np.testing.assert_allclose(-gain, law, rtol=1e-5, atol=1e-6 * np.abs(law).max())
+
+
+def test_no_other_gain_costs_less():
+    """Perturbed gains of the regulator, in the real loop."""
+    plant = slow_plant(2.25, shell())
+    design = lbt.lqg(plant, command_weight=0.01)
+    from lbt_synth.design.lqg_result import lqg_controller
+
+    def cost(x):
+        changed = lqg_controller(
+            plant,
+            design.gain_predictor,
+            design.gain_state * (1 + x[0]) + x[1] * np.eye(1, design.gain_state.shape[1]),
+            design.gain_mirror * (1 + x[2]),
+        )
+        loop = lbt.close_loop(plant.hardware, changed)
+        if not loop.is_stable:
+            return 1e12
+        residual, commands = loop_powers(plant, design.estimation, changed)
+        return residual + 0.01 * commands
+
+    best = minimize(cost, np.zeros(3), method="Nelder-Mead", options={"maxfev": 60})
+    assert cost(np.zeros(3)) == pytest.approx(design.objective_nm**2, rel=1e-9)
+    assert best.fun >= design.objective_nm**2 * (1 - 1e-9)
+
+
+def test_the_exact_residual_is_that_of_a_simulation():
+    plant = slow_plant(2.25, shell(), vibrations=None)
+    design = lbt.lqg(plant)
+    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
+    run = lbt.simulate(
+        design.controller, truth, hardware=plant.hardware, frames=40_000, seed=4, cases=4
+    )
+    assert np.sqrt(np.mean(run.rms_nm**2)) == pytest.approx(design.rms, rel=0.01)
+    exact = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
+    assert exact.rms_nm == pytest.approx(design.rms, rel=1e-9)
+    assert lbt.least_residual(plant.hardware, truth).rms_nm == pytest.approx(design.rms, rel=1e-9)
+
+
+def test_coupled_matrices_and_redundant_commands():
+    sensor = np.array([[1.0, 0.2], [0.0, 0.8], [0.1, 0.1]])
+    influence = np.array([[1.0, 0.1, 0.4], [-0.2, 0.9, 0.3]])
+    plant = slow_plant(2.25, shell(), modes=2, sensor_matrix=sensor, influence_matrix=influence)
+    design = lbt.lqg(plant)
+    assert design.certificate.passed
+    assert design.controller.C.shape[0] == 3
+    assert design.rms == pytest.approx(model_rms(plant, design.controller), rel=1e-9)
+
+
+def test_other_disturbances_meet_the_same_loop():
+    plant = slow_plant(2.25, shell())
+    design = lbt.lqg(plant)
+    moved = lbt.retuned_plant(plant, 2.0)
+    assert astuple(moved.hardware.mirror) == astuple(plant.hardware.mirror)
+    error = design.error_system(moved)
+    from lbt_synth.lyapunov import stationary_covariance
+
+    X = stationary_covariance(error.A, error.B @ error.B.T)
+    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5, vibrations=moved.vibrations)
+    budget = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
+    assert np.sqrt(error.C @ X @ error.C.T)[0, 0] == pytest.approx(budget.rms_nm, rel=1e-8)
+    with pytest.raises(lbt.ProblemError, match="must come in a TipTiltPlant"):
+        design.error_system(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
+    with pytest.raises(lbt.ProblemError, match="must have 4 states"):
+        design.error_system(slow_plant(2.25, shell(), vibrations=None))
+
+
+def test_what_is_left_of_the_settled_mirror():
+    """Against the difference of two series of positions, tap by tap."""
+    plant = slow_plant(2.0, shell(), vibrations=None)
+    design = lbt.lqg(plant)
+    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
+    loop = lbt.close_loop(plant.hardware, design.controller)
+    left = lbt.settling_error(loop, truth)
+    run = lbt.simulate(
+        design.controller, truth, hardware=plant.hardware, frames=60_000, seed=1, cases=2
+    )
+    taps = plant.hardware.mirror_taps
+    missed = []
+    for u in run.commands[:, :, 0]:
+        real = np.convolve(u, taps)[: u.size]
+        missed.append((np.concatenate([[0], u[:-1]]) - real)[taps.size :])
+    assert np.std(missed) == pytest.approx(left.rms_nm, rel=0.01)
+    # a sinusoid by hand
+    shake = lbt.Truth(turbulence=None, noise_nm=0.0, vibrations=(
+        lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),))  # fmt: skip
+    z = np.exp(2j * np.pi * 20 / 800)
+    change = z**-1 - np.sum(taps * z ** -np.arange(taps.size))
+    command = loop.system.frequency_response([20.0])[0, 1, 0] * 100 * np.sqrt(2)
+    assert abs(lbt.settling_error(loop, shake).line_amplitudes_nm[0, 0]) == pytest.approx(
+        abs(change * command), rel=1e-9
+    )
+
+
+def test_a_settled_mirror_leaves_nothing():
+    plant = slow_plant(2.25)
+    loop = lbt.close_loop(plant.hardware, lbt.lqg(plant).controller)
+    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
+    assert lbt.settling_error(loop, truth).rms_nm == 0
+
+
+@pytest.mark.parametrize("ending", ["fits", "npz", "json"])
+@pytest.mark.parametrize("mirror", [None, "slow"])
+def test_gain_files(tmp_path, ending, mirror):
+    plant = slow_plant(2.0, shell() if mirror else None, modes=2)
+    design = lbt.lqg(plant, command_weight=0.01)
+    loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"x.{ending}", design))
+    assert isinstance(loaded, lbt.LqgDesign)
+    assert loaded.recertified().passed
+    np.testing.assert_array_equal(loaded.controller.A, design.controller.A)
+    np.testing.assert_array_equal(loaded.gain_mirror, design.gain_mirror)
+    assert loaded.command_weight == 0.01
+    assert loaded.objective_nm == design.objective_nm
+    if mirror:
+        assert astuple(loaded.hardware.mirror) == astuple(plant.hardware.mirror)
+    else:
+        assert loaded.hardware.mirror is None
+    other = lbt.load_gain(lbt.save_gain(tmp_path / f"k.{ending}", lbt.kalman(plant)))
+    assert other.recertified().passed
+    np.testing.assert_array_equal(other.hardware.mirror_taps, plant.hardware.mirror_taps)
+
+
+def test_a_gain_file_that_does_not_fit_its_mirror_is_refused(tmp_path):
+    design = lbt.lqg(slow_plant(2.0, shell()))
+    broken = replace(design, gain_mirror=design.gain_mirror[:-1])
+    path = lbt.save_gain(tmp_path / "x.json", broken)
+    with pytest.raises(lbt.GainFileError, match="GAIN_MIRROR must be"):
+        lbt.load_gain(path)
+
+
+@pytest.mark.parametrize("field", ["gain_predictor", "gain_state", "gain_mirror", "objective_nm"])
+def test_changed_gains_fail_the_certificate(field):
+    design = lbt.lqg(slow_plant(2.0, shell()))
+    assert design.recertified().passed
+    value = getattr(design, field)
+    changed = replace(design, **{field: value * (1 + 1e-4)})
+    certificate = changed.recertified()
+    assert not certificate.passed
+    with pytest.raises(lbt.CertificateError):
+        certificate.require()
+
+
+def test_a_changed_controller_fails_the_certificate():
+    design = lbt.lqg(slow_plant(2.0, shell()))
+    K = design.controller
+    changed = lbt.Controller(A=K.A, B=K.B * 1.0001, C=K.C, D=K.D, dt_s=K.dt_s)
+    failed = [c.name for c in replace(design, controller=changed).recertified().checks
+              if not c.passed]  # fmt: skip
+    assert "controller against its gains" in failed
+
+
+def test_the_other_designs_and_analyses_take_a_moving_mirror():
+    plant = slow_plant(2.25, shell(300.0), modes=2)
+    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
+    made = {
+        "kalman": lbt.kalman(plant),
+        "hinf": lbt.hinf(plant, gamma_ratio=1.3, method="riccati"),
+        "integrator": lbt.optimal_integrator(plant.hardware, truth),
+        "lqg": lbt.lqg(plant),
+    }
+    limit = lbt.least_residual(plant.hardware, truth).rms_nm
+    for design in made.values():
+        loop = lbt.close_loop(plant.hardware, design.controller)
+        assert loop.is_stable
+        assert lbt.residual_budget(loop, truth).rms_nm >= limit * (1 - 1e-9)
+    assert lbt.stable_sensor_gains(plant.hardware, made["integrator"].controller)[1] > 1
+    found = lbt.strehl_map(
+        made["lqg"], truth, lbt.Imaging(diameter_m=8.22), errors_hz=[0.0], sensor_gains=[1.0],
+        delay_errors_frames=[0.0, 0.1],
+    )  # fmt: skip
+    assert found.stable.all()
+    late = replace(plant.hardware, delay_frames=2.35)
+    exact = lbt.residual_budget(lbt.close_loop(late, made["lqg"].controller), truth)
+    assert found.residual_nm[1, 0, 0] == pytest.approx(exact.rms_nm, rel=1e-6)
+
+
+def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell(300.0))
+    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    objective = lbt.ResidualVariance(turbulence=slow, noise_nm=20.0)
+    demands = [lbt.ModulusMargin(at_least=0.5)]
+    spec = lbt.Specification(objective=objective, demands=demands)
+    design = lbt.shape(path, spec, functions=25, states=None)
+    assert lbt.loop_margins(lbt.close_loop(path, design.controller)).modulus > 0.5
+    free = lbt.lqg(lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0, modes=1,
+                                      mirror=path.mirror))  # fmt: skip
+    assert design.objective_nm[0] >= free.rms
+    with pytest.raises(lbt.ProblemError, match="mirror that settles at once"):
+        lbt.shape(path, lbt.Specification(objective=objective,
+                                          demands=[lbt.DelayError(frames=0.2)]))  # fmt: skip
+
+
+def test_wrong_arguments_are_refused():
+    plant = slow_plant(2.0, shell())
+    with pytest.raises(lbt.ProblemError, match="lqg needs a TipTiltPlant"):
+        lbt.lqg(plant.full())
+    with pytest.raises(lbt.ProblemError, match="command_weight must be at least 0"):
+        lbt.lqg(plant, command_weight=-1.0)
+    flat = slow_plant(2.0, shell(), modes=2, influence_matrix=[[1.0], [0.5]])
+    with pytest.raises(lbt.DimensionError, match="must have rank 2"):
+        lbt.lqg(flat)
+    with pytest.raises(lbt.ProblemError, match="needs a TipTiltPlant"):
+        lbt.mirror_study(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
+    with pytest.raises(lbt.ProblemError, match="settles at once"):
+        lbt.mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
+
+
+def test_complex_zeros_outside_the_circle_have_no_limit():
+    """A mode with little damping, sampled slowly."""
+    truth = lbt.Truth(turbulence=lbt_axis_plant().turbulence[0], noise_nm=15.5)
+    rng, refused = np.random.default_rng(0), 0
+    for _ in range(200):
+        mirror = lbt.PositionLoop(
+            natural_frequency_hz=rng.uniform(50, 2000), damping=rng.uniform(0.01, 0.1),
+            proportional_per_s2=0.0, derivative_per_s=0.0,
+        )  # fmt: skip
+        path = lbt.LoopHardware(
+            frame_rate_hz=800, delay_frames=rng.uniform(2, 3), modes=1, mirror=mirror
+        )
+        zeros = path.mirror_system.core.zeros
+        late = zeros[np.abs(zeros) > 1]
+        if np.any(np.abs(late.imag) > 1e-6):
+            refused += 1
+            with pytest.raises(lbt.ProblemError, match="real zeros outside the unit circle"):
+                lbt.least_residual(path, truth)
+    assert refused > 0
+
+
+# --------------------------------------------------------------------------
+# Configuration and command line
+# --------------------------------------------------------------------------
+def test_the_example_has_a_mirror_for_design_and_loop():
+    config = lbt.load_config(SLOW_YAML)
+    assert config.hardware.mirror is config.plant.hardware.mirror
+    step = config.hardware.mirror.step_response()
+    assert 3e-3 < step.settling_s < 6e-3
+    rows = lbt.mirror_study(config.plant, config.truth, config.imaging)
+    by_name = {row.design: row for row in rows}
+    assert not by_name["kalman, settled mirror"].stable
+    assert by_name["lqg"].strehl > 0.8
+    assert by_name["lqg"].residual_nm < 0.3 * by_name["kalman, real positions"].residual_nm
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("bandwidth_hz: 100.0", "bandwith_hz: 100.0", "did you mean bandwidth_hz"),
+        ("bandwidth_hz: 100.0", "proportional_per_s2: 4.0e5", "expected either bandwidth_hz"),
+        ("    bandwidth_hz: 100.0", "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0",
+         "bandwidth_damping goes with bandwidth_hz"),
+        ("bandwidth_hz: 100.0", "bandwidth_hz: 10.0", "mirror.local_loop: bandwidth_hz must be"),
+        ("frame_rate_hz: 800.0", "frame_rate_hz: 990.0", "986.30137 and 1000 Hz"),
+        ("delay_samples: 1", "delay_samples: 1.5", "mirror.local_loop.delay_samples"),
+    ],
+)  # fmt: skip
+def test_wrong_sections_are_refused(tmp_path, old, new, message):
+    text = SLOW_YAML.read_text()
+    assert old in text
+    path = tmp_path / "a.yaml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(lbt.ConfigError, match=message):
+        lbt.load_config(path)
+
+
+def test_gains_of_a_configuration(tmp_path):
+    text = SLOW_YAML.read_text()
+    start = text.index("    bandwidth_hz: 100.0")
+    end = text.index("    sampling_hz")
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        text[:start] + "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0\n" + text[end:]
+    )
+    mirror = lbt.load_config(path).hardware.mirror
+    assert (mirror.proportional_per_s2, mirror.derivative_per_s) == (4.0e5, 800.0)
+
+
+def run(capsys, *arguments):
+    import json
+
+    from lbt_synth.cli.main import main
+
+    status = main([*map(str, arguments), "--json"])
+    captured = capsys.readouterr()
+    return status, json.loads(captured.out), captured.err
+
+
+def test_commands(tmp_path, capsys):
+    gain = tmp_path / "lqg.fits"
+    status, data, _ = run(capsys, "design", SLOW_YAML, "--method", "lqg", "-o", gain)
+    assert status == 0
+    assert data["rms"] == pytest.approx(data["limit_nm"], rel=1e-6)
+    assert data["mirror"]["settling_s"] > 3e-3
+    assert run(capsys, "verify", gain)[0] == 0
+    assert run(capsys, "show", gain, "--matrices")[0] == 0
+    figure = tmp_path / "m.png"
+    table = tmp_path / "m.csv"
+    status, data, _ = run(capsys, "mirror", SLOW_YAML, "-o", figure, "-o", table)
+    assert status == 0
+    assert figure.stat().st_size > 10_000
+    assert table.read_text().count("\n") == 5
+    assert [row["stable"] for row in data["rows"]] == [True, False, True, True]
+    status, data, _ = run(capsys, "simulate", SLOW_YAML, gain, "--frames", 500, "--cases", 1)
+    assert status == 0
+    assert run(capsys, "sigma", gain, "-o", tmp_path / "s.png")[0] == 0
+
+
+def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
+    from lbt_synth.cli.main import main
+
+    gain = str(tmp_path / "kalman.npz")
+    assert main(["design", str(SLOW_YAML), "--method", "kalman", "-o", gain]) == 0
+    assert "as if the mirror settled at once" in capsys.readouterr().out
+
+
+def test_wrong_commands(tmp_path, capsys):
+    settled = ROOT / "examples" / "lbt.yaml"
+    gain = tmp_path / "kalman.fits"
+    assert run(capsys, "design", settled, "--method", "kalman", "-o", gain)[0] == 0
+    status, _, err = run(capsys, "simulate", SLOW_YAML, gain)
+    assert status == 1
+    assert "another mirror" in err
+    status, _, err = run(capsys, "mirror", settled)
+    assert status == 2
+    assert "mirror.local_loop is missing" in err
+    status, _, err = run(capsys, "mirror", SLOW_YAML, "--tolerance", "2")
+    assert status == 2
+    assert "tolerance" in err
+    for extra, text in ((("--horizon", "2"), "takes no horizon"), (("--gain", "1"), "--gain goes"),
+                        (("--route", "sdp"), "takes no --route")):  # fmt: skip
+        status, _, err = run(capsys, "design", SLOW_YAML, "--method", "lqg", *extra, "-o", gain)
+        assert status == 2
+        assert text in err
+    status, _, err = run(
+        capsys, "design", settled, "--method", "kalman", "--command-weight", "0.1", "-o", gain
+    )
+    assert status == 2
+    assert "--command-weight goes with --method lqg" in err
