@@ -130,7 +130,7 @@ def test_a_filter_of_another_loop_is_refused(setup):
         ("turbulence: frozen_flow", "turbulence: none", "truth.turbulence must be frozen_flow"),
         ("mirror:\n  modes: 672 ", "mirror: {}\n# ", "mirror.modes is missing"),
         ("subapertures_across: 30", "subapertures_across: 80", "pixels must be even"),
-        ("design:", "end_to_end: {pixels: 61}\ndesign:", "pixels must be even"),
+        ("pixels: 60", "pixels: 61", "pixels must be even"),
     ],
 )
 def test_configurations_that_cannot_be_simulated(tmp_path, capsys, old, new, match):

@@ -224,8 +224,9 @@ def small_config(folder):
         ("subapertures_across: 30", "subapertures_across: 8"),
         ("photons: 50.0", "photons: 5000.0"),
         ("modes: 672", "modes: 20"),
-        ("design:\n", "end_to_end: {pixels: 24, actuators_across: 7, frames: 40,"
-         " settle_frames: 200}\n\ndesign:\n"),
+        ("pixels: 60", "pixels: 24\n  actuators_across: 7"),
+        ("frames: 1600", "frames: 40"),
+        ("settle_frames: 400", "settle_frames: 200"),
     ):  # fmt: skip
         assert old in text
         text = text.replace(old, new, 1)

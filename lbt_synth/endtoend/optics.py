@@ -22,7 +22,7 @@ from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.validation import FloatArray
 
 _SUPPORTED = "1.1"
-_NO_CLAMP = -1e4  # a slope computer that sets negative pixels to zero loses a fifth of the gain
+NO_CLAMP = -1e4  # a slope computer that sets negative pixels to zero loses a fifth of the gain
 _PUPIL_GAP = 4  # subapertures between the four pupils on the detector
 _MARGIN = 4
 _FIELD_ARCSEC = 2.0
@@ -321,7 +321,7 @@ class Optics:
 
     def _slope_computer(self, detector: Any, indices: Any) -> Any:
         computer = _part("processing_objects.pyr_slopec:PyrSlopec")(
-            indices, norm_factor=self.system.photons, thr_value=_NO_CLAMP
+            indices, norm_factor=self.system.photons, thr_value=NO_CLAMP
         )
         computer.inputs["in_pixels"].set(detector.outputs["out_pixels"])
         return computer
