@@ -62,7 +62,12 @@ from .loop import strehl as strehl
 from .loop import strehl_of_series as strehl_of_series
 from .loop import youla_controller as youla_controller
 from .modal import MixedController as MixedController
+from .modal import ModalFilters as ModalFilters
+from .modal import ModalLoop as ModalLoop
+from .modal import ModalRun as ModalRun
 from .modal import Reconstructor as Reconstructor
+from .modal import modal_filters as modal_filters
+from .modal import modal_loop as modal_loop
 from .modal import project_out as project_out
 from .modal import reconstructor as reconstructor
 from .models import ARModel as ARModel
@@ -70,6 +75,7 @@ from .models import Atmosphere as Atmosphere
 from .models import EstimationProblem as EstimationProblem
 from .models import FullStatePlant as FullStatePlant
 from .models import LoopHardware as LoopHardware
+from .models import ModalTurbulence as ModalTurbulence
 from .models import SinusoidalVibration as SinusoidalVibration
 from .models import Spectrum as Spectrum
 from .models import TabulatedSpectrum as TabulatedSpectrum

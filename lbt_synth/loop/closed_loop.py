@@ -185,7 +185,7 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
     State: controller, past commands u(k-1) ... u(k-I), last residual phi_res(k-1).
     """
     k = controller.to_statespace()
-    n, m, q = hardware.modes, hardware.n_commands, hardware.n_measurements
+    m, q = hardware.n_commands, hardware.n_measurements
     if (k.C.shape[0], k.B.shape[1]) != (m, q):
         raise DimensionError(
             f"the controller must map {q} measurements to {m} commands; got "
@@ -196,37 +196,72 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
             f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
             f"designed for {1 / k.dt_s:.6g} Hz. Design it for this frame rate."
         )
-    taps = hardware.mirror_taps
+    return loop_matrices(
+        k.A, k.B, k.C, k.D,
+        taps=hardware.mirror_taps, sensor=hardware.sensor, mirror=hardware.influence,
+    )  # fmt: skip
+
+
+def loop_matrices(
+    A: FloatArray,
+    B: FloatArray,
+    C: FloatArray,
+    D: FloatArray,
+    *,
+    taps: FloatArray,
+    sensor: FloatArray,
+    mirror: FloatArray,
+) -> tuple[FloatArray, ...]:
+    """Close the loop around a controller in the textbook form, or around each of a stack.
+
+    Parameters
+    ----------
+    A, B, C, D : (..., s, s), (..., s, q), (..., m, s), (..., m, q) ndarray
+        The controllers.
+    taps : (t,) ndarray
+        Weights of the commands u(k), u(k-1), ... in the correction.
+    sensor, mirror : (q, n), (n, m) ndarray
+        Sensor and mirror response, the same for all.
+
+    Returns
+    -------
+    tuple of ndarray
+        ``A0, A1, B, C0, C1, D`` of the loops: with a sensor gain g, ``A = A0 + g A1`` and
+        ``C = C0 + g C1``. The outputs are residual, command and measurement.
+    """
+    lead, order = A.shape[:-2], A.shape[-1]
+    (q, n), m = sensor.shape, mirror.shape[1]
     past = len(taps) - 1
-    states = k.n_states + past * m + n
-    x = slice(0, k.n_states)
-    u = slice(k.n_states, k.n_states + past * m)
+    states = order + past * m + n
+    x = slice(0, order)
+    u = slice(order, order + past * m)
     r = slice(states - n, states)
-    mirror = hardware.influence
 
     measured = np.zeros((q, states))  # y = g measured x + noise
-    measured[:, r] = hardware.sensor
-    command0 = np.zeros((m, states))  # u = (command0 + g command1) x + D noise
-    command0[:, x] = k.C
-    command1 = k.D @ measured
+    measured[:, r] = sensor
+    command0 = np.zeros((*lead, m, states))  # u = (command0 + g command1) x + D noise
+    command0[..., x] = C
+    command1 = D @ measured
     residual0 = -taps[0] * mirror @ command0  # phi_res = (...) x + phi_tot - tap D noise
     for i in range(past):
-        residual0[:, u.start + i * m : u.start + (i + 1) * m] -= taps[i + 1] * mirror
+        residual0[..., u.start + i * m : u.start + (i + 1) * m] -= taps[i + 1] * mirror
     residual1 = -taps[0] * mirror @ command1
 
-    A0, A1 = np.zeros((states, states)), np.zeros((states, states))
-    B = np.zeros((states, n + q))
-    A0[x, x], A1[x], B[x, n:] = k.A, k.B @ measured, k.B
+    A0, A1 = np.zeros((2, *lead, states, states))
+    inputs = np.zeros((*lead, states, n + q))
+    A0[..., x, x], A1[..., x, :], inputs[..., x, n:] = A, B @ measured, B
     if past:
         first = slice(u.start, u.start + m)
-        A0[first], A1[first], B[first, n:] = command0, command1, k.D
-        A0[u.start + m : u.stop, u.start : u.stop - m] = np.eye((past - 1) * m)
-    A0[r], A1[r] = residual0, residual1
-    B[r, :n], B[r, n:] = np.eye(n), -taps[0] * mirror @ k.D
-    C0 = np.vstack([residual0, command0, np.zeros((q, states))])
-    C1 = np.vstack([residual1, command1, measured])
-    D = np.zeros((n + m + q, n + q))
-    D[:n, :n], D[:n, n:] = np.eye(n), B[r, n:]
-    D[n : n + m, n:] = k.D
-    D[n + m :, n:] = np.eye(q)
-    return A0, A1, B, C0, C1, D
+        A0[..., first, :], A1[..., first, :], inputs[..., first, n:] = command0, command1, D
+        A0[..., u.start + m : u.stop, u.start : u.stop - m] = np.eye((past - 1) * m)
+    A0[..., r, :], A1[..., r, :] = residual0, residual1
+    inputs[..., r, :n], inputs[..., r, n:] = np.eye(n), -taps[0] * mirror @ D
+    outputs0, outputs1 = np.zeros((2, *lead, n + m + q, states))
+    outputs0[..., :n, :], outputs0[..., n : n + m, :] = residual0, command0
+    outputs1[..., :n, :], outputs1[..., n : n + m, :] = residual1, command1
+    outputs1[..., n + m :, :] = measured
+    direct = np.zeros((*lead, n + m + q, n + q))
+    direct[..., :n, :] = inputs[..., r, :]
+    direct[..., n : n + m, n:] = D
+    direct[..., n + m :, n:] = np.eye(q)
+    return A0, A1, inputs, outputs0, outputs1, direct

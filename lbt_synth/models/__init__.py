@@ -4,6 +4,7 @@ from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.modal_turbulence import ModalTurbulence
 from lbt_synth.models.plant import TipTiltPlant, retuned_plant, tip_tilt_plant
 from lbt_synth.models.prior import spread_plant
 from lbt_synth.models.problem import EstimationProblem
@@ -19,6 +20,7 @@ __all__ = [
     "EstimationProblem",
     "FullStatePlant",
     "LoopHardware",
+    "ModalTurbulence",
     "SinusoidalVibration",
     "Spectrum",
     "TabulatedSpectrum",
