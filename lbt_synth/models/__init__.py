@@ -4,7 +4,7 @@ from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.modal_turbulence import ModalTurbulence
+from lbt_synth.models.modal_turbulence import ModalTurbulence, modal_turbulence
 from lbt_synth.models.plant import TipTiltPlant, retuned_plant, tip_tilt_plant
 from lbt_synth.models.prior import spread_plant
 from lbt_synth.models.problem import EstimationProblem
@@ -13,6 +13,7 @@ from lbt_synth.models.truth import SinusoidalVibration, Spectrum, TabulatedSpect
 from lbt_synth.models.turbulence import ar1_turbulence, ar2_turbulence, le_roux_pole
 from lbt_synth.models.units import nm_per_mas
 from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.zernike import noll_orders
 
 __all__ = [
     "ARModel",
@@ -31,7 +32,9 @@ __all__ = [
     "ar2_turbulence",
     "illuminated_subapertures",
     "le_roux_pole",
+    "modal_turbulence",
     "nm_per_mas",
+    "noll_orders",
     "pyramid_tilt_noise_nm",
     "retuned_plant",
     "spread_plant",

@@ -10,7 +10,19 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar import ARModel, variance_ratios
-from lbt_synth.validation import FloatArray, frozen, integer, matrix, number, real_array, sequence
+from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.models.turbulence import le_roux_pole
+from lbt_synth.models.zernike import noll_orders, zernike_variances
+from lbt_synth.validation import (
+    FloatArray,
+    frozen,
+    instance,
+    integer,
+    matrix,
+    number,
+    real_array,
+    sequence,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,3 +200,67 @@ class ModalTurbulence:
         response = 1 - self.coefficients @ lags
         drive = 2 * self.driving_rms_nm**2 / self.frame_rate_hz
         return np.asarray(drive[:, None] / np.abs(response) ** 2)
+
+
+def modal_turbulence(
+    atmosphere: Atmosphere, *, modes: int, frame_rate_hz: float
+) -> ModalTurbulence:
+    """AR1 models of the first Zernike modes after piston, in Noll's order.
+
+    Each has the variance of von Karman turbulence on a disc and the pole of Le Roux et al.,
+    ``exp(-2 pi 0.3 (n + 1) V / (D f_s))`` with the radial order n: the cut-off frequency of the
+    mode is right, the shape of its spectrum is not (that of frozen flow falls with the power
+    -17/3, that of AR1 with -2), and what modes of one azimuthal order have in common is left out.
+    B. Le Roux et al., J. Opt. Soc. Am. A 21, 1261 (2004), doi:10.1364/JOSAA.21.001261. Modes of
+    a mirror that are sorted like Zernike modes (Karhunen-Loeve modes) have nearly these variances.
+
+    Parameters
+    ----------
+    atmosphere : Atmosphere
+        Turbulence and telescope; an obstruction plays no part.
+    modes : int
+        Number of modes, tip and tilt first.
+    frame_rate_hz : float
+        Sampling frequency [Hz].
+
+    Returns
+    -------
+    ModalTurbulence
+        Processes of order 1; mode i has Noll's number i + 2.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
+    ...                      diameter_m=8.22)
+    >>> modes = lbt.modal_turbulence(air, modes=672, frame_rate_hz=800)
+    >>> modes.rms_nm[[0, 2, 671]].round(1).tolist()
+    [591.6, 308.8, 3.0]
+    >>> modes.coefficients[[0, 2, 671], 0].round(4).tolist()
+    [0.9886, 0.9829, 0.8089]
+    """
+    instance(atmosphere, Atmosphere)
+    radial, _ = noll_orders(modes)
+    orders = range(1, int(radial[-1]) + 1)
+    poles = np.array(
+        [
+            le_roux_pole(
+                wind_speed_m_s=atmosphere.wind_speed_m_s,
+                diameter_m=atmosphere.diameter_m,
+                frame_rate_hz=frame_rate_hz,
+                radial_order=order,
+            )
+            for order in orders
+        ]
+    )[radial - 1]
+    variances = zernike_variances(atmosphere, int(radial[-1]))[radial - 1]
+    return ModalTurbulence(
+        coefficients=poles[:, None],
+        driving_rms_nm=np.sqrt(variances * (1 - poles**2)),
+        frame_rate_hz=frame_rate_hz,
+    )
