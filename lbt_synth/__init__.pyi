@@ -63,10 +63,13 @@ from .loop import strehl_of_series as strehl_of_series
 from .loop import youla_controller as youla_controller
 from .modal import MixedController as MixedController
 from .modal import ModalFilters as ModalFilters
+from .modal import ModalGains as ModalGains
 from .modal import ModalLoop as ModalLoop
 from .modal import ModalRun as ModalRun
 from .modal import Reconstructor as Reconstructor
 from .modal import modal_filters as modal_filters
+from .modal import modal_gains as modal_gains
+from .modal import modal_gains_from_telemetry as modal_gains_from_telemetry
 from .modal import modal_loop as modal_loop
 from .modal import project_out as project_out
 from .modal import reconstructor as reconstructor
