@@ -63,12 +63,15 @@ class ModalLoop:
         Largest modulus of the poles of the loop that each mode belongs to.
     blocks : tuple
         Matrices of the loops, those of the same size together.
+    systems : tuple
+        The same from the phase to the residual, ready for long series.
     """
 
     delay_frames: float
     sensor_gain: FloatArray
     spectral_radii: FloatArray
     blocks: tuple[LoopBlock, ...]
+    systems: tuple[SystemStack, ...]
 
     @property
     def n_modes(self) -> int:
@@ -189,11 +192,8 @@ class ModalLoop:
                 f"there must be more frames than settle_frames; got {frames} and {settle}."
             )
         scaled = noise if np.all(self.sensor_gain == 1) else noise / self.sensor_gain[:, None]
-        residual = np.empty(total.shape)
-        commands = np.empty(total.shape) if all_series else None
         with np.errstate(all="ignore"):  # what is not finite is refused below
-            for block in self.blocks:
-                _run_block(block, total, scaled, residual, commands)
+            residual, commands = self._filtered(total, scaled, with_commands=all_series)
         measurements = None
         if all_series:
             measurements = noise.copy()
@@ -209,6 +209,33 @@ class ModalLoop:
             measurements=None if measurements is None else _read_only(measurements[:, settle:]),
             rms_nm=frozen(rms),
         )
+
+    def _filtered(
+        self, total: FloatArray, scaled: FloatArray, *, with_commands: bool
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Residual, and commands if they are wanted, of all modes."""
+        if len(self.blocks) == 1 and not with_commands:
+            modes = self.blocks[0].modes
+            if modes.shape[1] == 1 and isinstance(_index(modes[:, 0]), slice):
+                # all modes in their order: no other array is needed
+                joined = _joined(self.blocks[0], total, scaled)
+                only = self.systems[0].filtered(joined, in_place=True)[:, 1:, 0]
+                only[:, :-1] -= scaled[:, 1:]
+                return only, None
+        residual = np.empty(total.shape)
+        commands = np.empty(total.shape) if with_commands else None
+        for block, system in zip(self.blocks, self.systems, strict=True):
+            w = block.modes.shape[1]
+            if with_commands:
+                system = SystemStack(block.A, block.B[..., :w], block.C, block.D[..., :w])
+            out = system.filtered(_joined(block, total, scaled))[:, 1:]
+            for i in range(w):
+                which = _index(block.modes[:, i])
+                residual[which] = out[..., i]
+                residual[which, :-1] -= scaled[which, 1:]
+                if commands is not None:
+                    commands[which] = out[..., w + i]
+        return residual, commands
 
 
 def modal_loop(
@@ -278,35 +305,26 @@ def modal_loop(
         sensor_gain=gain,
         spectral_radii=frozen(radii),
         blocks=tuple(blocks),
+        systems=tuple(_residual_systems(block) for block in blocks),
     )
 
 
-def _run_block(
-    block: LoopBlock,
-    total: FloatArray,
-    scaled: FloatArray,
-    residual: FloatArray,
-    commands: FloatArray | None,
-) -> None:
-    """Fill in the series of one block's modes."""
+def _residual_systems(block: LoopBlock) -> SystemStack:
+    w = block.modes.shape[1]
+    return SystemStack(block.A, block.B[..., :w], block.C[:, :w], block.D[:, :w, :w])
+
+
+def _joined(block: LoopBlock, total: FloatArray, scaled: FloatArray) -> FloatArray:
+    """Return phi' of a block's modes, (N, frames + 1, w), of the frames -1, 0, ..."""
     count, w = block.modes.shape
-    frames = total.shape[1]
-    outputs = w if commands is None else 2 * w
-    loops = SystemStack(block.A, block.B[..., :w], block.C[:, :outputs], block.D[:, :outputs, :w])
-    joined = np.empty((count, frames + 1, w))  # phi' of the frames -1, 0, ...
+    out = np.empty((count, total.shape[1] + 1, w))
     for i in range(w):
         which = _index(block.modes[:, i])
-        noise, entry = scaled[which], joined[:, :, i]
+        noise, entry = scaled[which], out[:, :, i]
         entry[:, 0] = noise[:, 0]
         np.add(total[which, :-1], noise[:, 1:], out=entry[:, 1:-1])
         entry[:, -1] = total[which, -1]
-    out = loops.filtered(joined, in_place=outputs == w)[:, 1:]
-    for i in range(w):
-        which = _index(block.modes[:, i])
-        residual[which] = out[..., i]
-        residual[which, :-1] -= scaled[which, 1:]
-        if commands is not None:
-            commands[which] = out[..., w + i]
+    return out
 
 
 def _index(modes: np.ndarray) -> Any:
