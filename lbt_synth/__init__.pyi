@@ -102,6 +102,7 @@ from .norms import largest_singular_values as largest_singular_values
 from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure
 from .plotting import map_figure as map_figure
+from .plotting import modal_figure as modal_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure

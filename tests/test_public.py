@@ -50,7 +50,9 @@ def test_public_fields_say_which_gain_they_are(name):
         assert field not in {"K", "k"}
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md", "docs/robustness.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/tutorial.md", "docs/robustness.md", "docs/modal.md"]
+)
 def test_examples_on_pages_run(page, monkeypatch):
     monkeypatch.chdir(ROOT)
     results = doctest.testfile(
