@@ -92,6 +92,7 @@ from .models import le_roux_pole as le_roux_pole
 from .models import modal_turbulence as modal_turbulence
 from .models import nm_per_mas as nm_per_mas
 from .models import noll_orders as noll_orders
+from .models import pyramid_modal_noise_nm as pyramid_modal_noise_nm
 from .models import pyramid_tilt_noise_nm as pyramid_tilt_noise_nm
 from .models import retuned_plant as retuned_plant
 from .models import spread_plant as spread_plant

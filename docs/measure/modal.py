@@ -1,10 +1,8 @@
 """Control of 672 modes of the LBT: ``python docs/measure/modal.py [-o modal.png]``.
 
-Turbulence: 0.8 arcsec, 22 m, 20 m/s, von Karman variances and AR1 poles by radial order. Noise: a
-model, not a measurement. Tip and tilt have 15.5 nm a frame; a pyramid with a modulation of 4
-lambda/D measures slopes below that spatial frequency and phase above it, so the noise is taken as
-15.5 nm times 2 / (n + 1) and not less than a quarter of it, the same for all modes of a radial
-order n. Delay 2 frames, 800 Hz.
+Turbulence: 0.8 arcsec, 22 m, 20 m/s, von Karman variances and AR1 poles by radial order. Noise:
+assumed, not measured, that of pyramid_modal_noise_nm from 15.5 nm for tip and tilt and a
+modulation of 4 lambda/D. Delay 2 frames, 800 Hz.
 """
 
 import argparse
@@ -42,7 +40,7 @@ def main() -> None:
     air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
     modes = lbt.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
     radial, _ = lbt.noll_orders(MODES)
-    noise = 15.5 * np.maximum(2 / (radial + 1), 0.25)
+    noise = lbt.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
 
     def integrators(gains):
         loop = lbt.modal_loop(lbt.MixedController.integrators(gains))

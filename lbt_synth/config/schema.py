@@ -58,7 +58,7 @@ class SensorSection(_Section):
 
 
 class MirrorSection(_Section):
-    """Deformable mirror; ``modes`` counts all its modes and is for the record."""
+    """Deformable mirror; ``modes`` counts all its modes, for modal control."""
 
     modes: Annotated[int, Field(ge=1)] | None = None
     influence_matrix: list[list[float]] | None = None

@@ -8,7 +8,11 @@ from lbt_synth.models.modal_turbulence import ModalTurbulence, modal_turbulence
 from lbt_synth.models.plant import TipTiltPlant, retuned_plant, tip_tilt_plant
 from lbt_synth.models.prior import spread_plant
 from lbt_synth.models.problem import EstimationProblem
-from lbt_synth.models.sensor import illuminated_subapertures, pyramid_tilt_noise_nm
+from lbt_synth.models.sensor import (
+    illuminated_subapertures,
+    pyramid_modal_noise_nm,
+    pyramid_tilt_noise_nm,
+)
 from lbt_synth.models.truth import SinusoidalVibration, Spectrum, TabulatedSpectrum, Truth
 from lbt_synth.models.turbulence import ar1_turbulence, ar2_turbulence, le_roux_pole
 from lbt_synth.models.units import nm_per_mas
@@ -35,6 +39,7 @@ __all__ = [
     "modal_turbulence",
     "nm_per_mas",
     "noll_orders",
+    "pyramid_modal_noise_nm",
     "pyramid_tilt_noise_nm",
     "retuned_plant",
     "spread_plant",
