@@ -62,8 +62,8 @@ def modal(arguments: Namespace) -> Report:
         },
         tables=[_totals(whole, _total(air.rms_nm)), _orders(records)],
         notes=[
-            "turbulence: AR1 models, von Karman variances, poles by radial order. The vibrations of "
-            "the model shake tip and tilt.",
+            "turbulence: AR1 models, von Karman variances, poles by radial order.",
+            "vibrations: those of the model, on tip and tilt.",
             assumed,
             "the modes are those of Zernike, independent; nothing leaks from one to another.",
         ],
