@@ -21,6 +21,7 @@ import control
 import numpy as np
 from engine import SIZED
 from harness import Row, machine, paired, seconds
+from modal import MODAL
 from realtime import REALTIME
 
 import lbt_synth as lbt
@@ -178,7 +179,7 @@ def main() -> None:
     pages = []
     everyday = {**imports(), **time_domain(), **synthesis(), **maps()}
     tables = [("everyday operations", "operation", everyday)]
-    for title, first, case in (*SIZED, *REALTIME):
+    for title, first, case in (*SIZED, *MODAL, *REALTIME):
         print(f"... {title}", file=sys.stderr)
         tables.append((title, first, {str(size): row for size, row in case().items()}))
     for title, first, rows in tables:

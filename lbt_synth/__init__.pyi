@@ -82,7 +82,15 @@ from .loop import strehl as strehl
 from .loop import strehl_of_series as strehl_of_series
 from .loop import youla_controller as youla_controller
 from .modal import MixedController as MixedController
+from .modal import ModalFilters as ModalFilters
+from .modal import ModalGains as ModalGains
+from .modal import ModalLoop as ModalLoop
+from .modal import ModalRun as ModalRun
 from .modal import Reconstructor as Reconstructor
+from .modal import modal_filters as modal_filters
+from .modal import modal_gains as modal_gains
+from .modal import modal_gains_from_telemetry as modal_gains_from_telemetry
+from .modal import modal_loop as modal_loop
 from .modal import project_out as project_out
 from .modal import reconstructor as reconstructor
 from .models import ARModel as ARModel
@@ -90,6 +98,7 @@ from .models import Atmosphere as Atmosphere
 from .models import EstimationProblem as EstimationProblem
 from .models import FullStatePlant as FullStatePlant
 from .models import LoopHardware as LoopHardware
+from .models import ModalTurbulence as ModalTurbulence
 from .models import PositionLoop as PositionLoop
 from .models import SinusoidalVibration as SinusoidalVibration
 from .models import Spectrum as Spectrum
@@ -102,7 +111,10 @@ from .models import ar1_turbulence as ar1_turbulence
 from .models import ar2_turbulence as ar2_turbulence
 from .models import illuminated_subapertures as illuminated_subapertures
 from .models import le_roux_pole as le_roux_pole
+from .models import modal_turbulence as modal_turbulence
 from .models import nm_per_mas as nm_per_mas
+from .models import noll_orders as noll_orders
+from .models import pyramid_modal_noise_nm as pyramid_modal_noise_nm
 from .models import pyramid_tilt_noise_nm as pyramid_tilt_noise_nm
 from .models import retuned_plant as retuned_plant
 from .models import spread_plant as spread_plant
@@ -117,6 +129,7 @@ from .plotting import limits_figure as limits_figure
 from .plotting import loop_figure as loop_figure
 from .plotting import map_figure as map_figure
 from .plotting import mirror_figure as mirror_figure
+from .plotting import modal_figure as modal_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 
-from lbt_synth.stacks import norms, transposed
+from lbt_synth.stacks import norms, symmetrised, transposed
 from lbt_synth.validation import FloatArray
 
 
@@ -39,6 +39,39 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
         X = solve_discrete_lyapunov(A, Q)
         X = X + solve_discrete_lyapunov(A, A @ X @ A.T - X + Q)
     return np.asarray((X + X.T) / 2)
+
+
+def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Solve ``X = A X A' + Q`` for a stack, by squaring with refinement.
+
+    Parameters
+    ----------
+    A, Q : (N, n, n) ndarray
+        State matrices, and symmetric covariances of the driving noise.
+
+    Returns
+    -------
+    X : (N, n, n) ndarray
+        The covariances; nan where A is not stable.
+    residuals : (N,) ndarray
+        Relative residual of each.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.lyapunov import stationary_covariances
+    >>> X, residuals = stationary_covariances(np.array([[[0.6]]]), np.array([[[64.0]]]))
+    >>> round(float(X[0, 0, 0]), 12), bool(residuals[0] < 1e-14)
+    (100.0, True)
+    """
+    X = smith_sum(A, Q)
+    with np.errstate(all="ignore"):  # what is not finite is reported
+        for _ in range(2):
+            X = symmetrised(X + smith_sum(A, symmetrised(A @ X @ transposed(A) - X + Q)))
+        AXA = A @ X @ transposed(A)
+        size = norms(X) + norms(AXA) + norms(Q)
+        residuals = norms(AXA - X + Q) / np.where(size > 0, size, 1.0)
+    return X, residuals
 
 
 def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:

@@ -101,3 +101,29 @@ def test_robustness_figure_of_an_unstable_method(config):
     )
     (axis,) = lbt.robustness_figure(rows).axes
     assert legend(axis) == ["Kalman", r"H$_\infty$: unstable"]
+
+
+def test_modal_figure_has_labels_units_and_all_modes():
+    residuals = {"integrators": [9.0, 5.0, 2.0], "Kalman filters": [8.0, 4.0, 1.0]}
+    above, below = lbt.modal_figure(
+        residuals, gains=[0.5, 0.4, 0.3], turbulence_nm=[90.0, 50.0, 20.0]
+    ).axes
+    assert above.get_ylabel() == "integrator gain"
+    assert below.get_ylabel() == "residual [nm rms]"
+    assert below.get_xlabel().startswith("mode")
+    assert [line.get_label() for line in below.get_lines()] == ["turbulence", *residuals]
+    for line, values in zip(below.get_lines()[1:], residuals.values(), strict=True):
+        assert line.get_xdata().tolist() == [1, 2, 3]
+        assert line.get_ydata().tolist() == values
+    assert len(lbt.modal_figure({"one": [1.0]}).axes) == 1
+
+
+def test_bad_modal_figures_are_refused():
+    for arguments, error, words in (
+        (({},), lbt.ProblemError, "got none"),
+        (({"a": [1.0, 0.0]},), lbt.ProblemError, "a must be above 0"),
+        (({"a": 1.0},), lbt.DimensionError, "one number a mode"),
+        (({"a": [1.0], "b": [1.0, 2.0]},), lbt.DimensionError, "b must have 1 modes"),
+    ):
+        with pytest.raises(error, match=words):
+            lbt.modal_figure(*arguments)

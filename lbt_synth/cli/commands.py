@@ -12,6 +12,7 @@ from lbt_synth.cli.front_command import tradeoff_command
 from lbt_synth.cli.limits_command import limits
 from lbt_synth.cli.loop_commands import sigma, simulate
 from lbt_synth.cli.mirror_command import mirror
+from lbt_synth.cli.modal_command import modal
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.paper_command import paper
 from lbt_synth.cli.robustness_command import robustness
@@ -24,6 +25,7 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "export": export,
     "limits": limits,
     "mirror": mirror,
+    "modal": modal,
     "paper": paper,
     "robustness": robustness,
     "show": show,

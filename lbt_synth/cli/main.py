@@ -291,6 +291,21 @@ def build_parser() -> argparse.ArgumentParser:
         help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
     )
 
+    modal = command(
+        "modal", "Integrators, optimised gains and Kalman filters for all modes of the mirror"
+    )
+    modal.add_argument("config", help=config_help)
+    modal.add_argument(
+        "--modes", type=int, help="number of modes, at least 2 (default: mirror.modes)"
+    )
+    modal.add_argument(
+        "-o",
+        "--output",
+        action="append",
+        default=[],
+        help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
+    )
+
     paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")
     paper.add_argument("-o", "--output", required=True, help="directory to write into")
     return parser

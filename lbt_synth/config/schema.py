@@ -85,7 +85,7 @@ class LocalLoopSection(_Section):
 
 
 class MirrorSection(_Section):
-    """Deformable mirror; ``modes`` counts those that an end-to-end simulation controls."""
+    """Deformable mirror; ``modes`` counts those that are controlled: by hundreds, or end to end."""
 
     modes: Annotated[int, Field(ge=1)] | None = None
     influence_matrix: list[list[float]] | None = None

@@ -15,6 +15,7 @@ from lbt_synth.statespace import Controller
 from lbt_synth.validation import frozen, number
 
 _TRIALS = 32
+TRIED_GAINS = 1e-4, 0.999  # parts of the limit between which the best gain is looked for
 
 
 def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
@@ -160,7 +161,7 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
         raise ProblemError(
             "the truth must disturb the loop; got no turbulence, vibration or noise."
         )
-    trials = np.log(np.geomspace(1e-4, 0.999, _TRIALS) * limit)
+    trials = np.log(np.geomspace(*TRIED_GAINS, _TRIALS) * limit)
     values = [variance(trial) for trial in trials]
     best = int(np.argmin(values))
     bracket = trials[max(best - 1, 0)], trials[min(best + 1, _TRIALS - 1)]

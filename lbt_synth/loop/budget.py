@@ -194,11 +194,22 @@ def _spectrum_covariance(loop: ClosedLoop, spectrum: Spectrum) -> FloatArray:
 def resonance_edges(loop: ClosedLoop) -> FloatArray:
     """Panels of (0, Nyquist) [Hz]: geometric, and more of them around each pole."""
     nyquist = loop.hardware.frame_rate_hz / 2
-    edges = [np.geomspace(1e-6, 1, 40), np.array([0.0])]
+    edges = [np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(loop.system.poles)]
+    return frozen(distinct_edges(np.concatenate(edges)) * nyquist)
+
+
+def pole_edges(poles: ComplexArray) -> FloatArray:
+    """Edges of panels around sharp poles, in units of the Nyquist frequency; in no order."""
     offsets = np.array([0.0, 1.0, 4.0, 16.0])
-    for pole in loop.system.poles:
+    edges = [np.zeros(0)]
+    for pole in np.ravel(poles):
         centre, width = abs(np.angle(pole)) / np.pi, max(1 - abs(pole), 1e-9) / np.pi
         if 1e-6 < width < 0.1:
             edges += [centre + offsets * width, centre - offsets * width]
-    grid = np.unique(np.clip(np.concatenate(edges), 0, 1))
-    return frozen(grid[np.concatenate([[True], np.diff(grid) > 1e-12])] * nyquist)
+    return np.concatenate(edges)
+
+
+def distinct_edges(edges: FloatArray) -> FloatArray:
+    """Sort edges into (0, 1), without those that coincide."""
+    grid = np.unique(np.clip(edges, 0, 1))
+    return np.asarray(grid[np.concatenate([[True], np.diff(grid) > 1e-12])])

@@ -10,6 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.lifting import Response
 from lbt_synth.statespace import Controller, StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray, number
 
@@ -185,7 +186,7 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
     State: controller, mirror (its past commands, if it settles), last residual phi_res(k-1).
     """
     k = controller.to_statespace()
-    n, m, q = hardware.modes, hardware.n_commands, hardware.n_measurements
+    m, q = hardware.n_commands, hardware.n_measurements
     if (k.C.shape[0], k.B.shape[1]) != (m, q):
         raise DimensionError(
             f"the controller must map {q} measurements to {m} commands; got "
@@ -196,32 +197,75 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
             f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
             f"designed for {1 / k.dt_s:.6g} Hz. Design it for this frame rate."
         )
-    mirror, each = hardware.mirror_system.whole, np.eye(m)
-    states = k.n_states + mirror.n_states * m + n
-    x, u = slice(0, k.n_states), slice(k.n_states, states - n)
+    return loop_matrices(
+        k.A,
+        k.B,
+        k.C,
+        k.D,
+        mirror=hardware.mirror_system.whole,
+        sensor=hardware.sensor,
+        influence=hardware.influence,
+    )
+
+
+def loop_matrices(
+    A: FloatArray,
+    B: FloatArray,
+    C: FloatArray,
+    D: FloatArray,
+    *,
+    mirror: Response,
+    sensor: FloatArray,
+    influence: FloatArray,
+) -> tuple[FloatArray, ...]:
+    """Close the loop around a controller in the textbook form, or around each of a stack.
+
+    Parameters
+    ----------
+    A, B, C, D : (..., s, s), (..., s, q), (..., m, s), (..., m, q) ndarray
+        The controllers.
+    mirror : Response
+        From a command to its position averaged over the exposure, the same for all commands.
+    sensor, influence : (q, n), (n, m) ndarray
+        Sensor and mirror response to the modes, the same for all controllers.
+
+    Returns
+    -------
+    tuple of ndarray
+        ``A0, A1, B, C0, C1, D`` of the loops: with a sensor gain g, ``A = A0 + g A1`` and
+        ``C = C0 + g C1``. The outputs are residual, command and measurement.
+    """
+    lead, order = A.shape[:-2], A.shape[-1]
+    (q, n), m = sensor.shape, influence.shape[1]
+    each = np.eye(m)
+    states = order + mirror.n_states * m + n
+    x, u = slice(0, order), slice(order, states - n)
     r = slice(states - n, states)
-    entry, direct = np.kron(mirror.B[:, None], each), mirror.D * hardware.influence
+    entry, through = np.kron(mirror.B[:, None], each), mirror.D * influence
 
     measured = np.zeros((q, states))  # y = g measured x + noise
-    measured[:, r] = hardware.sensor
-    command0 = np.zeros((m, states))  # u = (command0 + g command1) x + D noise
-    command0[:, x] = k.C
-    command1 = k.D @ measured
-    residual0 = -direct @ command0  # phi_res = (...) x + phi_tot - direct D noise
-    residual0[:, u] -= hardware.influence @ np.kron(mirror.C, each)
-    residual1 = -direct @ command1
+    measured[:, r] = sensor
+    command0 = np.zeros((*lead, m, states))  # u = (command0 + g command1) x + D noise
+    command0[..., x] = C
+    command1 = D @ measured
+    residual0 = -through @ command0  # phi_res = (...) x + phi_tot - through D noise
+    residual0[..., u] -= influence @ np.kron(mirror.C, each)
+    residual1 = -through @ command1
 
-    A0, A1 = np.zeros((states, states)), np.zeros((states, states))
-    B = np.zeros((states, n + q))
-    A0[x, x], A1[x], B[x, n:] = k.A, k.B @ measured, k.B
-    A0[u], A1[u], B[u, n:] = entry @ command0, entry @ command1, entry @ k.D
-    A0[u, u] += np.kron(mirror.A, each)
-    A0[r], A1[r] = residual0, residual1
-    B[r, :n], B[r, n:] = np.eye(n), -direct @ k.D
-    C0 = np.vstack([residual0, command0, np.zeros((q, states))])
-    C1 = np.vstack([residual1, command1, measured])
-    D = np.zeros((n + m + q, n + q))
-    D[:n, :n], D[:n, n:] = np.eye(n), B[r, n:]
-    D[n : n + m, n:] = k.D
-    D[n + m :, n:] = np.eye(q)
-    return A0, A1, B, C0, C1, D
+    A0, A1 = np.zeros((2, *lead, states, states))
+    inputs = np.zeros((*lead, states, n + q))
+    A0[..., x, x], A1[..., x, :], inputs[..., x, n:] = A, B @ measured, B
+    A0[..., u, :], A1[..., u, :] = entry @ command0, entry @ command1
+    inputs[..., u, n:] = entry @ D
+    A0[..., u, u] += np.kron(mirror.A, each)
+    A0[..., r, :], A1[..., r, :] = residual0, residual1
+    inputs[..., r, :n], inputs[..., r, n:] = np.eye(n), -through @ D
+    outputs0, outputs1 = np.zeros((2, *lead, n + m + q, states))
+    outputs0[..., :n, :], outputs0[..., n : n + m, :] = residual0, command0
+    outputs1[..., :n, :], outputs1[..., n : n + m, :] = residual1, command1
+    outputs1[..., n + m :, :] = measured
+    direct = np.zeros((*lead, n + m + q, n + q))
+    direct[..., :n, :] = inputs[..., r, :]
+    direct[..., n : n + m, n:] = D
+    direct[..., n + m :, n:] = np.eye(q)
+    return A0, A1, inputs, outputs0, outputs1, direct

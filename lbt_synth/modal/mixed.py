@@ -15,6 +15,8 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design import Design
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.modal.banks import Bank, RunningBanks
+from lbt_synth.modal.filters import ModalFilters
 from lbt_synth.modal.reconstructor import Reconstructor, mode_indices
 from lbt_synth.simulation.run import SteppedController
 from lbt_synth.statespace import Controller, RunningController
@@ -31,7 +33,7 @@ class MixedController:
 
     Parameters
     ----------
-    filter : Design, Controller, object with ``step(y)`` and ``reset()``, or None
+    filter : Design, Controller, ModalFilters, object with ``step(y)`` and ``reset()``, or None
         Controller of the filtered modes, such as a Kalman design of a tip/tilt plant. An
         object with a state is stepped as it is. None: all modes have integrators.
     gains : (n,) array_like
@@ -192,6 +194,33 @@ class MixedController:
         self._command = command
         return command.copy()
 
+    def banks(self) -> tuple[Bank, ...]:
+        """Return the controllers of single modes and the filter as banks, without a reconstructor.
+
+        Raises
+        ------
+        ProblemError
+            If the filter is no linear controller of this package.
+        """
+        kept = np.setdiff1d(np.arange(self.n_modes), self._modes)
+        one = np.ones((kept.size, 1, 1))
+        leak, gain = self._leak[kept, None, None], self._gain[kept, None, None]
+        own = Bank(modes=kept[:, None], A=leak, B=gain, C=one, D=np.zeros_like(one))
+        out = [own] if kept.size else []
+        if isinstance(self._running, RunningBanks):
+            out += [bank.of_modes(self._modes) for bank in self._running.banks]
+        elif isinstance(self._running, RunningController):
+            k = self._running.controller
+            out.append(
+                Bank(modes=self._modes[None], A=k.A[None], B=k.B[None], C=k.C[None], D=k.D[None])
+            )
+        elif self._running is not None:
+            raise ProblemError(
+                "only a filter with matrices (a design or a Controller) makes a linear "
+                f"controller; got {type(self._running).__name__}."
+            )
+        return tuple(out)
+
     def as_controller(self, dt_s: float | None = None) -> Controller:
         """Return the same map as one linear controller, for exact analysis.
 
@@ -218,46 +247,43 @@ class MixedController:
         >>> lbt.close_loop(path, classical.as_controller(path.dt_s)).is_stable
         True
         """
-        n, period = self.n_modes, dt_s
-        selected = np.zeros((0, n))
-        parts = [np.zeros((0, 0))] * 3
+        n, banks = self.n_modes, self.banks()
+        period = dt_s
+        if period is None and isinstance(self._running, RunningController):
+            period = self._running.controller.dt_s
+        A: list[FloatArray] = []
+        inputs: list[FloatArray] = []
+        outputs: list[FloatArray] = []
         direct = np.zeros((n, n))
-        if self._running is not None:
-            if not isinstance(self._running, RunningController):
-                raise ProblemError(
-                    "only a filter with matrices (a design or a Controller) makes a linear "
-                    f"controller; got {type(self._running).__name__}."
-                )
-            k = self._running.controller
-            period = k.dt_s if period is None else period
-            selected = np.eye(n)[self._modes]
-            parts = [k.A, k.B, k.C]
-            direct = selected.T @ k.D @ selected
-        A, B, C = parts
-        kept = np.setdiff1d(np.arange(n), self._modes)
-        rest = np.eye(n)[kept]
-        inputs = np.vstack([B @ selected, self._gain[kept, None] * rest])
+        for bank in banks:
+            for modes, *parts in zip(bank.modes, bank.A, bank.B, bank.C, bank.D, strict=True):
+                chosen = np.eye(n)[modes]
+                A.append(parts[0])
+                inputs.append(parts[1] @ chosen)
+                outputs.append(chosen.T @ parts[2])
+                direct += chosen.T @ parts[3] @ chosen
+        B = np.vstack(inputs)
         if self.reconstructor is not None:
-            inputs = inputs @ self.reconstructor.matrix
-            direct = direct @ self.reconstructor.matrix
+            B, direct = B @ self.reconstructor.matrix, direct @ self.reconstructor.matrix
         return Controller(
-            A=block_diag(A, np.diag(self._leak[kept])),
-            B=inputs,
-            C=np.hstack([selected.T @ C, rest.T]),
-            D=direct,
+            A=block_diag(*A), B=B, C=np.hstack(outputs), D=direct,
             dt_s=1.0 if period is None else period,
-        )
+        )  # fmt: skip
 
 
 def _started(given: Any, modes: int) -> SteppedController:
     """Return the filter as an object to step, of as many inputs and outputs as modes."""
     if isinstance(given, Design):
         given = given.controller
-    running = given.start() if isinstance(given, Controller) else given
+    running = given.start() if isinstance(given, Controller | ModalFilters) else given
     if not isinstance(running, SteppedController):
         raise ProblemError(
             "filter must be a design, a Controller, an object with step(y) and reset(), or None; "
             f"got {type(given).__name__}."
+        )
+    if isinstance(running, RunningBanks) and running.n_modes != modes:
+        raise DimensionError(
+            f"the filters must be for the {modes} filtered modes; got {running.n_modes}."
         )
     if isinstance(running, RunningController):
         D = running.controller.D

@@ -124,17 +124,22 @@ def resonance_coefficients(
 
 
 def variance_ratio(coefficients: FloatArray) -> float:
-    """Variance of a stationary AR process over that of its driving noise.
+    """Variance of a stationary AR process over that of its driving noise."""
+    return float(variance_ratios(coefficients))
+
+
+def variance_ratios(coefficients: FloatArray) -> FloatArray:
+    """Variance over that of the driving noise, for processes (..., order), (...).
 
     By Levinson's recursion stepped down: with the reflection coefficients r the
     ratio is ``1 / prod(1 - r^2)``. Loses fewer digits than a Lyapunov equation
     when the poles crowd at the unit circle.
     """
     a = np.array(coefficients, dtype=np.float64)
-    ratio = 1.0
-    while a.size:
-        r, rest = a[-1], a[:-1]
+    ratio = np.ones(a.shape[:-1])
+    while a.shape[-1]:
+        r, rest = a[..., -1:], a[..., :-1]
         shrink = (1 - r) * (1 + r)
-        ratio /= shrink
-        a = (rest + r * rest[::-1]) / shrink
-    return float(ratio)
+        ratio = ratio / shrink[..., 0]
+        a = (rest + r * rest[..., ::-1]) / shrink
+    return np.asarray(ratio, dtype=np.float64)

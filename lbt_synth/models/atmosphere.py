@@ -132,8 +132,10 @@ class Atmosphere:
         return np.asarray(np.where(x < log_f[0], low, values))
 
 
-def _nm_per_radian(air: Atmosphere) -> float:
-    return air.seeing_wavelength_um * 1e3 / (2 * np.pi)
+def kolmogorov_constant_nm2(air: Atmosphere) -> float:
+    """Factor of ``(f^2 + L0^-2)^(-11/6)`` in the spatial phase spectrum [nm^2 m^(-5/3)]."""
+    nm_per_radian = air.seeing_wavelength_um * 1e3 / (2 * np.pi)
+    return float(_VON_KARMAN * air.fried_parameter_m ** (-5 / 3) * nm_per_radian**2)
 
 
 def _filtered_spectrum(air: Atmosphere, f: FloatArray) -> FloatArray:
@@ -150,8 +152,8 @@ def _filtered_spectrum(air: Atmosphere, f: FloatArray) -> FloatArray:
         edge = edge - eps**3 * _bessel_j2(eps * argument)
     amplitude = 2 * edge / argument
     tilt_filter = 2 * amplitude**2 / ((1 - eps**2) ** 2 * (1 + eps**2))
-    phase = _VON_KARMAN * air.fried_parameter_m ** (-5 / 3) * (f**2 + inner) ** (-11 / 6)
-    return np.asarray(phase * tilt_filter * _nm_per_radian(air) ** 2)
+    phase = kolmogorov_constant_nm2(air) * (f**2 + inner) ** (-11 / 6)
+    return np.asarray(phase * tilt_filter)
 
 
 def _bessel_j2(x: FloatArray) -> FloatArray:

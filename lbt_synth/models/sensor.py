@@ -1,11 +1,12 @@
-"""Measurement noise of a modulated pyramid sensor on tip and tilt."""
+"""Measurement noise of a modulated pyramid sensor: of tip and tilt, and assumed of more modes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from lbt_synth.models.units import nm_per_mas
-from lbt_synth.validation import number
+from lbt_synth.models.zernike import noll_orders
+from lbt_synth.validation import FloatArray, frozen, number
 
 
 def illuminated_subapertures(across: float, obstruction: float = 0.0) -> float:
@@ -99,3 +100,46 @@ def pyramid_tilt_noise_nm(
     mas = np.degrees(wavelength * 1e-6 / diameter) * 3600e3  # lambda / D
     noise_mas = np.pi * modulation * mas / 2 * np.sqrt(slope_variance / count)
     return float(noise_mas * nm_per_mas(diameter))
+
+
+def pyramid_modal_noise_nm(
+    tilt_noise_nm: float, *, modes: int, modulation_lambda_over_d: float
+) -> FloatArray:
+    """Assume a noise for each Zernike mode of a pyramid from that of its tilt [nm rms wavefront].
+
+    A modulated pyramid measures slopes at spatial frequencies below its modulation and phase
+    above. A mode of radial order n has about ``(n + 1) / 2`` periods over the pupil, so its
+    noise is taken as that of the tilt times ``2 / (n + 1)``, and not less than one over the
+    modulation. A model of convenience: a measured interaction matrix tells the noise of its
+    modes (:class:`Reconstructor`).
+
+    Parameters
+    ----------
+    tilt_noise_nm : float
+        Noise of tip, and of tilt, per frame [nm].
+    modes : int
+        Number of modes, in Noll's order after piston.
+    modulation_lambda_over_d : float
+        Modulation radius [lambda/D].
+
+    Returns
+    -------
+    (modes,) ndarray
+        Noise of each mode [nm].
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> noise = lbt.pyramid_modal_noise_nm(15.5, modes=100, modulation_lambda_over_d=4)
+    >>> noise[[0, 2, 5, 99]].round(2).tolist()
+    [15.5, 10.33, 7.75, 3.88]
+    """
+    tilt = number(tilt_noise_nm, "tilt_noise_nm", above=0)
+    modulation = number(modulation_lambda_over_d, "modulation_lambda_over_d", above=0)
+    radial, _ = noll_orders(modes)
+    return frozen(tilt * np.maximum(2 / (radial + 1), 1 / max(modulation, 1.0)))

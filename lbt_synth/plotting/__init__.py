@@ -10,6 +10,7 @@ from lbt_synth.plotting.figures import (
 from lbt_synth.plotting.front import tradeoff_figure
 from lbt_synth.plotting.limits import limits_figure
 from lbt_synth.plotting.mirror import mirror_figure
+from lbt_synth.plotting.modal import modal_figure
 from lbt_synth.plotting.strehl_map import map_figure
 from lbt_synth.plotting.style import FIGURE_ENDINGS, require_figure_name, save_figure
 
@@ -20,6 +21,7 @@ __all__ = [
     "loop_figure",
     "map_figure",
     "mirror_figure",
+    "modal_figure",
     "require_figure_name",
     "robustness_figure",
     "save_figure",

@@ -1,9 +1,11 @@
-"""A linear system driven by long series, by matrix products over blocks of frames.
+"""Linear systems driven by long series, by matrix products over blocks of frames.
 
 Within a block of b frames the outputs are a matrix times (state at the block's
 beginning, inputs of the block); the states at the beginnings obey a recursion
-with ``A^b`` that is solved in the same way. The result is that of the
-frame-by-frame recursion up to rounding.
+with ``A^b``. One system, of any size, has many cases of inputs, and its recursion is
+solved by blocks again; a stack of small systems has one case each, and its recursion
+goes block by block, all systems at once. The result is that of the frame-by-frame
+recursion up to rounding.
 """
 
 from __future__ import annotations
@@ -11,12 +13,15 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from lbt_synth.errors import DimensionError
+from lbt_synth.stacks import transposed
 from lbt_synth.statespace import StateSpace
 from lbt_synth.validation import FloatArray, real_array
 
 _BLOCK = 8
+_STACK_BLOCK = 32  # of small systems: their products are small, and their recursion is slow
 _STEPS = 16  # of the recursion between blocks
 _CACHED = 500_000  # numbers of inputs and outputs worked on at once
 
@@ -59,7 +64,7 @@ def filter_series(system: StateSpace, inputs: Any) -> FloatArray:
     lead, frames = u.shape[:-2], u.shape[-2]
     cases = int(np.prod(lead))
     u = u.reshape(cases, frames, m)
-    operators = _block_operators(system)
+    operators = _block_operators(system.A, system.B, system.C, system.D, _BLOCK)
     out = np.empty((cases, frames, p))
     # as many cases at once as fit into the processor's cache
     batch = max(1, _CACHED // max(1, frames * (m + p)))
@@ -83,8 +88,91 @@ def _filter_batch(operators: _BlockOperators, u: FloatArray) -> FloatArray:
     return np.asarray(out.reshape(cases, blocks * _BLOCK, -1)[:, :frames])
 
 
+class SystemStack:
+    """Small systems of the same sizes, ready to be driven by one series each.
+
+    Parameters
+    ----------
+    A, B, C, D : (N, n, n), (N, n, m), (N, p, n), (N, p, m) ndarray
+        The systems, ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.simulation.linear import SystemStack
+    >>> one = np.ones((2, 1, 1))
+    >>> sums = SystemStack(np.array([[[1.0]], [[0.5]]]), one, one, one)
+    >>> sums.filtered(np.ones((2, 3, 1)))[:, :, 0].tolist()
+    [[1.0, 2.0, 3.0], [1.0, 2.0, 2.5]]
+    """
+
+    def __init__(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
+        self._operators = _block_operators(A, B, C, D, _STACK_BLOCK)
+        self._outputs, self._inputs = D.shape[-2:]
+
+    def filtered(self, inputs: FloatArray, *, in_place: bool = False) -> FloatArray:
+        """Compute the outputs from zero states.
+
+        Parameters
+        ----------
+        inputs : (N, frames, m) ndarray
+            One series a system.
+        in_place : bool, optional
+            Write over the inputs; there must be as many outputs.
+
+        Returns
+        -------
+        (N, frames, p) ndarray
+            The outputs.
+        """
+        u, op, block = inputs, self._operators, _STACK_BLOCK
+        count, frames, m = u.shape
+        p, n = self._outputs, op.step.shape[-1]
+        whole, tail = divmod(frames, block)
+        out = u if in_place else np.empty((count, frames, p))
+        full = u[:, : whole * block].reshape(count, whole, block * m)
+        last = np.zeros((count, block, m))  # the last block, when it is not full
+        last[:, :tail] = u[:, whole * block :]
+        last = last.reshape(count, 1, block * m)
+        # as many systems at once as fit into the processor's cache
+        batch = min(count, max(1, _CACHED // max(1, frames * (m + p))))
+        parts = [slice(start, start + batch) for start in range(0, count, batch)]
+
+        drive = np.zeros((whole + 1, n, count))
+        for part in parts:
+            drive[:whole, :, part] = (full[part] @ op.reach[part]).transpose(1, 2, 0)
+        states = _block_states(op.step, drive)
+        product, more = np.empty((2, batch, whole, block * p))
+        for part in parts:
+            some = full[part]
+            size = len(some)
+            before = np.ascontiguousarray(states[:whole, :, part].transpose(2, 0, 1))
+            np.matmul(some, op.toeplitz[part], out=product[:size])
+            np.matmul(before, op.observe[part], out=more[:size])
+            target = out[part, : whole * block].reshape(size, whole, block * p)
+            np.add(product[:size], more[:size], out=target)
+        if tail:
+            ends = last @ op.toeplitz + states[whole].T[:, None] @ op.observe
+            out[:, whole * block :] = ends.reshape(count, block, p)[:, :tail]
+        return out
+
+
+def _block_states(step: FloatArray, drive: FloatArray) -> FloatArray:
+    """States at the blocks' beginnings, (blocks, n, N), one block after the other.
+
+    The systems are the last axis, so that the products of all small matrices are a few
+    sums over long rows.
+    """
+    matrices = np.ascontiguousarray(step.transpose(2, 1, 0))  # (column, row, system)
+    states = np.zeros_like(drive)
+    for j in range(len(drive) - 1):
+        np.einsum("jis,js->is", matrices, states[j], out=states[j + 1])
+        states[j + 1] += drive[j]
+    return states
+
+
 class _BlockOperators(NamedTuple):
-    """What a block of frames does, transposed for row vectors.
+    """What a block of frames does, transposed for row vectors; of one system or of each of many.
 
     ``step`` advances the state by a block, ``reach`` maps the block's inputs to
     the state after it, ``observe`` the state before it and ``toeplitz`` the
@@ -97,20 +185,26 @@ class _BlockOperators(NamedTuple):
     toeplitz: FloatArray
 
 
-def _block_operators(system: StateSpace) -> _BlockOperators:
-    powers = _powers(system.A, _BLOCK)
-    p, m = system.D.shape
-    markov = np.stack([system.D] + [system.C @ powers[i] @ system.B for i in range(_BLOCK - 1)])
-    # entry (j, input, i, output) is markov[i - j] for i >= j
-    lag = np.arange(_BLOCK) - np.arange(_BLOCK)[:, None]
-    toeplitz = np.where((lag >= 0)[:, :, None, None], markov[np.maximum(lag, 0)], 0.0)
+def _block_operators(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, block: int
+) -> _BlockOperators:
+    lead, (p, m) = D.shape[:-2], D.shape[-2:]
+    rows, columns = [C], [B]  # C A^i, A^i B
+    for _ in range(block - 1):
+        rows.append(rows[-1] @ A)
+        columns.append(A @ columns[-1])
+    markov = np.zeros((*lead, 2 * block - 1, p, m))  # zeros, D, C B, C A B, ...
+    markov[..., block - 1, :, :] = D
+    for i in range(block - 1):
+        markov[..., block + i, :, :] = rows[i] @ B
+    # entry (j, output, input, i) is that of lag i - j
+    late = sliding_window_view(markov, block, axis=-3)[..., ::-1, :, :, :]
+    axes = [*range(len(lead)), *(len(lead) + i for i in (0, 2, 3, 1))]
     return _BlockOperators(
-        step=powers[_BLOCK],
-        reach=np.vstack([(powers[_BLOCK - 1 - j] @ system.B).T for j in range(_BLOCK)]),
-        observe=np.hstack([(system.C @ powers[i]).T for i in range(_BLOCK)]),
-        toeplitz=np.ascontiguousarray(
-            toeplitz.transpose(0, 3, 1, 2).reshape(_BLOCK * m, _BLOCK * p)
-        ),
+        step=np.linalg.matrix_power(A, block),
+        reach=np.concatenate([transposed(column) for column in reversed(columns)], axis=-2),
+        observe=np.concatenate([transposed(row) for row in rows], axis=-1),
+        toeplitz=np.ascontiguousarray(late.transpose(axes)).reshape(*lead, block * m, block * p),
     )
 
 

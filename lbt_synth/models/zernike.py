@@ -1,0 +1,95 @@
+"""Zernike modes: their order after Noll, and their variance in von Karman turbulence.
+
+R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976), doi:10.1364/JOSA.66.000207.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import jv
+
+from lbt_synth.models.atmosphere import Atmosphere, kolmogorov_constant_nm2
+from lbt_synth.quadrature import gauss_panels
+from lbt_synth.validation import FloatArray, IntArray, frozen, integer
+
+_FURTHEST = 30  # times the order plus 2: where the integral goes over to its tail
+
+
+def noll_orders(modes: int) -> tuple[IntArray, IntArray]:
+    """Radial and azimuthal orders of the first Zernike modes after piston, in Noll's order.
+
+    Parameters
+    ----------
+    modes : int
+        Number of modes: Noll's numbers j = 2 to ``modes + 1``.
+
+    Returns
+    -------
+    radial, azimuthal : (modes,) int ndarray
+        Orders n and m, the azimuthal one not negative.
+
+    Raises
+    ------
+    ProblemError
+        If ``modes`` is no integer of at least 1.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> radial, azimuthal = lbt.noll_orders(10)
+    >>> radial.tolist(), azimuthal.tolist()
+    ([1, 1, 2, 2, 2, 3, 3, 3, 3, 4], [1, 1, 0, 2, 2, 1, 1, 3, 3, 0])
+    """
+    count = integer(modes, "modes", at_least=1)
+    radial: list[int] = []
+    azimuthal: list[int] = []
+    n = 0
+    while len(radial) < count:
+        n += 1
+        for m in range(n % 2, n + 1, 2):
+            twice = 1 if m == 0 else 2
+            radial += [n] * twice
+            azimuthal += [m] * twice
+    return _read_only(radial[:count]), _read_only(azimuthal[:count])
+
+
+@lru_cache(maxsize=32)
+def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
+    """Variance of a Zernike mode of each radial order 1 to ``highest``, (highest,) [nm^2].
+
+    The same for all azimuthal orders, on a disc without obstruction::
+
+        2 pi (n + 1) int 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) (2 J_n+1(pi D f) / (pi D f))^2 f df
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.models.zernike import zernike_variances
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
+    ...                      diameter_m=8.22)
+    >>> (zernike_variances(air, 3) ** 0.5).round(1).tolist()
+    [591.6, 308.8, 183.7]
+    """
+    top = integer(highest, "highest", at_least=1)
+    inner = 0.0 if atmosphere.outer_scale_m is None else atmosphere.outer_scale_m**-2
+    per_x = np.pi * atmosphere.diameter_m  # x = pi D f
+    out = np.empty(top)
+    for n in range(1, top + 1):
+        # octaves where nothing oscillates, then half periods of the Bessel function squared
+        end = _FURTHEST * (n + 2)
+        edges = np.concatenate([np.geomspace(1e-24, 0.5, 160), np.arange(1.0, end, np.pi / 2)])
+        x, w = gauss_panels(edges, 8)
+        spectrum = ((x / per_x) ** 2 + inner) ** (-11 / 6)
+        integral = float(np.sum(w * spectrum * jv(n + 1, x) ** 2 / x))
+        # beyond, J^2 is 1 / (pi x) in the mean, and the outer scale is not felt
+        integral += per_x ** (11 / 3) * edges[-1] ** (-14 / 3) * 3 / (14 * np.pi)
+        out[n - 1] = 8 * np.pi * (n + 1) / per_x**2 * integral
+    return frozen(kolmogorov_constant_nm2(atmosphere) * out)
+
+
+def _read_only(values: list[int]) -> IntArray:
+    out = np.array(values, dtype=np.int64)
+    out.setflags(write=False)
+    return out

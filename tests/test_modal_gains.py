@@ -1,0 +1,201 @@
+"""Optimised modal gains, from spectra and from telemetry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize_scalar
+
+import lbt_synth as lbt
+from lbt_synth.modal.gains import _minimised
+
+RATE = 800.0
+LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,))
+
+
+@pytest.mark.parametrize(
+    ("delay", "noise", "sensor_gain"), [(1, 15.5, 1.0), (2, 60.0, 0.6), (2.5, 2.0, 1.3)]
+)
+def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_gain):
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
+    ar1 = lbt.ar1_turbulence(air, frame_rate_hz=RATE)
+    table = lbt.TabulatedSpectrum(
+        frequency_hz=[0, 1, 5, 30, 31, 32, 400], density_nm2_hz=[4e4, 4e4, 50, 1, 90, 0.5, 0.01]
+    )
+    found = lbt.modal_gains(
+        [air, ar1, table, ar1], noise_nm=noise, frame_rate_hz=RATE, delay_frames=delay,
+        sensor_gain=sensor_gain, vibrations={3: LINE},
+    )  # fmt: skip
+    for i, (spectrum, lines) in enumerate([(air, ()), (ar1, ()), (table, ()), (ar1, (LINE,))]):
+        truth = lbt.Truth(
+            turbulence=spectrum, noise_nm=noise, sensor_gain=sensor_gain, vibrations=lines
+        )
+        best = lbt.optimal_integrator(path, truth)
+        loop = lbt.close_loop(path, best.controller, sensor_gain=sensor_gain)
+        assert found.rms_nm[i] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-6)
+        assert found.gains[i] == pytest.approx(best.gain, rel=1e-4)
+        if isinstance(spectrum, lbt.ARModel):  # where the answer is exact, so is this
+            assert found.gains[i] == pytest.approx(best.gain, rel=1e-6)
+    assert not found.limited.any()
+
+
+def test_residuals_are_those_of_the_loop():
+    rng = np.random.default_rng(0)
+    n = 200
+    air = lbt.ModalTurbulence(
+        coefficients=rng.uniform(0.5, 0.999, (n, 1)), driving_rms_nm=10 ** rng.uniform(-1, 2, n),
+        frame_rate_hz=RATE,
+    )  # fmt: skip
+    noise, gain = 10 ** rng.uniform(0, 2, n), rng.uniform(0.3, 1.2, n)
+    lines = {5: [LINE], 77: [LINE, LINE]}
+    found = lbt.modal_gains(
+        air, noise_nm=noise, frame_rate_hz=RATE, sensor_gain=gain, vibrations=lines,
+        delay_frames=2.3,
+    )  # fmt: skip
+
+    def exact(gains):
+        loop = lbt.modal_loop(
+            lbt.MixedController.integrators(gains), delay_frames=2.3, sensor_gain=gain
+        )
+        return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
+
+    least = exact(found.gains)
+    assert np.allclose(least, found.rms_nm, rtol=1e-6)
+    smallest = 1e-4 * lbt.integrator_gain_limit(2.3) / gain
+    for factor in (0.9, 0.99, 1.01, 1.1):
+        other = np.clip(factor * found.gains, smallest, found.limit)
+        assert np.all(exact(other) >= least * (1 - 1e-6))
+
+
+def test_a_quiet_sensor_is_limited_by_stability():
+    fast = lbt.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=RATE)
+    slow = lbt.ARModel(coefficients=[1.999, -0.99900025], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    found = lbt.modal_gains([slow, fast], noise_nm=[0.0, 0.5], frame_rate_hz=RATE, margin=0.5)
+    assert found.limited.tolist() == [True, False]
+    assert found.gains[0] == pytest.approx(0.5)
+    assert np.allclose(found.limit, 0.5)
+    weak = lbt.modal_gains([slow], noise_nm=0.0, frame_rate_hz=RATE, margin=0.5, sensor_gain=1.25)
+    assert weak.gains[0] == pytest.approx(0.4)
+    loop = lbt.modal_loop(lbt.MixedController.integrators(found.gains))
+    air = lbt.ModalTurbulence.of([slow, fast])
+    assert np.allclose(found.rms_nm, loop.residual_rms_nm(air, noise_nm=[0.0, 0.5]), rtol=1e-6)
+
+
+@given(a=st.floats(0.02, 0.9), b=st.floats(0.01, 10), delta=st.floats(0, 1))
+def test_minimum_between_the_points(a, b, delta):
+    """A function with the pole that residuals have, minimised without knowing it."""
+    h = np.geomspace(1e-4, 0.9999, 161)
+
+    def function(x):
+        return (b + (np.log(x) - np.log(a)) ** 2) * (1 + delta * x) / (1 - x)
+
+    highest = 0.999
+    place, value = _minimised(h, function(h)[None], 1.0, np.array([highest]))
+    best = minimize_scalar(
+        lambda log: function(np.exp(log)), bounds=(np.log(1e-4), np.log(highest)), method="bounded",
+        options={"xatol": 1e-10},
+    )  # fmt: skip
+    assert value[0] == pytest.approx(best.fun, rel=1e-9)
+    assert place[0] == pytest.approx(np.exp(best.x), rel=1e-4)
+
+
+def test_telemetry_finds_what_the_models_say():
+    rng = np.random.default_rng(1)
+    n, frames, noise = 40, 60_000, 20.0
+    poles = np.linspace(0.9, 0.995, n)
+    air = lbt.ModalTurbulence(
+        coefficients=poles[:, None], driving_rms_nm=np.geomspace(3, 30, n), frame_rate_hz=RATE
+    )
+    gain = np.linspace(0.5, 1.0, n)
+    white = air.driving_rms_nm[:, None] * rng.standard_normal((n, frames))
+    total = np.empty((n, frames))
+    state = np.zeros(n)
+    for k in range(frames):
+        state = poles * state + white[:, k]
+        total[:, k] = state
+    loop = lbt.modal_loop(
+        lbt.MixedController.integrators(np.full(n, 0.2)), delay_frames=2.5, sensor_gain=gain
+    )
+    run = loop.run(total, noise * rng.standard_normal((n, frames)), all_series=True)
+    known = {"frame_rate_hz": RATE, "delay_frames": 2.5, "sensor_gain": gain}
+    exact = lbt.modal_gains(air, noise_nm=noise, **known)
+    found = lbt.modal_gains_from_telemetry(run.measurements, run.commands, noise_nm=noise, **known)
+
+    def cost(gains):
+        closed = lbt.modal_loop(
+            lbt.MixedController.integrators(gains), delay_frames=2.5, sensor_gain=gain
+        )
+        return closed.residual_rms_nm(air, noise_nm=noise)
+
+    # what is lost by gains from telemetry, in residual
+    assert np.max(cost(found.gains) / exact.rms_nm - 1) < 0.01
+    assert np.median(np.abs(found.gains / exact.gains - 1)) < 0.1
+    # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high
+    guessed = lbt.modal_gains_from_telemetry(run.measurements, run.commands, **known)
+    assert np.all(guessed.noise_nm > 0.97 * noise)
+    assert np.max(cost(guessed.gains) / exact.rms_nm - 1) < 0.15
+
+
+def test_noise_from_a_quiet_band():
+    rng = np.random.default_rng(2)
+    frames, noise = 40_000, np.array([[3.0], [30.0]])
+    k = np.arange(frames)
+    slow = 300 * np.sin(2 * np.pi * 0.5 * k / RATE) + 100 * np.sin(2 * np.pi * 3.1 * k / RATE)
+    loop = lbt.modal_loop(lbt.MixedController.integrators([0.3, 0.3]))
+    run = loop.run(
+        np.stack([slow, slow]), noise * rng.standard_normal((2, frames)), all_series=True
+    )
+    found = lbt.modal_gains_from_telemetry(run.measurements, run.commands, frame_rate_hz=RATE)
+    assert np.allclose(found.noise_nm, noise[:, 0], rtol=0.02)
+    assert found.gains[0] > found.gains[1]
+
+
+def test_bad_input_is_refused(air):
+    known = {"frame_rate_hz": RATE}
+    ar1 = lbt.ar1_turbulence(air, frame_rate_hz=RATE)
+
+    class Odd:
+        def psd(self, frequency_hz):
+            return np.where(frequency_hz > 10, -1.0, 1.0)
+
+    class Lines:
+        """A comb of lines that no quadrature finds twice."""
+
+        def psd(self, frequency_hz):
+            return np.sin(1e9 * frequency_hz) ** 200
+
+    for spectra, arguments, error, words in (
+        ([ar1], {"noise_nm": -1}, lbt.ProblemError, "noise_nm must be at least 0"),
+        ([ar1], {"noise_nm": [1, 2]}, lbt.DimensionError, "one a mode"),
+        ([ar1], {"noise_nm": 1, "margin": 0}, lbt.ProblemError, "margin must be at least"),
+        ([ar1], {"noise_nm": 1, "margin": 0.9999}, lbt.ProblemError, "leave room"),
+        ([ar1], {"noise_nm": 1, "sensor_gain": 1e-6}, lbt.ProblemError, "leave room"),
+        ([ar1], {"noise_nm": 1, "delay_frames": 0}, lbt.ProblemError, "delay_frames"),
+        ([], {"noise_nm": 1}, lbt.ProblemError, "one spectrum a mode"),
+        (ar1, {"noise_nm": 1}, lbt.ProblemError, "one spectrum a mode"),
+        ([ar1, 3], {"noise_nm": 1}, lbt.ProblemError, "one spectrum a mode"),
+        ([ar1, Odd()], {"noise_nm": 1}, lbt.ProblemError, "that of mode 1 is not"),
+        ([Lines()], {"noise_nm": 0}, lbt.NumericalError, "did not settle"),
+        ([ar1], {"noise_nm": 1, "frame_rate_hz": 500}, lbt.ProblemError, "sampled at the frame"),
+        (lbt.ModalTurbulence.of([ar1]), {"noise_nm": 1, "frame_rate_hz": 500}, lbt.ProblemError,
+         "sampled at the frame"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=words):
+            lbt.modal_gains(spectra, **(known | arguments))
+
+    nothing = lbt.TabulatedSpectrum(frequency_hz=[0, 1], density_nm2_hz=[0, 0])
+    with pytest.raises(lbt.ProblemError, match="got none in mode 0"):
+        lbt.modal_gains([nothing], noise_nm=0, **known)
+
+    series = np.zeros((2, 3000))
+    for y, u, arguments, error, words in (
+        (series, series[:, 1:], {}, lbt.DimensionError, "must both be"),
+        (series[:, :900], series[:, :900], {}, lbt.ProblemError, "longer than a segment"),
+        (series + np.nan, series, {}, lbt.NonFiniteError, "measurements"),
+        (series, series, {"segment_frames": 8}, lbt.ProblemError, "segment_frames"),
+        (series, series, {}, lbt.ProblemError, "got none in mode 0"),
+    ):
+        with pytest.raises(error, match=words):
+            lbt.modal_gains_from_telemetry(y, u, **(known | arguments))
