@@ -13,14 +13,22 @@ import json
 import multiprocessing
 import os
 import re
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.files import write_atomically
 from lbt_synth.validation import integer
 
@@ -69,6 +77,8 @@ def run_cases(
         another campaign, or cannot be written.
     ProblemError
         If a name is no file name, or a case or a result does not fit into JSON.
+    NumericalError
+        If a process ended without a result.
 
     Examples
     --------
@@ -154,10 +164,17 @@ def _pool(workers: int) -> Iterator[Executor]:
             initializer=_watch_parent,
             initargs=(os.getpid(),),
         ) as pool:
+            others = set(multiprocessing.active_children())
             try:
                 yield pool
+            except BrokenExecutor as error:
+                raise NumericalError(
+                    "a process of the campaign ended without a word, for want of memory perhaps. "
+                    "What is finished is kept: start again, with fewer jobs."
+                ) from error
             except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
+                for worker in set(multiprocessing.active_children()) - others:
+                    worker.terminate()  # what they run is not waited for
                 raise
     finally:
         for name, value in before.items():
@@ -166,6 +183,8 @@ def _pool(workers: int) -> Iterator[Executor]:
 
 
 def _watch_parent(parent: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and ends them
+
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_ORPHAN_SECONDS)

@@ -7,10 +7,24 @@ behind the message is on the exception, so that a script need not parse text.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class LbtSynthError(Exception):
     """Base class of every error that this package raises on purpose."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle with the data, whatever the constructor asks for: other processes raise, too."""
+        return _rebuilt, (type(self), self.args, self.__dict__)
+
+
+def _rebuilt(
+    kind: type[LbtSynthError], args: tuple[Any, ...], data: dict[str, Any]
+) -> LbtSynthError:
+    error = kind.__new__(kind)
+    error.args = args
+    error.__dict__.update(data)
+    return error
 
 
 # --------------------------------------------------------------------------

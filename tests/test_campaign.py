@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lbt_synth.campaign import run_cases
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import NumericalError, OutputError, ProblemError, UnstableLoopError
 
 CASES = {f"case-{i}": {"x": i} for i in range(6)}
 
@@ -199,3 +199,36 @@ def test_two_campaigns_in_one_directory_are_refused(tmp_path):
         run_cases(square, CASES, tmp_path / "out")
     first.kill()
     first.communicate()
+
+
+def test_an_interrupt_ends_the_processes_at_once(tmp_path):
+    first = started(tmp_path, 2)
+    wait_for(lambda: len(results(tmp_path)) >= 2)
+    first.send_signal(signal.SIGINT)
+    _, errors = first.communicate(timeout=10)
+    assert first.returncode != 0
+    assert errors.count("KeyboardInterrupt") == 1  # the parent's own
+    workers = {int(line.split()[1]) for line in (tmp_path / "runs.txt").read_text().splitlines()}
+    wait_for(lambda: not any(alive(pid) for pid in workers), seconds=5)
+
+
+def dies(case):
+    if case["x"] == 1:
+        os._exit(7)
+    return square(case)
+
+
+def test_a_process_that_dies_is_reported(tmp_path):
+    with pytest.raises(NumericalError, match="ended without a word"):
+        run_cases(dies, CASES, tmp_path, jobs=2)
+    assert run_cases(square, CASES, tmp_path) == EXPECTED
+
+
+def raises_with_data(case):
+    raise UnstableLoopError("no", spectral_radius=1.5)
+
+
+def test_errors_come_back_with_their_data(tmp_path):
+    with pytest.raises(UnstableLoopError, match="no") as caught:
+        run_cases(raises_with_data, CASES, tmp_path, jobs=2)
+    assert caught.value.spectral_radius == 1.5

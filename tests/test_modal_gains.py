@@ -121,7 +121,9 @@ def test_telemetry_finds_what_the_models_say():
     run = loop.run(total, noise * rng.standard_normal((n, frames)), all_series=True)
     known = {"frame_rate_hz": RATE, "delay_frames": 2.5, "sensor_gain": gain}
     exact = lbt.modal_gains(air, noise_nm=noise, **known)
-    found = lbt.modal_gains_from_telemetry(run.measurements, run.commands, noise_nm=noise, **known)
+    found = lbt.modal_gains_from_telemetry(
+        run.measurements.T, run.commands.T, noise_nm=noise, **known
+    )
 
     def cost(gains):
         closed = lbt.modal_loop(
@@ -133,7 +135,7 @@ def test_telemetry_finds_what_the_models_say():
     assert np.max(cost(found.gains) / exact.rms_nm - 1) < 0.01
     assert np.median(np.abs(found.gains / exact.gains - 1)) < 0.1
     # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high
-    guessed = lbt.modal_gains_from_telemetry(run.measurements, run.commands, **known)
+    guessed = lbt.modal_gains_from_telemetry(run.measurements.T, run.commands.T, **known)
     assert np.all(guessed.noise_nm > 0.97 * noise)
     assert np.max(cost(guessed.gains) / exact.rms_nm - 1) < 0.15
 
@@ -147,7 +149,7 @@ def test_noise_from_a_quiet_band():
     run = loop.run(
         np.stack([slow, slow]), noise * rng.standard_normal((2, frames)), all_series=True
     )
-    found = lbt.modal_gains_from_telemetry(run.measurements, run.commands, frame_rate_hz=RATE)
+    found = lbt.modal_gains_from_telemetry(run.measurements.T, run.commands.T, frame_rate_hz=RATE)
     assert np.allclose(found.noise_nm, noise[:, 0], rtol=0.02)
     assert found.gains[0] > found.gains[1]
 
@@ -189,10 +191,10 @@ def test_bad_input_is_refused(air):
     with pytest.raises(lbt.ProblemError, match="got none in mode 0"):
         lbt.modal_gains([nothing], noise_nm=0, **known)
 
-    series = np.zeros((2, 3000))
+    series = np.zeros((3000, 2))
     for y, u, arguments, error, words in (
-        (series, series[:, 1:], {}, lbt.DimensionError, "must both be"),
-        (series[:, :900], series[:, :900], {}, lbt.ProblemError, "longer than a segment"),
+        (series, series[1:], {}, lbt.DimensionError, "must both be"),
+        (series[:900], series[:900], {}, lbt.ProblemError, "longer than a segment"),
         (series + np.nan, series, {}, lbt.NonFiniteError, "measurements"),
         (series, series, {"segment_frames": 8}, lbt.ProblemError, "segment_frames"),
         (series, series, {}, lbt.ProblemError, "got none in mode 0"),

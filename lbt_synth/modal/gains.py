@@ -168,8 +168,8 @@ def modal_gains_from_telemetry(
 
     Parameters
     ----------
-    measurements, commands : (n, frames) array_like
-        Modal measurements y(k) and commands u(k) [nm].
+    measurements, commands : (frames, n) array_like
+        Modal measurements y(k) and commands u(k) [nm], a row a frame as in telemetry.
     frame_rate_hz : float
         Frame rate [Hz].
     noise_nm : float or (n,) array_like, optional
@@ -204,7 +204,8 @@ def modal_gains_from_telemetry(
     >>> walk = 0.99 * np.cumsum(rng.standard_normal((1, 20_000)), axis=1)
     >>> loop = lbt.modal_loop(lbt.MixedController.integrators([0.3]))
     >>> run = loop.run(walk, noise, all_series=True)
-    >>> found = lbt.modal_gains_from_telemetry(run.measurements, run.commands, frame_rate_hz=800)
+    >>> found = lbt.modal_gains_from_telemetry(
+    ...     run.measurements.T, run.commands.T, frame_rate_hz=800)
     >>> bool(abs(found.noise_nm[0] - 5) < 0.5), bool(0.1 < found.gains[0] < 0.25)
     (True, True)
     """
@@ -212,10 +213,11 @@ def modal_gains_from_telemetry(
 
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     y, u = real_array(measurements, "measurements"), real_array(commands, "commands")
-    if y.ndim != 2 or y.shape != u.shape or len(y) == 0:
+    if y.ndim != 2 or y.shape != u.shape or y.size == 0:
         raise DimensionError(
-            f"measurements and commands must both be (modes, frames); got {y.shape} and {u.shape}."
+            f"measurements and commands must both be (frames, modes); got {y.shape} and {u.shape}."
         )
+    y, u = y.T, u.T
     count, frames = y.shape
     segment = integer(segment_frames, "segment_frames", at_least=16)
     gain = per_mode_number(sensor_gain, "sensor_gain", count)
