@@ -40,7 +40,7 @@ def table_figure(entries: Sequence[EndToEndEntry]) -> Any:
                     marker=MARKERS[1], markersize=3.5, label="Agapito et al. 2008",
                 )  # fmt: skip
             panel.plot(
-                error, [e.modal for e in mine], color=COLOURS[1], linestyle="--",
+                error, [e.modal for e in mine], color=COLOURS[1], linestyle="--", zorder=3,
                 label="modal, measured optical gain",
             )  # fmt: skip
             scatter = [0.0 if np.isnan(e.scatter) else e.scatter for e in mine]
