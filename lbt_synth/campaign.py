@@ -194,19 +194,23 @@ def _watch_parent(parent: int) -> None:
 
 
 def _digest(name: str, case: Case) -> str:
-    if not _NAME.match(name):
+    if not isinstance(name, str) or not _NAME.match(name):
         raise ProblemError(f"the name of a case must be letters, digits and . _ + -; got {name!r}.")
     try:
-        text = json.dumps(case, sort_keys=True, allow_nan=False)
+        return _hash(case)
     except (TypeError, ValueError) as error:
         raise ProblemError(f"the case {name} must fit into JSON: {error}.") from error
+
+
+def _hash(content: Mapping[str, Any]) -> str:
+    text = json.dumps(dict(content), sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read(path: Path, expected: str) -> dict[str, Any] | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        asked, result = content["asked"], content["result"]
+        asked, digest, result = content["asked"], content["digest"], dict(content["result"])
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -220,16 +224,19 @@ def _read(path: Path, expected: str) -> dict[str, Any] | None:
             "the results of the old settings.",
             path=path,
         )
-    return dict(result)
+    if digest != _hash(result):
+        raise OutputError(
+            f"{path} was changed after it was written. Delete it, and it is run again.", path=path
+        )
+    return result
 
 
 def _write(
     folder: Path, name: str, asked: str, case: Case, result: Mapping[str, Any]
 ) -> dict[str, Any]:
     try:
-        text = json.dumps(
-            {"asked": asked, "case": case, "result": result}, indent=1, allow_nan=False
-        )
+        written = {"asked": asked, "digest": _hash(result), "case": case, "result": dict(result)}
+        text = json.dumps(written, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ProblemError(f"the result of {name} must fit into JSON: {error}.") from error
     write_atomically(folder / f"{name}.json", text.encode())

@@ -98,14 +98,33 @@ def test_results_of_other_settings_are_not_mixed_in(tmp_path):
     assert json.loads((tmp_path / "case-0.json").read_text())["result"] == {"square": 0}
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"asked": 1}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[1]", '{"asked": 1}', '{"asked": 1, "digest": 2, "result": 3}']
+)
 def test_a_file_that_is_no_result_is_named(tmp_path, text):
     (tmp_path / "case-0.json").write_text(text)
     with pytest.raises(OutputError, match="no result of a campaign"):
         run_cases(square, CASES, tmp_path)
 
 
-@pytest.mark.parametrize("name", ["", "../a", "a/b", ".hidden", "a b"])
+def test_a_result_that_was_changed_is_not_believed(tmp_path):
+    run_cases(square, CASES, tmp_path)
+    file = tmp_path / "case-3.json"
+    file.write_text(file.read_text().replace('"square": 9', '"square": 10'))
+    with pytest.raises(OutputError, match="changed after it was written"):
+        run_cases(square, CASES, tmp_path)
+    file.unlink()
+    assert run_cases(square, CASES, tmp_path) == EXPECTED
+
+
+@pytest.mark.parametrize("returned", [3, None, "abc", [1, 2]])
+def test_a_result_has_to_be_a_mapping(tmp_path, returned):
+    with pytest.raises(ProblemError, match="result of a must fit"):
+        run_cases(lambda _: returned, {"a": {"x": 1}}, tmp_path)
+    assert not list(tmp_path.glob("*.json"))
+
+
+@pytest.mark.parametrize("name", ["", "../a", "a/b", ".hidden", "a b", 3])
 def test_names_are_names_of_files(tmp_path, name):
     with pytest.raises(ProblemError, match="name of a case"):
         run_cases(square, {name: {"x": 1}}, tmp_path)

@@ -123,6 +123,15 @@ def test_a_filter_of_another_loop_is_refused(setup):
         setup.controller(three)
 
 
+def test_a_filter_for_another_mirror_is_refused(setup):
+    slow = lbt.load_config("examples/lbt_slow_mirror.yaml")
+    with pytest.raises(ProblemError, match="another mirror"):
+        setup.controller(lbt.lqg(slow.plant))
+    with pytest.raises(ProblemError, match="another mirror"):
+        slow.end_to_end.controller(lbt.kalman(lbt.load_config(CONFIG).plant))
+    assert slow.end_to_end.controller(lbt.lqg(slow.plant)).n_modes == 672
+
+
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
@@ -307,6 +316,7 @@ def test_a_design_cannot_take_the_name_of_the_papers(setup):
         ["--frames", "1"],
         ["--settle-frames", "10"],
         ["--seed", "-1"],
+        ["--seed", "5000000000"],
         ["--pixels", "7"],
         ["nowhere.fits"],
     ],

@@ -153,7 +153,7 @@ def test_in_the_linear_range_it_is_the_modal_loop(cache, method, delay):
     # what the air and the photons add, in squares
     quiet = replace(setup, vibrations=()).run(design, cache=cache)
     still = np.hypot(*quiet.rms_nm[:2])
-    assert np.sqrt(found**2 - still**2) == pytest.approx(expected, rel=0.03)
+    assert np.sqrt(found**2 - still**2) == pytest.approx(expected, rel=0.04)
     assert still < expected
 
 
@@ -283,3 +283,25 @@ def test_a_table_that_was_killed_goes_on(tmp_path, cache):
     }
     lines = (out / "table_ii.csv").read_text().splitlines()
     assert len(lines) == 7
+
+
+def test_phase_screens_are_kept_by_their_content_and_drawn_anew_if_damaged(tmp_path, calibration):
+    setup = replace(SETUP, frames=20, settle_frames=200)
+    known = {"cache": tmp_path, "calibration": calibration}
+    first = setup.run(None, **known)
+    (file,) = tmp_path.glob("screens/*/*.fits")
+    whole = file.read_bytes()
+    for damage in (whole[:1000], b"", whole[: len(whole) // 2]):
+        file.write_bytes(damage)
+        assert np.array_equal(setup.run(None, **known).residual_nm, first.residual_nm)
+        assert file.read_bytes() == whole
+    # 1.5 and 1.5001 m have the same pixel to three decimals, which is how SPECULA names a screen
+    other = replace(BRIGHT, diameter_m=1.5001)
+    lbt.run_end_to_end(other, setup.controller(None), frames=2, settle_frames=200, **known)
+    assert len(list(tmp_path.glob("screens/*/*.fits"))) == 2
+
+
+def test_a_cache_that_takes_no_screens(tmp_path, calibration):
+    (tmp_path / "screens").write_text("not a directory")
+    with pytest.raises(lbt.OutputError, match="phase screen"):
+        replace(SETUP, frames=2).run(None, cache=tmp_path, calibration=calibration)

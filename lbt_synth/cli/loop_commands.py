@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import asdict, astuple, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,8 @@ from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
 from lbt_synth.limits import least_residual
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
-from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models import Truth
+from lbt_synth.models.hardware import same_mirror
 from lbt_synth.plotting import require_figure_name, save_figure, sigma_figure, simulation_figure
 from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
@@ -222,13 +223,6 @@ def foreign_notes(config: Config, design: Design) -> list[str]:
             else "note: designed for other dynamics of the mirror than it is run with."
         )
     return notes
-
-
-def same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
-    """Whether two loops have the same dynamics of the mirror."""
-    if one.mirror is None or other.mirror is None:
-        return one.mirror is other.mirror
-    return astuple(one.mirror) == astuple(other.mirror)
 
 
 def real_truth(config: Config, arguments: Namespace) -> Truth:

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.loop_commands import named_designs, real_truth, same_mirror
+from lbt_synth.cli.loop_commands import named_designs, real_truth
 from lbt_synth.cli.output import Report, TableText, counting, fixed, progress
 from lbt_synth.cli.writing import require_outputs, write_outputs
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import stable_sensor_gains
+from lbt_synth.models.hardware import same_mirror
 from lbt_synth.plotting import map_figure, robustness_figure
 from lbt_synth.robustness_map import StrehlMap, strehl_map
 from lbt_synth.sweep import METHODS, frequency_robustness

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
@@ -43,7 +45,7 @@ def case_of(
     Returns
     -------
     dict
-        Two cases that are equal give equal runs.
+        Two cases that are equal give equal runs; the versions of the programs are in them.
     """
     system = {
         field.name: getattr(setup.system, field.name)
@@ -52,6 +54,7 @@ def case_of(
     }
     hardware = setup.system.hardware
     return {
+        "versions": {name: _version(name) for name in ("lbt-synth", "specula")},
         "system": system,
         "hardware": {
             "frame_rate_hz": hardware.frame_rate_hz,
@@ -118,7 +121,7 @@ def summary(run: EndToEndRun) -> dict[str, Any]:
     rms = run.rms_nm
     return {
         "strehl": run.strehl,
-        "strehl_error": run.strehl_error,
+        "strehl_error": None if math.isnan(run.strehl_error) else run.strehl_error,
         "other_modes_strehl": run.other_modes_strehl,
         "tip_rms_nm": float(rms[0]),
         "tilt_rms_nm": float(rms[1]),
@@ -127,6 +130,13 @@ def summary(run: EndToEndRun) -> dict[str, Any]:
         "tip_tilt_gain_error": run.tip_tilt_gain_error,
         "tip_tilt_noise_nm": run.tip_tilt_noise_nm,
     }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def _hardware(path: Mapping[str, Any]) -> LoopHardware:

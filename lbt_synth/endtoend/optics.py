@@ -7,9 +7,12 @@ bookkeeping of modes.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import io
 import logging
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.endtoend.system import EndToEndSystem
-from lbt_synth.errors import MissingExtraError, ProblemError
+from lbt_synth.errors import MissingExtraError, OutputError, ProblemError
 from lbt_synth.validation import FloatArray
 
 _SUPPORTED = "1.1"
@@ -125,6 +128,19 @@ def _parameters(system: EndToEndSystem) -> Any:
 def _pupil(system: EndToEndSystem, parameters: Any) -> Any:
     make = _part("data_objects.pupilstop:Pupilstop")
     return make(parameters, mask_diam=1.0, obs_diam=system.obstruction)
+
+
+def _discard_damaged(files: Iterable[Path]) -> None:
+    """Delete phase screens that are cut off: they are drawn anew."""
+    from astropy.io import fits
+
+    for file in files:
+        try:
+            with warnings.catch_warnings(), fits.open(io.BytesIO(file.read_bytes())) as units:
+                warnings.simplefilter("error")
+                _ = units[0].data.shape
+        except Exception:  # astropy has no common class for what damage makes it raise
+            file.unlink()
 
 
 class Optics:
@@ -267,11 +283,7 @@ class Optics:
                 f"at {system.wind_speed_m_s:g} m/s need {side}. Run fewer frames, with several "
                 "seeds."
             )
-        screens.mkdir(parents=True, exist_ok=True)
-        air = _part("processing_objects.atmo_evolution:AtmoEvolution")(
-            parameters, system.outer_scale_m, [0.0], [1.0], data_dir=str(screens),
-            pixel_phasescreens=side, seed=(seed or 0) + 1,
-        )  # fmt: skip
+        air = self._evolution(screens, side, (seed or 0) + 1, parameters)
         self._weather = [
             self._input(np.array([value]))
             for value in (
@@ -282,6 +294,24 @@ class Optics:
         for name, given in zip(names, self._weather, strict=True):
             air.inputs[name].set(given)
         return air
+
+    def _evolution(self, screens: Path, side: int, seed: int, parameters: Any) -> Any:
+        """Air with a screen from a directory of its own: the name of a screen rounds its pixel."""
+        facts = [self.system.pixel_m, self.system.outer_scale_m, side, specula_version()]
+        folder = screens / hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            _discard_damaged(folder.glob(f"ps_seed{seed}_*.fits"))
+            return _part("processing_objects.atmo_evolution:AtmoEvolution")(
+                parameters, self.system.outer_scale_m, [0.0], [1.0],
+                data_dir=str(folder), pixel_phasescreens=side, seed=seed,
+            )  # fmt: skip
+        except OSError as error:
+            raise OutputError(
+                f"cannot make or read a phase screen in {folder}: {error}. Name another "
+                "directory with --cache.",
+                path=folder,
+            ) from error
 
     def _pyramid(self, parameters: Any) -> tuple[Any, Any]:
         system = self.system

@@ -65,7 +65,11 @@ class EndToEndRun:
 
     @property
     def strehl_error(self) -> float:
-        """Standard error of the Strehl ratio, from batches of frames; nan for short runs."""
+        """Standard error of the Strehl ratio, from eight batches of frames; nan for short runs.
+
+        It is that of this air: what changes more slowly than a batch counts too little, and other
+        seeds scatter by more.
+        """
         batches = np.array_split(self.strehl_series, _BATCHES)
         if len(self.strehl_series) < 2 * _BATCHES:
             return float("nan")

@@ -20,6 +20,7 @@ from lbt_synth.validation import FloatArray, instance, integer
 
 _SCREENS = "screens"
 RAMP_FRAMES = 200
+_LARGEST_SEED = 2**31 - 2  # the optics draw from twice that, in 32 bits
 
 
 def run_end_to_end(
@@ -106,7 +107,7 @@ has; got FilterDesign.
         )
     frames = integer(frames, "frames", at_least=2)
     settle = integer(settle_frames, "settle_frames", at_least=RAMP_FRAMES)
-    seed = integer(seed, "seed", at_least=0)
+    seed = checked_seed(seed)
     shaken = Truth(turbulence=None, vibrations=tuple(vibrations))
     total = settle + frames
     tilts = draw_disturbance(
@@ -126,6 +127,20 @@ has; got FilterDesign.
         settle_frames=settle,
         seconds=time.perf_counter() - started,
     )
+
+
+def checked_seed(seed: int) -> int:
+    """Return a seed that each part of the optics can take.
+
+    Raises
+    ------
+    ProblemError
+        If it is no integer from 0 to 2147483646.
+    """
+    checked = integer(seed, "seed", at_least=0)
+    if checked > _LARGEST_SEED:
+        raise ProblemError(f"seed must be at most {_LARGEST_SEED}; got {checked}.")
+    return checked
 
 
 def _close(

@@ -10,11 +10,12 @@ import numpy as np
 
 from lbt_synth.endtoend.calibration import Calibration
 from lbt_synth.endtoend.result import EndToEndRun
-from lbt_synth.endtoend.run import RAMP_FRAMES, run_end_to_end
+from lbt_synth.endtoend.run import RAMP_FRAMES, checked_seed, run_end_to_end
 from lbt_synth.endtoend.system import EndToEndSystem
 from lbt_synth.errors import ProblemError
 from lbt_synth.modal import MixedController
 from lbt_synth.models import SinusoidalVibration, Vibration
+from lbt_synth.models.hardware import same_mirror
 from lbt_synth.validation import FloatArray, instance, integer, number
 
 
@@ -64,12 +65,9 @@ class EndToEndSetup:
     def __post_init__(self) -> None:
         instance(self.system, EndToEndSystem)
         object.__setattr__(self, "vibrations", tuple(self.vibrations))
-        for name, least in (
-            ("frames", 2),
-            ("settle_frames", RAMP_FRAMES),
-            ("seed", 0),
-        ):
+        for name, least in (("frames", 2), ("settle_frames", RAMP_FRAMES)):
             object.__setattr__(self, name, integer(getattr(self, name), name, at_least=least))
+        object.__setattr__(self, "seed", checked_seed(self.seed))
         object.__setattr__(self, "gain", number(self.gain, "gain", at_least=0))
         object.__setattr__(self, "leak", number(self.leak, "leak", at_least=0, at_most=1))
         first = integer(self.leak_from_mode, "leak_from_mode", at_least=2)
@@ -112,6 +110,11 @@ class EndToEndSetup:
                 f"the filter must be for the loop of the configuration, {mine.frame_rate_hz:g} Hz "
                 f"and {mine.delay_frames:g} frames; got one for {hardware.frame_rate_hz:g} Hz and "
                 f"{hardware.delay_frames:g} frames. Design it from this configuration."
+            )
+        if hardware is not None and not same_mirror(hardware, mine):
+            raise ProblemError(
+                "the filter was designed for another mirror than that of the configuration. Design "
+                "for its mirror.local_loop, best with --method lqg."
             )
         gains = np.full(self.system.modes, self.gain)
         if tip_tilt_gain is not None:

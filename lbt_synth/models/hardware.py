@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -151,3 +151,10 @@ class LoopHardware:
     def mirror_taps(self) -> FloatArray:
         """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``, to rounding."""
         return self.mirror_system.taps
+
+
+def same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
+    """Whether two loops have the same dynamics of the mirror."""
+    if one.mirror is None or other.mirror is None:
+        return one.mirror is other.mirror
+    return astuple(one.mirror) == astuple(other.mirror)
