@@ -410,9 +410,11 @@ def test_a_process_that_is_all_but_a_walk_is_refused():
         )
         return loop.residual_rms_nm(air, noise_nm=5.0)[1]
 
-    # noise alone and a random walk of steps v: (g / (2 - 3 g + g^2 ...)) has the limit 15.96872
-    for distance in (1e-6, 1e-7, 1e-8, 1e-9):
-        assert residual(distance) == pytest.approx(15.968719, rel=2e-6)
+    # under a random walk the residual is AR2, e(k+1) = e(k) - g e(k-1) + v + g n
+    g, v, n = 0.5, 10.0, 5.0
+    walk = np.sqrt((1 + g) / ((1 - g) * ((1 + g) ** 2 - 1)) * (v**2 + g**2 * n**2))
+    for distance in (1e-7, 1e-8, 1e-9):
+        assert residual(distance) == pytest.approx(walk, rel=1e-6)
     for distance in (1e-12, 1e-15):
         with pytest.raises(lbt.NumericalError, match="rounding of the variance.*mode 1"):
             residual(distance)

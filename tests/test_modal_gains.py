@@ -132,13 +132,19 @@ def test_telemetry_finds_what_the_models_say():
         )
         return closed.residual_rms_nm(air, noise_nm=noise)
 
-    # what is lost by gains from telemetry, in residual
-    assert np.max(cost(found.gains) / exact.rms_nm - 1) < 0.01
+    # what is lost by gains from telemetry, in residual; less where the segments are longer,
+    # which tell the modes that are best left alone from those that wander
+    assert np.max(cost(found.gains) / exact.rms_nm - 1) < 0.02
+    longer = lbt.modal_gains_from_telemetry(
+        run.measurements.T, run.commands.T, noise_nm=noise, segment_frames=4096, **known
+    )
+    assert np.max(cost(longer.gains) / exact.rms_nm - 1) < 0.01
     assert np.median(np.abs(found.gains / exact.gains - 1)) < 0.1
-    # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high
+    # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high, and
+    # nothing is lost by that
     guessed = lbt.modal_gains_from_telemetry(run.measurements.T, run.commands.T, **known)
     assert np.all(guessed.noise_nm > 0.97 * noise)
-    assert np.max(cost(guessed.gains) / exact.rms_nm - 1) < 0.15
+    assert np.max(cost(guessed.gains) / exact.rms_nm - 1) < 0.02
 
 
 def ar_series(coefficients, driving, modes, frames, rng):
@@ -173,7 +179,7 @@ def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
     assert np.std(variances) < 4 * noise**2 * np.sqrt(2 / frames)
     # where the noise is put plays no part in the choice of the gain
     guessed = lbt.modal_gains_from_telemetry(*series, frame_rate_hz=RATE)
-    assert np.allclose(guessed.gains, found.gains, rtol=5e-3, atol=2e-4)
+    assert np.quantile(np.abs(guessed.gains / found.gains - 1), 0.9) < 5e-3
 
 
 @pytest.mark.parametrize("segment_frames", [256, 511])

@@ -1,8 +1,8 @@
 """Optimised modal gains from telemetry: the spectrum of the pseudo-open-loop measurement.
 
 What is estimated is the spectrum of the difference of two frames. Turbulence falls so steeply
-that a periodogram of the phase itself leaks, and says nothing below its first frequency, where
-the loop rejects least precisely what there is most of; that of the difference is flat. The
+that a periodogram of the phase itself leaks, and misses what lies below its first frequency;
+that of the difference is flat there, and reaches down to 0. The
 rejection ``|1 - z^-1|^2 / |1 - z^-1 + h z^-1 M|^2`` loses its numerator then.
 
 The periodogram scatters about the spectrum, also where there is nothing but noise: the noise is
@@ -78,12 +78,15 @@ def modal_gains_from_telemetry(
 
     Notes
     -----
-    The gains do not depend on the noise, given or found: it moves what is called residual by the
+    The gains hardly depend on the noise, given or found: it moves what is called residual by the
     same amount at every gain. The squared residual scatters, with both signs, by about
     ``noise_nm**2 sqrt(2 / frames)`` over the sensor gain squared from the noise alone, twice that
     where the noise is found, and by what the turbulence scatters itself: 4.1 nm behind 15.5 nm
     of noise have a standard deviation of 1.0 nm after 2048 frames and 0.24 nm after 40 000. A
     residual is at least the noise that the loop lets through.
+
+    Gains below some ``2 pi / segment_frames`` are beyond the resolution of the periodogram: a mode
+    that is best left alone may get one of that size. Longer segments resolve them.
 
     Examples
     --------
