@@ -29,8 +29,10 @@ def frozen(array: npt.ArrayLike) -> FloatArray:
     return out
 
 
-def real_array(value: Any, name: str) -> FloatArray:
-    """Return a finite, read-only float64 array of any shape."""
+def float_array(value: Any, name: str) -> FloatArray:
+    """Return a float64 array of any shape: finite or not, and no copy where there need be none."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
     try:
         raw = np.asarray(value)
     except ValueError as error:
@@ -41,7 +43,12 @@ def real_array(value: Any, name: str) -> FloatArray:
         raise ProblemError(f"{name} must be real; got complex numbers.")
     if raw.dtype.kind not in "fiub":
         raise ProblemError(f"{name} must be an array of numbers; got {type(value).__name__}.")
-    out = frozen(raw)
+    return np.asarray(raw, dtype=np.float64)
+
+
+def real_array(value: Any, name: str) -> FloatArray:
+    """Return a finite, read-only float64 array of any shape."""
+    out = frozen(float_array(value, name))
     if not np.all(np.isfinite(out)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(out))[0])
         raise NonFiniteError(

@@ -285,3 +285,41 @@ def test_a_filter_without_matrices_is_stepped_but_not_linear():
     assert mixed.step([1.0, 1.0, 3.0]).tolist() == [0.5, 0.5, -3.0]
     with pytest.raises(lbt.ProblemError, match="only a filter with matrices"):
         mixed.as_controller()
+
+
+class Own:
+    """A filter that returns what it is told to."""
+
+    def __init__(self, out):
+        self.out = out
+
+    def reset(self):
+        pass
+
+    def step(self, y):
+        return self.out
+
+
+def test_what_a_filter_returns_is_checked():
+    for out, error, words in (
+        (5.0, lbt.DimensionError, r"commands must have shape \(2,\).*got \(\)"),
+        (np.zeros(3), lbt.DimensionError, r"got \(3,\)"),
+        (np.array([1.0, np.nan]), lbt.NonFiniteError, "commands must be finite"),
+        (["a", "b"], lbt.ProblemError, "commands must be an array of numbers"),
+    ):
+        own = Own(np.zeros(2))
+        control = lbt.MixedController(filter=own, gains=[0.0, 0.0, 0.5])
+        assert control.step([1.0, 1.0, 1.0]).tolist() == [0.0, 0.0, 0.5]
+        own.out = out
+        with pytest.raises(error, match=words):
+            control.step([1.0, 1.0, 1.0])
+        own.out = np.ones(2)  # the integrators are as before
+        assert control.step([1.0, 1.0, 1.0]).tolist() == [1.0, 1.0, 1.0]
+
+
+def test_measurements_that_are_no_numbers_are_refused():
+    control = lbt.MixedController.integrators([0.5])
+    for y, words in (("a", "array of numbers"), (["1.0"], "array of numbers"), ([1j], "real")):
+        with pytest.raises(lbt.ProblemError, match=words):
+            control.step(y)
+    assert control.step([1]).tolist() == [0.5]

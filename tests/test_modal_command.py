@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 
+import numpy as np
 import pytest
 from plants import LBT_YAML
 from test_cli import run
@@ -53,6 +54,30 @@ def test_modal_without_a_pyramid(tmp_path, capsys):
     status, _, error = run(capsys, "modal", config)
     assert status == 2
     assert "the key mirror.modes is missing" in error
+
+
+def test_modal_knows_the_local_loop(capsys):
+    """Gains and filters of a slow mirror are those of loops with that mirror."""
+    slow = LBT_YAML.parent / "lbt_slow_mirror.yaml"
+    status, text, _ = run(capsys, "modal", slow, "--modes", 5, "--json")
+    assert status == 0
+    data, config = json.loads(text), lbt.load_config(slow)
+    shell = config.hardware.mirror
+    assert shell is not None
+    air = lbt.modal_turbulence(config.atmosphere, modes=5, frame_rate_hz=800)
+    noise = lbt.pyramid_modal_noise_nm(config.noise_nm, modes=5, modulation_lambda_over_d=4)
+    line = config.plant.vibrations[0]
+    known = {"noise_nm": noise, "vibrations": {0: line, 1: line}}
+    gains = lbt.modal_gains(air, frame_rate_hz=800, mirror=shell, **known)
+    filters = lbt.modal_filters(air, mirror=shell, **known)
+    assert data["rows"][0]["gain"] == pytest.approx(gains.gains[0])
+    assert data["residual_nm"]["Kalman filters"] == pytest.approx((filters.rms_nm**2).sum() ** 0.5)
+    loop = lbt.modal_loop(
+        lbt.MixedController.integrators(gains.gains), mirror=shell, frame_rate_hz=800
+    )
+    assert np.allclose(loop.residual_rms_nm(air, **known), gains.rms_nm, rtol=1e-6)
+    status, text, _ = run(capsys, "modal", slow, "--modes", 5)
+    assert "the Kalman filters know its real positions" in text
 
 
 @pytest.mark.parametrize(

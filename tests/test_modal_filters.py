@@ -111,6 +111,38 @@ def test_each_filter_is_that_of_kalman(delay, order):
         assert filters.rms_nm[i] == pytest.approx(exact.rms_nm, rel=1e-8)
 
 
+@pytest.mark.parametrize("delay", [1, 2, 2.6])
+@pytest.mark.parametrize("bandwidth", [60.0, 500.0])
+def test_filters_know_the_mirror_as_kalman_does(delay, bandwidth):
+    shell = lbt.PositionLoop.of_bandwidth(
+        natural_frequency_hz=20, damping=0.5, bandwidth_hz=bandwidth
+    )
+    air, lines = some_air(4), {1: [LINE], 3: [LINE, HUM]}
+    noise, gain = np.linspace(5, 20, 4), np.linspace(0.6, 1.1, 4)
+    known = {"delay_frames": delay, "mirror": shell}
+    filters = lbt.modal_filters(air, noise_nm=noise, vibrations=lines, sensor_gain=gain, **known)
+    loop = lbt.modal_loop(filters, sensor_gain=gain)
+    assert (loop.mirror, loop.frame_rate_hz, loop.delay_frames) == (shell, RATE, delay)
+    exact = loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
+    assert np.allclose(exact, filters.rms_nm, rtol=1e-9)
+    for i in range(4):
+        plant = lbt.tip_tilt_plant(
+            frame_rate_hz=RATE, turbulence=air.model(i), vibrations=lines.get(i),
+            noise_nm=float(noise[i]), sensor_gain=float(gain[i]), modes=1, **known,
+        )  # fmt: skip
+        one = lbt.kalman(plant)
+        mine = filters.controller(i)
+        assert mine.n_states == one.controller.n_states
+        for name in "ABCD":
+            assert np.allclose(getattr(mine, name), getattr(one.controller, name), atol=1e-10)
+        truth = lbt.Truth(
+            turbulence=air.model(i), vibrations=tuple(lines.get(i, ())), noise_nm=noise[i]
+        )
+        path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[gain[i]]], **known)
+        budget = lbt.residual_budget(lbt.close_loop(path, one.controller), truth)
+        assert filters.rms_nm[i] == pytest.approx(budget.rms_nm, rel=1e-8)
+
+
 @pytest.mark.parametrize("delay", [1, 2.6, 3])
 def test_stacked_plants_are_tip_tilt_plants(delay):
     air, lines = some_air(3), lines_per_mode({2: [LINE, HUM]}, 3)
@@ -138,15 +170,16 @@ def test_a_failing_mode_is_named():
     gains[2] *= 1.001
     examined = certificates.Examined(4)
     examined.filters(stack, gains, solution)
-    examined.loops(stack.modes, np.full(4, 0.5), filters.rms_nm[:, None] ** 2, np.zeros(4))
-    checks = examined.certificate(whole_delay=False)
+    zero = np.zeros(4)
+    examined.loops(stack.modes, np.full(4, 0.5), filters.rms_nm[:, None] ** 2, zero, zero)
+    checks = examined.certificate(applied=False)
     assert not checks.passed
     with pytest.raises(lbt.CertificateError, match="least-variance gain .mode 2."):
         checks.require()
     gains[:] = 5.0
     examined.filters(stack, gains, solution)
     with pytest.raises(lbt.CertificateError, match="modes 0, 1, 2 and 3"):
-        examined.certificate(whole_delay=False).require()
+        examined.certificate(applied=False).require()
 
 
 def test_stacked_lyapunov_is_scipys():
@@ -173,6 +206,8 @@ def test_bad_filters_are_refused():
         ({"noise_nm": 1, "sensor_gain": -1}, lbt.ProblemError, "sensor_gain must be above 0"),
         ({"noise_nm": 1, "vibrations": [LINE]}, lbt.ProblemError, "must be a mapping"),
         ({"noise_nm": 1, "vibrations": {3: LINE}}, lbt.ProblemError, "from 0 to 2"),
+        ({"noise_nm": 1, "vibrations": {0: 3}}, lbt.ProblemError, "list of Vibration"),
+        ({"noise_nm": 1, "mirror": 3}, lbt.ProblemError, "PositionLoop"),
         ({"noise_nm": 1, "vibrations": {0: [1]}}, lbt.ProblemError, "list of Vibration"),
     ):
         with pytest.raises(error, match=words):
@@ -182,6 +217,8 @@ def test_bad_filters_are_refused():
         filters.controller(1)
     with pytest.raises(lbt.DimensionError, match=r"\(1,\)"):
         filters.start().step([1.0, 2.0])
+    with pytest.raises(lbt.ProblemError, match="y must be an array of numbers"):
+        filters.start().step(["a"])
 
 
 # ---------------------------------------------------------------- the loop of all modes
@@ -325,3 +362,68 @@ def test_bad_loops_are_refused():
     two = lbt.modal_filters(some_air(2), noise_nm=1.0)
     with pytest.raises(lbt.DimensionError, match="for the 1 filtered modes; got 2"):
         lbt.MixedController(filter=two, gains=[0.1, 0.1], filtered=(0,))
+
+
+# ---------------------------------------------------------------- rates, delays, digits
+def test_loops_have_the_rate_of_their_filters():
+    air, slow = some_air(2), lbt.ARModel(coefficients=[0.9], driving_rms_nm=5, frame_rate_hz=400)
+    filters = lbt.modal_filters(air, noise_nm=10.0, delay_frames=3)
+    mixed = lbt.MixedController(filter=filters, gains=[0.0, 0.0])
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=air.model(0), noise_nm=10.0, delay_frames=3
+    )
+    both = lbt.MixedController(filter=lbt.kalman(plant), gains=[0.0, 0.0, 0.2])
+    for controller in (filters, mixed, both):
+        loop = lbt.modal_loop(controller)
+        assert (loop.delay_frames, loop.frame_rate_hz, loop.is_stable) == (3.0, RATE, True)
+        assert lbt.modal_loop(controller, delay_frames=2.8).delay_frames == 2.8
+        n = controller.n_modes
+        with pytest.raises(lbt.ProblemError, match="loop's frame rate, 800 Hz; got 400 Hz"):
+            loop.residual_rms_nm([slow] * n, noise_nm=10.0)
+        with pytest.raises(lbt.ProblemError, match="frame_rate_hz must be that of the filters"):
+            lbt.modal_loop(controller, frame_rate_hz=400)
+        if controller is not filters:
+            assert controller.as_controller().dt_s == 1 / RATE
+            assert controller.as_controller(1 / RATE).dt_s == 1 / RATE
+            with pytest.raises(lbt.ProblemError, match="dt_s must be that of the filter"):
+                controller.as_controller(1 / 400)
+    assert np.allclose(
+        lbt.modal_loop(mixed).residual_rms_nm(air, noise_nm=10.0), filters.rms_nm, rtol=1e-9
+    )
+    plain = lbt.MixedController.integrators([0.1, 0.1])
+    free = lbt.modal_loop(plain)
+    assert (free.frame_rate_hz, free.delay_frames) == (None, 2.0)
+    assert free.residual_rms_nm([slow] * 2, noise_nm=1.0).shape == (2,)
+    with pytest.raises(lbt.ProblemError, match="loop's frame rate, 800 Hz"):
+        lbt.modal_loop(plain, frame_rate_hz=RATE).residual_rms_nm([slow] * 2, noise_nm=1.0)
+    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5, bandwidth_hz=300)
+    with pytest.raises(lbt.ProblemError, match="needs frame_rate_hz"):
+        lbt.modal_loop(plain, mirror=shell)
+
+
+def test_a_process_that_is_all_but_a_walk_is_refused():
+    loop = lbt.modal_loop(lbt.MixedController.integrators([0.5, 0.5]))
+
+    def residual(distance):
+        air = lbt.ModalTurbulence(
+            coefficients=[[0.9], [1 - distance]], driving_rms_nm=[1.0, 10.0], frame_rate_hz=RATE
+        )
+        return loop.residual_rms_nm(air, noise_nm=5.0)[1]
+
+    # under a random walk the residual is AR2, e(k+1) = e(k) - g e(k-1) + v + g n
+    g, v, n = 0.5, 10.0, 5.0
+    walk = np.sqrt((1 + g) / ((1 - g) * ((1 + g) ** 2 - 1)) * (v**2 + g**2 * n**2))
+    for distance in (1e-7, 1e-8, 1e-9):
+        assert residual(distance) == pytest.approx(walk, rel=1e-6)
+    for distance in (1e-12, 1e-15):
+        with pytest.raises(lbt.NumericalError, match="rounding of the variance.*mode 1"):
+            residual(distance)
+
+
+def test_series_that_are_no_numbers_are_refused():
+    loop = lbt.modal_loop(lbt.MixedController.integrators([0.5]))
+    for total, noise in (("a", "b"), ([["1", "2"]], [[0, 0]]), ([[1j, 0]], [[0, 0]])):
+        with pytest.raises(lbt.ProblemError, match="total_nm must be"):
+            loop.run(total, noise)
+    with pytest.raises(lbt.DimensionError, match="rows of unequal length"):
+        loop.run([[1.0], [1.0, 2.0]], [[1.0]])

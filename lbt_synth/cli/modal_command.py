@@ -31,16 +31,18 @@ def modal(arguments: Namespace) -> Report:
             config.atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz
         )
         lines = _vibrations(config, count)
-        delay, gain = config.hardware.delay_frames, config.settings.model.sensor_gain
-        known: dict[str, Any] = {
-            "noise_nm": noise, "vibrations": lines, "delay_frames": delay, "sensor_gain": gain,
-        }  # fmt: skip
+        path: dict[str, Any] = {
+            "delay_frames": config.hardware.delay_frames,
+            "sensor_gain": config.settings.model.sensor_gain,
+            "mirror": config.hardware.mirror,
+        }
+        known: dict[str, Any] = {"noise_nm": noise, "vibrations": lines, **path}
         gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **known)
         filters = modal_filters(air, **known)
 
         def integrators(one: float) -> FloatArray:
             control = MixedController.integrators(np.full(count, one))
-            loop = modal_loop(control, delay_frames=delay, sensor_gain=gain)
+            loop = modal_loop(control, frame_rate_hz=air.frame_rate_hz, **path)
             return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
 
         best = minimize_scalar(
@@ -65,6 +67,7 @@ def modal(arguments: Namespace) -> Report:
             "turbulence: AR1 models, von Karman variances, poles by radial order.",
             "vibrations: those of the model, on tip and tilt.",
             assumed,
+            *_mirror_notes(config),
             "the modes are those of Zernike, independent; nothing leaks from one to another.",
         ],
     )  # fmt: skip
@@ -120,6 +123,17 @@ def _vibrations(config: Config, count: int) -> dict[int, list[Vibration]]:
                 )  # fmt: skip
                 found.setdefault(axis, []).append(own)
     return found
+
+
+def _mirror_notes(config: Config) -> list[str]:
+    """Say what the controllers know of a mirror with dynamics."""
+    if config.hardware.mirror is None:
+        return []
+    return [
+        "mirror: its local loop on every mode; the Kalman filters know its real positions, but "
+        "command their estimates as if it were there at once (lbt-synth mirror, design lqg: tip "
+        "and tilt without this lag)."
+    ]
 
 
 def _total(rms: FloatArray) -> float:

@@ -99,7 +99,7 @@ def integrator_gain_limit(delay_frames: float) -> float:
     return start * stable_sensor_gains(hardware, _controller(hardware, start))[1]
 
 
-def _gain_limit(hardware: LoopHardware) -> float:
+def hardware_gain_limit(hardware: LoopHardware) -> float:
     """Gain at which an integrator becomes unstable, whatever the mirror."""
     if hardware.mirror is None:
         return integrator_gain_limit(hardware.delay_frames)
@@ -147,7 +147,7 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     >>> 0.2 < design.gain < 0.6
     True
     """
-    limit = _gain_limit(hardware) / max(1.0, truth.sensor_gain)
+    limit = hardware_gain_limit(hardware) / max(1.0, truth.sensor_gain)
 
     def variance(log_gain: float) -> float:
         controller = _controller(hardware, float(np.exp(log_gain)))

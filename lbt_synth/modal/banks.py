@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, float_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,7 +70,7 @@ class RunningBanks:
 
     def step(self, y: Any) -> FloatArray:
         """Take the measurements y(k), (n,), and return the commands u(k), (n,)."""
-        measured = np.asarray(y, dtype=np.float64)
+        measured = float_array(y, "y")
         if measured.shape != (self.n_modes,):
             raise DimensionError(f"y must have shape ({self.n_modes},); got {measured.shape}.")
         command = np.zeros(self.n_modes)

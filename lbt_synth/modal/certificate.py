@@ -26,7 +26,7 @@ class Examined:
 
     def __init__(self, modes: int) -> None:
         self.radius, self.loop_radius = np.full((2, modes), np.nan)
-        self.riccati, self.lyapunov, self.loop_lyapunov = np.full((3, modes), np.nan)
+        self.riccati, self.lyapunov, self.loop_lyapunov, self.rounding = np.full((4, modes), np.nan)
         self.estimation, self.residual = np.full((2, modes), np.nan)  # variances
         self.variance, self.gain = np.full((2, modes), np.nan)  # relative distances
 
@@ -47,14 +47,22 @@ class Examined:
         self.gain[modes] = norms(gains - optimal) / np.where(size > 0, size, 1.0)
 
     def loops(
-        self, modes: np.ndarray, radii: FloatArray, variances: FloatArray, residuals: FloatArray
+        self,
+        modes: np.ndarray,
+        radii: FloatArray,
+        variances: FloatArray,
+        residuals: FloatArray,
+        rounding: FloatArray,
     ) -> None:
         """Take the closed loops: stability, variance of the residual."""
         self.loop_radius[modes], self.loop_lyapunov[modes] = radii, residuals
-        self.residual[modes] = variances[:, 0]
+        self.residual[modes], self.rounding[modes] = variances[:, 0], rounding
 
-    def certificate(self, *, whole_delay: bool) -> Certificate:
-        """Return the checks, each of its worst mode; one that fails names all modes that do."""
+    def certificate(self, *, applied: bool) -> Certificate:
+        """Return the checks, each of its worst mode; one that fails names all modes that do.
+
+        ``applied``: the loop applies the estimate itself, at once and a whole delay later.
+        """
         stable = 1 - STABILITY_MARGIN
         equation = "relative, by squaring"
         checks = [
@@ -71,12 +79,16 @@ class Examined:
             _worst("residual of the loop's Lyapunov equation", self.loop_lyapunov,
                    RESIDUAL_TOLERANCE, equation),
         ]  # fmt: skip
-        if whole_delay:
-            # the loop applies the estimate itself: its residual is the estimation error
+        if applied:  # the residual is the estimation error
             apart = np.abs(self.residual - self.estimation) / self.estimation
             checks.append(
                 _worst("residual of the closed loop, against the estimation error", apart,
                        VARIANCE_TOLERANCE, "relative, two Lyapunov equations")
+            )  # fmt: skip
+        else:
+            checks.append(
+                _worst("rounding in the residual of the closed loop", self.rounding,
+                       VARIANCE_TOLERANCE, "relative, sizes of the terms of its variance")
             )  # fmt: skip
         return Certificate(
             checks=tuple(checks),

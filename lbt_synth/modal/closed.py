@@ -60,11 +60,12 @@ def spectral_radii(A: FloatArray) -> FloatArray:
 
 def block_variances(
     block: LoopBlock, turbulence: ModalTurbulence, lines: Lines, noise_nm: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Exact variance of the residual of each mode, (N, w), under models and white noise.
 
     The models are joined to the loops, and the Lyapunov equations solved; the second array,
-    (N,), is their relative residuals.
+    (N,), is their relative residuals. The third, (N,), is what rounding may have done to the
+    variances, relative: they are small differences where a process is nearly a random walk.
     """
     count, w = block.modes.shape
     n = block.A.shape[-1]
@@ -85,4 +86,9 @@ def block_variances(
         A[:, x, x], B[:, x, v] = models[:, i], drives[:, i]
     P, residuals = stationary_covariances(A, B @ transposed(B))
     output = C @ P @ transposed(C) + D @ transposed(D)
-    return np.diagonal(output, axis1=-2, axis2=-1).copy(), residuals
+    variances = np.diagonal(output, axis1=-2, axis2=-1).copy()
+    sizes = np.abs(C) @ np.abs(P) @ np.abs(transposed(C))
+    sizes = np.diagonal(sizes, axis1=-2, axis2=-1) + np.sum(D**2, axis=-1)
+    small = np.finfo(float).tiny  # no disturbance: 0, and nothing is lost
+    rounding = np.finfo(float).eps * np.max(sizes / np.maximum(variances, small), axis=-1)
+    return variances, residuals, np.asarray(rounding)

@@ -24,6 +24,7 @@ from lbt_synth.modal.plants import (
 from lbt_synth.modal.reconstructor import modes_named
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.local_loop import PositionLoop
 from lbt_synth.models.modal_turbulence import ModalTurbulence
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.riccati import DareSolution, solve_dare
@@ -48,6 +49,8 @@ class ModalFilters:
         Measurement noise and sensor gain of each mode that the design assumes.
     delay_frames : float
         Total delay [frames].
+    mirror : PositionLoop or None
+        Dynamics of the mirror that the controllers know; None: it settles at once.
     states, controller_states : (n,) ndarray
         Number of states of each filter, and of each controller.
     gain_predictor : (n, s) ndarray
@@ -67,6 +70,7 @@ class ModalFilters:
     noise_nm: FloatArray
     sensor_gain: FloatArray
     delay_frames: float
+    mirror: PositionLoop | None
     states: IntArray
     controller_states: IntArray
     gain_predictor: FloatArray
@@ -82,6 +86,21 @@ class ModalFilters:
     def n_modes(self) -> int:
         """Number of modes n."""
         return int(self.noise_nm.size)
+
+    @property
+    def dt_s(self) -> float:
+        """Frame period [s]."""
+        return 1 / self.turbulence.frame_rate_hz
+
+    @property
+    def hardware(self) -> LoopHardware:
+        """Loop that the filters are designed for, of one mode with a unit sensor."""
+        return LoopHardware(
+            frame_rate_hz=self.turbulence.frame_rate_hz,
+            delay_frames=self.delay_frames,
+            modes=1,
+            mirror=self.mirror,
+        )
 
     def controller(self, mode: int) -> Controller:
         """Return the controller of one mode.
@@ -110,7 +129,7 @@ class ModalFilters:
             B=self.B[i, :s],
             C=self.C[i, :, :s],
             D=self.D[i],
-            dt_s=1 / self.turbulence.frame_rate_hz,
+            dt_s=self.dt_s,
         )
 
     def banks(self) -> tuple[Bank, ...]:
@@ -134,11 +153,17 @@ def modal_filters(
     vibrations: Mapping[int, Vibration | Sequence[Vibration]] | None = None,
     delay_frames: float = 2.0,
     sensor_gain: Any = 1.0,
+    mirror: PositionLoop | None = None,
 ) -> ModalFilters:
     """Design a Kalman filter for every mode, all at once.
 
     Each mode is the plant of :func:`tip_tilt_plant` for a single mode. Modes are independent:
     neither their turbulence nor their noise is correlated.
+
+    A mirror with dynamics is treated as :func:`kalman` does: what it really did is taken out of
+    the measurements, so that every loop is stable, but the command is the estimate itself, as if
+    the mirror were there at once; ``rms_nm`` holds the lag that this leaves. :func:`lqg`
+    designs commands that lead the mirror, one or two modes at a time.
 
     Parameters
     ----------
@@ -152,6 +177,8 @@ def modal_filters(
         Total delay of the loop [frames], at least 1, fractions allowed.
     sensor_gain : float or (n,) array_like, optional
         Sensor (optical) gain that the design assumes.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror, the same for all modes; one that settles at once by default.
 
     Returns
     -------
@@ -181,14 +208,16 @@ def modal_filters(
     n = air.n_modes
     noise = per_mode_number(noise_nm, "noise_nm", n)
     gain = per_mode_number(sensor_gain, "sensor_gain", n)
-    hardware = LoopHardware(frame_rate_hz=air.frame_rate_hz, delay_frames=delay_frames, modes=1)
+    hardware = LoopHardware(
+        frame_rate_hz=air.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
+    )
     lines = lines_per_mode(vibrations, n)
-    taps = hardware.mirror_taps
+    response = hardware.mirror_system.whole
     stacks = plant_stacks(
         air, lines, noise_nm=noise, delay_frames=hardware.delay_frames, sensor_gain=gain
     )
     s = max(stack.A.shape[-1] for stack in stacks)
-    c = s + len(taps) - 1
+    c = s + response.n_states
     parts = {
         "gain_predictor": np.zeros((n, s)), "A": np.zeros((n, c, c)), "B": np.zeros((n, c, 1)),
         "C": np.zeros((n, 1, c)), "D": np.zeros((n, 1, 1)),
@@ -200,18 +229,18 @@ def modal_filters(
         modes, size = stack.modes, stack.A.shape[-1]
         solution = _solved(stack)
         gains = np.array(transposed(solution.gain_feedback))
-        A, B, C, D = stack.controllers(gains, taps)
+        A, B, C, D = stack.controllers(gains, response)
         used = A.shape[-1]
         states[modes], poles[modes, :size] = size, solution.poles
         parts["gain_predictor"][modes, :size] = gains[..., 0]
         parts["A"][modes, :used, :used], parts["B"][modes, :used] = A, B
         parts["C"][modes, :, :used], parts["D"][modes] = C, D
         bank = Bank(modes=modes[:, None], A=A, B=B, C=C, D=D)
-        block = close_bank(bank, gain, hardware.mirror_system.whole)
+        block = close_bank(bank, gain, response)
         examined.filters(stack, gains, solution)
         examined.loops(modes, spectral_radii(block.A), *block_variances(block, air, lines, noise))
     whole = hardware.delay_frames >= 2 and hardware.delay_frames == int(hardware.delay_frames)
-    certificate = examined.certificate(whole_delay=whole).require(
+    certificate = examined.certificate(applied=whole and mirror is None).require(
         "Scale the noise or the turbulence of these modes to sizes that occur."
     )
     poles.setflags(write=False)
@@ -221,8 +250,9 @@ def modal_filters(
         noise_nm=noise,
         sensor_gain=gain,
         delay_frames=hardware.delay_frames,
+        mirror=mirror,
         states=_read_only(states),
-        controller_states=_read_only(states + len(taps) - 1),
+        controller_states=_read_only(states + response.n_states),
         poles=poles,
         rms_nm=frozen(np.sqrt(examined.residual)),
         certificate=certificate,

@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.design.integrator import TRIED_GAINS, integrator_gain_limit
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.loop.budget import distinct_edges, pole_edges
 from lbt_synth.modal.plants import Lines, lines_per_mode, per_mode_number
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.local_loop import PositionLoop
 from lbt_synth.models.modal_turbulence import ModalTurbulence
 from lbt_synth.models.truth import Spectrum, breakpoints_below
 from lbt_synth.models.vibration import Vibration
@@ -29,15 +30,14 @@ from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     frozen,
-    integer,
     number,
-    real_array,
 )
+
+Density = Callable[[FloatArray], FloatArray]
 
 _GRID = 161  # loop gains
 _HIGHEST = 0.9999  # of the stability limit: end of the grid
 _RESONANT = (0.3, 0.6, 0.8, 0.9, 0.97, 0.99, 0.999)  # of the limit: resonances that are resolved
-_QUIET = 0.4  # of the frame rate: the noise is found above
 _WINDOW = 10  # points of a polynomial
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _STEPS = 45  # golden sections: 1e-9 of the bracket
@@ -66,6 +66,8 @@ class ModalGains:
         Measurement noise that was given or found [nm].
     delay_frames : float
         Total delay [frames].
+    mirror : PositionLoop or None
+        Dynamics of the mirror; None: it settles at once.
     """
 
     gains: FloatArray
@@ -74,6 +76,7 @@ class ModalGains:
     limited: BoolArray
     noise_nm: FloatArray
     delay_frames: float
+    mirror: PositionLoop | None
 
 
 def modal_gains(
@@ -85,6 +88,7 @@ def modal_gains(
     delay_frames: float = 2.0,
     sensor_gain: Any = 1.0,
     margin: float = 0.001,
+    mirror: PositionLoop | None = None,
 ) -> ModalGains:
     """Find the integrator gain of least residual for every mode, from spectra.
 
@@ -104,7 +108,10 @@ def modal_gains(
         Sensor (optical) gain of each mode, known.
     margin : float, optional
         Distance from the stability limit as a part of it: gains are at most ``(1 - margin)``
-        times :func:`integrator_gain_limit`, and that over a sensor gain above 1.
+        times :func:`integrator_gain_limit` (or the limit with the mirror's dynamics), and that
+        over a sensor gain above 1.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror, the same for all modes; one that settles at once by default.
 
     Returns
     -------
@@ -128,7 +135,10 @@ def modal_gains(
     >>> found.gains[[0, 50, 99]].round(3).tolist()
     [0.456, 0.304, 0.212]
     """
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    path = LoopHardware(
+        frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
+    )
+    rate = path.frame_rate_hz
     densities, count = _densities(spectra, rate)
     lines = lines_per_mode(vibrations, count)
     edges = _own_edges(spectra, lines, rate)
@@ -140,121 +150,12 @@ def modal_gains(
                 out[mode] += line.ar_model(rate).psd(frequency)
         return out
 
-    return _least(
-        density, edges, rate,
+    return least_residuals(
+        density, edges, path,
         noise=per_mode_number(noise_nm, "noise_nm", count, zero=True),
         gain=per_mode_number(sensor_gain, "sensor_gain", count),
-        delay_frames=delay_frames,
         margin=margin,
     )  # fmt: skip
-
-
-def modal_gains_from_telemetry(
-    measurements: Any,
-    commands: Any,
-    *,
-    frame_rate_hz: float,
-    noise_nm: Any = None,
-    delay_frames: float = 2.0,
-    sensor_gain: Any = 1.0,
-    margin: float = 0.001,
-    segment_frames: int = 1024,
-) -> ModalGains:
-    """Find the integrator gain of least residual for every mode, from a running loop.
-
-    Measurements and commands of the closed loop give the pseudo-open-loop measurement
-    ``y(k) + sensor_gain phi_cor(k-1)``, with ``phi_cor`` the mirror's correction; its
-    periodogram (Welch) less that of the noise is the spectrum.
-
-    Parameters
-    ----------
-    measurements, commands : (frames, n) array_like
-        Modal measurements y(k) and commands u(k) [nm], a row a frame as in telemetry.
-    frame_rate_hz : float
-        Frame rate [Hz].
-    noise_nm : float or (n,) array_like, optional
-        Measurement noise per frame [nm]; by default the mean of the periodogram's upper
-        fifth, where there should be nothing but noise.
-    delay_frames : float, optional
-        Total delay of the loop [frames], at least 1, fractions allowed.
-    sensor_gain : float or (n,) array_like, optional
-        Sensor (optical) gain of each mode, known.
-    margin : float, optional
-        Distance from the stability limit as a part of it, as for :func:`modal_gains`.
-    segment_frames : int, optional
-        Length of the periodogram's segments [frames], at least 16.
-
-    Returns
-    -------
-    ModalGains
-        The gains, and what they leave.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of its range or not finite, sizes clash, or the series are shorter
-        than a segment.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> rng = np.random.default_rng(0)
-    >>> noise = 5.0 * rng.standard_normal((1, 20_000))
-    >>> walk = 0.99 * np.cumsum(rng.standard_normal((1, 20_000)), axis=1)
-    >>> loop = lbt.modal_loop(lbt.MixedController.integrators([0.3]))
-    >>> run = loop.run(walk, noise, all_series=True)
-    >>> found = lbt.modal_gains_from_telemetry(
-    ...     run.measurements.T, run.commands.T, frame_rate_hz=800)
-    >>> bool(abs(found.noise_nm[0] - 5) < 0.5), bool(0.1 < found.gains[0] < 0.25)
-    (True, True)
-    """
-    from scipy.signal import welch
-
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    y, u = real_array(measurements, "measurements"), real_array(commands, "commands")
-    if y.ndim != 2 or y.shape != u.shape or y.size == 0:
-        raise DimensionError(
-            f"measurements and commands must both be (frames, modes); got {y.shape} and {u.shape}."
-        )
-    y, u = y.T, u.T
-    count, frames = y.shape
-    segment = integer(segment_frames, "segment_frames", at_least=16)
-    gain = per_mode_number(sensor_gain, "sensor_gain", count)
-    taps = LoopHardware(frame_rate_hz=rate, delay_frames=delay_frames, modes=1).mirror_taps
-    first = len(taps)  # frame whose correction is known
-    if frames - first < segment:
-        raise ProblemError(
-            f"the series must be longer than a segment, {segment} frames; got {frames}. Record "
-            "more, or shorten segment_frames."
-        )
-    open_loop = y[:, first:] / gain[:, None]
-    for i, tap in enumerate(taps):
-        open_loop = open_loop + tap * u[:, first - 1 - i : frames - 1 - i]
-    frequency, power = welch(open_loop, fs=rate, nperseg=segment, axis=1)
-    frequency, power = frequency[1:-1], power[:, 1:-1]  # the ends are not one-sided
-    if noise_nm is None:
-        white = np.mean(power[:, frequency > _QUIET * rate], axis=1)
-        noise = np.sqrt(white * rate / 2) * gain
-    else:
-        noise = per_mode_number(noise_nm, "noise_nm", count, zero=True)
-        white = 2 * (noise / gain) ** 2 / rate
-    table = np.maximum(power - white[:, None], 0.0)
-
-    def density(wanted: FloatArray) -> FloatArray:
-        left = np.clip(np.searchsorted(frequency, wanted) - 1, 0, frequency.size - 2)
-        part = np.clip(
-            (wanted - frequency[left]) / (frequency[left + 1] - frequency[left]), 0.0, 1.0
-        )
-        return np.asarray(table[:, left] * (1 - part) + table[:, left + 1] * part)
-
-    return _least(
-        density, 2 * frequency / rate, rate,
-        noise=noise, gain=gain, delay_frames=delay_frames, margin=margin,
-    )  # fmt: skip
-
-
-Density = Callable[[FloatArray], FloatArray]
 
 
 def _densities(spectra: ModalTurbulence | Sequence[Spectrum], rate: float) -> tuple[Density, int]:
@@ -294,8 +195,7 @@ def _own_edges(
     """Edges of panels where spectra have peaks or kinks, in units of the Nyquist frequency."""
     models = [line.ar_model(rate) for own in lines for line in own]
     if isinstance(spectra, ModalTurbulence):
-        poles = np.unique(np.linalg.eigvals(spectra.companions).round(3))
-        edges = [pole_edges(poles.astype(np.complex128))]
+        edges = [pole_edges(_distinct(np.linalg.eigvals(spectra.companions).ravel()))]
     else:
         distinct = {id(spectrum): spectrum for spectrum in spectra}.values()
         models += [spectrum for spectrum in distinct if isinstance(spectrum, ARModel)]
@@ -305,19 +205,48 @@ def _own_edges(
     return np.concatenate(edges)
 
 
-def _least(
+def _distinct(poles: Any) -> ComplexArray:
+    """Leave out poles that have the place and the distance from the circle of another one.
+
+    Both to a quarter of that distance, which is the width of the peak: panels fit all of them.
+    """
+    inside = poles[np.abs(poles) < 1]
+    steps = np.round(np.log(1 - np.abs(inside)) * 4)
+    places = np.round(np.abs(np.angle(inside)) / np.exp(steps / 4) * 4)
+    _, kept = np.unique(np.stack([steps, places]), axis=1, return_index=True)
+    return np.asarray(inside[kept], dtype=np.complex128)
+
+
+def least_residuals(
     density: Density,
     own_edges: FloatArray,
-    rate: float,
+    path: LoopHardware,
     *,
     noise: FloatArray,
     gain: FloatArray,
-    delay_frames: float,
     margin: float,
+    differenced: bool = False,
 ) -> ModalGains:
-    """Find the gains on finer and finer panels, until residuals and gains stand still."""
-    taps = LoopHardware(frame_rate_hz=rate, delay_frames=delay_frames, modes=1).mirror_taps
-    limit = integrator_gain_limit(delay_frames)
+    """Find the gains on finer and finer panels, until residuals and gains stand still.
+
+    Parameters
+    ----------
+    density : callable
+        Spectra of all modes (n, f) at frequencies (f,).
+    own_edges : (e,) ndarray
+        Edges of panels that they ask for, in units of the Nyquist frequency.
+    path : LoopHardware
+        Rate, delay and mirror.
+    noise, gain : (n,) ndarray
+        Measurement noise [nm] and sensor gain of each mode.
+    margin : float
+        Distance from the stability limit.
+    differenced : bool, optional
+        Whether the spectra are estimates for the difference of two frames: scatter may make
+        them negative. Residuals are at least the propagated noise then.
+    """
+    rate, taps = path.frame_rate_hz, path.mirror_taps
+    limit = hardware_gain_limit(path)
     least, most = TRIED_GAINS
     distance = number(margin, "margin", at_least=round(1 - most, 9), below=1)
     loop_gains = np.geomspace(least, _HIGHEST, _GRID) * limit
@@ -335,20 +264,25 @@ def _least(
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
         spectra = density(nodes)
-        wrong = np.flatnonzero(~(np.isfinite(spectra) & (spectra >= 0)).all(axis=1))
+        sound = np.isfinite(spectra) & ((spectra >= 0) | differenced)
+        wrong = np.flatnonzero(~sound.all(axis=1))
         if wrong.size:
             raise ProblemError(
                 f"every spectrum must be finite and at least 0; that of mode {wrong[0]} is not."
             )
-        rejection, propagation = _transfers(nodes / rate, taps, loop_gains)
+        rejection, propagation = _transfers(nodes / rate, taps, loop_gains, differenced)
         variances = (spectra * weights) @ rejection.T
-        variances += np.outer((noise / gain) ** 2, propagation @ weights * 2 / rate)
+        propagated = propagation @ weights * 2 / rate
+        variances += np.outer((noise / gain) ** 2, propagated)
         if np.any(variances[:, 0] == 0):
             raise ProblemError(
                 "every mode must have turbulence, vibration or noise; got none in mode "
                 f"{int(np.argmin(variances[:, 0]))}."
             )
         found = _minimised(loop_gains, variances, limit, highest)
+        if differenced:
+            floor = (noise / gain) ** 2 * np.interp(found[0], loop_gains, propagated)
+            found = found[0], np.maximum(found[1], floor)
         if last is not None and _alike(found, last):
             allowed = highest / gain
             gains = np.minimum(found[0] / gain, allowed)
@@ -356,7 +290,8 @@ def _least(
             limited.setflags(write=False)
             return ModalGains(
                 gains=frozen(gains), rms_nm=frozen(np.sqrt(found[1])), limit=frozen(allowed),
-                limited=limited, noise_nm=noise, delay_frames=float(delay_frames),
+                limited=limited, noise_nm=noise, delay_frames=path.delay_frames,
+                mirror=path.mirror,
             )  # fmt: skip
         last = found
         edges = np.union1d(edges, (edges[1:] + edges[:-1]) / 2)
@@ -383,14 +318,17 @@ def _characteristic(taps: FloatArray, loop_gain: float) -> FloatArray:
 
 
 def _transfers(
-    turns: FloatArray, taps: FloatArray, loop_gains: FloatArray
+    turns: FloatArray, taps: FloatArray, loop_gains: FloatArray, differenced: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Squared moduli (gains, f) of phase and of noise over sensor gain to the residual."""
+    """Squared moduli (gains, f) of phase and of noise over sensor gain to the residual.
+
+    The phase is replaced by its difference of two frames, if that is wanted.
+    """
     delay = np.exp(-2j * np.pi * turns)
     mirror: ComplexArray = np.polynomial.polynomial.polyval(delay, np.asarray(taps))
     difference = 1 - delay
     power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
-    rejection = np.abs(difference) ** 2 / power
+    rejection = (1.0 if differenced else np.abs(difference) ** 2) / power
     return rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power
 
 

@@ -14,7 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError, UnstableLoopError
+from lbt_synth.certify import RESIDUAL_TOLERANCE, VARIANCE_TOLERANCE
+from lbt_synth.errors import (
+    DimensionError,
+    NonFiniteError,
+    NumericalError,
+    ProblemError,
+    UnstableLoopError,
+)
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.modal.closed import LoopBlock, block_variances, close_bank, spectral_radii
 from lbt_synth.modal.filters import ModalFilters
@@ -23,10 +30,11 @@ from lbt_synth.modal.plants import lines_per_mode, per_mode_number, turbulence_o
 from lbt_synth.modal.reconstructor import modes_named
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.local_loop import PositionLoop
 from lbt_synth.models.modal_turbulence import ModalTurbulence
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.simulation.linear import SystemStack
-from lbt_synth.validation import FloatArray, frozen, integer, real_array
+from lbt_synth.validation import FloatArray, float_array, frozen, integer, number, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,6 +65,10 @@ class ModalLoop:
     ----------
     delay_frames : float
         Total delay [frames].
+    frame_rate_hz : float or None
+        Frame rate [Hz]; None where nothing says it, a loop for any.
+    mirror : PositionLoop or None
+        Dynamics of the mirror; None: it settles at once.
     sensor_gain : (n,) ndarray
         Real sensor (optical) gain of each mode.
     spectral_radii : (n,) ndarray
@@ -68,6 +80,8 @@ class ModalLoop:
     """
 
     delay_frames: float
+    frame_rate_hz: float | None
+    mirror: PositionLoop | None
     sensor_gain: FloatArray
     spectral_radii: FloatArray
     blocks: tuple[LoopBlock, ...]
@@ -129,15 +143,37 @@ class ModalLoop:
         UnstableLoopError
             If a loop is unstable.
         ProblemError
-            If sizes clash or a value is out of its range.
+            If sizes clash, a value is out of its range, or the models are sampled at another
+            frame rate than the loop's.
+        NumericalError
+            If rounding leaves too few digits: a process that is all but a random walk.
         """
         self.require_stable()
         air = turbulence_of(turbulence, self.n_modes)
+        rate = self.frame_rate_hz
+        if rate is not None and not np.isclose(air.frame_rate_hz, rate, rtol=1e-9):
+            raise ProblemError(
+                f"turbulence must be sampled at the loop's frame rate, {rate:.6g} Hz; got "
+                f"{air.frame_rate_hz:.6g} Hz."
+            )
         noise = per_mode_number(noise_nm, "noise_nm", self.n_modes, zero=True)
         lines = lines_per_mode(vibrations, self.n_modes)
         out = np.zeros(self.n_modes)
         for block in self.blocks:
-            variances, _ = block_variances(block, air, lines, noise)
+            variances, residuals, rounding = block_variances(block, air, lines, noise)
+            for what, error, limit in (
+                ("the relative residual of the Lyapunov equation", residuals, RESIDUAL_TOLERANCE),
+                ("rounding of the variance, relative,", rounding, VARIANCE_TOLERANCE),
+            ):
+                bad = np.flatnonzero(~(error < limit))
+                if bad.size:
+                    raise NumericalError(
+                        f"{what} must be below {limit:g}; got {np.max(error):.3g} in "
+                        f"{modes_named(np.unique(block.modes[bad]))}. A process with a pole this "
+                        "close to 1 is a random walk: move the pole inwards.",
+                        status="lyapunov",
+                        residual=float(np.max(error)),
+                    )
             out[block.modes] = np.sqrt(np.maximum(variances, 0))
         return frozen(out)
 
@@ -167,7 +203,7 @@ class ModalLoop:
         UnstableLoopError
             If a loop is unstable.
         ProblemError
-            If sizes clash or a value is not finite.
+            If sizes clash, or a value is no number or not finite.
 
         Examples
         --------
@@ -179,7 +215,7 @@ class ModalLoop:
         [[1.0, 0.5, 0.0], [1.0, 0.75, 0.0]]
         """
         self.require_stable()
-        total, noise = np.asarray(total_nm, np.float64), np.asarray(noise_nm, np.float64)
+        total, noise = float_array(total_nm, "total_nm"), float_array(noise_nm, "noise_nm")
         if total.ndim != 2 or total.shape != noise.shape or len(total) != self.n_modes:
             raise DimensionError(
                 f"total_nm and noise_nm must both be ({self.n_modes}, frames); got {total.shape} "
@@ -243,17 +279,26 @@ def modal_loop(
     *,
     delay_frames: float | None = None,
     sensor_gain: Any = 1.0,
+    mirror: PositionLoop | None = None,
+    frame_rate_hz: float | None = None,
 ) -> ModalLoop:
-    """Close the loop of every mode, with a unit sensor and mirror.
+    """Close the loop of every mode, with a unit sensor and a mirror of unit gain.
 
     Parameters
     ----------
     controller : MixedController or ModalFilters
         Controllers of the modes, without a reconstructor: y are modal coefficients.
     delay_frames : float, optional
-        Total delay [frames]; that of the filters by default, 2 for a mixed controller.
+        Real total delay [frames]; by default that of the filters, or of the design that is the
+        mixed controller's filter, or 2.
     sensor_gain : float or (n,) array_like, optional
         Real sensor (optical) gain, of all modes or of each.
+    mirror : PositionLoop, optional
+        Real dynamics of the mirror, the same for all modes; by default those that the filters
+        or the design know, or none.
+    frame_rate_hz : float, optional
+        Frame rate [Hz]; by default that of the filters or of the design. Only a mirror with
+        dynamics needs it.
 
     Returns
     -------
@@ -263,8 +308,8 @@ def modal_loop(
     Raises
     ------
     ProblemError
-        If the controller has a reconstructor or is of another kind, or a value is out of its
-        range.
+        If the controller has a reconstructor or is of another kind, a value is out of its
+        range, or the frame rate is not that of the filters.
 
     Examples
     --------
@@ -277,21 +322,17 @@ def modal_loop(
     >>> one.residual_rms_nm(air, noise_nm=5.0).round(2).tolist()
     [15.98]
     """
-    if isinstance(controller, ModalFilters):
-        delay = controller.delay_frames if delay_frames is None else delay_frames
-    elif isinstance(controller, MixedController):
-        delay = 2.0 if delay_frames is None else delay_frames
-        if controller.reconstructor is not None:
-            raise ProblemError(
-                "a modal loop is that of modal coefficients; got a controller with a "
-                "reconstructor. Leave it out, or use simulate with the sensor's matrix."
-            )
-    else:
+    if not isinstance(controller, MixedController | ModalFilters):
         raise ProblemError(
             "controller must be a MixedController or ModalFilters; got "
             f"{type(controller).__name__}. Try MixedController.integrators(gains)."
         )
-    hardware = LoopHardware(frame_rate_hz=1.0, delay_frames=delay, modes=1)
+    if isinstance(controller, MixedController) and controller.reconstructor is not None:
+        raise ProblemError(
+            "a modal loop is that of modal coefficients; got a controller with a "
+            "reconstructor. Leave it out, or use simulate with the sensor's matrix."
+        )
+    hardware, rate = _path(controller, delay_frames, mirror, frame_rate_hz)
     n = controller.n_modes
     gain = per_mode_number(sensor_gain, "sensor_gain", n)
     radii = np.zeros(n)
@@ -302,11 +343,43 @@ def modal_loop(
         blocks.append(block)
     return ModalLoop(
         delay_frames=hardware.delay_frames,
+        frame_rate_hz=rate,
+        mirror=hardware.mirror,
         sensor_gain=gain,
         spectral_radii=frozen(radii),
         blocks=tuple(blocks),
         systems=tuple(_residual_systems(block) for block in blocks),
     )
+
+
+def _path(
+    controller: MixedController | ModalFilters,
+    delay_frames: float | None,
+    mirror: PositionLoop | None,
+    frame_rate_hz: float | None,
+) -> tuple[LoopHardware, float | None]:
+    """Return the path of one mode, from what is given and what the controller is for; its rate."""
+    period, designed = controller.dt_s, controller.hardware
+    rate = None if period is None else 1 / period
+    if frame_rate_hz is not None:
+        given = number(frame_rate_hz, "frame_rate_hz", above=0)
+        if rate is not None and not np.isclose(given, rate, rtol=1e-9):
+            raise ProblemError(
+                f"frame_rate_hz must be that of the filters, {rate:.6g} Hz; got {given:.6g} Hz."
+            )
+        rate = given
+    if designed is not None:
+        delay_frames = designed.delay_frames if delay_frames is None else delay_frames
+        mirror = designed.mirror if mirror is None else mirror
+    if mirror is not None and rate is None:
+        raise ProblemError("a mirror with dynamics needs frame_rate_hz; got none.")
+    path = LoopHardware(
+        frame_rate_hz=1.0 if rate is None else rate,
+        delay_frames=2.0 if delay_frames is None else delay_frames,
+        modes=1,
+        mirror=mirror,
+    )
+    return path, rate
 
 
 def _residual_systems(block: LoopBlock) -> SystemStack:

@@ -18,9 +18,10 @@ from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.modal.banks import Bank, RunningBanks
 from lbt_synth.modal.filters import ModalFilters
 from lbt_synth.modal.reconstructor import Reconstructor, mode_indices
+from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.simulation.run import SteppedController
 from lbt_synth.statespace import Controller, RunningController
-from lbt_synth.validation import FloatArray, frozen, instance, real_array
+from lbt_synth.validation import FloatArray, float_array, frozen, instance, real_array
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -145,6 +146,22 @@ class MixedController:
         return int(self.gains.size)
 
     @property
+    def dt_s(self) -> float | None:
+        """Sampling period of the filter [s]; None where nothing says it."""
+        if isinstance(self.filter, ModalFilters):
+            return self.filter.dt_s
+        if isinstance(self._running, RunningController):
+            return self._running.controller.dt_s
+        return None
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the filter is designed for, of any number of modes; None if it says none."""
+        if isinstance(self.filter, ModalFilters):
+            return self.filter.hardware
+        return self.filter.hardware if isinstance(self.filter, Design) else None
+
+    @property
     def n_measurements(self) -> int:
         """Number of measurements: slopes with a reconstructor, modes without."""
         return self.n_modes if self.reconstructor is None else self.reconstructor.n_slopes
@@ -172,10 +189,14 @@ class MixedController:
         ------
         DimensionError
             If y has another size.
+            The same for the commands of a filter that is an object of your own.
         NonFiniteError
-            If a measurement is not finite; the state is then as before.
+            If a measurement is not finite; the state is then as before. Or if a command of
+            the filter is not: the integrators are then as before, the filter has stepped.
+        ProblemError
+            If y or the commands of the filter are no real numbers.
         """
-        measured = np.asarray(y, dtype=np.float64)
+        measured = float_array(y, "y")
         if measured.shape != (self.n_measurements,):
             raise DimensionError(
                 f"y must have shape ({self.n_measurements},); got {measured.shape}."
@@ -190,7 +211,18 @@ class MixedController:
         command = self._leak * self._command
         command += self._gain * measured
         if self._running is not None:
-            command[self._modes] = self._running.step(measured[self._modes])
+            own = float_array(self._running.step(measured[self._modes]), "the filter's commands")
+            if own.shape != self._modes.shape:
+                raise DimensionError(
+                    f"the filter's commands must have shape {self._modes.shape}, one a filtered "
+                    f"mode; got {own.shape}."
+                )
+            if not np.isfinite(own).all():
+                raise NonFiniteError(
+                    "the filter's commands must be finite; got NaN or an infinite value. The "
+                    "integrators are as before, the filter has stepped: reset()."
+                )
+            command[self._modes] = own
         self._command = command
         return command.copy()
 
@@ -227,7 +259,7 @@ class MixedController:
         Parameters
         ----------
         dt_s : float, optional
-            Sampling period [s]; that of the filter by default, 1 where there is none.
+            Sampling period [s]; by default that of the filter, 1 where there is none.
 
         Returns
         -------
@@ -237,7 +269,7 @@ class MixedController:
         Raises
         ------
         ProblemError
-            If the filter is no linear controller of this package.
+            If the filter is no linear controller of this package, or has another period.
 
         Examples
         --------
@@ -248,9 +280,13 @@ class MixedController:
         True
         """
         n, banks = self.n_modes, self.banks()
-        period = dt_s
-        if period is None and isinstance(self._running, RunningController):
-            period = self._running.controller.dt_s
+        own = self.dt_s
+        period = own if dt_s is None else dt_s
+        if own is not None and period is not None and not np.isclose(period, own, rtol=1e-9):
+            raise ProblemError(
+                f"dt_s must be that of the filter, {own:.9g} s; got {period:.9g} s. Design the "
+                "filter for this frame rate."
+            )
         A: list[FloatArray] = []
         inputs: list[FloatArray] = []
         outputs: list[FloatArray] = []

@@ -10,6 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar import ARModel
+from lbt_synth.models.lifting import Response
 from lbt_synth.models.modal_turbulence import ModalTurbulence
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.stacks import transposed
@@ -61,10 +62,12 @@ def lines_per_mode(
         i = integer(mode, "a mode of vibrations", at_least=0)
         if i >= modes:
             raise ProblemError(f"a mode of vibrations must be from 0 to {modes - 1}; got {i}.")
-        each = (given,) if isinstance(given, Vibration) else tuple(given)
-        if not all(isinstance(line, Vibration) for line in each):
+        each = (given,) if isinstance(given, Vibration) else given
+        if not isinstance(each, list | tuple) or not all(
+            isinstance(line, Vibration) for line in each
+        ):
             raise ProblemError(f"mode {i} must have a list of Vibration; got {given!r}.")
-        lines[i] = each
+        lines[i] = tuple(each)
     return tuple(lines)
 
 
@@ -133,14 +136,13 @@ class PlantStack:
     L: FloatArray
     R: FloatArray
 
-    def controllers(self, gains: FloatArray, taps: FloatArray) -> tuple[FloatArray, ...]:
+    def controllers(self, gains: FloatArray, mirror: Response) -> tuple[FloatArray, ...]:
         """Return controllers ``A, B, C, D`` of predictor gains (N, s, 1), in new-state form.
 
-        As :meth:`FullStatePlant.controller` for one mode: the filters, and the past commands.
+        As :meth:`FullStatePlant.controller` for one mode: the filters, and the mirror's states.
         """
         count, s = self.A.shape[:2]
-        past = len(taps) - 1
-        size = s + past
+        size = s + mirror.n_states
         sensor = self.C[:, :, -1:]  # the measurement is of the oldest phase
         A, C, L = (
             np.zeros((count, size, size)),
@@ -148,12 +150,11 @@ class PlantStack:
             np.zeros((count, 1, size)),
         )
         A[:, :s, :s], C[..., :s], L[..., :s] = self.A, self.C, self.L
-        C[..., s:] = -sensor * taps[1:]
-        A[:, s + 1 :, s:-1] = np.eye(max(past - 1, 0))
+        A[:, s:, s:], C[..., s:] = mirror.A, -sensor * mirror.C
         B, known = np.zeros((2, count, size, 1))
         B[:, :s] = gains
-        known[:, s : s + 1] = 1.0
-        A += (known + taps[0] * B * sensor) @ L - B @ C
+        known[:, s:] = mirror.B[:, None]
+        A += (known + mirror.D * B * sensor) @ L - B @ C
         return A, B, L, np.zeros((count, 1, 1))
 
     def errors(self, gains: FloatArray) -> tuple[FloatArray, FloatArray]:
