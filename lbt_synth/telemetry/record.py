@@ -41,9 +41,9 @@ CONVENTION = _CONVENTION.format(
 )
 MOVING_CONVENTION = _CONVENTION.format(
     correction="phi_cor(k) = N (c0 u(k) + c1 u(k-1) + c2 u(k-2) + ...) with the mirror taps c "
-    "recorded here: position of a mirror that does not settle at once, averaged over exposure k; "
-    "d = delay_frames from the middle of an exposure to the middle of the one that a mirror which "
-    "settles at once would hold the command over"
+    "recorded here: the weights of the commands in the position of a mirror that does not settle "
+    "at once, averaged over exposure k. They hold the whole delay: d = delay_frames as it would be "
+    "with a mirror that settles at once, and the mirror's lag after it"
 )
 _BOUNDED: dict[str, dict[str, Any]] = {
     "delay_frames": {"at_least": 0, "at_most": 1000},
