@@ -5,25 +5,29 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from lbt_synth.errors import OutputError
 
 
-def require_writable(*paths: str | os.PathLike[str]) -> None:
-    """Refuse outputs that cannot be written, before any work is done.
+def require_writable(
+    *paths: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
+) -> None:
+    """Refuse outputs that cannot be written or would replace an input, before any work is done.
 
     Parameters
     ----------
     *paths : path-like
         Files to be written.
+    inputs : iterable of path-like, optional
+        Files that are read.
 
     Raises
     ------
     OutputError
-        If the directory of one does not exist or takes no files, or its name is that of a
-        directory.
+        If the directory of one does not exist or takes no files, its name is that of a
+        directory, or it is an input, by whatever name or link.
 
     Examples
     --------
@@ -33,6 +37,7 @@ def require_writable(*paths: str | os.PathLike[str]) -> None:
         ...
     lbt_synth.errors.OutputError: cannot write nowhere/at/all.png: no directory nowhere/at.
     """
+    refuse_replacing(paths, inputs)
     for path in paths:
         target = Path(path)
         if not target.parent.is_dir():
@@ -48,6 +53,48 @@ def require_writable(*paths: str | os.PathLike[str]) -> None:
                 f"({getattr(error, 'strerror', None) or error}).",
                 path=target,
             ) from error
+
+
+def refuse_replacing(
+    outputs: Iterable[str | os.PathLike[str]], inputs: Iterable[str | os.PathLike[str]]
+) -> None:
+    """Refuse to write what is read: the same file by whatever name, symbolic or hard link.
+
+    Parameters
+    ----------
+    outputs, inputs : iterable of path-like
+        Files to be written, and files that are read. They need not exist.
+
+    Raises
+    ------
+    OutputError
+        If an output is an input.
+
+    Examples
+    --------
+    >>> from lbt_synth.files import refuse_replacing
+    >>> refuse_replacing(["a/../k.fits"], ["k.fits"])
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.OutputError: a/../k.fits must not replace the input k.fits; give another name.
+    """
+    read = list(inputs)
+    for path in outputs:
+        for source in read:
+            if _is_same(Path(path), Path(source)):
+                raise OutputError(
+                    f"{path} must not replace the input {source}; give another name.",
+                    path=Path(path),
+                )
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    try:
+        if one.resolve() == other.resolve():
+            return True
+        return one.samefile(other)
+    except (OSError, ValueError, RuntimeError):  # one is not there, no name, or a ring of links
+        return False
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:

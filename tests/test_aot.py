@@ -116,6 +116,9 @@ def test_the_file_says_what_the_telemetry_says(tmp_path):
     ours = json.loads(card.value)
     assert ours["controller_digest"] == seen.controller_digest
     assert ours["controller_states"] == 2
+    assert ours["mirror"] == dataclasses.asdict(seen.mirror)
+    assert ours["mirror_taps"] == seen.mirror_taps.tolist()
+    assert "with the mirror taps c" in system.config
     assert ours["metadata"] == dict(seen.metadata)
 
 

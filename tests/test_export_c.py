@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
+from lbt_synth.export.rehearsal import WrittenTerms, rehearsed_error
 
 FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
@@ -48,6 +49,22 @@ def test_the_compiled_controller_closes_the_loop(tmp_path, loaded, designs, name
     assert error < LIMITS[precision]
     if single:  # what the file says of itself, met in another loop
         assert written.error / 10 < error < 10 * written.error
+
+
+@pytest.mark.parametrize("precision", LIMITS)
+@pytest.mark.parametrize("name", ["kalman", "hinf", "prior", "turned"])
+def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, precision):
+    """Bit for bit in the loop, and the error that is told is that of the compiled source."""
+    design, single = designs[name], precision == "single"
+    written = lbt.export_c(tmp_path / "ctl.c", design, precision=precision)
+    theirs = Compiled(written.files[0], single=single)
+    assert rehearsed_error(design, theirs) == written.error
+    assert 0 < written.error < LIMITS[precision]
+    assert written.error_single == (written.error if single else pytest.approx(3e-7, rel=10))
+    ours = WrittenTerms(design.controller, np.float32 if single else np.float64)
+    theirs.reset()
+    for y in np.random.default_rng(6).standard_normal((50, 2)):
+        assert np.array_equal(ours.step(y), theirs.step(y))
 
 
 @pytest.mark.parametrize("precision", LIMITS)
@@ -231,6 +248,15 @@ def test_single_precision_has_a_largest_number(tmp_path):
         lbt.ProblemError, match=r"below 3.4e\+38 in single precision; got 1e\+39 in B"
     ):
         lbt.export_c(tmp_path / "single.c", bare_design(huge), precision="single")
+    assert not list(tmp_path.glob("single*"))
+
+
+def test_arithmetic_that_overflows_is_refused(tmp_path):
+    """Coefficients that fit, products that do not."""
+    steep = lbt.Controller(A=[[0.5]], B=[[1e30]], C=[[1e30]], D=[[0.0]])
+    lbt.export_c(tmp_path / "k.c", bare_design(steep))
+    with pytest.raises(lbt.NumericalError, match="must stay finite in single precision"):
+        lbt.export_c(tmp_path / "single.c", bare_design(steep), precision="single")
     assert not list(tmp_path.glob("single*"))
 
 

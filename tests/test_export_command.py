@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 
@@ -92,6 +93,21 @@ def test_a_transfer_function_that_single_precision_breaks_gets_a_note(
     assert data["error"] < 1e-6
 
 
+def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys):
+    """An integrator beside large states that the command subtracts again."""
+    slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
+    large = lbt.Controller(
+        A=[[1, 0, 0], [0, 0.3, 0], [0, 0, 0.3]], B=[[0.4], [1e5], [1e5]], C=[[1, 1, -1]], D=[[0]],
+        dt_s=1 / 800,
+    )  # fmt: skip
+    gain = lbt.save_gain(tmp_path / "g.fits", dataclasses.replace(slow, controller=large))
+    arguments = ("export", gain, "--format", "c", "-o", tmp_path / "k.c")
+    status, text, _ = run(capsys, *arguments, "--precision", "single")
+    assert status == 0
+    assert re.search(r"note: in single precision commands are off by [\d.]+ of the largest", text)
+    assert "note:" not in run(capsys, *arguments)[1]
+
+
 @pytest.mark.parametrize("name", ["kalman", "turned"])
 def test_show_prints_the_cost(capsys, designs, gains, name):
     cost = lbt.frame_cost(designs[name])
@@ -113,7 +129,7 @@ BAD = [
     (("KALMAN", "--format", "c", "-o", "k.mat"), 2, "must end in .c"),
     (("KALMAN", "--format", "mat", "-o", "k.c"), 2, "must end in .mat"),
     (("KALMAN", "--format", "iir", "-o", "k.mat"), 2, "must end in .fits"),
-    (("KALMAN", "--format", "iir", "-o", "KALMAN"), 2, "must not replace the gain file"),
+    (("KALMAN", "--format", "iir", "-o", "KALMAN"), 2, "must not replace the input"),
     (("KALMAN", "--format", "c", "-o", "none/k.c"), 2, "no directory none"),
     (("KALMAN", "--format", "pdf", "-o", "k.pdf"), 2, "invalid choice"),
     (("KALMAN", "-o", "k.c"), 2, "required"),

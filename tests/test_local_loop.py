@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import control
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import lbt_axis_plant
+from plants import ROOT, lbt_axis_plant
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -294,6 +296,26 @@ def test_rates_that_do_not_fit_are_refused():
         lbt.LoopHardware(frame_rate_hz=800, mirror=shell(ramp_samples=91))
     with pytest.raises(lbt.ProblemError, match="expected a PositionLoop"):
         lbt.LoopHardware(frame_rate_hz=800, mirror=0.7)
+
+
+def test_a_local_loop_has_so_many_samples_a_frame():
+    quick = shell(sampling_hz=8e7)
+    lbt.LoopHardware(frame_rate_hz=8e2 * 10, mirror=quick)
+    with pytest.raises(lbt.ProblemError, match=r"at most 100000 samples .* Lower sampling_hz to"):
+        lbt.LoopHardware(frame_rate_hz=799, mirror=quick)
+    with pytest.raises(lbt.ProblemError, match="= inf"):
+        lbt.LoopHardware(frame_rate_hz=1e-308, mirror=quick)
+
+
+def test_the_page_says_where_the_settled_design_becomes_unstable(config):
+    """Stable at the figure of docs/mirror.md, unstable a tenth of a hertz below."""
+    text = (ROOT / "docs" / "mirror.md").read_text(encoding="utf-8")
+    edge = float(re.search(r"stable down to ([\d.]+) Hz", text)[1])
+    settled = lbt.kalman(config.plant)
+    for bandwidth, stable in ((edge, True), (edge - 0.1, False)):
+        mirror = shell(natural_frequency_hz=20, damping=0.5, bandwidth_hz=bandwidth)
+        path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, mirror=mirror)
+        assert lbt.close_loop(path, settled.controller).is_stable is stable
 
 
 def test_a_mirror_that_rings_for_ever_is_refused():

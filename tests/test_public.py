@@ -7,6 +7,7 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,16 @@ def test_examples_on_pages_run(page, monkeypatch):
     )
     assert results.attempted > 5
     assert results.failed == 0
+
+
+_PAGES = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md"))]
+
+
+@pytest.mark.parametrize("page", _PAGES)
+def test_no_figure_is_left_to_be_filled_in(page):
+    """``{{NAME}}`` stands for what is still to be measured; LaTeX and JSON close braces, too."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert re.findall(r".*(?:\{\{|\b[A-Z][A-Z0-9_]*\}\}).*", text) == []
 
 
 def test_readme_names_commands_that_exist():

@@ -15,9 +15,14 @@ from plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth import archive
-from lbt_synth.telemetry import CONVENTION, LAYERS, layout
+from lbt_synth.telemetry import CONVENTION, LAYERS, layout, losses
 
 ENDINGS = ("fits", "npz")
+
+
+SHELL = lbt.PositionLoop.of_bandwidth(
+    natural_frequency_hz=50, damping=0.5, bandwidth_hz=150, sampling_hz=24_000, ramp_samples=3
+)
 
 
 def full(*, frames=6, with_slopes=True, random=0, **changes):
@@ -27,6 +32,7 @@ def full(*, frames=6, with_slopes=True, random=0, **changes):
     fields = {
         "frame_rate_hz": 800.0,
         "delay_frames": 2.25,
+        "mirror": SHELL,
         "commands": rng.standard_normal((frames, 2)),
         "measurements": rng.standard_normal((frames, 2)),
         "residual_nm": rng.standard_normal((frames, 2)),
@@ -63,7 +69,9 @@ def same(one, other, *, but=(), rtol=0.0):
         if field.name in but:
             continue
         a, b = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(a, lbt.Controller):
+        if isinstance(a, lbt.PositionLoop):
+            assert dataclasses.asdict(a) == dataclasses.asdict(b)
+        elif isinstance(a, lbt.Controller):
             for name in "ABCD":
                 assert np.array_equal(getattr(a, name), getattr(b, name))
             assert a.dt_s == b.dt_s
@@ -166,7 +174,8 @@ def test_the_fits_file_explains_itself(tmp_path):
         assert header["LBTTELEM"] == 1
         assert (header["RATE_HZ"], header["DELAY"], header["SENSGAIN"]) == (800, 2.25, 0.358)
         assert (header["DIAMETER"], header["STREHL"], header["WAVELEN"]) == (8.22, 0.83, 2.2)
-        assert header["TIMING"] == CONVENTION
+        assert header["TIMING"] == seen.convention
+        assert np.array_equal(units["MIRROR_TAPS"].data, seen.mirror_taps)
         assert np.array_equal(units["COMMANDS"].data, seen.commands)
         assert np.array_equal(units["CTRL_A"].data, seen.controller.A)
         assert units["COMMANDS"].header["BUNIT"] == "nm"
@@ -229,6 +238,91 @@ def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
     assert np.array_equal(run.commands[1], u)
 
 
+@pytest.mark.parametrize("kind", ["fits", "npz", pytest.param("aot", marks=pytest.mark.e2e)])
+@pytest.mark.parametrize("delay", [2.0, 2.25])
+def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind, delay):
+    """phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...), as the file says, with what it holds."""
+    path = lbt.LoopHardware(
+        frame_rate_hz=800.0,
+        delay_frames=delay,
+        influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
+        mirror=SHELL,
+    )
+    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
+    design = lbt.integrator(path, gain=0.1)
+    run = lbt.simulate(design.controller, truth, hardware=path, frames=120, seed=5)
+    written = lbt.telemetry_of(run, path, design=design)
+    name = "t.aot.fits" if kind == "aot" else f"t.{kind}"
+    seen = lbt.load_telemetry(lbt.save_telemetry(tmp_path / name, written))
+    assert "phi_cor(k) = N (c0 u(k) + c1 u(k-1)" in seen.convention
+    assert "u(k-d+1)" not in seen.convention
+    taps, u = seen.mirror_taps, seen.commands
+    assert taps.size > 5
+    corrected = sum(c * np.vstack([np.zeros((i, 2)), u[: len(u) - i]]) for i, c in enumerate(taps))
+    error = run.total_nm[0] - corrected @ seen.influence_matrix.T - run.residual_nm[0]
+    assert np.max(np.abs(error[taps.size :])) < 1e-9
+    if kind != "aot":
+        assert np.array_equal(seen.total_nm, run.total_nm[0])
+    # the loop of the file is the loop that ran
+    assert np.array_equal(seen.hardware.mirror_taps, path.mirror_taps)
+    replayed = lbt.simulate(
+        (seen.controller or design.controller), truth, hardware=seen.hardware, frames=120, seed=5
+    )
+    assert np.allclose(replayed.residual_nm, run.residual_nm, rtol=0, atol=1e-9)
+    assert "mirror" not in losses(seen)
+
+
+def test_the_taps_stand_in_the_file(tmp_path):
+    """For who reads it without this package: an array of FITS or NumPy, and the words."""
+    seen = full()
+    with fits.open(lbt.save_telemetry(tmp_path / "t.fits", seen)) as units:
+        assert np.array_equal(units["MIRROR_TAPS"].data, seen.hardware.mirror_taps)
+        assert "with the mirror taps c" in units[0].header["TIMING"]
+    with np.load(lbt.save_telemetry(tmp_path / "t.npz", seen)) as arrays:
+        assert np.array_equal(arrays["MIRROR_TAPS"], seen.hardware.mirror_taps)
+
+
+def test_a_settled_mirror_leaves_the_file_as_it_was(tmp_path):
+    seen = full(mirror=None)
+    assert seen.convention == CONVENTION
+    assert seen.mirror_taps is None
+    arrays, meta = layout.pack(seen, "float64")
+    assert "MIRROR_TAPS" not in arrays
+    assert "mirror" not in meta  # what 0.1 wrote, and reads
+    assert layout.unpack(arrays, meta).mirror is None
+
+
+@pytest.mark.parametrize(
+    ("edit", "text"),
+    [
+        (lambda a, m: a.pop("MIRROR_TAPS"), "go together"),
+        (lambda a, m: m.pop("mirror"), "go together"),
+        (lambda a, m: a.update(MIRROR_TAPS=a["MIRROR_TAPS"][::-1]), "not those of its mirror"),
+        (lambda a, m: m["mirror"].update(ramp_samples=2), "not those of its mirror"),
+    ],
+)
+def test_taps_and_mirror_must_agree(edit, text):
+    arrays, meta = layout.pack(full(), "float64")
+    edit(arrays, meta)
+    with pytest.raises(ValueError, match=text):
+        layout.unpack(arrays, meta)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"mirror": 3}, "expected a PositionLoop; got int"),
+        ({"delay_frames": None}, "needs delay_frames"),
+        ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
+        ({"frame_rate_hz": 790.0, "controller": None}, "whole number of samples a frame"),
+    ],
+)
+def test_a_mirror_that_does_not_fit_is_refused(changes, text):
+    with pytest.raises(lbt.ProblemError, match=text):
+        full(**changes)
+
+
 def test_the_camera_gives_telescope_and_strehl_ratio():
     path = lbt.LoopHardware(frame_rate_hz=800)
     design = lbt.integrator(path, gain=0.5)
@@ -275,7 +369,7 @@ def test_hardware_of_slopes_is_seen_through_the_reconstructor():
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"delay_frames": None}, "does not tell the delay"),
+        ({"delay_frames": None, "mirror": None}, "does not tell the delay"),
         ({"influence_matrix": None, "commands": np.ones((6, 3)), "controller": None,
           "integrator_gains": None}, "3 commands of 2 modes, and no influence_matrix"),
     ],
@@ -333,7 +427,7 @@ def test_hardware_that_is_not_told(changes, text):
         ({"metadata": {"a": float("inf")}}, "metadata must be finite; got inf for 'a'"),
         ({"integrator_gains": [0.4]}, "integrator_gains must have shape"),
         ({"controller": 3}, "controller must be a Controller; got int"),
-        ({"frame_rate_hz": 801.0}, "controller must run at 801 Hz; got one for 800 Hz"),
+        ({"frame_rate_hz": 801.0, "mirror": None}, "controller must run at 801 Hz; got one for 800 Hz"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused(changes, text):

@@ -13,7 +13,7 @@ from test_cli import run
 from test_telemetry import full, same
 
 import lbt_synth as lbt
-from lbt_synth.telemetry import CONVENTION, losses
+from lbt_synth.telemetry import losses
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,9 @@ def test_what_is_in_a_file(capsys, night):
         "pixel",
         "frame rate",
         "2.25",
-        CONVENTION,
+        "mirror_taps",
+        "mirror, natural_frequency_hz",
+        seen.convention,
     ):
         assert words in text
     status, text, _ = run(capsys, "telemetry", night, "--json")
@@ -81,6 +83,8 @@ def test_what_is_in_a_file(capsys, night):
     assert (data["frame_rate_hz"], data["delay_frames"], data["seed"]) == (800, 2.25, 7)
     assert data["metadata"] == dict(seen.metadata)
     assert data["integrator_gains"] == [0.4, 0.4]
+    assert data["mirror"]["ramp_samples"] == 3
+    assert data["mirror_taps"] == seen.mirror_taps.tolist()
 
 
 def test_conversion_between_formats(tmp_path, capsys, night):

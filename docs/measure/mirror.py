@@ -70,7 +70,10 @@ def delays() -> None:
 
 
 def stable_to(hardware: lbt.LoopHardware, design: lbt.Design, low: float, high: float) -> float:
-    """Bandwidth [Hz] between a stable and an unstable one at which a loop becomes unstable."""
+    """Last stable bandwidth [Hz] between a stable and an unstable one.
+
+    Print it rounded towards the stable side.
+    """
 
     def is_stable(bandwidth: float) -> bool:
         mirror = lbt.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=bandwidth)
@@ -95,7 +98,7 @@ def errors() -> None:
     fails_hz = abs(np.angle(poles[np.argmax(np.abs(poles))])) * real.frame_rate_hz / (2 * np.pi)
     there = np.sum(real.mirror_taps * (-1.0) ** np.arange(real.mirror_taps.size))
     print(
-        f"kalman, settled: stable down to {edge:.0f} Hz, settling in "
+        f"kalman, settled: stable down to {np.ceil(10 * edge) / 10:.1f} Hz, settling in "
         f"{1e3 * mirror.step_response().settling_s:.2f} ms; fails at {fails_hz:.0f} Hz, where the "
         f"amplitude of the mirror is {abs(there):.3f}"
     )
@@ -106,7 +109,8 @@ def errors() -> None:
         low = stable_to(here.hardware, design, believed, believed / 4)
         high = stable_to(here.hardware, design, believed, believed * 8)
         print(
-            f"lqg for {believed} Hz: stable from {low:.1f} to {high:.1f} Hz, "
+            f"lqg for {believed} Hz: stable from {np.ceil(10 * low) / 10:.1f} to "
+            f"{np.floor(10 * high) / 10:.1f} Hz, "
             f"modulus {margins.modulus:.3f}, delay margin {margins.delay_frames:.2f} frames"
         )
         for factor in (0.9, 0.95, 1.05, 1.1):

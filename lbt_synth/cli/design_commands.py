@@ -62,7 +62,7 @@ _OWNERS = {
 def design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
     _refuse_foreign_options(arguments)
-    require_writable(require_gain_name(arguments.output))
+    require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
     with working(f"designing ({arguments.method})", quiet=arguments.json):
         made = _synthesise(load_config(arguments.config), arguments)
     path = save_gain(arguments.output, made)

@@ -19,7 +19,7 @@ from lbt_synth.endtoend import Calibration, EndToEndRun, EndToEndSetup, calibrat
 from lbt_synth.endtoend.cases import summary, with_pixels
 from lbt_synth.endtoend.optics import specula_version
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import write_atomically
+from lbt_synth.files import refuse_replacing, write_atomically
 from lbt_synth.gainfile import load_gain
 from lbt_synth.paper.end_to_end import (
     EndToEndEntry,
@@ -33,14 +33,20 @@ from lbt_synth.plotting import end_to_end_figure, save_figure
 from lbt_synth.tables import csv_bytes
 from lbt_synth.telemetry import Telemetry, save_telemetry
 
+_RUN = ("run.png", "telemetry.fits", "summary.json")
+_TABLES = {"II": ("table_ii.csv",), "III": ("table_iii.csv", "table_iii.png", "table_iii.pdf")}
+
 
 def end_to_end(arguments: Namespace) -> Report:
     """Close the loop of a gain file end to end, and write what came of it."""
+    outputs = [Path(arguments.output) / name for name in _RUN]
+    refuse_replacing(outputs, [arguments.config, arguments.gain])
     setup = _setup(arguments)
     design = load_gain(arguments.gain)
     setup.controller(design)  # refuses a filter of another loop before any work
     version = specula_version()
-    folder = made_directory(arguments.output)
+    made_directory(arguments.output)
+    figure_file, telemetry_file, summary_file = outputs
     calibration = _calibrated(setup, arguments)
     total = setup.frames + setup.settle_frames
     with counting(total=total, what="frames", quiet=arguments.json) as count:
@@ -60,15 +66,13 @@ def end_to_end(arguments: Namespace) -> Report:
         "milliseconds_a_frame": 1e3 * run.seconds / total,
     }
     files = [
-        save_figure(end_to_end_figure(run), folder / "run.png"),
+        save_figure(end_to_end_figure(run), figure_file),
         save_telemetry(
-            folder / "telemetry.fits",
+            telemetry_file,
             _telemetry(run, design, calibration, arguments),
             precision="float32",
         ),
-        write_atomically(
-            folder / "summary.json", json.dumps(plain(data), indent=1).encode() + b"\n"
-        ),
+        write_atomically(summary_file, json.dumps(plain(data), indent=1).encode() + b"\n"),
     ]
     data["files"] = [str(path) for path in files]
     return Report(
@@ -104,6 +108,9 @@ def _figures(run: EndToEndRun, figures: dict[str, Any]) -> list[tuple[str, str, 
 
 def end_to_end_table(arguments: Namespace) -> Report:
     """Run Tables II and III of the paper end to end, or what is missing of them."""
+    folder = Path(arguments.output)
+    written = [folder / name for number in arguments.tables for name in _TABLES[number]]
+    refuse_replacing(written, [arguments.config, *arguments.gains])
     setup = _setup(arguments)
     designs = named_designs(arguments.gains)
     if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:
@@ -116,7 +123,7 @@ def end_to_end_table(arguments: Namespace) -> Report:
         "tables": arguments.tables,
     }
     total = len(all_cases(plan_tables(setup, **plan)))
-    folder = made_directory(arguments.output)
+    made_directory(folder)
     results = made_directory(folder / "cases")
     _calibrated(setup, arguments)
     with counting(total=total, what="runs", quiet=arguments.json) as count:
@@ -124,13 +131,13 @@ def end_to_end_table(arguments: Namespace) -> Report:
             setup, results, **plan, jobs=arguments.jobs, cache=arguments.cache, progress=count
         )
     files = [
-        write_atomically(folder / f"table_{number.lower()}.csv", _csv(table, number))
+        write_atomically(folder / _TABLES[number][0], _csv(table, number))
         for number in arguments.tables
     ]
     distances: dict[str, float] = {}
     if "III" in arguments.tables:
         figure = table_figure(table)
-        files += [save_figure(figure, folder / f"table_iii.{ending}") for ending in ("png", "pdf")]
+        files += [save_figure(figure, folder / name) for name in _TABLES["III"][1:]]
         methods = dict.fromkeys(e.method for e in table if e.table == "III")
         distances = {method: modal_distance(table, method) for method in methods}
     return Report(
@@ -223,6 +230,7 @@ def _telemetry(
         name=f"end to end, {system.modes} modes",
         frame_rate_hz=system.frame_rate_hz,
         delay_frames=system.hardware.delay_frames,
+        mirror=system.hardware.mirror,
         commands=run.commands,
         measurements=run.measurements,
         residual_nm=run.residual_nm,

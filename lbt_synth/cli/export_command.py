@@ -24,9 +24,9 @@ def export(arguments: Namespace) -> Report:
     for option in _OWNED:
         if getattr(arguments, option) is not None and arguments.format != "c":
             raise ProblemError(f"--{option} goes with --format c; got --format {arguments.format}.")
-    require_writable(arguments.output)
-    if Path(arguments.output).resolve() == Path(arguments.gain).resolve():
-        raise ProblemError(f"the output must not replace the gain file; got {arguments.output}.")
+    target = Path(arguments.output)
+    header = [target.parent / f"{target.stem}.h"] if arguments.format == "c" else []
+    require_writable(target, *header, inputs=[arguments.gain])
     design, digest = load_with_digest(arguments.gain)
     with working("exporting", quiet=arguments.json):
         written = _written(design, digest, arguments)
@@ -74,6 +74,11 @@ def _written(design: Design, digest: str, arguments: Namespace) -> Exported:
 
 
 def _notes(arguments: Namespace, written: Exported) -> list[str]:
+    if arguments.precision == "single" and not written.error <= _SINGLE_SUFFICES:
+        return [
+            f"note: in single precision commands are off by {written.error:.2g} of the largest "
+            "one. Export with --precision double."
+        ]
     if arguments.format == "iir" and not written.error_single <= _SINGLE_SUFFICES:
         unstable = math.isinf(written.error_single)
         effect = (

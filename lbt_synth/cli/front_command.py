@@ -16,7 +16,7 @@ from lbt_synth.validation import integer
 
 def tradeoff_command(arguments: Namespace) -> Report:
     """Make filters from the least norm to the least variance."""
-    require_outputs(arguments.output)
+    require_outputs(arguments.output, inputs=[arguments.config])
     count = integer(arguments.points, "--points", at_least=2)
     taps = integer(arguments.taps, "--taps", at_least=1)
     config = load_config(arguments.config)

@@ -17,7 +17,7 @@ from lbt_synth.plotting import limits_figure
 
 def limits(arguments: Namespace) -> Report:
     """Compare designs with the limits of performance."""
-    require_outputs(arguments.output)
+    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     config = load_config(arguments.config)
     given = named_designs(arguments.gains)
     with working("comparing", quiet=arguments.json):

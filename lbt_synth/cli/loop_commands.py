@@ -28,7 +28,7 @@ from lbt_synth.telemetry import require_telemetry_name
 
 def sigma(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
-    _require_figure(arguments.output)
+    _require_figure(arguments.output, inputs=arguments.gains)
     designs = named_designs(arguments.gains)
     with working("drawing", quiet=arguments.json):
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
@@ -76,11 +76,12 @@ def sigma(arguments: Namespace) -> Report:
 
 def simulate(arguments: Namespace) -> Report:
     """Close the loop in the time domain, beside the exact answer."""
+    inputs = [arguments.config, arguments.gain]
     if arguments.output is not None:
-        _require_figure(arguments.output)
+        _require_figure(arguments.output, inputs=inputs)
     if arguments.telemetry is not None:
         require_telemetry_name(arguments.telemetry)
-        require_writable(arguments.telemetry)
+        require_writable(arguments.telemetry, inputs=inputs)
     config = load_config(arguments.config)
     design = load_gain(arguments.gain)
     truth = real_truth(config, arguments)
@@ -234,9 +235,9 @@ def real_truth(config: Config, arguments: Namespace) -> Truth:
     )
 
 
-def _require_figure(output: str) -> None:
+def _require_figure(output: str, *, inputs: list[str]) -> None:
     """Refuse an output that cannot become a figure, before any work is done."""
-    require_writable(require_figure_name(output))
+    require_writable(require_figure_name(output), inputs=inputs)
 
 
 def named_designs(paths: list[str]) -> dict[str, Design]:

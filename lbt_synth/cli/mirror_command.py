@@ -19,7 +19,7 @@ _FEW = 8
 
 def mirror(arguments: Namespace) -> Report:
     """Look at the mirror of a configuration."""
-    require_outputs(arguments.output)
+    require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
     hardware, shell = config.hardware, config.hardware.mirror
     if shell is None:

@@ -22,7 +22,7 @@ _MOST_MODES = 20_000
 
 def modal(arguments: Namespace) -> Report:
     """Compare integrators, optimised gains and Kalman filters, mode by mode."""
-    require_outputs(arguments.output)
+    require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
     count = _count(arguments.modes, config)
     noise, assumed = _noise(config, count)

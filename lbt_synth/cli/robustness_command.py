@@ -28,7 +28,7 @@ _FEW = 8  # sensor gains that are all listed
 
 def robustness(arguments: Namespace) -> Report:
     """Strehl ratio over an error of the vibration frequency."""
-    require_outputs(arguments.output)
+    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     _require_matching_options(arguments)
     config = load_config(arguments.config)
     return _maps(config, arguments) if arguments.gains else _designed_anew(config, arguments)

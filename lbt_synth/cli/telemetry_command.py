@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from argparse import Namespace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import require_writable
 from lbt_synth.simulation import Simulation
 from lbt_synth.telemetry import (
-    CONVENTION,
     LAYERS,
     Telemetry,
     load_telemetry,
@@ -50,12 +50,12 @@ def telemetry(arguments: Namespace) -> Report:
         raise ProblemError("--format and --precision are of what -o writes; give -o FILE.")
     if output is not None:
         kind = require_telemetry_name(output, arguments.format)
-        require_writable(output)
+        require_writable(output, inputs=[arguments.file])
     seen = load_telemetry(arguments.file)
     report = _description(seen)
     report.data["file"] = arguments.file
     if "timing" not in seen.metadata:  # of another program
-        report.notes.append(CONVENTION)
+        report.notes.append(seen.convention)
     if kind is not None:
         precision = arguments.precision or "float64"
         path = save_telemetry(output, seen, format=kind, precision=precision)
@@ -116,6 +116,8 @@ def _description(seen: Telemetry) -> Report:
     ]
     if seen.controller is not None:
         facts.append(("states of the controller", seen.controller.n_states, ""))
+    if seen.mirror is not None:
+        facts += [(f"mirror, {name}", value, "") for name, value in asdict(seen.mirror).items()]
     facts += [(key, value, "") for key, value in seen.metadata.items()]
     data: dict[str, Any] = {name: getattr(seen, name) for _, name, _ in _FACTS}
     data |= {
@@ -127,7 +129,9 @@ def _description(seen: Telemetry) -> Report:
         "controller_states": None if seen.controller is None else seen.controller.n_states,
         "integrator_gains": seen.integrator_gains,
         "metadata": dict(seen.metadata),
-        "convention": CONVENTION,
+        "mirror": None if seen.mirror is None else asdict(seen.mirror),
+        "mirror_taps": seen.mirror_taps,
+        "convention": seen.convention,
     }
     seconds = seen.frames / seen.frame_rate_hz
     return Report(

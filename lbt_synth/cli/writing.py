@@ -32,8 +32,8 @@ def made_directory(path: str | Path) -> Path:
     return folder
 
 
-def require_outputs(outputs: Sequence[str]) -> None:
-    """Refuse names that are neither of a table nor of a figure, and places that cannot be written.
+def require_outputs(outputs: Sequence[str], *, inputs: Sequence[str]) -> None:
+    """Refuse names of neither a table nor a figure, inputs, and places that cannot be written.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def require_outputs(outputs: Sequence[str]) -> None:
             raise ProblemError(
                 f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
             )
-    require_writable(*outputs)
+    require_writable(*outputs, inputs=inputs)
 
 
 def write_outputs(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -9,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.export.c_text import header_text, source_text
 from lbt_synth.export.provenance import provenance, require_sound
-from lbt_synth.export.rehearsal import MatrixForm, rehearsed_error
+from lbt_synth.export.rehearsal import FRAMES, WrittenTerms, rehearsed_error
 from lbt_synth.export.result import Exported
 from lbt_synth.files import write_together
 from lbt_synth.statespace import Controller
@@ -56,7 +57,8 @@ def export_c(
     Returns
     -------
     Exported
-        Source and header, and the error of the chosen precision.
+        Source and header, and the error of the chosen precision and of single: the terms
+        added as they stand in the source, by a processor that rounds each of them.
 
     Raises
     ------
@@ -67,7 +69,8 @@ def export_c(
     CertificateError
         If the certificate that the design carries has a failed check.
     NumericalError
-        If the loop is unstable with the rounded coefficients.
+        If the loop is unstable with the rounded coefficients, or the commands of a frame
+        overflow.
 
     Examples
     --------
@@ -92,9 +95,21 @@ def export_c(
     require_sound(design)
     controller = _rounded(design.controller) if single else design.controller
     require_sound(design, controller)
-    error = rehearsed_error(design, MatrixForm(design.controller, np.float32))
+    error_double, error_single = (
+        rehearsed_error(design, WrittenTerms(design.controller, dtype))
+        for dtype in (np.float64, np.float32)
+    )
+    error = error_single if single else error_double
+    if not math.isfinite(error):
+        raise NumericalError(
+            f"the commands must stay finite in {precision} precision; they grew beyond all "
+            f"numbers within {FRAMES} frames. "
+            + ("Try double precision." if single else "Scale the states of the controller."),
+            status="arithmetic",
+            residual=error,
+        )
     lines = provenance(design, gain_digest)
-    if single:
+    if single:  # the figure in double precision would be that of this machine's products
         lines.append(("precision", f"single: commands within {error:.1e} of the largest one"))
     written = write_together(
         {
@@ -106,7 +121,7 @@ def export_c(
             ).encode("ascii"),
         }
     )
-    return Exported(files=written, error=error if single else 0.0, error_single=error)
+    return Exported(files=written, error=error, error_single=error_single)
 
 
 def require_identifier(name: str) -> str:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
+from lbt_synth.export.cost import as_one
 from lbt_synth.simulation.run import SteppedController, step_loop
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import FloatArray
@@ -35,6 +37,43 @@ class MatrixForm:
         measured = y.astype(self._dtype)
         self._state = A @ self._state + B @ measured
         return np.asarray(C @ self._state + D @ measured, dtype=np.float64)
+
+
+class WrittenTerms:
+    """A controller stepped as the C source is written: term by term, each rounded.
+
+    In each row of ``[A, B]`` and ``[C, D]`` the terms that are not zero are added from left to
+    right, as one statement of the straight-line source does and as the loops over whole matrices
+    do, which add zeros besides.
+    """
+
+    def __init__(self, controller: Controller, dtype: Any) -> None:
+        with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is found
+            whole = as_one(controller).astype(dtype)
+        n = controller.n_states
+        self._rows = [_terms(whole[:n]), _terms(whole[n:])]
+        self._dtype, self._n = dtype, n
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the state to zero."""
+        self._state = np.zeros(self._n, dtype=self._dtype)
+
+    def step(self, y: FloatArray) -> FloatArray:
+        """Take y(k), return u(k)."""
+        (old_places, old), (new_places, new) = self._rows
+        measured = y.astype(self._dtype)
+        known = np.concatenate([self._state, measured])
+        self._state = np.add.accumulate(old * known[old_places])[-1]
+        known = np.concatenate([self._state, measured])
+        return np.asarray(np.add.accumulate(new * known[new_places])[-1], dtype=np.float64)
+
+
+def _terms(rows: npt.NDArray[Any]) -> tuple[npt.NDArray[np.intp], npt.NDArray[Any]]:
+    """Places and factors of the terms, (longest row, rows); short rows end with zeros."""
+    length = max(1, int(np.max(np.count_nonzero(rows, axis=1), initial=0)))
+    places = np.argsort(rows == 0, axis=1, kind="stable")[:, :length]
+    return places.T, np.ascontiguousarray(np.take_along_axis(rows, places, axis=1).T)
 
 
 def rehearsed_error(design: Design, other: SteppedController) -> float:

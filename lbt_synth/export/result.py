@@ -17,7 +17,7 @@ class Exported:
     error : float
         Largest difference of the commands from those of the controller, over the largest
         command, with the arithmetic of the file: in the closed loop where the design is of one,
-        on white noise elsewhere. 0 where the file holds the controller's own numbers.
+        on white noise elsewhere.
     error_single : float
         The same in single precision; inf if the loop is then unstable.
     """

@@ -25,6 +25,7 @@ _WHOLE = 1e-9  # by which the ratio of the rates may miss an integer, relative
 _NOTHING = 1e-14  # a leading tap of at most this is none
 _TAIL = 1e-15  # what is left of the step response where the taps end
 _MOST_TAPS = 4000
+_MOST_SAMPLES = 100_000  # of the local loop, a frame; they are run one by one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,8 +135,8 @@ def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float)
     Raises
     ------
     ProblemError
-        If the rates do not fit, the ramp of the command is longer than a frame, or the mirror
-        takes more than 4000 frames to settle.
+        If the rates do not fit (a whole number of at most 100 000 samples a frame), the ramp of
+        the command is longer than a frame, or the mirror takes more than 4000 frames to settle.
     """
     return _lifted(
         loop.natural_frequency_hz, loop.damping, loop.proportional_per_s2, loop.derivative_per_s,
@@ -178,9 +179,17 @@ def samples_a_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
     Raises
     ------
     ProblemError
-        If it is no whole number, or less than the ramp of the command.
+        If it is no whole number, above 100 000, or less than the ramp of the command.
     """
     ratio = loop.sampling_hz / frame_rate_hz
+    if not ratio <= _MOST_SAMPLES:
+        raise ProblemError(
+            f"the local loop of the mirror must run at most {_MOST_SAMPLES} samples a frame; got "
+            f"{loop.sampling_hz:.9g} Hz over {frame_rate_hz:.9g} Hz = {ratio:.9g}. Lower "
+            f"sampling_hz to {_MOST_SAMPLES * frame_rate_hz:.9g} Hz or less, or raise the frame "
+            "rate; a mirror that settles within a few samples of so slow a loop needs no local "
+            "loop at all."
+        )
     samples = round(ratio)
     if samples < 1 or abs(ratio - samples) > _WHOLE * ratio:
         low, high = int(np.floor(ratio)), int(np.floor(ratio)) + 1

@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import warnings
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ import numpy.typing as npt
 
 from lbt_synth.archive import reason
 from lbt_synth.errors import OutputError, TelemetryError
+from lbt_synth.models import PositionLoop
 from lbt_synth.telemetry.filters import TimeFilters, integrator_gains, time_filters
-from lbt_synth.telemetry.record import CONVENTION, Telemetry
+from lbt_synth.telemetry.layout import with_same_taps
+from lbt_synth.telemetry.record import Telemetry
 from lbt_synth.validation import FloatArray
 
 _MARK = b"AOT-VERS="
@@ -197,7 +200,8 @@ def _system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         ao_mode="SCAO",
         name=_ascii(seen.name) or None,
         strehl_ratio=seen.strehl,
-        config=CONVENTION + " Time filters: sum b_i z^i / sum a_i z^i, after the control matrix.",
+        config=seen.convention
+        + " Time filters: sum b_i z^i / sum a_i z^i, after the control matrix.",
         main_telescope=telescope,
         sources=[star],
         scoring_cameras=cameras,
@@ -214,6 +218,10 @@ def _cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     gains = seen.integrator_gains
     ours["integrator_gains"] = None if gains is None else gains.tolist()
     ours["psf_pixel_mas"] = seen.psf_pixel_mas if seen.psf is None else None
+    if seen.mirror is not None and seen.mirror_taps is not None:
+        # the standard's TFZ_NUM and TFZ_DEN of a corrector: of what, and with which delay, it
+        # does not say
+        ours["mirror"], ours["mirror_taps"] = asdict(seen.mirror), seen.mirror_taps.tolist()
     if seen.controller is not None:
         ours["controller_states"] = seen.controller.n_states
     text = json.dumps(ours, allow_nan=False)
@@ -296,7 +304,8 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
     fields = _series(loops[0]) | _facts(system)
     if len(loops) > 1:
         fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
-    return Telemetry(**fields)
+    taps = fields.pop("mirror_taps", None)
+    return with_same_taps(Telemetry(**fields), taps)
 
 
 def _facts(system: Any) -> dict[str, Any]:
@@ -307,6 +316,9 @@ def _facts(system: Any) -> dict[str, Any]:
         if datum.key == _CARD_OF_OURS:
             ours = json.loads(datum.value)
             facts |= {name: ours[name] for name in (*_IN_OURS, "integrator_gains", "psf_pixel_mas")}
+            if "mirror" in ours:
+                facts["mirror"] = PositionLoop(**ours["mirror"])
+                facts["mirror_taps"] = ours["mirror_taps"]
     telescope = system.main_telescope
     if telescope is not None:
         facts["diameter_m"] = telescope.enclosing_diameter or telescope.inscribed_diameter

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,9 @@ import numpy.typing as npt
 import lbt_synth
 from lbt_synth.archive import Cards
 from lbt_synth.errors import ProblemError
+from lbt_synth.models import PositionLoop
 from lbt_synth.statespace import Controller
-from lbt_synth.telemetry.record import CONVENTION, Telemetry
+from lbt_synth.telemetry.record import Telemetry
 from lbt_synth.validation import FloatArray
 
 SCHEMA = "lbt_synth telemetry"
@@ -70,7 +71,11 @@ LAYERS = {
     "MODES": Layer(field="mode_maps", axes="mode, row, column", meaning="modes, of rms 1"),
     "PSF": Layer(field="psf", axes="row, column", meaning="image of the camera"),
     "INTGAINS": Layer(field="integrator_gains", axes="command", meaning="integrator gains"),
+    "MIRROR_TAPS": Layer(
+        field="mirror_taps", axes="age", meaning="c: phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...)"
+    ),
 }
+_SAME_TAPS = 1e-9  # what is read beside what the mirror of the file has
 _FACTS = (
     "frame_rate_hz",
     "delay_frames",
@@ -121,13 +126,15 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "library_version": lbt_synth.__version__,
-        "convention": CONVENTION,
+        "convention": telemetry.convention,
         **{name: getattr(telemetry, name) for name in _FACTS},
         "metadata": dict(telemetry.metadata),
     }
     if (k := telemetry.controller) is not None:
         arrays |= {f"CTRL_{name}": getattr(k, name) for name in "ABCD"}
         meta["controller_dt_s"] = k.dt_s
+    if telemetry.mirror is not None:
+        meta["mirror"] = asdict(telemetry.mirror)
     return arrays, meta
 
 
@@ -156,9 +163,35 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
         )
     if left:
         raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(left))}")
-    return Telemetry(
-        **fields, **{name: meta[name] for name in _FACTS}, metadata=dict(meta["metadata"])
+    taps = fields.pop("mirror_taps", None)
+    if "mirror" in meta:  # files of a mirror that settles at once have none
+        fields["mirror"] = PositionLoop(**meta["mirror"])
+    return with_same_taps(
+        Telemetry(
+            **fields, **{name: meta[name] for name in _FACTS}, metadata=dict(meta["metadata"])
+        ),
+        taps,
     )
+
+
+def with_same_taps(telemetry: Telemetry, taps: npt.ArrayLike | None) -> Telemetry:
+    """Return telemetry whose mirror has the taps that stand in its file.
+
+    Raises
+    ------
+    ValueError
+        If it has others.
+    """
+    own = telemetry.mirror_taps
+    if (own is None) != (taps is None):
+        raise ValueError("a mirror and its taps go together; it has one of them")
+    if own is not None and taps is not None:
+        found = np.asarray(taps, dtype=np.float64)
+        size = max(own.size, found.size)
+        one, other = (np.pad(each.ravel(), (0, size - each.size)) for each in (own, found))
+        if not np.allclose(one, other, rtol=0, atol=_SAME_TAPS):
+            raise ValueError("its taps are not those of its mirror")
+    return telemetry
 
 
 def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]]:
@@ -171,7 +204,7 @@ def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]
         value = getattr(telemetry, name)
         if value is not None and not (isinstance(value, int) and value > _LARGEST_CARD):
             cards[key] = (value, comment)
-    cards["TIMING"] = (CONVENTION, "")
+    cards["TIMING"] = (telemetry.convention, "")
     cards["SHA256"] = (meta["digest"], "")
     return cards
 

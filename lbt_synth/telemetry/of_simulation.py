@@ -95,6 +95,7 @@ def telemetry_of(
     return Telemetry(
         frame_rate_hz=simulation.frame_rate_hz,
         delay_frames=hardware.delay_frames,
+        mirror=hardware.mirror,
         commands=simulation.commands[case],
         measurements=simulation.measurements[case],
         residual_nm=residual,

@@ -11,22 +11,39 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.models import LoopHardware
+from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import FloatArray, frozen, integer, matrix, number, real_array
+from lbt_synth.validation import (
+    FloatArray,
+    frozen,
+    instance,
+    integer,
+    matrix,
+    number,
+    real_array,
+)
 
 Scalar: TypeAlias = str | float | int | bool
 
-CONVENTION = (
+_CONVENTION = (
     "Row k of every series is frame k of 1/frame_rate_hz. "
     "y(k) = sensor_gain S phi_res(k-1) + noise(k): the measurement of frame k is of the exposure "
     "of frame k-1. u(k) is the command computed from y up to y(k). "
-    "phi_res(k) = phi_tot(k) - phi_cor(k), phi_cor(k) = N u(k-d+1), d = delay_frames from the "
-    "middle of an exposure to the middle of the command computed from it; for d = j+1+f, "
-    "phi_cor(k) = N ((1-f) u(k-j) + f u(k-j-1)). S is the interaction matrix, N the influence "
-    "matrix, each the identity where it is not given. Where slopes are recorded, "
+    "phi_res(k) = phi_tot(k) - phi_cor(k), {correction}. S is the interaction matrix, N the "
+    "influence matrix, each the identity where it is not given. Where slopes are recorded, "
     "slopes(k) = sensor_gain S phi_res(k-1) + noise(k), y(k) = reconstructor slopes(k). "
     "Units: nm rms of wavefront, unless a unit is given."
+)
+CONVENTION = _CONVENTION.format(
+    correction="phi_cor(k) = N u(k-d+1), d = delay_frames from the "
+    "middle of an exposure to the middle of the command computed from it; for d = j+1+f, "
+    "phi_cor(k) = N ((1-f) u(k-j) + f u(k-j-1))"
+)
+MOVING_CONVENTION = _CONVENTION.format(
+    correction="phi_cor(k) = N (c0 u(k) + c1 u(k-1) + c2 u(k-2) + ...) with the mirror taps c "
+    "recorded here: the weights of the commands in the position of a mirror that does not settle "
+    "at once, averaged over exposure k. They hold the whole delay: d = delay_frames as it would be "
+    "with a mirror that settles at once, and the mirror's lag after it"
 )
 _BOUNDED: dict[str, dict[str, Any]] = {
     "delay_frames": {"at_least": 0, "at_most": 1000},
@@ -52,8 +69,10 @@ class Telemetry:
         phi_res(k) = phi_tot(k) - N u(k-d+1)
 
     with S the interaction and N the influence matrix, each the identity where it is not
-    given. Where the slopes are recorded, they are ``sensor_gain S phi_res(k-1) + noise(k)``,
-    and ``y(k)`` is the reconstructor times ``slopes(k)``.
+    given. With a ``mirror`` it is ``phi_tot(k) - N (c[0] u(k) + c[1] u(k-1) + ...)`` with the
+    taps c of :attr:`mirror_taps`. Where the slopes are recorded, they are
+    ``sensor_gain S phi_res(k-1) + noise(k)``, and ``y(k)`` is the reconstructor times
+    ``slopes(k)``.
 
     Parameters
     ----------
@@ -66,6 +85,9 @@ class Telemetry:
         sensor gave where no ``slopes`` are beside them.
     delay_frames : float, optional
         Total delay d [frames]; None if it is not known.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror, as in :class:`LoopHardware`; a mirror that settles at once by
+        default. It needs a delay of at least one frame.
     residual_nm, total_nm : (frames, n) array_like, optional
         Phase after and before the correction [nm], known to simulations only.
     slopes : (frames, s) array_like, optional
@@ -115,7 +137,8 @@ class Telemetry:
     Raises
     ------
     ProblemError
-        If sizes clash, or a value is not finite, out of range or of another kind.
+        If sizes clash, or a value is not finite, out of range or of another kind; or if the
+        mirror does not fit the frame rate.
 
     Examples
     --------
@@ -130,6 +153,7 @@ class Telemetry:
     commands: FloatArray
     measurements: FloatArray
     delay_frames: float | None = None
+    mirror: PositionLoop | None = None
     residual_nm: FloatArray | None = None
     total_nm: FloatArray | None = None
     slopes: FloatArray | None = None
@@ -164,6 +188,11 @@ class Telemetry:
                 self._set(name, number(value, name, **bounds))
         if self.seed is not None:
             self._set("seed", integer(self.seed, "seed", at_least=0))
+        if self.mirror is not None:
+            instance(self.mirror, PositionLoop)
+            if self.delay_frames is None:
+                raise ProblemError("telemetry of a mirror with dynamics needs delay_frames.")
+            _ = self.mirror_taps  # what does not fit is refused
         self._check_series()
         self._check_matrices()
         self._check_words()
@@ -318,6 +347,20 @@ class Telemetry:
         return self.measurements if self.slopes is None else self.slopes
 
     @property
+    def mirror_taps(self) -> FloatArray | None:
+        """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``, if there is a mirror."""
+        if self.mirror is None or self.delay_frames is None:
+            return None
+        return LoopHardware(
+            frame_rate_hz=self.frame_rate_hz, delay_frames=self.delay_frames, mirror=self.mirror
+        ).mirror_taps
+
+    @property
+    def convention(self) -> str:
+        """What the rows are, in sentences that files carry."""
+        return CONVENTION if self.mirror is None else MOVING_CONVENTION
+
+    @property
     def hardware(self) -> LoopHardware:
         """The loop as the records tell it, at sensor gain 1.
 
@@ -345,6 +388,7 @@ class Telemetry:
             delay_frames=self.delay_frames,
             sensor_matrix=np.eye(n) if sensor is None else sensor,
             influence_matrix=np.eye(n) if influence is None else influence,
+            mirror=self.mirror,
         )
 
 
