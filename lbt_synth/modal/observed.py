@@ -120,8 +120,8 @@ def modal_gains_from_telemetry(
     first = len(taps)  # frame whose correction is known
     if frames - first <= segment:
         raise ProblemError(
-            f"the series must be longer than a segment, {segment} frames; got {frames}. Record "
-            "more, or shorten segment_frames."
+            f"the series must be longer than a segment, {segment} frames and {first} of delay and "
+            f"mirror; got {frames}. Record more, or shorten segment_frames."
         )
     open_loop = y[:, first:] / gain[:, None]
     for i, tap in enumerate(taps):
