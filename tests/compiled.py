@@ -12,6 +12,7 @@ import numpy as np
 STRICT = [
     "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion", "-Wconversion",
 ]  # fmt: skip
+PLAIN = ["-O2", "-ffp-contract=off"]  # each product and each sum is rounded
 _fresh = itertools.count()
 
 
@@ -31,7 +32,7 @@ class Compiled:
             # a new name each time: a library that is loaded is not loaded again
             target = source.with_name(f"{source.stem}{next(_fresh)}.so")
             subprocess.run(
-                [compiler(), *STRICT, "-O2", "-shared", "-fPIC", source, "-o", target], check=True
+                [compiler(), *STRICT, *PLAIN, "-shared", "-fPIC", source, "-o", target], check=True
             )
             library = ctypes.CDLL(str(target))
         self.library = library

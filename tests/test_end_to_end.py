@@ -4,6 +4,7 @@ import importlib.metadata
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
+from lbt_synth.cli import end_to_end_commands
 from lbt_synth.cli.main import main
 from lbt_synth.endtoend.cases import case_of
 from lbt_synth.errors import ConfigError, MissingExtraError, OutputError, ProblemError
@@ -192,6 +194,21 @@ def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path,
     with pytest.raises(MissingExtraError) as caught:
         lbt.calibrate(lbt.load_config(CONFIG).end_to_end.system, cache=tmp_path)
     assert caught.value.extra == "e2e"
+
+
+def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
+    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5, bandwidth_hz=150)
+    slow = replace(setup.system.hardware, mirror=shell)
+    run = made_run(replace(setup.system, modes=3, hardware=slow), frames=20)
+    design = lbt.integrator(slow, gain=0.1)
+    gain = lbt.save_gain(tmp_path / "i.fits", design)
+    monkeypatch.setattr(end_to_end_commands, "specula_version", lambda: "1.1")
+    seen = end_to_end_commands._telemetry(
+        run, design, SimpleNamespace(key="k"), SimpleNamespace(gain=str(gain))
+    )
+    seen = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.fits", seen))
+    assert np.array_equal(seen.hardware.mirror_taps, slow.mirror_taps)
+    assert "with the mirror taps c" in seen.convention
 
 
 def test_a_case_holds_all_that_decides_and_fits_into_json(setup):
