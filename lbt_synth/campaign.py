@@ -16,7 +16,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -104,10 +104,11 @@ def run_cases(
         if progress is not None and results:
             progress(len(results))
         missing = {name: case for name, case in cases.items() if name not in results}
-        for name, result in _results(function, missing, jobs, executor):
-            results[name] = _write(folder, name, digests[name], cases[name], result)
-            if progress is not None:
-                progress(1)
+        with contextlib.closing(_results(function, missing, jobs, executor)) as coming:
+            for name, result in coming:
+                results[name] = _write(folder, name, digests[name], cases[name], result)
+                if progress is not None:
+                    progress(1)
     return {name: results[name] for name in cases}
 
 
@@ -116,7 +117,7 @@ def _results(
     cases: Mapping[str, Case],
     jobs: int,
     executor: Executor | None,
-) -> Iterator[tuple[str, Mapping[str, Any]]]:
+) -> Generator[tuple[str, Mapping[str, Any]], None, None]:
     """Yield results as they come; if a case fails, those that run are still waited for."""
     if not cases:
         return
@@ -143,10 +144,9 @@ def _results(
                         failure = error
                         for other in pending:
                             other.cancel()
-        except BaseException:
+        finally:
             for future in futures:
                 future.cancel()
-            raise
         if failure is not None:
             raise failure
 
@@ -172,7 +172,7 @@ def _pool(workers: int) -> Iterator[Executor]:
                     "a process of the campaign ended without a word, for want of memory perhaps. "
                     "What is finished is kept: start again, with fewer jobs."
                 ) from error
-            except BaseException:
+            except (KeyboardInterrupt, SystemExit, GeneratorExit):
                 for worker in set(multiprocessing.active_children()) - others:
                     worker.terminate()  # what they run is not waited for
                 raise

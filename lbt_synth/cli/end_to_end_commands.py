@@ -12,11 +12,11 @@ from typing import Any
 
 from lbt_synth.cli.loop_commands import named_designs
 from lbt_synth.cli.output import Report, TableText, counting, fixed, plain
-from lbt_synth.cli.writing import made_directory
+from lbt_synth.cli.writing import made_directory, records_csv
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
 from lbt_synth.endtoend import Calibration, EndToEndRun, EndToEndSetup, calibrate
-from lbt_synth.endtoend.cases import summary, with_pixels
+from lbt_synth.endtoend.cases import summary
 from lbt_synth.endtoend.optics import specula_version
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import refuse_replacing, write_atomically
@@ -24,13 +24,12 @@ from lbt_synth.gainfile import load_gain
 from lbt_synth.paper.end_to_end import (
     EndToEndEntry,
     all_cases,
-    end_to_end_tables,
     modal_distance,
     plan_tables,
+    run_tables,
 )
 from lbt_synth.paper.end_to_end_figure import table_figure
 from lbt_synth.plotting import end_to_end_figure, save_figure
-from lbt_synth.tables import csv_bytes
 from lbt_synth.telemetry import Telemetry, save_telemetry
 
 _RUN = ("run.png", "telemetry.fits", "summary.json")
@@ -116,22 +115,26 @@ def end_to_end_table(arguments: Namespace) -> Report:
     if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:
         raise ProblemError("--seeds, --row-seeds and --jobs must be at least 1.")
     specula_version()
-    plan: dict[str, Any] = {
-        "designs": {_case_name(name): design for name, design in designs.items()},
-        "seeds": range(setup.seed, setup.seed + arguments.seeds),
-        "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
-        "tables": arguments.tables,
-    }
-    total = len(all_cases(plan_tables(setup, **plan)))
+    rows = plan_tables(
+        setup,
+        {_case_name(name): design for name, design in designs.items()},
+        seeds=range(setup.seed, setup.seed + arguments.seeds),
+        row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
+        tables=arguments.tables,
+    )
+    total = len(all_cases(rows))
     made_directory(folder)
     results = made_directory(folder / "cases")
     _calibrated(setup, arguments)
     with counting(total=total, what="runs", quiet=arguments.json) as count:
-        table = end_to_end_tables(
-            setup, results, **plan, jobs=arguments.jobs, cache=arguments.cache, progress=count
+        table = run_tables(
+            setup, rows, results, jobs=arguments.jobs, cache=arguments.cache, progress=count
         )
     files = [
-        write_atomically(folder / _TABLES[number][0], _csv(table, number))
+        write_atomically(
+            folder / _TABLES[number][0],
+            records_csv([_record(entry) for entry in table if entry.table == number]),
+        )
         for number in arguments.tables
     ]
     distances: dict[str, float] = {}
@@ -159,7 +162,9 @@ def end_to_end_table(arguments: Namespace) -> Report:
 
 
 def _setup(arguments: Namespace) -> EndToEndSetup:
-    setup = with_pixels(load_config(arguments.config).end_to_end, arguments.pixels)
+    setup = load_config(arguments.config).end_to_end
+    if arguments.pixels is not None:
+        setup = replace(setup, system=replace(setup.system, pixels=arguments.pixels))
     changes = {
         name: getattr(arguments, name)
         for name in ("frames", "settle_frames", "seed")
@@ -193,13 +198,6 @@ def _record(entry: EndToEndEntry) -> dict[str, Any]:
         "tilt_rms_nm": entry.tilt_rms_nm,
         "other_modes_strehl_percent": entry.other_modes,
     }
-
-
-def _csv(table: Sequence[EndToEndEntry], number: str) -> bytes:
-    records = [_record(entry) for entry in table if entry.table == number]
-    return csv_bytes(
-        list(records[0]), [["" if v is None or v != v else v for v in r.values()] for r in records]
-    )
 
 
 def _table(table: Sequence[EndToEndEntry], number: str) -> TableText:

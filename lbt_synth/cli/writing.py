@@ -59,14 +59,15 @@ def write_outputs(
     report.data["files"] = []
     for output in outputs:
         if Path(output).suffix.lower() == ".csv":
-            path = write_atomically(output, _csv(records))
+            path = write_atomically(output, records_csv(records))
         else:
             path = save_figure(figure(), output)
         report.data["files"].append(str(path))
         report.notes.append(f"written: {path}")
 
 
-def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
+def records_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return records with the same keys as a CSV table; what is not a number is left empty."""
     cells = [
         ["" if isinstance(v, float) and math.isnan(v) else v for v in record.values()]
         for record in records

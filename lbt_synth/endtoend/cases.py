@@ -6,7 +6,7 @@ import importlib.metadata
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from typing import Any
 
 from lbt_synth.endtoend.result import EndToEndRun
@@ -24,7 +24,6 @@ def case_of(
     controller: Controller | None,
     *,
     vibrations: Sequence[Vibration | SinusoidalVibration] = (),
-    tip_tilt_gain: float | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Return the case of one run: other vibrations and another seed than the set-up's.
@@ -37,8 +36,6 @@ def case_of(
         Controller of tip and tilt; None for integrators.
     vibrations : sequence of Vibration or SinusoidalVibration, optional
         Vibrations of tip and tilt.
-    tip_tilt_gain : float, optional
-        Gain of tip and tilt where there is no controller.
     seed : int, optional
         Seed of the run.
 
@@ -63,7 +60,6 @@ def case_of(
         },
         "setup": {**{name: getattr(setup, name) for name in _SETUP}, "seed": seed},
         "vibrations": [asdict(line) for line in vibrations],
-        "tip_tilt_gain": tip_tilt_gain,
         "controller": None
         if controller is None
         else {name: getattr(controller, name).tolist() for name in _MATRICES}
@@ -99,7 +95,6 @@ def run_case(
     matrices = case["controller"]
     run = setup.run(
         None if matrices is None else Controller(**matrices),
-        tip_tilt_gain=case["tip_tilt_gain"],
         cache=cache,
     )
     return summary(run)
@@ -147,10 +142,3 @@ def _hardware(path: Mapping[str, Any]) -> LoopHardware:
 def _vibration(line: Mapping[str, Any]) -> Vibration | SinusoidalVibration:
     kind = Vibration if "damping" in line else SinusoidalVibration
     return kind(**{**line, "direction": tuple(line["direction"])})
-
-
-def with_pixels(setup: EndToEndSetup, pixels: int | None) -> EndToEndSetup:
-    """Return a set-up with another number of pixels across the pupil, or the same."""
-    if pixels is None:
-        return setup
-    return replace(setup, system=replace(setup.system, pixels=pixels))

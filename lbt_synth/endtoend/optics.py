@@ -252,10 +252,10 @@ class Optics:
         return float(self._camera.psf_pixel_size)
 
     @property
-    def diffraction_peak(self) -> float:
-        """Value of the image's centre without any aberration."""
-        reference = self._camera.ref.i
-        return float(reference[reference.shape[0] // 2, reference.shape[1] // 2])
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns of the image."""
+        rows, columns = self._camera.out_size
+        return int(rows), int(columns)
 
     def _input(self, value: FloatArray) -> Any:
         return self._value(value=np.array(value, dtype=np.float32), precision=1)

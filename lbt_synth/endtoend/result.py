@@ -10,6 +10,7 @@ from lbt_synth.endtoend.system import EndToEndSystem
 from lbt_synth.validation import FloatArray
 
 _BATCHES = 8
+_TIP_TILT = slice(2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,31 +94,34 @@ class EndToEndRun:
         Regression of the measurements on the true residual: the noise of a
         measurement is that of a later frame than the residual it is of.
         """
-        y, phase = self.measurements[1:], self.residual_nm[:-1]
-        return np.asarray(np.sum(y * phase, axis=0) / np.sum(phase**2, axis=0))
+        return self._regressed(slice(None), axis=0)[0]
 
     @property
     def optical_gain_error(self) -> FloatArray:
         """Standard error of each optical gain, for noise that is white, (modes,)."""
-        y, phase = self.measurements[1:], self.residual_nm[:-1]
-        left = y - self.optical_gain * phase
-        return np.asarray(np.sqrt(np.sum(left**2, axis=0) / np.sum(phase**2, axis=0) / len(y)))
+        return self._regressed(slice(None), axis=0)[1]
 
     @property
     def tip_tilt_gain(self) -> float:
         """Optical gain of tip and tilt together."""
-        y, phase = self.measurements[1:, :2], self.residual_nm[:-1, :2]
-        return float(np.sum(y * phase) / np.sum(phase**2))
+        return float(self._regressed(_TIP_TILT)[0])
 
     @property
     def tip_tilt_gain_error(self) -> float:
         """Standard error of the optical gain of tip and tilt."""
-        y, phase = self.measurements[1:, :2], self.residual_nm[:-1, :2]
-        left = y - self.tip_tilt_gain * phase
-        return float(np.sqrt(np.mean(left**2) / np.sum(phase**2)))
+        return float(self._regressed(_TIP_TILT)[1])
 
     @property
     def tip_tilt_noise_nm(self) -> float:
         """What the optical gain does not explain of the measured tip and tilt [nm rms a mode]."""
-        y, phase = self.measurements[1:, :2], self.residual_nm[:-1, :2]
-        return float(np.sqrt(np.mean((y - self.tip_tilt_gain * phase) ** 2)))
+        return float(self._regressed(_TIP_TILT)[2])
+
+    def _regressed(
+        self, modes: slice, axis: int | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Gain of some modes, each or together, its standard error, and what it leaves [nm rms]."""
+        y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
+        power = np.sum(phase**2, axis=axis)
+        gain = np.asarray(np.sum(y * phase, axis=axis) / power)
+        left = np.mean((y - gain * phase) ** 2, axis=axis)
+        return gain, np.asarray(np.sqrt(left / power)), np.asarray(np.sqrt(left))

@@ -15,7 +15,7 @@ from lbt_synth.endtoend.system import EndToEndSystem
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import SinusoidalVibration, Truth, Vibration
 from lbt_synth.simulation import draw_disturbance
-from lbt_synth.simulation.run import SteppedController
+from lbt_synth.simulation.run import SteppedController, stepped
 from lbt_synth.validation import FloatArray, instance, integer
 
 _SCREENS = "screens"
@@ -159,18 +159,18 @@ def _close(
         name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")
     }  # fmt: skip
     strehl, others = np.empty(kept), np.empty(kept)
-    images: list[FloatArray] = []
+    psf = np.zeros(optics.image_shape)
     past = np.zeros((len(taps), n))  # u(k), u(k-1), ...
     slopes = calibration.reference
     controller.reset()
     for k in range(len(tilts)):
         y = inverse @ (slopes - calibration.reference)
-        past = np.vstack([_command(controller, y, k), past[:-1]])
+        past = np.vstack([stepped(controller, y, n, frame=k), past[:-1]])
         slopes = optics.expose(taps @ past, tilts[k], seeing=min(1.0, (k + 1) / RAMP_FRAMES))
         row = k - settle
         if row >= 0:
             strehl[row], frame = optics.image()
-            images = [images[0] + frame] if images else [frame]
+            psf += frame
             residual, others[row] = _residual(modes, optics)
             for name, value in zip(out, (y, past[0], residual), strict=True):
                 out[name][row] = value
@@ -180,19 +180,8 @@ def _close(
         **out,
         "strehl_series": strehl,
         "other_modes_series": others,
-        "psf": images[0] / kept,
+        "psf": psf / kept,
     }
-
-
-def _command(controller: SteppedController, y: FloatArray, frame: int) -> FloatArray:
-    u = np.asarray(controller.step(y), dtype=np.float64)
-    if u.shape != y.shape or not np.all(np.isfinite(u)):
-        raise ProblemError(
-            f"the controller must return {y.size} finite commands; got {u.shape} "
-            f"{'' if np.all(np.isfinite(u)) else 'with values that are not finite '}"
-            f"in frame {frame}."
-        )
-    return u
 
 
 def _residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:

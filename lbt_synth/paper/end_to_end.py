@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lbt_synth.campaign import run_cases
-from lbt_synth.design import Design, hinf, kalman
+from lbt_synth.design import Design, hinf, integrator, kalman
 from lbt_synth.endtoend import EndToEndSetup, calibrate
 from lbt_synth.endtoend.cases import case_of, run_case
 from lbt_synth.errors import ProblemError, UnstableLoopError
@@ -202,7 +202,8 @@ def _table_ii(
             seeds=seeds,
         )
         gain = CLASSICAL_GAIN_VIBRATION if shaken else CLASSICAL_GAIN
-        yield _planned(setup, row, "classical", _integrators(gain), published.classical, gain=gain)
+        classical = integrator(setup.system.hardware, gain=gain).controller
+        yield _planned(setup, row, "classical", classical, published.classical)
         yield from _filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
         yield from _fixed(setup, row, fixed)
 
@@ -243,8 +244,6 @@ def _planned(
     method: str,
     controller: Controller,
     paper: float,
-    *,
-    gain: float | None = None,
 ) -> Planned:
     tuned = method in _FILTERS
     true_hz = row.truth_hz if tuned else row.moved_hz
@@ -266,21 +265,13 @@ def _planned(
         cases={
             f"{name}-vibration-{met}-seed-{seed}": case_of(
                 setup,
-                None if gain is not None else controller,
+                controller,
                 vibrations=lines,
-                tip_tilt_gain=gain,
                 seed=seed,
             )
             for seed in row.seeds
         },
     )
-
-
-def _integrators(gain: float) -> Controller:
-    return Controller(
-        A=np.eye(2), B=gain * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)),
-        dt_s=1 / given.FRAME_RATE_HZ,
-    )  # fmt: skip
 
 
 def _paper_filter(method: str, model_hz: float) -> Controller:
@@ -355,6 +346,22 @@ def end_to_end_tables(
     lbt_synth.errors.ProblemError: tables must be one of II, III; got 'IV'.
     """
     rows = plan_tables(setup, designs, seeds=seeds, row_seeds=row_seeds, tables=tables)
+    return run_tables(
+        setup, rows, directory, jobs=jobs, executor=executor, cache=cache, progress=progress
+    )
+
+
+def run_tables(
+    setup: EndToEndSetup,
+    rows: Sequence[Planned],
+    directory: str | os.PathLike[str],
+    *,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[EndToEndEntry]:
+    """Run what is missing of tables of :func:`plan_tables`; see :func:`end_to_end_tables`."""
     calibrate(setup.system, cache=cache)  # once, and not in each process
     results = run_cases(
         functools.partial(run_case, cache=cache),

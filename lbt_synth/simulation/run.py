@@ -181,6 +181,27 @@ def settling_frames(radius: float) -> int:
     return int(min(np.ceil(np.log(_SETTLED) / np.log(radius)), _MOST_SETTLING))
 
 
+def stepped(
+    controller: SteppedController | RunningController, y: FloatArray, size: int, *, frame: int
+) -> FloatArray:
+    """Give a controller its measurements, and return its commands if they are some.
+
+    Raises
+    ------
+    ProblemError
+        If it returns something else than so many finite commands.
+    """
+    u = np.asarray(controller.step(y), dtype=np.float64)
+    finite = bool(np.all(np.isfinite(u)))
+    if u.shape != (size,) or not finite:
+        kind = "" if finite else " with values that are not finite"
+        raise ProblemError(
+            f"the controller must return {size} finite commands; got {u.shape}{kind} in frame "
+            f"{frame}."
+        )
+    return u
+
+
 def step_loop(
     controller: SteppedController | RunningController,
     sensor_gain: float,
@@ -205,11 +226,7 @@ def step_loop(
         commands = np.zeros((len(taps), m))  # u(k), u(k-1), ...
         for k in range(frames):
             y = sensor_gain * hardware.sensor @ residual + noise[case, k]
-            u = np.asarray(controller.step(y), dtype=np.float64)
-            if u.shape != (m,) or not np.all(np.isfinite(u)):
-                raise ProblemError(
-                    f"the controller must return {m} finite commands; got {u!r} in frame {k}."
-                )
+            u = stepped(controller, y, m, frame=k)
             commands = np.vstack([u, commands[:-1]])
             residual = total[case, k] - hardware.influence @ (taps @ commands)
             out[case, k] = np.concatenate([residual, u, y])
