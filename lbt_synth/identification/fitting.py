@@ -144,6 +144,11 @@ def grow(data: LoopPeriodogram, rules: Rules, start: Grown | None = None) -> Gro
     return search.pruned(search.plain(current), measure=True)
 
 
+def has_corner(theta: FloatArray) -> bool:
+    """Whether the turbulence rolls off behind a corner."""
+    return bool(theta[CORNER] < np.log(_NO_CORNER))
+
+
 class _Search:
     def __init__(self, data: LoopPeriodogram, rules: Rules) -> None:
         self.data, self.rules = data, rules
@@ -298,7 +303,7 @@ class _Search:
     def plain(self, current: Grown) -> Grown:
         """Return the model without the roll-off of the turbulence, if that is not worth it."""
         theta = current.theta.copy()
-        if theta[CORNER] >= np.log(_NO_CORNER):
+        if not has_corner(theta):
             return current
         theta[CORNER] = np.log(2 * _NO_CORNER)
         try:
@@ -354,7 +359,7 @@ class _Search:
         theta = start.theta.copy()
         if not self.free_gain:
             theta[GAIN] = np.log(self.rules.gain or 1.0)
-        if theta[CORNER] >= np.log(_NO_CORNER):
+        if not has_corner(theta):
             theta[CORNER] = _CORNER[0] + np.log(self.angle)
         try:
             return self.fitted(theta, start.parts)
@@ -366,7 +371,7 @@ class _Search:
         merged = self.data.merged(self._groups(theta, parts))
         free = np.ones(theta.size, dtype=bool)
         free[GAIN] = self.free_gain
-        free[CORNER] = theta[CORNER] < np.log(_NO_CORNER)
+        free[CORNER] = has_corner(theta)
         got = fit(Likelihood(merged), theta, self._priors(theta, parts), free=free)
         got = replace(got, contrast=self.full.contrast(got.parameters))
         return Grown(fitted=got, parts=parts)
@@ -405,7 +410,7 @@ class _Search:
     def _priors(self, theta: FloatArray, parts: tuple[Part, ...]) -> Priors:
         centre, width = theta.copy(), np.full(theta.size, np.inf)
         centre[GAIN], width[GAIN] = _GAIN_PRIOR
-        if theta[CORNER] < np.log(_NO_CORNER):
+        if has_corner(theta):
             centre[CORNER], width[CORNER] = _CORNER[0] + np.log(self.angle), _CORNER[1]
         for i, part in enumerate(parts):
             at = FIRST + PARAMETERS * i
