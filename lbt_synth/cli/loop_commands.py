@@ -120,7 +120,7 @@ def simulate(arguments: Namespace) -> Report:
         ("  noise", None, budget.noise_nm, "nm rms"),
         ("commands", float(command_rms), None, "nm rms"),
         ("least residual of any linear controller", None, limit_nm, "nm rms"),
-        ("  residual above it", None, above, "%"),
+        ("  residual above it", None, round(above, 6) + 0.0, "%"),
     ]
     report = Report(
         data={
