@@ -1,0 +1,14 @@
+"""Prediction against data: what controllers would have left of a recorded disturbance."""
+
+from lbt_synth.replay.estimate import ResidualEstimate
+from lbt_synth.replay.predictor import LeastSquaresPredictor, least_squares_predictor
+from lbt_synth.replay.residual import replayed_residual
+from lbt_synth.replay.stretches import split_halves
+
+__all__ = [
+    "LeastSquaresPredictor",
+    "ResidualEstimate",
+    "least_squares_predictor",
+    "replayed_residual",
+    "split_halves",
+]
