@@ -4,11 +4,15 @@ from lbt_synth.replay.estimate import ResidualEstimate
 from lbt_synth.replay.predictor import LeastSquaresPredictor, least_squares_predictor
 from lbt_synth.replay.residual import replayed_residual
 from lbt_synth.replay.stretches import split_halves
+from lbt_synth.replay.table import PredictionRow, PredictionTable, prediction_against_data
 
 __all__ = [
     "LeastSquaresPredictor",
+    "PredictionRow",
+    "PredictionTable",
     "ResidualEstimate",
     "least_squares_predictor",
+    "prediction_against_data",
     "replayed_residual",
     "split_halves",
 ]
