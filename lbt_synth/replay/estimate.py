@@ -205,7 +205,10 @@ def _mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) -
     total, start = np.zeros((n, n)), 0
     for begin, end in stretches:
         length = end - begin
-        x, y = rfft(one[start : start + length], axis=0), rfft(other[start : start + length], axis=0)
+        x, y = (
+            rfft(one[start : start + length], axis=0),
+            rfft(other[start : start + length], axis=0),
+        )
         weight = np.full(len(x), 2.0)  # a frequency and its negative
         weight[0] = 1.0
         weight[-1] = 2.0 if length % 2 else 1.0

@@ -178,7 +178,7 @@ def _controller(
 ) -> Controller:
     """Make the controller from y to u of a filter of z: the newest values of z are its states."""
     n, _, count = coefficients.shape
-    A = np.kron(np.eye(count, k=-1), np.eye(n))
+    A = np.eye(n * count, k=-n)
     B = np.zeros((n * count, n))
     B[:n] = back
     rows = coefficients.transpose(0, 2, 1).reshape(n, count * n)

@@ -51,7 +51,8 @@ def split_halves(
         Frames of the record.
     gap_frames : int, optional
         Frames after the last one of the fit that neither half has, so that the test does not
-        know the end of the fit.
+        know the end of the fit. A replay drops the frames in which its loop settles: they
+        are a gap already.
     fit_share : float, optional
         Part of the usable frames that is fitted, in (0, 1).
 
@@ -88,8 +89,8 @@ def split_halves(
             test.append((after, stop))
     if not fit or not test:
         raise ProblemError(
-            f"a record must leave frames to fit and to test on; got {len(fit)} stretches to fit and "
-            f"{len(test)} to test, of {frames} frames with a gap of {gap}. Record more, or shorten "
-            "gap_frames."
+            f"a record must leave frames to fit and to test on; got {len(fit)} stretches to fit "
+            f"and {len(test)} to test, of {frames} frames with a gap of {gap}. Record more, or "
+            "shorten gap_frames."
         )
     return tuple(fit), tuple(test)

@@ -310,9 +310,7 @@ def prediction_against_data(
     )
 
 
-def _halves(
-    usable: Stretches, fit: Any, test: Any, frames: int
-) -> tuple[Stretches, Stretches]:
+def _halves(usable: Stretches, fit: Any, test: Any, frames: int) -> tuple[Stretches, Stretches]:
     if (fit is None) != (test is None):
         raise ProblemError("fit and test must both be given, or neither; got one of them.")
     if fit is None:
@@ -340,7 +338,9 @@ def _held(plant: TipTiltPlant, name: str, controller: Controller) -> ClosedLoop:
     try:
         loop.require_stable()
     except UnstableLoopError as error:
-        raise UnstableLoopError(f"{name}: {error}", spectral_radius=error.spectral_radius) from error
+        raise UnstableLoopError(
+            f"{name}: {error}", spectral_radius=error.spectral_radius
+        ) from error
     return loop
 
 
