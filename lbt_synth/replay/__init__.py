@@ -3,8 +3,9 @@
 from lbt_synth.replay.estimate import ResidualEstimate
 from lbt_synth.replay.predictor import LeastSquaresPredictor, least_squares_predictor
 from lbt_synth.replay.residual import replayed_residual
+from lbt_synth.replay.rows import PredictionRow, PredictionTable
 from lbt_synth.replay.stretches import split_halves
-from lbt_synth.replay.table import PredictionRow, PredictionTable, prediction_against_data
+from lbt_synth.replay.table import prediction_against_data
 
 __all__ = [
     "LeastSquaresPredictor",
