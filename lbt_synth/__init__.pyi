@@ -23,6 +23,7 @@ from .design import integrator_gain_limit as integrator_gain_limit
 from .design import kalman as kalman
 from .design import lqg as lqg
 from .design import mixed as mixed
+from .design import model_integrator as model_integrator
 from .design import optimal_integrator as optimal_integrator
 from .design import polytopic as polytopic
 from .design import robust as robust
@@ -77,6 +78,7 @@ from .loop import ResidualBudget as ResidualBudget
 from .loop import close_loop as close_loop
 from .loop import jitter_strehl as jitter_strehl
 from .loop import loop_margins as loop_margins
+from .loop import model_budget as model_budget
 from .loop import residual_budget as residual_budget
 from .loop import settling_error as settling_error
 from .loop import stable_sensor_gains as stable_sensor_gains
@@ -136,6 +138,14 @@ from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
 from .plotting import tradeoff_figure as tradeoff_figure
+from .replay import LeastSquaresPredictor as LeastSquaresPredictor
+from .replay import PredictionRow as PredictionRow
+from .replay import PredictionTable as PredictionTable
+from .replay import ResidualEstimate as ResidualEstimate
+from .replay import least_squares_predictor as least_squares_predictor
+from .replay import prediction_against_data as prediction_against_data
+from .replay import replayed_residual as replayed_residual
+from .replay import split_halves as split_halves
 from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare
