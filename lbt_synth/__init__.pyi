@@ -134,6 +134,17 @@ from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
 from .plotting import tradeoff_figure as tradeoff_figure
+from .records import Finding as Finding
+from .records import LinePrior as LinePrior
+from .records import LoopRecord as LoopRecord
+from .records import RecordHealth as RecordHealth
+from .records import SpectrumRecord as SpectrumRecord
+from .records import lines_of_accelerometer as lines_of_accelerometer
+from .records import load_lines as load_lines
+from .records import load_record as load_record
+from .records import loop_record as loop_record
+from .records import record_of as record_of
+from .records import require_length as require_length
 from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution
 from .riccati import solve_dare as solve_dare
