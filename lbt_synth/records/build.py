@@ -141,7 +141,7 @@ def loop_record(
     y = _laid_out(y[keep], at, frames)
     y, measured = _judged(
         y, there, "measurements", findings,
-        (("stuck", stuck), ("saturated", saturated), ("outlier", outliers)),
+        (("saturated", saturated), ("stuck", stuck), ("outlier", outliers)),
     )  # fmt: skip
     commanded = np.ones(frames, dtype=np.bool_)
     if u is not None:
@@ -313,8 +313,8 @@ def _report(
 
 
 def _clipped(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Commands at a limit; those of an open or halted loop are held, not clipped."""
-    return saturated(series, good & ~stuck(series, good)) if np.ptp(series) > 0 else ~good & good
+    """Find commands at a limit; zero is none, but that of an open loop."""
+    return saturated(series, good & (series != 0))
 
 
 def _held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> None:

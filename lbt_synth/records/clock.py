@@ -184,8 +184,9 @@ def _on_grid(times: FloatArray, rate: float | None) -> IntArray:
 
 
 def _rate_of(times: FloatArray, frame: IntArray) -> float:
-    """Rate by the first and last times that are there, to nine digits."""
-    span = times[-1] - times[0]
-    if not span > 0 or frame[-1] == 0:
+    """Rate by a straight line through times and frames, to nine digits."""
+    t, n = times - times.mean(), frame - frame.mean()
+    slope = float(n @ t)
+    if not slope > 0:
         raise ProblemError("times_s must rise; all rows have the same time.")
-    return float(f"{frame[-1] / span:.9g}")
+    return float(f"{float(n @ n) / slope:.9g}")

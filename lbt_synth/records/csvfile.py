@@ -13,7 +13,7 @@ from lbt_synth.validation import FloatArray
 
 _GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 _DELIMITERS = (";", "\t", ",", "|")
-_LOOKED_AT = 20  # rows, to find the delimiter
+_LOOKED_AT = 20  # rows, to find decimal commas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,7 +68,7 @@ def read_csv(text: str) -> TextTable:
     last_comment = ""
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip("\r\n ")
-        if not line.strip():
+        if not line:
             continue
         if line.lstrip().startswith("#"):
             comments.append(line.lstrip().lstrip("#").strip())
@@ -78,7 +78,7 @@ def read_csv(text: str) -> TextTable:
         numbers.append(number)
     if not lines:
         raise TelemetryError("it has no rows.")
-    sign = _delimiter(lines)
+    sign = _delimiter(lines[0])
     notes: list[str] = []
     decimal = (
         sign in {";", "\t"}
@@ -109,14 +109,9 @@ def read_csv(text: str) -> TextTable:
     )
 
 
-def _delimiter(lines: list[str]) -> str | None:
-    """Sign between the cells; None for blanks, or for a single column."""
-    some = lines[:_LOOKED_AT]
-    for sign in _DELIMITERS:
-        counts = {len(_cells(line, sign)) for line in some}
-        if counts != {1} and all(sign in line for line in some):
-            return sign
-    return None
+def _delimiter(line: str) -> str | None:
+    """Sign between the cells, by the first row; None for blanks, or for a single column."""
+    return next((sign for sign in _DELIMITERS if sign in line), None)
 
 
 def _cells(line: str, sign: str | None) -> list[str]:

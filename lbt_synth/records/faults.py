@@ -14,7 +14,7 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray
 _SHORTEST_RUN = 5  # equal values, a stuck sensor
 _RARE = 1e-3  # runs of chance allowed in a record
 _QUANTISED = 2**20  # levels at most, where equal neighbours say little
-_LONG_RUN = 4.0  # over the 99th percentile of the runs of a quantised series
+_MANY_RUNS = 100  # that a chance is computed from
 _SAME_LEVEL = 1e-9  # of the range
 _LEAST_AT_LIMIT = 4  # values at an end of the range
 _LIMIT_RATIO = 4  # over the next values inside
@@ -46,13 +46,20 @@ def stuck(series: FloatArray, good: BoolArray) -> BoolArray:
         return out
     each = equal_runs(series, good)
     lengths = each[:, 1] - each[:, 0]
-    least = float(_SHORTEST_RUN)
     repeated = float(np.mean(lengths > 1))  # chance that a value is seen again
-    if 0 < repeated < 1:
-        least = max(least, 1 + np.log(_RARE / len(series)) / np.log(repeated))
     if _quantised(series[good]):
-        least = max(least, _LONG_RUN * float(np.quantile(lengths, 0.99)))
-    for start, stop in each[lengths >= least]:
+        # a slow series stays on a level longer than the mean run tells: the largest such chance
+        longer = np.cumsum(np.bincount(lengths)[::-1])[::-1]  # runs of at least that length
+        many = longer[1:] >= _MANY_RUNS
+        chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
+        repeated = max(repeated, float(np.max(chances, initial=0.0)))
+    if repeated >= 1:
+        least = np.inf if len(lengths) > 1 else 0.0
+    elif repeated > 0:
+        least = 1 + np.log(_RARE / len(series)) / np.log(repeated)
+    else:
+        least = 0.0
+    for start, stop in each[lengths >= max(least, _SHORTEST_RUN)]:
         out[start:stop] = True
     return out
 
@@ -117,6 +124,11 @@ def outliers(series: FloatArray, good: BoolArray) -> BoolArray:
             break
         out |= found
         good &= ~found
+    if out.any():  # frames between outliers that are too few to be judged
+        beside = np.append(out[1:], False) | np.append(False, out[:-1])
+        for start, stop in runs(good):
+            if stop - start < 3 and beside[start:stop].any():
+                out[start:stop] = True
     return out
 
 

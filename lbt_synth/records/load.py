@@ -21,7 +21,7 @@ from lbt_synth.records.contents import ENDINGS, FITS, Contents, read_contents
 from lbt_synth.records.health import joined
 from lbt_synth.records.of_telemetry import record_of
 from lbt_synth.records.record import LoopRecord
-from lbt_synth.records.selection import Series, select
+from lbt_synth.records.selection import Series, counted, select
 from lbt_synth.records.spectrum import SpectrumRecord
 from lbt_synth.records.units import FREQUENCIES, TIMES, density_unit, nm_per, unit_word
 from lbt_synth.telemetry import load_telemetry
@@ -200,7 +200,11 @@ def _join_commands(contents: Contents, path: Path) -> None:
         )
     own = [each for each in contents.columns if each.role != "commands"]
     if not any(each.role in ("measurements", "open_loop") for each in own):
-        own = [replace(each, role=each.role or "measurements") for each in own]
+        plain = counted([each for each in own if each.role is None])
+        own = [each for each in own if each.role is not None]
+        own += [replace(each, role="measurements") for each in plain]
+    if any(each.axis is None for each in named):
+        named = counted(named)
     contents.columns = own + [replace(each, role="commands") for each in named]
     if "unit" in other.facts:
         contents.facts["command unit"] = other.facts["unit"]

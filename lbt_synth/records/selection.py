@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lbt_synth.errors import ProblemError
@@ -103,6 +103,11 @@ def select(
     return _with_notes(series, contents.columns, notes)
 
 
+def counted(columns: Sequence[Column]) -> list[Column]:
+    """Columns as axes, in the order in which they stand."""
+    return [replace(each, axis=axis) for axis, each in enumerate(columns)]
+
+
 def _roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> dict[str, list[Column]]:
     """Columns of each role: those that were chosen, then by names."""
     out: dict[str, list[Column]] = {role: [] for role in ROLES}
@@ -117,14 +122,15 @@ def _roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> dict[
         for one in (wanted,) if isinstance(wanted, str | int) else sequence(wanted, "columns"):
             taken += (found := _found(columns, one))
             out[role] += found
-    used = {id(each) for each in taken}
+        out[role] = counted(out[role])
+    used = {id(each.values) for each in taken}
     if len(used) < len(taken):
         raise ProblemError("a column was chosen twice in columns.")
     fixed = set(chosen or {})
     if fixed & {"density", "amplitude"}:
         fixed |= {"density", "amplitude"}
     for each in columns:
-        if each.role is not None and each.role not in fixed and id(each) not in used:
+        if each.role is not None and each.role not in fixed and id(each.values) not in used:
             out[each.role].append(each)
     return out
 
@@ -158,10 +164,10 @@ def _nameless(
             + " Or say what kind the record is."
         )
     if kind == "spectrum" and len(columns) > 1:
-        out["frequency"], out["density"] = [columns[0]], list(columns[1:])
+        out["frequency"], out["density"] = [columns[0]], counted(columns[1:])
         notes.append("the first column was taken for the frequencies, the others for densities")
     elif kind == "open_loop":
-        out["open_loop"] = list(columns)
+        out["open_loop"] = counted(columns)
         notes.append("all columns were taken for the open-loop series")
     return out
 
@@ -209,12 +215,12 @@ def _single(roles: Mapping[str, list[Column]], role: str) -> Column | None:
 def _of_axes(found: Sequence[Column], role: str, axes: Sequence[int] | None) -> tuple[Column, ...]:
     """Columns of the axes, in the order of the axes that their names tell."""
     known = [each.axis for each in found if each.axis is not None]
-    if len(found) > 1 and (len(known) not in (0, len(found)) or len(set(known)) < len(known)):
+    if len(found) > 1 and (len(known) < len(found) or len(set(known)) < len(known)):
         raise ProblemError(
             f"{_named(found)} are all named as {role}, and not each of an axis of its own; choose "
             f"by columns={{'{role}': ...}}."
         )
-    ordered = sorted(found, key=lambda each: each.axis or 0) if known else list(found)
+    ordered = sorted(found, key=lambda each: each.axis or 0)
     if axes is None:
         if len(ordered) > 2:
             raise ProblemError(
@@ -243,8 +249,8 @@ def _with_notes(series: Series, columns: Sequence[Column], notes: list[str]) -> 
         ) if each is not None),
     ]  # fmt: skip
     said = [f"{word}: {_named(chosen)}" for word, chosen in parts if chosen]
-    used = {id(each) for _, chosen in parts for each in chosen}
-    left = [each for each in columns if id(each) not in used]
+    used = {id(each.values) for _, chosen in parts for each in chosen}
+    left = [each for each in columns if id(each.values) not in used]
     if left:
         said.append(f"not used: {_named(left)}")
     return Series(
