@@ -94,7 +94,7 @@ def test_density_has_unit_variance_and_passes_critical_damping_smoothly() -> Non
         assert mean == pytest.approx(1, rel=1e-6)
     around = [log_density(0.1, z, s[1:]) for z in (1 - 1e-9, 1 + 1e-9)]
     for one, other in zip(*around, strict=True):
-        assert one == pytest.approx(other, rel=1e-6, abs=1e-6)
+        assert np.allclose(one, other, rtol=1e-6, atol=1e-6)
 
 
 def test_roll_off_has_unit_gain_at_zero_and_a_right_derivative() -> None:
@@ -116,9 +116,7 @@ def test_periodogram_of_white_noise_is_its_density_and_leaks_nothing_of_turbulen
     assert np.mean(data.power(1.0)) == pytest.approx(density, rel=0.02)
     # a random walk a thousand times larger at low frequencies leaves the noise as it is
     walk = np.cumsum(rng.standard_normal(white.size)) * 2
-    leaking = loop_periodogram(
-        white + walk, None, frame_rate_hz=RATE, stretches=[(0, white.size)]
-    )
+    leaking = loop_periodogram(white + walk, None, frame_rate_hz=RATE, stretches=[(0, white.size)])
     walk_density = 2 * 4 / RATE / (4 * np.sin(np.pi * data.frequency_hz / RATE) ** 2)
     high = data.frequency_hz > 300
     excess = np.mean(leaking.power(1.0)[high] / (density + walk_density[high]))
@@ -140,9 +138,7 @@ def test_a_gap_shortens_the_segments_and_keeps_most_frames() -> None:
     rng = np.random.default_rng(0)
     y = rng.standard_normal(30_000)
     y[9990:10_010] = 1e6  # what a gap holds is never used
-    data = loop_periodogram(
-        y, None, frame_rate_hz=RATE, stretches=[(0, 9990), (10_010, 30_000)]
-    )
+    data = loop_periodogram(y, None, frame_rate_hz=RATE, stretches=[(0, 9990), (10_010, 30_000)])
     assert np.mean(data.power(1.0)) == pytest.approx(2 / RATE, rel=0.03)
     assert 0.8 * 15_000 < np.sum(data.count) < 15_000
 
@@ -225,9 +221,7 @@ def test_closed_loop_gives_lines_noise_and_sensor_gain() -> None:
     assert found.sensor_gain == pytest.approx(0.6, abs=4 * found.sensor_gain_error)
     assert found.sensor_gain_error < 0.03
     assert found.whiteness.white
-    assert found.turbulence.rms_nm == pytest.approx(
-        300, abs=5 * found.turbulence_fit.rms_error_nm
-    )
+    assert found.turbulence.rms_nm == pytest.approx(300, abs=5 * found.turbulence_fit.rms_error_nm)
     assert found.turbulence_fit.rms_nm == pytest.approx(found.turbulence.rms_nm, rel=1e-9)
     # the model stands for the spectrum of the phase
     truth = slow().psd(found.frequency_hz) + 2 * (6 / 0.6) ** 2 / RATE
@@ -306,7 +300,7 @@ def test_what_the_loop_does_not_show_is_said() -> None:
 def test_an_announced_line_is_found_where_a_search_would_not_dare() -> None:
     rng = np.random.default_rng(5)
     n = 16_384
-    y = rng.standard_normal(n) + 0.115 * np.sin(2 * np.pi * 90.0 * np.arange(n) / RATE)
+    y = rng.standard_normal(n) + 0.05 * np.sin(2 * np.pi * 90.0 * np.arange(n) / RATE)
     plain = lbt.identify_axis(10 * y, frame_rate_hz=RATE)
     told = lbt.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
     wrong = lbt.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(140.0, 0.05)])
@@ -329,9 +323,7 @@ def test_a_start_leads_to_the_same_place() -> None:
 
 def test_what_is_left_out_is_not_white() -> None:
     y, c = loop_of(lines=((40, 0.01, 30),))
-    found = lbt.identify_axis(
-        y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6, most_lines=0
-    )
+    found = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6, most_lines=0)
     assert not found.lines
     assert not found.whiteness.white
     assert found.whiteness.p_value < 1e-6
@@ -364,7 +356,7 @@ def joint(gains: tuple[float, float], loop_gains: tuple[float, float]) -> lbt.Id
     y, c = (np.hstack([part[i] for part in parts]) for i in range(2))
     u = np.vstack([c, np.zeros((2, 2))])
     record = lbt.loop_record(
-        np.vstack([np.zeros((2, 2)), y]), u, frame_rate_hz=RATE, delay_frames=2.0
+        np.vstack([np.zeros((2, 2)), y]), u, frame_rate_hz=RATE, delay_frames=2.0, unit="nm"
     )
     return lbt.identify(record)
 
@@ -384,11 +376,11 @@ def test_axes_share_a_sensor_gain_where_they_agree() -> None:
 
 def test_identify_needs_what_it_needs() -> None:
     y = np.random.default_rng(0).standard_normal((6000, 1))
-    without = lbt.loop_record(y, y, frame_rate_hz=RATE)
+    without = lbt.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
     with pytest.raises(ProblemError, match="Give delay_frames"):
         lbt.identify(without)
     with pytest.raises(ProblemError, match="one number, or 1"):
-        lbt.identify(lbt.loop_record(y, frame_rate_hz=RATE), sensor_gain=[1.0, 2.0])
+        lbt.identify(lbt.loop_record(y, frame_rate_hz=RATE, unit="nm"), sensor_gain=[1.0, 2.0])
     with pytest.raises(ProblemError, match="must be"):
         lbt.identification_figure("model")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -81,14 +82,14 @@ def candidates(
     found.sort(reverse=True)
     out: list[Candidate] = []
     taken: list[tuple[int, int]] = []
-    for gain, start, stop in found:
+    for worth, start, stop in found:
         if len(out) == most:
             break
         reach = max(3, stop - start)
         if any(start < b + reach and stop > a - reach for a, b in taken):
             continue
         taken.append((start, stop))
-        out.append(shape_of(data, power, model, start, stop, gain))
+        out.append(shape_of(data, power, model, start, stop, worth))
     return out
 
 
@@ -127,7 +128,9 @@ def shape_of(
     )
 
 
-def smooth_background(power: FloatArray, frequency_hz: FloatArray, count: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def smooth_background(
+    power: FloatArray, frequency_hz: FloatArray, count: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Medians of a density over bands of equal ratio: a background without its lines.
 
     Returns
@@ -138,15 +141,13 @@ def smooth_background(power: FloatArray, frequency_hz: FloatArray, count: FloatA
     from scipy.special import gammaincinv
 
     low, high = frequency_hz[0], frequency_hz[-1]
-    edges = np.unique(
-        np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80))
-    )
+    edges = np.unique(np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80)))
     edges = np.append(edges[np.concatenate([[True], np.diff(edges) >= 1])], frequency_hz.size)
     edges = np.unique(edges)
     shape = max(float(np.median(count)), 0.5)
     to_mean = shape / float(gammaincinv(shape, 0.5))
     f, d, w = [], [], []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         f.append(float(np.mean(frequency_hz[a:b])))
         d.append(float(np.median(power[a:b])) * (to_mean if b - a > 2 else 1.0))
         w.append(float(np.sum(count[a:b])))

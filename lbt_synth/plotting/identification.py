@@ -53,7 +53,7 @@ def identification_figure(
     >>> import lbt_synth as lbt
     >>> rng = np.random.default_rng(0)
     >>> record = lbt.loop_record(np.cumsum(rng.standard_normal((4096, 1)), axis=0),
-    ...                          frame_rate_hz=500)
+    ...                          frame_rate_hz=500, unit="nm")
     >>> len(lbt.identification_figure(lbt.identify(record)).axes)
     3
     """
