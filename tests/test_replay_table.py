@@ -146,10 +146,10 @@ def test_replays_are_quick():
     ]
     best = np.inf
     for _ in range(3):
-        start = time.perf_counter()
+        start = time.process_time()
         for controller in controllers * 2:
             lbt.replayed_residual(z, controller, plant.hardware, noise_nm=[15.0, 10.0])
-        best = min(best, time.perf_counter() - start)
+        best = min(best, time.process_time() - start)
     assert best < 0.3
 
 
