@@ -381,7 +381,7 @@ def test_identify_needs_what_it_needs() -> None:
         lbt.identify(without)
     with pytest.raises(ProblemError, match="one number, or 1"):
         lbt.identify(lbt.loop_record(y, frame_rate_hz=RATE, unit="nm"), sensor_gain=[1.0, 2.0])
-    with pytest.raises(ProblemError, match="must be"):
+    with pytest.raises(ProblemError, match="expected an IdentifiedModel"):
         lbt.identification_figure("model")
 
 
