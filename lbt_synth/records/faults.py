@@ -107,7 +107,7 @@ def outliers(series: FloatArray, good: BoolArray) -> BoolArray:
 
     The scale is the median deviation of the second differences, that of the whole record or
     of the 256 frames around, whichever is larger: a burst of vibration is no outlier, and one
-    value cannot raise the median. A strong sinusoid stays below 1.4 of its own scale.
+    value cannot raise the median. A strong sinusoid stays below its own scale.
     """
     good = good.copy()
     out = np.zeros(len(series), dtype=np.bool_)
