@@ -251,6 +251,17 @@ def test_gaps_of_every_kind():
     )
 
 
+def test_masked_and_absurd_values_are_gaps():
+    y = np.random.default_rng(0).standard_normal((100, 1))
+    y[20] = 1e308
+    y[30] = -3e105
+    masked = np.ma.masked_array(y, mask=np.arange(100)[:, None] == 50)
+    for unit in ("nm", "m"):
+        seen = lbt.loop_record(masked, frame_rate_hz=RATE, unit=unit)
+        assert np.flatnonzero(~seen.usable).tolist() == [20, 30, 50]
+        assert np.all(np.abs(seen.measurements) < 1e11)
+
+
 def test_a_dead_axis_leaves_nothing():
     y = np.random.default_rng(0).standard_normal((5000, 2))
     y[:, 1] = 0.0

@@ -287,7 +287,9 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     assert any("3 was given; the file has 2.5" in note for note in other.health.notes)
     # a delay of unknown unit is not taken
     unsure = hdus(tmp_path / "b.fits", image("Y", y, "nm"), image("U", u, "nm"), DELAY=0.002)
-    assert lbt.load_record(unsure, frame_rate_hz=RATE).delay_frames is None
+    seen = lbt.load_record(unsure, frame_rate_hz=RATE)
+    assert seen.delay_frames is None
+    assert any("does not say that it is in frames" in note for note in seen.health.notes)
     twice = hdus(tmp_path / "c.fits", image("POL", y, "nm", FPS=400.0), FRAMRATE=RATE)
     with pytest.raises(lbt.ProblemError, match="frame_rate_hz is told twice"):
         lbt.load_record(twice)
@@ -447,6 +449,25 @@ def test_damage(tmp_path, name, content, words):
     with pytest.raises(lbt.TelemetryError, match=words) as caught:
         lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
     assert "Traceback" not in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [2000, 4000, 6000])
+def test_truncated_files(tmp_path, series, size):
+    path = hdus(tmp_path / "a.fits", image("POL", np.tile(series[0], (10, 1)), "nm"))
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(lbt.LbtSynthError, match=r"a\.fits"):
+        lbt.load_record(path, frame_rate_hz=RATE)
+
+
+def test_nulls_of_integer_columns(tmp_path):
+    values = np.random.default_rng(0).integers(-500, 500, 40).astype(np.int32)
+    values[7] = -99999
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column("POL", "J", array=values, null=-99999, unit="nm")]
+    )
+    seen = lbt.load_record(hdus(tmp_path / "a.fits", table), frame_rate_hz=RATE)
+    assert np.flatnonzero(~seen.usable).tolist() == [7]
+    assert np.array_equal(seen.measurements[8:, 0], values[8:])
 
 
 def test_no_pickle_is_opened(tmp_path):
