@@ -205,18 +205,23 @@ def test_resonances_and_closed_loops_are_no_faults():
 
 
 @settings(max_examples=30)
-@given(seed=st.integers(0, 2**31), at=st.integers(0, 4999), sign=st.sampled_from([-1, 1]))
+@given(
+    seed=st.integers(0, 2**31),
+    at=st.one_of(st.integers(0, 3), st.integers(0, 4999)),
+    sign=st.sampled_from([-1, 1]),
+)
 def test_one_spike_is_one_outlier(seed, at, sign):
     rng = np.random.default_rng(seed)
     y = 15 * rng.standard_normal((5000, 2))
-    y[at, 1] += sign * 300
+    y[at, 1] += sign * 450  # half of it bends the frame beside an end
     seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
     found = np.flatnonzero(~seen.usable)
     assert at in found
-    assert len(found) <= (2 if at in (0, 1, 4998, 4999) else 1)
+    # beside an end the frames that nothing can judge go with it
+    assert len(found) == {0: 2, 1: 2, 2: 3}.get(min(at, 4999 - at), 1)
     assert kinds(seen) == {("outlier", "measurements", 1)}
     assert np.array_equal(seen.measurements[seen.usable], y[seen.usable])
-    assert np.max(np.abs(seen.measurements)) < 200  # the filler is not the spike
+    assert np.max(np.abs(seen.measurements)) < 300  # the filler is not the spike
 
 
 @pytest.mark.parametrize("length", [2, 3, 4])
