@@ -12,10 +12,10 @@ from scipy.optimize import approx_fprime
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.identification.components import coefficients, log_density, log_roll_off
 from lbt_synth.identification.periodogram import loop_periodogram
 from lbt_synth.identification.search import candidates
 from lbt_synth.identification.whittle import GAIN, Likelihood
+from lbt_synth.models.resonance import coefficients, log_density, log_roll_off
 
 RATE = 1000.0
 FRAMES = 16_384

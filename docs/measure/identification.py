@@ -21,7 +21,7 @@ from functools import partial
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.identification.components import coefficients
+from lbt_synth.models.resonance import coefficients
 
 RATE = 1000.0
 NEAR_HZ = 0.1

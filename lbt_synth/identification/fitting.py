@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.identification.components import PARAMETERS
 from lbt_synth.identification.periodogram import LoopPeriodogram
 from lbt_synth.identification.search import Candidate, candidates, shape_of, smooth_background
 from lbt_synth.identification.whittle import (
@@ -28,8 +27,10 @@ from lbt_synth.identification.whittle import (
     damping_parameter,
     damping_ratio,
     fit,
+    observed,
 )
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.models.resonance import PARAMETERS
+from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)
 _GAIN_PRIOR = (np.log(0.7), 1.0)
@@ -38,7 +39,7 @@ _PART_DAMPING = (0.0, 1.0)
 _LINE_DAMPING = (np.log(0.01 / 0.99), 2.0)
 _NO_CORNER = 50.0  # angle a frame of a corner that is none
 _CORNER = (np.log(50.0), 2.0)  # of its frequency [Hz]
-_SLOWEST = 3.0  # width of the prior on the logarithm of a turbulence's frequency
+_SLOWEST = 1.5  # width of the prior on the logarithm of a turbulence's frequency
 _MOST_TURBULENCES = 3
 _ANNOUNCED = 5.0  # log-likelihood that a line whose frequency is known must add
 _SPLIT = 9.0  # and the second of two that lie in each other's skirts
@@ -140,12 +141,38 @@ def grow(data: LoopPeriodogram, rules: Rules, start: Grown | None = None) -> Gro
         if better is None:
             break
         current = better
-    return search.pruned(search.plain(current), measure=True)
+    return search.measured(search.pruned(search.plain(current)))
 
 
 def has_corner(theta: FloatArray) -> bool:
     """Whether the turbulence rolls off behind a corner."""
     return bool(theta[CORNER] < np.log(_NO_CORNER))
+
+
+def _without(theta: FloatArray, i: int) -> FloatArray:
+    """Parameters without a component."""
+    at = FIRST + PARAMETERS * i
+    return np.delete(theta, slice(at, at + PARAMETERS))
+
+
+def _dropped(grown: Grown, i: int) -> tuple[FloatArray, tuple[Part, ...]] | None:
+    """Parameters and parts without a component; another turbulence takes the place of the first.
+
+    None if there is no other.
+    """
+    theta, parts = grown.theta, grown.parts
+    if i > 0:
+        return _without(theta, i), parts[:i] + parts[i + 1 :]
+    others = [j for j, part in enumerate(parts) if j > 0 and not part.line]
+    if not others:
+        return None
+    j = max(others, key=lambda j: float(theta[FIRST + PARAMETERS * j + 2]))
+    at = FIRST + PARAMETERS * j
+    promoted = theta.copy()
+    promoted[FIRST : FIRST + PARAMETERS] = theta[at : at + PARAMETERS]
+    ratio = damping_ratio(theta[at + 1], first=False)
+    promoted[FIRST + 1] = damping_parameter(ratio, first=True)
+    return _without(promoted, j), parts[:j] + parts[j + 1 :]
 
 
 class _Search:
@@ -331,7 +358,7 @@ class _Search:
                 continue
             at = FIRST + PARAMETERS * i
             centre, half = self._place(theta, i)
-            without = self._without(theta, i)
+            without = _without(theta, i)
             rest = self.full.model(without)
             reach = max(10 * half, 20 * self.step)
             start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
@@ -380,44 +407,50 @@ class _Search:
 
     def fitted(self, theta: FloatArray, parts: tuple[Part, ...]) -> Grown:
         """Fit all parameters."""
-        merged = self.data.merged(self._groups(theta, parts))
-        free = np.ones(theta.size, dtype=bool)
-        free[GAIN] = self.free_gain
-        free[CORNER] = has_corner(theta)
-        got = fit(Likelihood(merged), theta, self._priors(theta, parts), free=free)
+        merged = Likelihood(self.data.merged(self._groups(theta, parts)))
+        got = fit(merged, theta, self._priors(theta, parts), free=self._free(theta))
         got = replace(got, contrast=self.full.contrast(got.parameters))
         return Grown(fitted=got, parts=parts)
 
-    def pruned(self, grown: Grown, *, measure: bool = False) -> Grown:
+    def measured(self, grown: Grown) -> Grown:
+        """Return the model with what each part adds, and its exact information."""
+        theta, parts = grown.theta, grown.parts
+        without = [self.full.contrast(_without(theta, i)) for i in range(1, len(parts))]
+        adds = [float("inf"), *(value - grown.fitted.contrast for value in without)]
+        merged = Likelihood(self.data.merged(self._groups(theta, parts)))
+        exact = observed(merged, grown.fitted, self._priors(theta, parts), free=self._free(theta))
+        return replace(grown, fitted=exact, adds=tuple(adds))
+
+    def _free(self, theta: FloatArray) -> BoolArray:
+        free = np.ones(theta.size, dtype=np.bool_)
+        free[GAIN] = self.free_gain
+        free[CORNER] = has_corner(theta)
+        return free
+
+    def pruned(self, grown: Grown) -> Grown:
         """Drop what adds less than it must, the least first."""
         while len(grown.parts) > 1:
             base = grown.fitted.contrast
-            adds = [
-                self.full.contrast(self._without(grown.theta, i)) - base
-                for i in range(1, len(grown.parts))
-            ]
-            asked = [self.asked(grown, i) for i in range(1, len(grown.parts))]
-            spare = [a - 4 * b for a, b in zip(adds, asked, strict=True)]
-            for i in 1 + np.argsort(spare):
-                if spare[i - 1] > 0:
+            trials = []
+            for i in range(len(grown.parts)):
+                less = _dropped(grown, i)
+                if less is None:
                     continue
-                parts = grown.parts[:i] + grown.parts[i + 1 :]
+                asked = self.asked(grown, i)
+                spare = self.full.contrast(less[0]) - base - 4 * asked
+                if spare <= 0:
+                    trials.append((spare, asked, less))
+            for _, asked, less in sorted(trials, key=lambda trial: trial[0]):
                 try:
-                    less = self.fitted(self._without(grown.theta, int(i)), parts)
+                    made = self.fitted(*less)
                 except NumericalError:
                     continue
-                adds[i - 1] = less.fitted.contrast - base
-                if adds[i - 1] < asked[i - 1]:
-                    grown = less
+                if made.fitted.contrast - base < asked:
+                    grown = made
                     break
             else:
-                return replace(grown, adds=(np.inf, *adds)) if measure else grown
-        return replace(grown, adds=(np.inf,)) if measure else grown
-
-    @staticmethod
-    def _without(theta: FloatArray, i: int) -> FloatArray:
-        at = FIRST + PARAMETERS * i
-        return np.delete(theta, slice(at, at + PARAMETERS))
+                return grown
+        return grown
 
     def _priors(self, theta: FloatArray, parts: tuple[Part, ...]) -> Priors:
         centre, width = theta.copy(), np.full(theta.size, np.inf)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.components import PARAMETERS, coefficients
 from lbt_synth.identification.fitting import Grown, Rules, grow, has_corner
 from lbt_synth.identification.periodogram import (
     SHORTEST_SEGMENT,
@@ -32,6 +31,7 @@ from lbt_synth.identification.whittle import (
     damping_ratio,
 )
 from lbt_synth.models import ARModel
+from lbt_synth.models.resonance import PARAMETERS, coefficients
 from lbt_synth.validation import FloatArray, frozen, integer, number, real_array
 
 LOWEST_LINE_HZ = 3.0
@@ -302,12 +302,14 @@ def identify_periodogram(
         return _described(data, rules, grown, None, "given")
     if not data.closed:
         return _described(data, rules, grown, None, "1: of an open loop it has no meaning")
-    error = float(np.sqrt(_covariance(grown)[GAIN, GAIN]))
+    variance = float(_covariance(grown)[GAIN, GAIN])
+    error = float(np.sqrt(variance)) if variance > 0 else float("inf")
     if error <= GAIN_ERROR:
         return _described(data, rules, grown, error, "found in the closed loop's data")
     rules = replace(rules, gain=assumed)
+    by = f" by {100 * error:.0f} %" if error < 10 else ""
     note = (
-        f"assumed to be {assumed:g}: these data leave it open by {100 * error:.0f} % (the loop "
+        f"assumed to be {assumed:g}: these data leave it open{by} (the loop "
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
     return _described(data, rules, grow(data, rules, grown), None, note)

@@ -15,18 +15,18 @@ Everything is in units of the measurement: a component's variance is g^2 times t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.identification.components import PARAMETERS, log_density, log_roll_off
 from lbt_synth.identification.periodogram import LoopPeriodogram, half_angle_square
-from lbt_synth.validation import FloatArray
+from lbt_synth.models.resonance import PARAMETERS, log_density, log_roll_off
+from lbt_synth.validation import BoolArray, FloatArray
 
 GAIN, NOISE, CORNER, FIRST = 0, 1, 2, 3  # places in the vector of parameters
+_DIFFERENCE = 1e-4  # of a logarithm
 _FARTHEST = 60.0  # of a logarithm: exp stays finite
 
 
@@ -159,7 +159,7 @@ def fit(
     start: FloatArray,
     priors: Priors,
     *,
-    free: Sequence[bool] | FloatArray,
+    free: BoolArray,
     steps: int = 40,
 ) -> Fitted:
     """Minimise L from a start, by scoring steps within a trust region.
@@ -239,3 +239,25 @@ def fit(
         information=information,
         left=left,
     )
+
+
+def observed(likelihood: Likelihood, fitted: Fitted, priors: Priors, *, free: BoolArray) -> Fitted:
+    """Return a minimum with the exact second derivatives of L, by differences of its gradient.
+
+    Where they are not positive definite, the expected ones stay.
+    """
+    moves = np.flatnonzero(np.asarray(free))
+    theta = fitted.parameters
+    exact = np.zeros((theta.size, theta.size))
+    for i in moves:
+        step = np.zeros(theta.size)
+        step[i] = _DIFFERENCE
+        up, down = (likelihood.derivatives(theta + sign * step)[1] for sign in (1, -1))
+        exact[i] = (up - down) / (2 * _DIFFERENCE)
+    exact = (exact + exact.T) / 2 + np.diag(1 / np.asarray(priors.width) ** 2)
+    block = exact[np.ix_(moves, moves)]
+    if np.any(np.diag(block) <= 0) or np.min(np.linalg.eigvalsh(block)) <= 0:
+        return fitted
+    exact = np.zeros_like(exact)
+    exact[np.ix_(moves, moves)] = block
+    return replace(fitted, information=exact)

@@ -111,18 +111,6 @@ class ARModel:
         return np.asarray(density)
 
 
-def resonance_coefficients(
-    frequency_hz: float, damping: float, frame_rate_hz: float
-) -> tuple[float, float]:
-    """Coefficients a1, a2 of a damped oscillator sampled at the frame rate.
-
-    ``a1 = 2 exp(-k w T) cos(w T sqrt(1 - k^2))``, ``a2 = -exp(-2 k w T)``.
-    """
-    wt = 2 * np.pi * frequency_hz / frame_rate_hz
-    decay = np.exp(-damping * wt)
-    return float(2 * decay * np.cos(wt * np.sqrt(1 - damping**2))), float(-(decay**2))
-
-
 def variance_ratio(coefficients: FloatArray) -> float:
     """Variance of a stationary AR process over that of its driving noise."""
     return float(variance_ratios(coefficients))

@@ -12,8 +12,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.models.ar import ARModel, resonance_coefficients, variance_ratio
+from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.models.resonance import coefficients, log_density
 from lbt_synth.validation import frozen, integer, number
 
 
@@ -140,16 +141,15 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     weight = np.diff(edges) / (rate / 2)
     white = 2 * noise**2 / rate
     target = atmosphere.psd(frequency) + white
-    delay = np.exp(-2j * np.pi * frequency / rate)
+    s = 4 * np.sin(np.pi * frequency / rate) ** 2
 
-    def unpack(p: np.ndarray) -> tuple[float, float, float]:
-        """Log frequency, log damping/(1 - damping), log rms -> a1, a2, driving variance."""
-        a1, a2 = resonance_coefficients(float(np.exp(p[0])), float(1 / (1 + np.exp(-p[1]))), rate)
-        return a1, a2, float(np.exp(2 * p[2])) / variance_ratio(frozen([a1, a2]))
+    def unpack(p: np.ndarray) -> tuple[float, float]:
+        """Log frequency and log damping/(1 - damping) -> angle a frame, damping."""
+        return 2 * np.pi * float(np.exp(p[0])) / rate, float(1 / (1 + np.exp(-p[1])))
 
     def contrast(p: np.ndarray) -> float:
-        a1, a2, drive = unpack(p)
-        model = 2 * drive / rate / np.abs(1 - a1 * delay - a2 * delay**2) ** 2 + white
+        density, _, _ = log_density(*unpack(p), s)
+        model = 2 / rate * np.exp(2 * p[2] + density) + white
         return float(np.sum(weight * (np.log(model) + target / model)))
 
     corner = 0.5 * atmosphere.wind_speed_m_s / atmosphere.diameter_m
@@ -164,7 +164,8 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
             "Try the AR1 model, or check that the noise is not above the turbulence.",
             status=str(fit.message),
         )
-    a1, a2, drive = unpack(fit.x)
+    a1, a2, drive = coefficients(*unpack(fit.x))
+    rms = float(np.exp(fit.x[2]))
     return ARModel(
-        coefficients=frozen([a1, a2]), driving_rms_nm=float(np.sqrt(drive)), frame_rate_hz=rate
+        coefficients=frozen([a1, a2]), driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
     )
