@@ -10,11 +10,20 @@ Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lbt_synth.errors import NumericalError
+from lbt_synth.identification.layout import (
+    NO_CORNER,
+    Grown,
+    Layout,
+    Part,
+    dropped,
+    has_corner,
+    without,
+)
 from lbt_synth.identification.periodogram import LoopPeriodogram
 from lbt_synth.identification.search import Candidate, candidates, shape_of, smooth_background
 from lbt_synth.identification.whittle import (
@@ -23,43 +32,17 @@ from lbt_synth.identification.whittle import (
     GAIN,
     Fitted,
     Likelihood,
-    Priors,
-    damping_parameter,
-    damping_ratio,
     fit,
     observed,
 )
 from lbt_synth.models.resonance import PARAMETERS
-from lbt_synth.validation import BoolArray, FloatArray, IntArray
+from lbt_synth.validation import BoolArray, FloatArray
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)
-_GAIN_PRIOR = (np.log(0.7), 1.0)
-_TURBULENCE_DAMPING = (np.log(0.5), 0.7)  # of the first component; of others the odds
-_PART_DAMPING = (0.0, 1.0)
-_LINE_DAMPING = (np.log(0.01 / 0.99), 2.0)
-_NO_CORNER = 50.0  # angle a frame of a corner that is none
-_CORNER = (np.log(50.0), 2.0)  # of its frequency [Hz]
-_SLOWEST = 1.5  # width of the prior on the logarithm of a turbulence's frequency
 _MOST_TURBULENCES = 3
 _ANNOUNCED = 5.0  # log-likelihood that a line whose frequency is known must add
 _SPLIT = 9.0  # and the second of two that lie in each other's skirts
 _MOST_ROUNDS = 12
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
-    """What a component of the model is.
-
-    Attributes
-    ----------
-    line : bool
-        Whether it is a line, or a part of the turbulence.
-    frequency : (mean, deviation) or None
-        Prior of the logarithm of its frequency, as an angle a frame.
-    """
-
-    line: bool
-    frequency: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,30 +65,6 @@ class Rules:
     lowest_line_hz: float
     most_lines: int
     announced: Sequence[tuple[float, float]] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Grown:
-    """A fitted model with the meaning of its parts.
-
-    Attributes
-    ----------
-    fitted : Fitted
-        The minimum; its contrast is that of all values, without priors.
-    parts : tuple of Part
-        One a component.
-    adds : tuple of float
-        What each component adds to the logarithm of the likelihood, the others refitted or not.
-    """
-
-    fitted: Fitted
-    parts: tuple[Part, ...]
-    adds: tuple[float, ...] = field(default=())
-
-    @property
-    def theta(self) -> FloatArray:
-        """The parameters."""
-        return self.fitted.parameters
 
 
 def grow(data: LoopPeriodogram, rules: Rules, start: Grown | None = None) -> Grown:
@@ -134,7 +93,7 @@ def grow(data: LoopPeriodogram, rules: Rules, start: Grown | None = None) -> Gro
     current = search.refitted(start) if start is not None else None
     if current is None:
         current = search.begun()
-    current = search.pruned(current)
+    current = search.announced(search.pruned(current))
     for _ in range(_MOST_ROUNDS):
         found = search.excesses(current)
         better = search.extended(current, found) or search.moved(current)
@@ -144,43 +103,11 @@ def grow(data: LoopPeriodogram, rules: Rules, start: Grown | None = None) -> Gro
     return search.measured(search.pruned(search.plain(current)))
 
 
-def has_corner(theta: FloatArray) -> bool:
-    """Whether the turbulence rolls off behind a corner."""
-    return bool(theta[CORNER] < np.log(_NO_CORNER))
-
-
-def _without(theta: FloatArray, i: int) -> FloatArray:
-    """Parameters without a component."""
-    at = FIRST + PARAMETERS * i
-    return np.delete(theta, slice(at, at + PARAMETERS))
-
-
-def _dropped(grown: Grown, i: int) -> tuple[FloatArray, tuple[Part, ...]] | None:
-    """Parameters and parts without a component; another turbulence takes the place of the first.
-
-    None if there is no other.
-    """
-    theta, parts = grown.theta, grown.parts
-    if i > 0:
-        return _without(theta, i), parts[:i] + parts[i + 1 :]
-    others = [j for j, part in enumerate(parts) if j > 0 and not part.line]
-    if not others:
-        return None
-    j = max(others, key=lambda j: float(theta[FIRST + PARAMETERS * j + 2]))
-    at = FIRST + PARAMETERS * j
-    promoted = theta.copy()
-    promoted[FIRST : FIRST + PARAMETERS] = theta[at : at + PARAMETERS]
-    ratio = damping_ratio(theta[at + 1], first=False)
-    promoted[FIRST + 1] = damping_parameter(ratio, first=True)
-    return _without(promoted, j), parts[:j] + parts[j + 1 :]
-
-
 class _Search:
     def __init__(self, data: LoopPeriodogram, rules: Rules) -> None:
         self.data, self.rules = data, rules
         self.full = Likelihood(data)
-        self.angle = 2 * np.pi / data.frame_rate_hz
-        self.step = float(np.median(np.diff(data.frequency_hz)))
+        self.layout = Layout(data)
         self.need = 0.5 * PARAMETERS * float(np.log(max(2.0, np.sum(data.count))))
         self.free_gain = rules.gain is None and data.closed
 
@@ -194,25 +121,13 @@ class _Search:
         if part.frequency is not None:
             return _ANNOUNCED
         if part.line:
-            centre, half = self._place(theta, i)
+            centre, half = self.layout.place(theta, i)
             for j, other in enumerate(grown.parts[: i if earlier else None]):
                 if other.line and j != i:
-                    its_centre, its_half = self._place(theta, j)
+                    its_centre, its_half = self.layout.place(theta, j)
                     if abs(centre - its_centre) < 4 * (half + its_half):
                         return _SPLIT
         return self.need
-
-    def _place(self, theta: FloatArray, i: int) -> tuple[float, float]:
-        """Frequency and half width of a component [Hz], the width at least a bin."""
-        at = FIRST + PARAMETERS * i
-        centre = float(np.exp(theta[at])) / self.angle
-        ratio = damping_ratio(theta[at + 1], first=i == 0)
-        return centre, max(centre * ratio, self.step)
-
-    def _component(self, frequency_hz: float, damping: float, variance: float) -> FloatArray:
-        """Parameters of a component that is not the first."""
-        odds = damping_parameter(damping, first=False)
-        return np.array([np.log(frequency_hz * self.angle), odds, np.log(variance)])
 
     def begun(self) -> Grown:
         """Background and first lines, from the best of several sensor gains."""
@@ -253,8 +168,8 @@ class _Search:
                 [
                     np.log(gain),
                     np.log(white),
-                    np.log(50.0 * self.angle),
-                    np.log(corner * self.angle),
+                    self.layout.plain_corner(),
+                    np.log(corner * self.layout.angle),
                     np.log(0.5),
                     np.log(slow),
                 ]
@@ -262,7 +177,7 @@ class _Search:
             free = np.ones(theta.size, dtype=bool)
             free[GAIN] = False
             try:
-                got = fit(Likelihood(smooth), theta, self._priors(theta, parts), free=free)
+                got = fit(Likelihood(smooth), theta, self.layout.priors(theta, parts), free=free)
             except NumericalError as error:
                 why = error
                 continue
@@ -274,35 +189,43 @@ class _Search:
         return Grown(fitted=best, parts=parts)
 
     def _with(self, ground: Grown, found: list[Candidate]) -> tuple[FloatArray, tuple[Part, ...]]:
-        """Parameters and parts with candidates (and announced lines, at first) added."""
+        """Parameters and parts with candidates added."""
         theta, parts = [ground.theta], list(ground.parts)
         for c in found:
             line = c.frequency_hz >= self.rules.lowest_line_hz
             damping = np.clip(c.half_width_hz / c.frequency_hz, 1e-4, 0.3) if line else 0.3
-            theta.append(self._component(c.frequency_hz, float(damping), c.variance_nm2))
+            theta.append(self.layout.component(c.frequency_hz, float(damping), c.variance_nm2))
             parts.append(Part(line=line))
-        if all(p.frequency is None for p in ground.parts):
-            model = self.full.model(ground.theta)
-            for f, error in self.rules.announced:
-                width = max(error, self.step)
-                known = (float(np.log(f * self.angle)), max(error, 0.1 * self.step) / f)
-                near = [
-                    i
-                    for i, p in enumerate(parts)
-                    if p.line and abs(np.exp(self._at(theta, i)[0]) / self.angle - f) < 3 * width
-                ]
-                if near:
-                    parts[near[0]] = Part(line=True, frequency=known)
-                    continue
-                level = float(np.interp(f, self.data.frequency_hz, model))
-                theta.append(self._component(f, 0.01, level * max(0.01 * f, self.step)))
-                parts.append(Part(line=True, frequency=known))
         return np.concatenate(theta), tuple(parts)
 
-    @staticmethod
-    def _at(theta: list[FloatArray], i: int) -> FloatArray:
-        whole = np.concatenate(theta)
-        return whole[FIRST + PARAMETERS * i : FIRST + PARAMETERS * (i + 1)]
+    def announced(self, current: Grown) -> Grown:
+        """Return the model with the lines that are known beforehand, those that are worth it.
+
+        A line that is there already, within three errors, is taken for the announced one.
+        """
+        step, angle = self.layout.step, self.layout.angle
+        theta, parts = [current.theta], list(current.parts)
+        model = self.full.model(current.theta)
+        for f, error in self.rules.announced:
+            known = (float(np.log(f * angle)), max(error, 0.1 * step) / f)
+            near = [
+                i
+                for i, part in enumerate(current.parts)
+                if part.line
+                and abs(self.layout.place(current.theta, i)[0] - f) < 3 * max(error, step)
+            ]
+            if near:
+                parts[near[0]] = Part(line=True, frequency=known)
+                continue
+            level = float(np.interp(f, self.data.frequency_hz, model))
+            theta.append(self.layout.component(f, 0.01, level * max(0.01 * f, step)))
+            parts.append(Part(line=True, frequency=known))
+        if not self.rules.announced:
+            return current
+        try:
+            return self.pruned(self.fitted(np.concatenate(theta), tuple(parts)))
+        except NumericalError:
+            return current
 
     def excesses(self, current: Grown, *, first: bool = False) -> list[Candidate]:
         """Bands with too much power: the few best, or at first all clear ones."""
@@ -338,16 +261,13 @@ class _Search:
         theta = current.theta.copy()
         if not has_corner(theta):
             return current
-        theta[CORNER] = np.log(2 * _NO_CORNER)
+        theta[CORNER] = np.log(2 * NO_CORNER)
         try:
             less = self.fitted(theta, current.parts)
         except NumericalError:
             return current
-        return (
-            less
-            if less.fitted.contrast - current.fitted.contrast < self.need / PARAMETERS
-            else current
-        )
+        worth = less.fitted.contrast - current.fitted.contrast
+        return less if worth < self.need / PARAMETERS else current
 
     def moved(self, current: Grown) -> Grown | None:
         """Return the model with a line begun anew, or split in two; None if none is better."""
@@ -357,22 +277,21 @@ class _Search:
             if not part.line:
                 continue
             at = FIRST + PARAMETERS * i
-            centre, half = self._place(theta, i)
-            without = _without(theta, i)
-            rest = self.full.model(without)
-            reach = max(10 * half, 20 * self.step)
+            centre, half = self.layout.place(theta, i)
+            rest = self.full.model(without(theta, i))
+            reach = max(10 * half, 20 * self.layout.step)
             start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
             seen = shape_of(data, power, rest, int(start), int(stop))
             trials = []
-            if abs(seen.frequency_hz - centre) > 0.5 * half + self.step:
+            if abs(seen.frequency_hz - centre) > 0.5 * half + self.layout.step:
                 anew = theta.copy()
-                anew[at : at + 3] = self._component(
+                anew[at : at + 3] = self.layout.component(
                     seen.frequency_hz,
                     min(seen.half_width_hz / seen.frequency_hz, 0.5),
                     seen.variance_nm2,
                 )
                 trials.append((anew, current.parts))
-            if half > 3 * self.step:
+            if half > 3 * self.layout.step:
                 pair = theta[at : at + 3] + np.log(
                     [[1 - half / centre, 0.5, 0.5], [1 + half / centre, 0.5, 0.5]]
                 )
@@ -399,7 +318,7 @@ class _Search:
         if not self.free_gain:
             theta[GAIN] = np.log(self.rules.gain or 1.0)
         if not has_corner(theta):
-            theta[CORNER] = _CORNER[0] + np.log(self.angle)
+            theta[CORNER] = self.layout.plain_corner()
         try:
             return self.fitted(theta, start.parts)
         except NumericalError:
@@ -407,18 +326,20 @@ class _Search:
 
     def fitted(self, theta: FloatArray, parts: tuple[Part, ...]) -> Grown:
         """Fit all parameters."""
-        merged = Likelihood(self.data.merged(self._groups(theta, parts)))
-        got = fit(merged, theta, self._priors(theta, parts), free=self._free(theta))
+        merged = Likelihood(self.data.merged(self.layout.groups(theta, parts)))
+        got = fit(merged, theta, self.layout.priors(theta, parts), free=self._free(theta))
         got = replace(got, contrast=self.full.contrast(got.parameters))
         return Grown(fitted=got, parts=parts)
 
     def measured(self, grown: Grown) -> Grown:
         """Return the model with what each part adds, and its exact information."""
         theta, parts = grown.theta, grown.parts
-        without = [self.full.contrast(_without(theta, i)) for i in range(1, len(parts))]
-        adds = [float("inf"), *(value - grown.fitted.contrast for value in without)]
-        merged = Likelihood(self.data.merged(self._groups(theta, parts)))
-        exact = observed(merged, grown.fitted, self._priors(theta, parts), free=self._free(theta))
+        less = [self.full.contrast(without(theta, i)) for i in range(1, len(parts))]
+        adds = [float("inf"), *(value - grown.fitted.contrast for value in less)]
+        merged = Likelihood(self.data.merged(self.layout.groups(theta, parts)))
+        exact = observed(
+            merged, grown.fitted, self.layout.priors(theta, parts), free=self._free(theta)
+        )
         return replace(grown, fitted=exact, adds=tuple(adds))
 
     def _free(self, theta: FloatArray) -> BoolArray:
@@ -433,7 +354,7 @@ class _Search:
             base = grown.fitted.contrast
             trials = []
             for i in range(len(grown.parts)):
-                less = _dropped(grown, i)
+                less = dropped(grown, i)
                 if less is None:
                     continue
                 asked = self.asked(grown, i)
@@ -451,33 +372,3 @@ class _Search:
             else:
                 return grown
         return grown
-
-    def _priors(self, theta: FloatArray, parts: tuple[Part, ...]) -> Priors:
-        centre, width = theta.copy(), np.full(theta.size, np.inf)
-        centre[GAIN], width[GAIN] = _GAIN_PRIOR
-        if has_corner(theta):
-            centre[CORNER], width[CORNER] = _CORNER[0] + np.log(self.angle), _CORNER[1]
-        for i, part in enumerate(parts):
-            at = FIRST + PARAMETERS * i
-            slow = _PART_DAMPING if i else _TURBULENCE_DAMPING
-            centre[at + 1], width[at + 1] = _LINE_DAMPING if part.line else slow
-            if part.frequency is not None:
-                centre[at], width[at] = part.frequency
-            elif not part.line:
-                centre[at], width[at] = np.log(self.angle), _SLOWEST
-        return Priors(centre=centre, width=width)
-
-    def _groups(self, theta: FloatArray, parts: tuple[Part, ...]) -> IntArray:
-        """Return the begin of groups of bins over which the model is nearly constant."""
-        f = self.data.frequency_hz
-        size = np.maximum(self.step, np.minimum(0.02 * f, 3.0))
-        for i, part in enumerate(parts):
-            if not part.line:
-                continue
-            centre, half_width = self._place(theta, i)
-            away = np.maximum(np.abs(f - centre) - 10 * self.step, 0)
-            np.minimum(
-                size, np.maximum(self.step, 0.1 * np.maximum(half_width, 2 * away)), out=size
-            )
-        place = np.floor(np.cumsum(self.step / size) - 1e-9)
-        return np.flatnonzero(np.concatenate([[True], np.diff(place) > 0]))

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.fitting import Grown, Rules, grow, has_corner
+from lbt_synth.identification.fitting import Rules, grow
+from lbt_synth.identification.layout import Grown, has_corner
 from lbt_synth.identification.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,

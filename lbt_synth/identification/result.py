@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from lbt_synth.identification.fitting import Grown
+from lbt_synth.identification.layout import Grown
 from lbt_synth.identification.periodogram import LoopPeriodogram
 from lbt_synth.identification.whiteness import Whiteness
 from lbt_synth.models import (
