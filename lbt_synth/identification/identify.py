@@ -38,6 +38,7 @@ from lbt_synth.validation import FloatArray, frozen, integer, number, real_array
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
 GAIN_ERROR = 0.1  # relative; a gain that is known worse is not identifiable
+UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 _WIDE = 0.1  # damping ratio
 
 
@@ -361,6 +362,11 @@ def _described(
         at = FIRST + PARAMETERS * i
         frequency = float(np.exp(theta[at])) * to_hz
         damping = damping_ratio(theta[at + 1], first=False)
+        damping_error = damping * (1 - damping) * float(error[at + 1])
+        finest = 0.0 if data.duration_s is None else UNRESOLVED / data.duration_s / frequency
+        resolved = damping >= finest
+        if not resolved:
+            damping = damping_error = finest
         rms = float(np.exp(theta[at + 2] / 2 - theta[GAIN]))
         along = np.zeros(theta.size)
         along[at + 2], along[GAIN] = 0.5, -1.0
@@ -378,7 +384,8 @@ def _described(
                 frequency_hz=frequency,
                 frequency_error_hz=frequency * float(error[at]),
                 damping=damping,
-                damping_error=damping * (1 - damping) * float(error[at + 1]),
+                damping_error=damping_error,
+                resolved=resolved,
                 rms_nm=rms,
                 rms_error_nm=rms * float(np.sqrt(along @ covariance @ along)),
                 prominence=own / rest,

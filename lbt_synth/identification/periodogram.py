@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.identification.window import tukey
 from lbt_synth.validation import FloatArray, IntArray
 
-_TAPER = 0.1  # of a segment, both ends together
 LONGEST_SEGMENT = 1 << 16
 SHORTEST_SEGMENT = 256
 
@@ -39,6 +39,8 @@ class LoopPeriodogram:
         Frame rate [Hz].
     resolution_hz : float
         Width of a frequency bin of the transform [Hz].
+    duration_s : float, optional
+        Duration of the tapered segments [s]; None if it is not known how the density was made.
     """
 
     frequency_hz: FloatArray
@@ -48,6 +50,7 @@ class LoopPeriodogram:
     count: FloatArray
     frame_rate_hz: float
     resolution_hz: float
+    duration_s: float | None = None
 
     @property
     def closed(self) -> bool:
@@ -73,6 +76,7 @@ class LoopPeriodogram:
             count=np.add.reduceat(self.count, starts),
             frame_rate_hz=self.frame_rate_hz,
             resolution_hz=self.resolution_hz,
+            duration_s=self.duration_s,
         )
 
 
@@ -115,7 +119,7 @@ def loop_periodogram(
             spare = stop - start - many * length
             starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
     rows = np.array(starts)[:, None] + np.arange(length)[None, :]
-    taper = _taper(length - 1)
+    taper = tukey(length - 1)
     size = _fast(length - 1)
     frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
     scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
@@ -139,6 +143,7 @@ def loop_periodogram(
         count=np.full(frequency.size, independent),
         frame_rate_hz=frame_rate_hz,
         resolution_hz=frame_rate_hz / length,
+        duration_s=(length - 1) / frame_rate_hz,
     )
 
 
@@ -157,12 +162,6 @@ def _segment_length(lengths: list[int]) -> int:
         u / most + 0.1 * np.log2(c / LONGEST_SEGMENT) for u, c in zip(used, candidates, strict=True)
     ]
     return candidates[int(np.argmax(worth))]
-
-
-def _taper(length: int) -> FloatArray:
-    from scipy.signal.windows import tukey
-
-    return np.asarray(tukey(length, _TAPER))
 
 
 def _fast(length: int) -> int:

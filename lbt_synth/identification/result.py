@@ -36,7 +36,10 @@ class IdentifiedLine:
     frequency_hz, frequency_error_hz : float
         Natural frequency and its standard error [Hz].
     damping, damping_error : float
-        Damping ratio and its standard error.
+        Damping ratio and its standard error. Where the line is not resolved, both are the
+        largest damping that the record does not tell from none.
+    resolved : bool
+        Whether the record is long enough to see the line's width.
     rms_nm, rms_error_nm : float
         Standard deviation of the displacement and its standard error [nm rms wavefront].
     prominence : float
@@ -52,6 +55,7 @@ class IdentifiedLine:
     frequency_error_hz: float
     damping: float
     damping_error: float
+    resolved: bool
     rms_nm: float
     rms_error_nm: float
     prominence: float

@@ -22,6 +22,7 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.periodogram import LoopPeriodogram, half_angle_square
+from lbt_synth.identification.window import FAR, WIDE, log_smearing
 from lbt_synth.models.resonance import PARAMETERS, log_density, log_roll_off
 from lbt_synth.validation import BoolArray, FloatArray
 
@@ -110,9 +111,27 @@ class Likelihood:
             if i == 0:
                 value = value + fall
             else:
+                self._smear(float(np.exp(f)), ratio, value, slopes[i])
                 slopes[i, 1] *= 1 - ratio
             np.exp(value + (variance + np.log(self._white)), out=density[1 + i])
         return density, slopes, by_corner
+
+    def _smear(self, frequency: float, ratio: float, value: FloatArray, slopes: FloatArray) -> None:
+        """Let the taper smear a narrow line, in place; ``slopes`` are by log f and log damping."""
+        data = self.data
+        if data.duration_s is None:
+            return
+        centre = frequency * data.frame_rate_hz / (2 * np.pi)
+        half_width = ratio * centre * data.duration_s
+        if half_width > WIDE:
+            return
+        reach = FAR / data.duration_s
+        start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
+        distance = (data.frequency_hz[start:stop] - centre) * data.duration_s
+        more, by_width, by_distance = log_smearing(half_width, distance)
+        value[start:stop] += more
+        slopes[0, start:stop] += by_width - by_distance * centre * data.duration_s
+        slopes[1, start:stop] += by_width
 
     def model(self, theta: FloatArray) -> FloatArray:
         """Density of the whole spectrum, (f,)."""
