@@ -95,6 +95,7 @@ from .modal import project_out as project_out
 from .modal import reconstructor as reconstructor
 from .models import ARModel as ARModel
 from .models import Atmosphere as Atmosphere
+from .models import DriftingVibration as DriftingVibration
 from .models import EstimationProblem as EstimationProblem
 from .models import FullStatePlant as FullStatePlant
 from .models import LoopHardware as LoopHardware
