@@ -73,12 +73,12 @@ def cases() -> list[Case]:
                      damping=damping)
             )  # fmt: skip
     ar1 = lbt.ar1_turbulence(CONFIG.atmosphere, frame_rate_hz=RATE_HZ)
-    for gain in (1.0, 0.358):
-        out.append(
-            Case(name=f"paper's model, sensor gain {gain:g}", plant=axis(ar1, 15.5, 0.0051),
-                 turbulence=CONFIG.atmosphere, damping=None, sensor_gain=gain)
-        )  # fmt: skip
-    return out
+    papers = axis(ar1, 15.5, 0.0051)
+    return out + [
+        Case(name=f"paper's model, sensor gain {gain:g}", plant=papers, damping=None,
+             turbulence=CONFIG.atmosphere, sensor_gain=gain)
+        for gain in (1.0, 0.358)
+    ]  # fmt: skip
 
 
 class Told:
@@ -200,9 +200,7 @@ def bumps() -> None:
     size = {"frames": frames, "cases": many, "rng": rng}
     total, noise = draw_disturbance(truth, hardware, **size), draw_noise(truth, hardware, **size)
     hows = "in parallel all the time", "replayed", "with the other's state", "from zero"
-    print(
-        "exchange 17 -> 20 Hz: rms of the next 20 frames, 0.1 s, largest; difference of commands"
-    )
+    print("exchange 17 -> 20 Hz: rms of the next 20 frames, 0.1 s, largest; difference of commands")
     for how in hows:
         change = Exchanged(case.design(17.0), case.design(20.0), frame, how)
         out = step_loop(change, 1.0, hardware, total, noise)

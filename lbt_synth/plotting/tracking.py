@@ -90,7 +90,7 @@ def tracking_figure(
         lower.set(xlabel="time [s]", ylabel=f"residual in {bin_s:g} s [nm rms]", yscale="log")
         lower.set_xlim(0, last_s)
         plain_ticks(lower)
-        lower.legend(loc="best", ncols=2)
+        lower.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     return figure
 
 

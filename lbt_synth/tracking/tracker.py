@@ -103,7 +103,8 @@ class TrackingController:
     extrapolate : bool, optional
         Whether the trend is followed; otherwise the frequencies are those of the window.
     trend_s : float, optional
-        How long fits count for the trend [s]; twice the window by default.
+        How long fits count for the trend [s]; twice the window by default, and at least five
+        updates.
     design : callable, optional
         From plant to :class:`FilterDesign`; :func:`kalman` by default.
 
@@ -150,7 +151,8 @@ class TrackingController:
         rate = plant.hardware.frame_rate_hz
         self._window_s = number(window_s, "window_s", at_least=_LEAST_FRAMES / rate)
         self._update_s = number(update_s, "update_s", at_least=1 / rate)
-        trend = 2 * self._window_s if trend_s is None else trend_s
+        longer = max(2 * self._window_s, 5 * self._update_s)
+        trend = longer if trend_s is None else trend_s
         self._trend_s = number(trend, "trend_s", at_least=0)
         self._window, self._every = round(self._window_s * rate), round(self._update_s * rate)
         self._rate, self._extrapolate = rate, bool(extrapolate)

@@ -38,9 +38,10 @@ def extrapolated(
     Returns
     -------
     frequency_hz : float
-        The answer; the last frequency where there are less than four.
+        The answer; the last frequency where there are less than four, or where the last two are
+        both off the line of the others: the trend has changed.
     slope_hz_s, slope_error_hz_s : float
-        The slope and its standard error; nan where there are less than four frequencies.
+        The slope and its standard error; nan where there is no line.
 
     Examples
     --------
@@ -59,7 +60,8 @@ def extrapolated(
     rest = frequency_hz - steep * time_s
     rest = np.abs(rest - np.median(rest))
     inside = rest <= max(_OUTLIER * float(np.median(rest)), 1e-9 * abs(last))
-    if np.count_nonzero(inside) < _LEAST_POINTS:
+    changed = not inside[-2:].any()  # one frequency may be wrong, two are another trend
+    if changed or np.count_nonzero(inside) < _LEAST_POINTS:
         return last, float("nan"), float("nan")
     t, f = time_s[inside], frequency_hz[inside]
     t_mean, f_mean = float(np.mean(t)), float(np.mean(f))
@@ -86,7 +88,7 @@ class LineTrack:
         """Add what a window gave, and forget what is older than a time."""
         self.time_s.append(time_s)
         self.frequency_hz.append(frequency_hz)
-        while self.time_s[0] < since_s:
+        while self.time_s[0] < since_s - 1e-6:  # not for rounding
             del self.time_s[0], self.frequency_hz[0]
 
     def at(self, time_s: float, *, overlap: float) -> float:
