@@ -1,10 +1,11 @@
 """The tables and the figure of docs/tracking.md.
 
-Run with ``python docs/measure/tracking.py`` from the repository (two minutes). With a directory
+Run with ``python docs/measure/tracking.py`` from the repository (three minutes). With a directory
 as its argument it writes the figure there.
 """
 
 import sys
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,9 +76,11 @@ def cases() -> list[Case]:
     ar1 = lbt.ar1_turbulence(CONFIG.atmosphere, frame_rate_hz=RATE_HZ)
     papers = axis(ar1, 15.5, 0.0051)
     return out + [
-        Case(name=f"paper's model, sensor gain {gain:g}", plant=papers, damping=None,
+        Case(name=f"paper's model, gain {gain:g}, {name}", plant=papers, damping=damping,
              turbulence=CONFIG.atmosphere, sensor_gain=gain)
-        for gain in (1.0, 0.358)
+        for gain, name, damping in (
+            (1.0, "sinusoid", None), (0.358, "sinusoid", None), (0.358, "resonance", 0.01)
+        )
     ]  # fmt: skip
 
 
@@ -145,7 +148,7 @@ def table() -> None:
         fit = [u.fitted_hz[0] for u in drifting] - case.line.frequency_hz_at(times)
         ahead = times + WINDOW_S / 2 + UPDATE_S / 2
         used = [u.frequencies_hz[0] for u in drifting] - case.line.frequency_hz_at(ahead)
-        print(f"{case.name:34s}" + ", ".join(cells))
+        print(f"{case.name:40s}" + ", ".join(cells))
         print(
             f"  kept {tracker.kept} of {len(tracker.history)}; frequency of the windows "
             f"{np.std(fit):.3f} Hz rms, mean {np.mean(fit):+.3f}; of the filters "
@@ -155,6 +158,39 @@ def table() -> None:
     for name in ("identify_s", "design_s", "switch_s"):
         taken = [1e3 * getattr(u, name) for u in updates]
         print(f"{name}: median {np.median(taken):.2f} ms, largest {np.max(taken):.2f} ms")
+
+
+def windows() -> None:
+    """Strehl ratio for other windows and times between updates, with and without the trend."""
+    print("window, update: Strehl ratio [%] with the trend, without")
+    for case in cases()[-2:]:
+        for window_s, update_s in ((2, 0.5), (2, 1), (4, 1), (4, 2), (8, 1), (8, 4)):
+            found = [
+                lbt.simulate(
+                    lbt.TrackingController(
+                        case.plant, lbt.LineFollower(case.plant), window_s=window_s,
+                        update_s=update_s, extrapolate=trend,
+                    ),
+                    case.truth(case.line), hardware=case.plant.hardware, seed=1,
+                    frames=round(DRIFT_S * RATE_HZ), settle_frames=round(SETTLE_S * RATE_HZ),
+                ).strehl(CONFIG.imaging)[0]
+                for trend in (True, False)
+            ]  # fmt: skip
+            print(f"  {case.name:40s}{window_s:4g} s{update_s:5g} s"
+                  + "".join(f"{100 * value:8.2f}" for value in found))  # fmt: skip
+
+
+def frame_times() -> None:
+    """Time of a frame of the exchangeable filter, and of the controller alone."""
+    case = cases()[0]
+    for name, running in (
+        ("exchangeable", lbt.SwitchedController(case.design(20.0))),
+        ("controller alone", case.design(20.0).controller.start()),
+    ):
+        y, started = np.zeros(1), time.perf_counter()
+        for _ in range(20_000):
+            running.step(y)
+        print(f"a frame, {name}: {1e6 * (time.perf_counter() - started) / 20_000:.1f} us")
 
 
 class Exchanged:
@@ -224,6 +260,8 @@ def main() -> None:
     """Print the tables, write the figure."""
     table()
     bumps()
+    frame_times()
+    windows()
     if len(sys.argv) > 1:
         case = cases()[5]
         runs, tracker = study(case)
