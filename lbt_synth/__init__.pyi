@@ -5,7 +5,9 @@ from .certify import certify_filter as certify_filter
 from .certify import certify_infeasible as certify_infeasible
 from .certify import certify_loop as certify_loop
 from .config import Config as Config
+from .config import identified_config as identified_config
 from .config import load_config as load_config
+from .config import save_config as save_config
 from .design import Design as Design
 from .design import EstimatorDesign as EstimatorDesign
 from .design import FilterDesign as FilterDesign

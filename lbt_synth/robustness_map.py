@@ -215,12 +215,13 @@ def _evaluated(
     loops = close_loops(hardware, controller, gains)
     # the others are computed from the loop that is furthest from instability
     reference = loops[int(np.argmin(np.max(np.abs(poles), axis=1)))]
-    turbulence, noise_nm = truths[0].turbulence, truths[0].noise_nm  # the same in all of them
-    common = np.array([noise_covariance(loop, noise_nm) for loop in loops])
-    if isinstance(turbulence, ARModel):
-        common += [ar_covariance(loop, turbulence, np.eye(n)) for loop in loops]
-    elif turbulence is not None:
-        common += spectrum_covariances(reference, gains, poles, turbulence)
+    truth = truths[0]  # turbulence and noise are the same in all of them
+    common = np.array([noise_covariance(loop, truth) for loop in loops])
+    for spectrum, modes in truth.turbulence_groups(n):
+        if isinstance(spectrum, ARModel):
+            common += [ar_covariance(loop, spectrum, np.eye(n)[list(modes)]) for loop in loops]
+        else:
+            common += spectrum_covariances(reference, gains, poles, spectrum, modes)
 
     gaussian = np.repeat(common[:, None], len(truths), axis=1)
     lines = []

@@ -137,7 +137,7 @@ def simulate(arguments: Namespace) -> Report:
             "frames": run.residual_nm.shape[1],
             "cases": len(strehls),
             "seed": run.seed,
-            "sensor_gain": config.settings.model.sensor_gain * truth.sensor_gain,
+            "sensor_gain": config.sensor_gain * truth.sensor_gain,
         },
         tables=[
             TableText(
@@ -230,9 +230,7 @@ def real_truth(config: Config, arguments: Namespace) -> Truth:
     """Truth of the configuration, at the sensor gain of the command line if there is one."""
     if arguments.sensor_gain is None:
         return config.truth
-    return replace(
-        config.truth, sensor_gain=arguments.sensor_gain / config.settings.model.sensor_gain
-    )
+    return replace(config.truth, sensor_gain=arguments.sensor_gain / config.sensor_gain)
 
 
 def _require_figure(output: str, *, inputs: list[str]) -> None:

@@ -25,15 +25,14 @@ def modal(arguments: Namespace) -> Report:
     require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
     count = _count(arguments.modes, config)
+    atmosphere = config.air("the turbulence of hundreds of modes is computed from it")
     noise, assumed = _noise(config, count)
     with working("designing", quiet=arguments.json):
-        air = modal_turbulence(
-            config.atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz
-        )
+        air = modal_turbulence(atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz)
         lines = _vibrations(config, count)
         path: dict[str, Any] = {
             "delay_frames": config.hardware.delay_frames,
-            "sensor_gain": config.settings.model.sensor_gain,
+            "sensor_gain": config.sensor_gain,
             "mirror": config.hardware.mirror,
         }
         known: dict[str, Any] = {"noise_nm": noise, "vibrations": lines, **path}
@@ -96,16 +95,22 @@ def _count(asked: int | None, config: Config) -> int:
 
 def _noise(config: Config, count: int) -> tuple[FloatArray, str]:
     """Noise of each mode, and what it was taken for."""
-    pyramid = config.settings.sensor.pyramid
+    settings = config.settings
+    for section, key in ((settings.sensor, "noise_nm"), (settings.model, "sensor_gain")):
+        if isinstance(getattr(section, key), list):
+            path = f"{'sensor' if section is settings.sensor else 'model'}.{key}"
+            raise ConfigError(
+                f"{config.source}: {path} must be one number for hundreds of modes; got one an "
+                "axis.",
+                path=path,
+            )
+    pyramid, one = settings.sensor.pyramid, float(config.noise_nm)
     if pyramid is None:
-        same = np.full(count, config.noise_nm)
-        return same, f"noise: {config.noise_nm:.6g} nm on every mode (assumed)."
+        return np.full(count, one), f"noise: {one:.6g} nm on every mode (assumed)."
     modulation = pyramid.modulation_lambda_over_d
-    noise = pyramid_modal_noise_nm(
-        config.noise_nm, modes=count, modulation_lambda_over_d=modulation
-    )
+    noise = pyramid_modal_noise_nm(one, modes=count, modulation_lambda_over_d=modulation)
     return noise, (
-        f"noise: {config.noise_nm:.6g} nm on tip and tilt, less on modes of higher order, down to "
+        f"noise: {one:.6g} nm on tip and tilt, less on modes of higher order, down to "
         f"{noise[-1]:.6g} nm (assumed, of a pyramid with a modulation of {modulation:g} lambda/D)."
     )
 

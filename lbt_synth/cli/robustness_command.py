@@ -181,7 +181,7 @@ def _believed_gain(name: str, design: Design, config: Config) -> float:
             f"{name} must run at the configuration's {here.frame_rate_hz:g} Hz; got a design for "
             f"{own.frame_rate_hz:g} Hz."
         )
-    unit = here.sensor / config.settings.model.sensor_gain
+    unit = here.sensor / config.sensor_gain
     gain = 0.0
     if own.sensor.shape == unit.shape:
         gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))

@@ -79,13 +79,20 @@ def write_first_case(
         metadata={
             "case": 0,
             "cases": len(run.commands),
-            "noise_nm": truth.noise_nm,
-            "model_sensor_gain": config.settings.model.sensor_gain,
+            **_one_or_each("noise_nm", truth.noise_nm),
+            **_one_or_each("model_sensor_gain", config.settings.model.sensor_gain),
         },
     )
     path = save_telemetry(output, seen)
     report.data["telemetry"] = str(path)
     _note_written(report, path, seen, require_telemetry_name(output), of="of case 0")
+
+
+def _one_or_each(name: str, value: Any) -> dict[str, float]:
+    """Return one number under its name, or a list by ``name_1``, ``name_2``, ..."""
+    if np.ndim(value) == 0:
+        return {name: float(value)}
+    return {f"{name}_{i}": float(each) for i, each in enumerate(value, start=1)}
 
 
 def _note_written(report: Report, path: Path, seen: Telemetry, kind: str, of: str = "") -> None:

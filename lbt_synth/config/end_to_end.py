@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from lbt_synth.config.needs import needed_atmosphere, needed_telescope
 from lbt_synth.config.schema import FileSection
 from lbt_synth.endtoend import EndToEndSetup, EndToEndSystem
 from lbt_synth.errors import ConfigError, ProblemError
@@ -20,7 +21,9 @@ def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth
     ConfigError
         If a section is missing that is needed, or says what optics cannot follow.
     """
-    pyramid, air, asked = settings.sensor.pyramid, settings.atmosphere, settings.end_to_end
+    pyramid, asked = settings.sensor.pyramid, settings.end_to_end
+    telescope = needed_telescope(settings, _HINT)
+    air = needed_atmosphere(settings, _HINT)
     if pyramid is None:
         raise ConfigError(f"the key sensor.pyramid is missing; {_HINT}.", path="sensor.pyramid")
     if air.outer_scale_m is None:
@@ -28,11 +31,17 @@ def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth
             "atmosphere.outer_scale_m must be a length: phase screens have an end. Try 25.",
             path="atmosphere.outer_scale_m",
         )
-    if settings.truth.turbulence != "frozen_flow":
+    if settings.true_turbulence != "frozen_flow":
         raise ConfigError(
             "truth.turbulence must be frozen_flow for an end-to-end simulation; got "
-            f"{settings.truth.turbulence}.",
+            f"{settings.true_turbulence}.",
             path="truth.turbulence",
+        )
+    if hardware.modes != 2:
+        raise ConfigError(
+            "an end-to-end simulation needs tip and tilt: loop.axes must be 2; got "
+            f"{hardware.modes}.",
+            path="loop.axes",
         )
     if settings.mirror.modes is None:
         raise ConfigError(f"the key mirror.modes is missing; {_HINT}.", path="mirror.modes")
@@ -49,8 +58,8 @@ def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth
     try:
         system = EndToEndSystem(
             hardware=modal,
-            diameter_m=settings.telescope.diameter_m,
-            obstruction=settings.telescope.obstruction,
+            diameter_m=telescope.diameter_m,
+            obstruction=telescope.obstruction,
             seeing_arcsec=air.seeing_arcsec,
             seeing_wavelength_um=air.seeing_wavelength_um,
             outer_scale_m=air.outer_scale_m,

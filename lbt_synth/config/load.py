@@ -2,46 +2,25 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from lbt_synth.config.end_to_end import end_to_end_setup
-from lbt_synth.config.schema import (
-    BandSection,
-    FileSection,
-    LocalLoopSection,
-    TrueVibrationSection,
-    VibrationSection,
-)
+from lbt_synth.config.mistakes import described
+from lbt_synth.config.needs import atmosphere_of, needed_atmosphere
+from lbt_synth.config.parts import noise_of, plant_of, reference_gain, truth_of
+from lbt_synth.config.schema import FileSection
 from lbt_synth.endtoend import EndToEndSetup
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.loop import Imaging
-from lbt_synth.models import (
-    ARModel,
-    Atmosphere,
-    LoopHardware,
-    PositionLoop,
-    SinusoidalVibration,
-    Spectrum,
-    TipTiltPlant,
-    Truth,
-    Vibration,
-    ar1_turbulence,
-    ar2_turbulence,
-    illuminated_subapertures,
-    nm_per_mas,
-    pyramid_tilt_noise_nm,
-    tip_tilt_plant,
-)
-from lbt_synth.models.prior import line_frequencies, spread_lines
+from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
+from lbt_synth.validation import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,10 +37,13 @@ class Config:
         What the loop really meets.
     imaging : Imaging
         The camera.
-    atmosphere : Atmosphere
-        Turbulence and telescope.
-    noise_nm : float
-        Measurement noise per frame [nm].
+    atmosphere : Atmosphere or None
+        Turbulence and telescope; None where the file has no atmosphere.
+    noise_nm : float or (q,) ndarray
+        Measurement noise per frame [nm], of all measurements or of each.
+    sensor_gain : float
+        Sensor gain that the design assumes, with which single real gains are compared: the
+        mean of ``model.sensor_gain`` where it is a list.
     source : pathlib.Path
         The file.
     """
@@ -70,14 +52,24 @@ class Config:
     plant: TipTiltPlant
     truth: Truth
     imaging: Imaging
-    atmosphere: Atmosphere
-    noise_nm: float
+    atmosphere: Atmosphere | None
+    noise_nm: float | FloatArray
+    sensor_gain: float
     source: Path
 
     @property
     def hardware(self) -> LoopHardware:
         """The loop."""
         return self.plant.hardware
+
+    def air(self, reason: str) -> Atmosphere:
+        """Return the atmosphere; raises ConfigError with the reason where the file has none."""
+        try:
+            needed_atmosphere(self.settings, reason)
+        except ConfigError as error:
+            raise ConfigError(f"{self.source}: {error}", path=error.path) from error
+        assert self.atmosphere is not None  # built from the section that is there
+        return self.atmosphere
 
     @property
     def end_to_end(self) -> EndToEndSetup:
@@ -119,7 +111,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     try:
         settings = FileSection.model_validate(raw)
     except ValidationError as error:
-        message, key = _describe(error)
+        message, key = described(error)
         raise ConfigError(f"{source}: {message}", path=key) from error
     return _build(settings, source)
 
@@ -143,72 +135,12 @@ def _read_yaml(source: Path) -> dict[str, Any]:
     return raw
 
 
-def _describe(error: ValidationError) -> tuple[str, str]:
-    """One sentence on the first mistake, with the path of its key."""
-    details = error.errors()
-    # an unknown key tells more than the missing one that it was meant to be
-    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
-    location = tuple(p for p in first["loc"] if p not in ("ar1", "ar2", "ar"))
-    key = _key_path(location)
-    more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
-    if first["type"] == "extra_forbidden":
-        known = _fields_at(FileSection, location[:-1])
-        close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
-        hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
-        return f"unknown key {key}; {hint}{more}", key
-    if first["type"] == "missing":
-        return f"the key {key} is missing.{more}", key
-    if first["type"] == "value_error":
-        return f"{key}: {first['ctx']['error']}.{more}", key
-    if first["type"] == "too_short" and key.endswith("vibrations"):
-        return f"{key} is empty; leave the key out for a model without vibrations.{more}", key
-    if first["type"] == "union_tag_invalid":
-        expected, got = first["ctx"]["expected_tags"], first["ctx"]["tag"]
-        return f"{key}.kind must be one of {expected}; got {got!r}.{more}", key
-    text = first["msg"][0].lower() + first["msg"][1:]
-    return f"{key}: {text}; got {first['input']!r}.{more}", key
-
-
-def _key_path(location: tuple[int | str, ...]) -> str:
-    out = ""
-    for part in location:
-        out += f"[{part}]" if isinstance(part, int) else f".{part}" if out else str(part)
-    return out
-
-
-def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Names of the keys known at a place of the schema."""
-    here: list[type[BaseModel]] = [model]
-    for part in location:
-        if isinstance(part, int):
-            continue
-        found: list[type[BaseModel]] = []
-        for section in here:
-            field = section.model_fields.get(str(part))
-            if field is not None:
-                found += _models_in(field.annotation)
-        here = found
-    return sorted({name for section in here for name in section.model_fields})
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [m for arg in getattr(annotation, "__args__", ()) for m in _models_in(arg)]
-
-
 def _build(settings: FileSection, source: Path) -> Config:
     try:
-        atmosphere = Atmosphere(
-            seeing_arcsec=settings.atmosphere.seeing_arcsec,
-            seeing_wavelength_um=settings.atmosphere.seeing_wavelength_um,
-            outer_scale_m=settings.atmosphere.outer_scale_m,
-            wind_speed_m_s=settings.atmosphere.wind_speed_m_s,
-            diameter_m=settings.telescope.diameter_m,
-        )
-        noise_nm = _noise_nm(settings)
-        plant = _plant(settings, atmosphere, noise_nm)
-        truth = _truth(settings, atmosphere, noise_nm, plant)
+        atmosphere = atmosphere_of(settings)
+        noise_nm = noise_of(settings)
+        plant = plant_of(settings, atmosphere, noise_nm)
+        truth = truth_of(settings, atmosphere, noise_nm, plant)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}", path=error.path) from error
     except ProblemError as error:
@@ -217,9 +149,10 @@ def _build(settings: FileSection, source: Path) -> Config:
         raise ConfigError(
             f"{source}: some value is far from any telescope: {error}. Check the units."
         ) from error
+    telescope = settings.telescope
     imaging = Imaging(
-        diameter_m=settings.telescope.diameter_m,
-        obstruction=settings.telescope.obstruction,
+        diameter_m=None if telescope is None else telescope.diameter_m,
+        obstruction=0.0 if telescope is None else telescope.obstruction,
         wavelength_um=settings.imaging.wavelength_um,
         other_modes=settings.imaging.other_modes_strehl,
     )
@@ -230,158 +163,6 @@ def _build(settings: FileSection, source: Path) -> Config:
         imaging=imaging,
         atmosphere=atmosphere,
         noise_nm=noise_nm,
+        sensor_gain=reference_gain(settings),
         source=source,
     )
-
-
-def _noise_nm(settings: FileSection) -> float:
-    sensor, telescope = settings.sensor, settings.telescope
-    if sensor.noise_nm is not None:
-        return sensor.noise_nm
-    if sensor.noise_mas is not None:
-        return sensor.noise_mas * nm_per_mas(telescope.diameter_m)
-    pyramid = sensor.pyramid
-    assert pyramid is not None  # the schema wants exactly one of the three
-    return pyramid_tilt_noise_nm(
-        photons=pyramid.photons,
-        read_noise_electrons=pyramid.read_noise_electrons,
-        modulation_lambda_over_d=pyramid.modulation_lambda_over_d,
-        subapertures=illuminated_subapertures(pyramid.subapertures_across, telescope.obstruction),
-        wavelength_um=pyramid.wavelength_um,
-        diameter_m=telescope.diameter_m,
-    )
-
-
-def _plant(settings: FileSection, atmosphere: Atmosphere, noise_nm: float) -> TipTiltPlant:
-    loop, model = settings.loop, settings.model
-    turbulence: ARModel
-    if model.turbulence.kind == "ar1":
-        turbulence = ar1_turbulence(atmosphere, frame_rate_hz=loop.frame_rate_hz)
-    elif model.turbulence.kind == "ar2":
-        turbulence = ar2_turbulence(atmosphere, frame_rate_hz=loop.frame_rate_hz, noise_nm=noise_nm)
-    else:
-        try:
-            turbulence = ARModel(
-                coefficients=np.array(model.turbulence.coefficients),
-                driving_rms_nm=model.turbulence.driving_rms_nm,
-                frame_rate_hz=loop.frame_rate_hz,
-            )
-        except ProblemError as error:
-            key = "model.turbulence.coefficients"
-            raise ConfigError(f"{key}: {error}", path=key) from error
-    lines: list[Vibration] | None = None
-    if model.vibrations is not None:
-        lines = []
-        for i, section in enumerate(model.vibrations):
-            key = f"model.vibrations[{i}].frequency_hz"
-            _below_nyquist(section.frequency_hz, loop.frame_rate_hz, key)
-            for direction in _directions(section):
-                line = Vibration(
-                    frequency_hz=section.frequency_hz,
-                    damping=section.damping,
-                    rms_nm=rms_nm(section, settings),
-                    direction=direction,
-                )
-                lines += _spread(line, section, loop.frame_rate_hz, i)
-    return tip_tilt_plant(
-        frame_rate_hz=loop.frame_rate_hz,
-        delay_frames=loop.delay_frames,
-        turbulence=turbulence,
-        vibrations=lines,
-        noise_nm=noise_nm,
-        sensor_matrix=settings.sensor.matrix,
-        influence_matrix=settings.mirror.influence_matrix,
-        sensor_gain=model.sensor_gain,
-        mirror=_mirror(settings.mirror.local_loop),
-    )
-
-
-def _mirror(section: LocalLoopSection | None) -> PositionLoop | None:
-    """Return the mirror's local loop, None for a mirror that settles at once."""
-    if section is None:
-        return None
-    given: dict[str, Any] = {k: v for k, v in section.model_dump().items() if v is not None}
-    make = PositionLoop if section.bandwidth_hz is None else PositionLoop.of_bandwidth
-    try:
-        return make(**given)
-    except ProblemError as error:
-        key = "mirror.local_loop"
-        raise ConfigError(f"{key}: {error}", path=key) from error
-
-
-def _spread(
-    line: Vibration, section: VibrationSection, frame_rate_hz: float, index: int
-) -> list[Vibration]:
-    """Return the lines that stand for a vibration of the model."""
-    if section.spread_hz is None:
-        return [line]
-    key = f"model.vibrations[{index}].spread_hz"
-    try:
-        frequencies = line_frequencies(
-            line.frequency_hz, section.spread_hz, section.lines or 5, name="the half width"
-        )
-        made = spread_lines(line, frequencies)
-        made[-1].ar_model(frame_rate_hz)
-    except ProblemError as error:
-        raise ConfigError(f"{key}: {error}", path=key) from error
-    return made
-
-
-def _truth(
-    settings: FileSection, atmosphere: Atmosphere, noise_nm: float, plant: TipTiltPlant
-) -> Truth:
-    lines: list[Vibration | SinusoidalVibration] = []
-    for i, section in enumerate(settings.truth.vibrations):
-        key = f"truth.vibrations[{i}].frequency_hz"
-        _below_nyquist(section.frequency_hz, settings.loop.frame_rate_hz, key)
-        for direction in _directions(section):
-            size: dict[str, Any] = {
-                "frequency_hz": section.frequency_hz,
-                "rms_nm": rms_nm(section, settings),
-                "direction": direction,
-            }
-            if section.damping is None:
-                lines.append(SinusoidalVibration(**size))
-            else:
-                lines.append(Vibration(**size, damping=section.damping))
-    spectra: dict[str, Spectrum | None] = {
-        "frozen_flow": atmosphere,
-        "model": plant.turbulence[0],
-        "none": None,
-    }
-    # the plant's sensor matrix holds the gain that the design assumes
-    return Truth(
-        turbulence=spectra[settings.truth.turbulence],
-        vibrations=tuple(lines),
-        noise_nm=noise_nm,
-        sensor_gain=settings.truth.sensor_gain / settings.model.sensor_gain,
-    )
-
-
-def rms_nm(
-    section: VibrationSection | TrueVibrationSection | BandSection, settings: FileSection
-) -> float:
-    """Return the deviation of a vibration [nm rms wavefront], given in nm or in mas."""
-    if section.rms_nm is not None:
-        return section.rms_nm
-    assert section.rms_mas is not None  # the schema wants exactly one of the two
-    return section.rms_mas * nm_per_mas(settings.telescope.diameter_m)
-
-
-def _directions(
-    section: VibrationSection | TrueVibrationSection,
-) -> list[tuple[float, float]]:
-    if section.direction_deg is not None:
-        angle = np.radians(section.direction_deg)
-        return [(float(np.cos(angle)), float(np.sin(angle)))]
-    axes = {"tip": [(1.0, 0.0)], "tilt": [(0.0, 1.0)], "both": [(1.0, 0.0), (0.0, 1.0)]}
-    return axes[section.axis or "both"]
-
-
-def _below_nyquist(frequency_hz: float, frame_rate_hz: float, key: str) -> None:
-    if not frequency_hz < frame_rate_hz / 2:
-        raise ConfigError(
-            f"{key}: must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "
-            f"got {frequency_hz:.6g}.",
-            path=key,
-        )

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from lbt_synth.config.load import Config, rms_nm
+from lbt_synth.config.load import Config
+from lbt_synth.config.parts import rms_nm
+from lbt_synth.config.schema import BandSection
 from lbt_synth.design import ShapedDesign, robust
 from lbt_synth.design.shaped import noise_of_modes
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.models import Spectrum
+from lbt_synth.models.truth import spectrum_key
 from lbt_synth.shaping import (
     Attenuation,
     CommandRms,
@@ -53,7 +56,7 @@ def robust_design(config: Config) -> ShapedDesign:
             "least. Try examples/lbt_robust.yaml.",
             path=_KEY,
         )
-    believed = config.settings.model.sensor_gain
+    believed = config.sensor_gain
     if section.sensor_gain is not None:
         low, high = section.sensor_gain
         if not low <= believed <= high:
@@ -63,7 +66,12 @@ def robust_design(config: Config) -> ShapedDesign:
                 f"{low:g} to {high:g}.",
                 path=key,
             )
-    spectrum: Spectrum | None = config.atmosphere if section.turbulence == "frozen_flow" else None
+    kind = section.turbulence or config.settings.usual_turbulence
+    spectrum: Spectrum | None = None
+    if kind == "frozen_flow":
+        spectrum = config.air(
+            f"{_KEY}.turbulence: frozen_flow is its spectrum. Give it, or {_KEY}.turbulence: model"
+        )
     try:
         bands = [
             _entry(
@@ -72,7 +80,7 @@ def robust_design(config: Config) -> ShapedDesign:
                 VibrationBand,
                 low_hz=band.low_hz,
                 high_hz=band.high_hz,
-                rms_nm=rms_nm(band, config.settings),
+                rms_nm=_band_rms_nm(config, band, f"{_KEY}.bands[{i}]"),
             )
             for i, band in enumerate(section.bands)
         ]
@@ -100,6 +108,14 @@ def robust_design(config: Config) -> ShapedDesign:
 T = TypeVar("T")
 
 
+def _band_rms_nm(config: Config, band: BandSection, key: str) -> float:
+    """Return the deviation of a band's sinusoid [nm]."""
+    try:
+        return rms_nm(band, config.settings, key)
+    except ConfigError as error:
+        raise ConfigError(f"{config.source}: {error}", path=error.path) from error
+
+
 def _entry(config: Config, name: str, kind: Callable[..., T], **values: float) -> T:
     """Make one entry of a list; what is wrong with it is said with its key."""
     key = f"{_KEY}.{name}"
@@ -119,7 +135,7 @@ def _entry(config: Config, name: str, kind: Callable[..., T], **values: float) -
 def _demands(config: Config, spectrum: Spectrum | None) -> list[Demand]:
     section = config.settings.design.robust
     assert section is not None  # of a robust design
-    believed = config.settings.model.sensor_gain
+    believed = config.sensor_gain
     out: list[Demand] = []
     if section.noise_peak is not None:
         out.append(NoisePeak(at_most=section.noise_peak))
@@ -149,7 +165,17 @@ def _demands(config: Config, spectrum: Spectrum | None) -> list[Demand]:
         for i, part in enumerate(section.mirror_uncertainty)
     ]
     noise = float(max(noise_of_modes(config.hardware, config.plant.R)))
-    turbulence = config.plant.turbulence[0] if spectrum is None else spectrum
+    turbulence = spectrum
+    if turbulence is None:
+        turbulence = config.plant.turbulence[0]
+        bounded = section.command_stroke_nm is not None or section.command_step_nm is not None
+        if bounded and len({spectrum_key(model) for model in config.plant.turbulence}) > 1:
+            raise ConfigError(
+                f"{config.source}: {_KEY}: bounds on the commands hold under one turbulence for "
+                "all axes, but model.turbulence has one an axis. Leave command_stroke_nm and "
+                "command_step_nm out, or give one model.",
+                path=_KEY,
+            )
     for bound, rate in ((section.command_stroke_nm, False), (section.command_step_nm, True)):
         if bound is not None:
             out.append(

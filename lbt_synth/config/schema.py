@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Damping = Annotated[float, Field(gt=0, lt=1)]
+ONE, EACH = "one", "each"  # one for all axes, or a list of one an axis
+
+
+def _one_or_each(value: Any) -> str:
+    return EACH if isinstance(value, list) else ONE
+
+
+PositiveOrEach = Annotated[
+    Annotated[Positive, Tag(ONE)] | Annotated[list[Positive], Field(min_length=1), Tag(EACH)],
+    Discriminator(_one_or_each),
+]
 
 
 class _Section(BaseModel):
@@ -44,7 +55,7 @@ class PyramidSection(_Section):
 class SensorSection(_Section):
     """Measurement noise: given, or from a pyramid."""
 
-    noise_nm: Positive | None = None
+    noise_nm: PositiveOrEach | None = None
     noise_mas: Positive | None = None
     pyramid: PyramidSection | None = None
     matrix: list[list[float]] | None = None
@@ -93,13 +104,15 @@ class MirrorSection(_Section):
 
 
 class LoopSection(_Section):
-    """Timing."""
+    """Timing, and how many axes there are."""
 
+    axes: Annotated[int, Field(ge=1, le=2)] | None = None
     frame_rate_hz: Positive
     delay_frames: Annotated[float, Field(ge=1)] = 2.0
 
 
 class _Line(_Section):
+    # which of axis and direction_deg is needed depends on the number of axes
     axis: Literal["tip", "tilt", "both"] | None = None
     direction_deg: float | None = None
     frequency_hz: Positive
@@ -110,7 +123,7 @@ class _Line(_Section):
     def _one_size_one_direction(self) -> _Line:
         if (self.rms_nm is None) == (self.rms_mas is None):
             raise ValueError("expected exactly one of rms_nm, rms_mas")
-        if (self.axis is None) == (self.direction_deg is None):
+        if self.axis is not None and self.direction_deg is not None:
             raise ValueError("expected exactly one of axis, direction_deg")
         return self
 
@@ -168,17 +181,24 @@ TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discrim
 class ModelSection(_Section):
     """What the design believes; leave ``vibrations`` out for a plant without any."""
 
-    turbulence: TurbulenceSection
+    turbulence: Annotated[
+        Annotated[TurbulenceSection, Tag(ONE)]
+        | Annotated[list[TurbulenceSection], Field(min_length=1), Tag(EACH)],
+        Discriminator(_one_or_each),
+    ]
     vibrations: Annotated[list[VibrationSection], Field(min_length=1)] | None = None
-    sensor_gain: Positive = 1.0
+    sensor_gain: PositiveOrEach = 1.0
 
 
 class TruthSection(_Section):
-    """What the loop really meets."""
+    """What the loop really meets; ``vibrations: model`` are those of the model."""
 
-    turbulence: Literal["frozen_flow", "model", "none"] = "frozen_flow"
-    vibrations: list[TrueVibrationSection] = []
-    sensor_gain: Positive = 1.0
+    turbulence: Literal["frozen_flow", "model", "none"] | None = None
+    vibrations: Annotated[
+        Annotated[Literal["model"], Tag(ONE)] | Annotated[list[TrueVibrationSection], Tag(EACH)],
+        Discriminator(_one_or_each),
+    ] = []
+    sensor_gain: PositiveOrEach = 1.0
 
 
 class ImagingSection(_Section):
@@ -224,7 +244,7 @@ class RobustSection(_Section):
     """The robust design: bands of vibrations, sensor gains, demands."""
 
     bands: Annotated[list[BandSection], Field(min_length=1)]
-    turbulence: Literal["frozen_flow", "model"] = "frozen_flow"
+    turbulence: Literal["frozen_flow", "model"] | None = None
     sensor_gain: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
     scenarios: Annotated[list[Positive], Field(min_length=1)] | None = None
     modulus_margin: Annotated[float, Field(gt=0, lt=1)] = 0.45
@@ -281,11 +301,11 @@ class EndToEndSection(_Section):
 
 
 class FileSection(_Section):
-    """A whole configuration file."""
+    """A whole configuration file; an identified system knows no telescope and no atmosphere."""
 
     version: Annotated[int, Field(ge=1, le=1)]
-    telescope: TelescopeSection
-    atmosphere: AtmosphereSection
+    telescope: TelescopeSection | None = None
+    atmosphere: AtmosphereSection | None = None
     sensor: SensorSection
     mirror: MirrorSection = MirrorSection()
     loop: LoopSection
@@ -296,3 +316,13 @@ class FileSection(_Section):
     simulation: SimulationSection = SimulationSection()
     robustness: RobustnessSection = RobustnessSection()
     end_to_end: EndToEndSection = EndToEndSection()
+
+    @property
+    def usual_turbulence(self) -> str:
+        """Turbulence of a truth that names none: that of the atmosphere, if there is one."""
+        return "model" if self.atmosphere is None else "frozen_flow"
+
+    @property
+    def true_turbulence(self) -> str:
+        """Turbulence that the loop meets: frozen_flow, model or none."""
+        return self.truth.turbulence or self.usual_turbulence

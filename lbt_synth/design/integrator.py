@@ -157,7 +157,8 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
         except UnstableLoopError:
             return np.inf
 
-    if truth.turbulence is None and not truth.vibrations and truth.noise_nm == 0:
+    turbulence = truth.turbulence_groups(hardware.modes)
+    if not turbulence and not truth.vibrations and not np.any(truth.noise_nm):
         raise ProblemError(
             "the truth must disturb the loop; got no turbulence, vibration or noise."
         )

@@ -108,15 +108,10 @@ def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
     """
     if isinstance(plant, FullStatePlant):
         return _limit(Reach.of(plant.hardware), plant_modes(plant))
-    # modes with the same model may be turned into each other
-    models = {
-        m.coefficients.tobytes() + repr(m.driving_rms_nm).encode(): m for m in plant.turbulence
-    }
-    shared = [
-        models[m.coefficients.tobytes() + repr(m.driving_rms_nm).encode()] for m in plant.turbulence
-    ]
     lines = [(fitted_direction(line, plant.hardware), line) for line in plant.vibrations]
-    modes = decoupled_modes(plant.hardware, noise_nm2=plant.R, turbulence=shared, vibrations=lines)
+    modes = decoupled_modes(
+        plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
+    )
     return _limit(Reach.of(plant.hardware), modes)
 
 
@@ -131,11 +126,11 @@ def truth_modes(
         along = fitted_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
             lines.append((along, vibration))
-    noise = np.eye(hardware.n_measurements) * (truth.noise_nm / truth.sensor_gain) ** 2
+    noise = np.diag((truth.noise_of(hardware.n_measurements) / truth.sensor_gain) ** 2)
     return decoupled_modes(
         hardware,
         noise_nm2=noise,
-        turbulence=[truth.turbulence] * hardware.modes,
+        turbulence=truth.turbulence_of(hardware.modes),
         vibrations=lines,
         directions=directions,
     )

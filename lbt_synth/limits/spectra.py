@@ -11,7 +11,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.limits.prediction import Reach
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.truth import Spectrum, breakpoints_below
+from lbt_synth.models.truth import Spectrum, breakpoints_below, spectrum_key
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.quadrature import SettledPanels, settled_panels
 from lbt_synth.validation import FloatArray
@@ -161,10 +161,10 @@ def decoupled_modes(
                 f"a disturbance must be sampled at the loop's {rate:.6g} Hz; "
                 f"got {model.frame_rate_hz:.6g} Hz."
             )
-    kinds = {id(spectrum): spectrum for spectrum in turbulence}
-    groups = {
-        key: np.diag([float(id(spectrum) == key) for spectrum in turbulence]) for key in kinds
-    }
+    # modes with the same spectrum may be turned into each other
+    keys = [spectrum_key(spectrum) for spectrum in turbulence]
+    kinds = dict(zip(keys, turbulence, strict=True))
+    groups = {key: np.diag([float(own == key) for own in keys]) for key in kinds}
     matrices = [("the noise of the sensor", noise)]
     matrices += [("the turbulence", projector) for projector in groups.values()]
     matrices += [

@@ -105,7 +105,8 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     UnstableLoopError
         If the loop is unstable or marginally stable.
     ProblemError
-        If a vibration does not fit the loop, or the sensor gains differ.
+        If a vibration, the turbulence or the noise does not fit the loop, or the sensor gains
+        differ.
 
     Examples
     --------
@@ -127,10 +128,11 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
         )
     n = loop.hardware.modes
     turbulence = np.zeros((n, n))
-    if isinstance(truth.turbulence, ARModel):
-        turbulence = ar_covariance(loop, truth.turbulence, np.eye(n))
-    elif truth.turbulence is not None:
-        turbulence = _spectrum_covariance(loop, truth.turbulence)
+    for spectrum, modes in truth.turbulence_groups(n):
+        if isinstance(spectrum, ARModel):
+            turbulence += ar_covariance(loop, spectrum, np.eye(n)[list(modes)])
+        else:
+            turbulence += _spectrum_covariance(loop, spectrum, modes)
 
     random_vibration = np.zeros((n, n))
     lines = []
@@ -144,15 +146,16 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
             lines.append(vibration.amplitude_nm * response @ direction)
     return ResidualBudget(
         turbulence_nm2=frozen(turbulence),
-        noise_nm2=frozen(noise_covariance(loop, truth.noise_nm)),
+        noise_nm2=frozen(noise_covariance(loop, truth)),
         random_vibration_nm2=frozen(random_vibration),
         line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
     )
 
 
-def noise_covariance(loop: ClosedLoop, noise_nm: float) -> FloatArray:
-    """Covariance of the residual that white noise on each measurement leaves."""
+def noise_covariance(loop: ClosedLoop, truth: Truth) -> FloatArray:
+    """Covariance of the residual that a truth's white noise on each measurement leaves."""
     n, s = loop.hardware.modes, loop.system
+    noise_nm = truth.noise_of(loop.hardware.n_measurements)
     B, D = s.B[:, n:] * noise_nm, s.D[:n, n:] * noise_nm
     states = stationary_covariance(s.A, B @ B.T)
     return np.asarray(s.C[:n] @ states @ s.C[:n].T + D @ D.T)
@@ -184,11 +187,13 @@ def _directed_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray
     return np.asarray(C @ stationary_covariance(A, np.outer(drive, drive)) @ C.T)
 
 
-def _spectrum_covariance(loop: ClosedLoop, spectrum: Spectrum) -> FloatArray:
+def _spectrum_covariance(
+    loop: ClosedLoop, spectrum: Spectrum, modes: tuple[int, ...]
+) -> FloatArray:
     """Integrate the residual's spectrum over (0, Nyquist), adaptively."""
 
     def density(frequency: FloatArray) -> FloatArray:
-        response = loop.sensitivity(frequency)
+        response = loop.sensitivity(frequency)[:, :, list(modes)]
         power = np.real(np.einsum("fij,fkj->fik", response, response.conj()))
         return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
 

@@ -8,6 +8,8 @@ that of a stable loop, at gain h, the others follow without G, which may be infi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lbt_synth.loop.closed_loop import ClosedLoop
@@ -67,7 +69,11 @@ def rejections(
 
 
 def spectrum_covariances(
-    reference: ClosedLoop, sensor_gains: FloatArray, poles: ComplexArray, spectrum: Spectrum
+    reference: ClosedLoop,
+    sensor_gains: FloatArray,
+    poles: ComplexArray,
+    spectrum: Spectrum,
+    modes: Sequence[int],
 ) -> FloatArray:
     """Covariance of the residual that a spectrum leaves, at each of many sensor gains.
 
@@ -80,7 +86,9 @@ def spectrum_covariances(
     poles : (g, states) complex ndarray
         Poles of these loops.
     spectrum : Spectrum
-        Spectrum of each mode, the modes independent.
+        Spectrum of each of the ``modes``, which are independent.
+    modes : sequence of int
+        The modes that have it.
 
     Returns
     -------
@@ -89,10 +97,11 @@ def spectrum_covariances(
     """
 
     def density(frequency: FloatArray) -> FloatArray:
-        S = rejections(reference, sensor_gains, frequency)
+        whole = rejections(reference, sensor_gains, frequency)
+        S = np.take(whole, modes, axis=-1)
         # S S* by entries, which for one or two modes is faster than products of matrices
-        power = np.empty(S.shape)
-        for i in range(S.shape[-1]):
+        power = np.empty(whole.shape)
+        for i in range(reference.hardware.modes):
             for j in range(i + 1):
                 product = S[..., i, :].real * S[..., j, :].real
                 product += S[..., i, :].imag * S[..., j, :].imag

@@ -19,8 +19,6 @@ from scipy.special import j0
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.budget import ResidualBudget
-from lbt_synth.models.atmosphere import ARCSEC_RAD
-from lbt_synth.models.units import nm_per_mas
 from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import (
     ComplexArray,
@@ -46,8 +44,9 @@ class Imaging:
 
     Parameters
     ----------
-    diameter_m : float
-        Telescope diameter [m].
+    diameter_m : float, optional
+        Telescope diameter [m], for records. Strehl ratios do not depend on it: a tilt of a
+        nm rms moves the image by ``4 a / wavelength`` in units of lambda/D.
     obstruction : float, optional
         Diameter of the central obstruction as a fraction of the telescope's.
     wavelength_um : float, optional
@@ -67,23 +66,26 @@ class Imaging:
     2.2
     """
 
-    diameter_m: float
+    diameter_m: float | None = None
     obstruction: float = 0.0
     wavelength_um: float = 2.2
     other_modes: float = 1.0
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "diameter_m", number(self.diameter_m, "diameter_m", above=0))
+        if self.diameter_m is not None:
+            set_(self, "diameter_m", number(self.diameter_m, "diameter_m", above=0))
         set_(self, "obstruction", number(self.obstruction, "obstruction", at_least=0, below=1))
         set_(self, "wavelength_um", number(self.wavelength_um, "wavelength_um", above=0))
         set_(self, "other_modes", number(self.other_modes, "other_modes", above=0, at_most=1))
 
     @property
     def cycles_per_nm(self) -> float:
-        """Highest spatial frequency D/lambda, in cycles per nm of tilt wavefront."""
-        cycles_per_rad = self.diameter_m / (self.wavelength_um * 1e-6)
-        return cycles_per_rad * ARCSEC_RAD * 1e-3 / nm_per_mas(self.diameter_m)
+        """Highest spatial frequency D/lambda, in cycles per nm of tilt wavefront.
+
+        An angle of theta is ``theta D / 4`` of wavefront, so that D cancels.
+        """
+        return 4 / (self.wavelength_um * 1e3)
 
 
 def strehl(budget: ResidualBudget, imaging: Imaging) -> float:

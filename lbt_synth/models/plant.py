@@ -24,7 +24,12 @@ from lbt_synth.models.ar import ARModel
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.local_loop import PositionLoop
-from lbt_synth.models.parts import checked_vibrations, noise_factor, per_mode
+from lbt_synth.models.parts import (
+    checked_vibrations,
+    measurement_gains,
+    noise_factor,
+    per_mode,
+)
 from lbt_synth.models.problem import LONGEST_HORIZON, EstimationProblem
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.statespace import Controller
@@ -204,7 +209,7 @@ def tip_tilt_plant(
     delay_frames: float = 2.0,
     sensor_matrix: Any = None,
     influence_matrix: Any = None,
-    sensor_gain: float = 1.0,
+    sensor_gain: float | Sequence[float] | FloatArray = 1.0,
     modes: int = 2,
     mirror: PositionLoop | None = None,
 ) -> TipTiltPlant:
@@ -216,8 +221,9 @@ def tip_tilt_plant(
         Frame rate [Hz].
     turbulence : ARModel or sequence of ARModel
         Turbulence of each mode; one model serves all modes.
-    noise_nm : float or (q, q) array_like
-        Standard deviation of the measurement noise per frame, or its covariance [nm^2].
+    noise_nm : float, (q,) or (q, q) array_like
+        Standard deviation of the measurement noise per frame, one for all measurements or one
+        a measurement [nm], or its covariance [nm^2].
     vibrations : sequence of Vibration, optional
         The vibrations; None for a plant without any.
     delay_frames : float, optional
@@ -227,8 +233,9 @@ def tip_tilt_plant(
         Sensor response; the identity by default.
     influence_matrix : (n, m) array_like, optional
         Mirror response; the identity by default.
-    sensor_gain : float, optional
-        Sensor (optical) gain that the design assumes; multiplies the sensor matrix.
+    sensor_gain : float or (q,) array_like, optional
+        Sensor (optical) gain that the design assumes; multiplies the sensor matrix, row by
+        row where there is one a measurement.
     modes : int, optional
         Number of modes n when no matrix gives it.
     mirror : PositionLoop, optional
@@ -255,7 +262,6 @@ def tip_tilt_plant(
     >>> plant.A.shape
     (4, 4)
     """
-    gain = number(sensor_gain, "sensor_gain", above=0)
     hardware = LoopHardware(
         frame_rate_hz=frame_rate_hz,
         delay_frames=delay_frames,
@@ -264,11 +270,12 @@ def tip_tilt_plant(
         modes=modes,
         mirror=mirror,
     )
-    if gain != 1:
+    gains = measurement_gains(sensor_gain, hardware.n_measurements)
+    if np.any(gains != 1):
         hardware = LoopHardware(
             frame_rate_hz=hardware.frame_rate_hz,
             delay_frames=hardware.delay_frames,
-            sensor_matrix=gain * hardware.sensor,
+            sensor_matrix=gains[:, None] * hardware.sensor,
             influence_matrix=hardware.influence,
             mirror=hardware.mirror,
         )

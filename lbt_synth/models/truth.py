@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.ar import ARModel
 from lbt_synth.models.drift import DriftingVibration
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.vibration import Vibration
-from lbt_synth.validation import FloatArray, number, real_array
+from lbt_synth.validation import FloatArray, frozen, number, real_array
 
 
 @runtime_checkable
@@ -188,20 +189,25 @@ class Truth:
 
     Parameters
     ----------
-    turbulence : Spectrum or None
-        Spectrum of each mode, the modes independent; None for no turbulence.
+    turbulence : Spectrum, sequence of (Spectrum or None), or None
+        Spectrum of each mode, the modes independent: one for all of them, or one a mode; None
+        for no turbulence.
     vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration, optional
         The vibrations that are really there. One that drifts can be simulated only.
-    noise_nm : float, optional
-        Standard deviation of the noise on each measurement, per frame [nm].
+    noise_nm : float or (q,) array_like, optional
+        Standard deviation of the noise on each measurement, per frame [nm]: one for all of
+        them, or one a measurement.
     sensor_gain : float, optional
         Real sensor (optical) gain relative to the sensor matrix:
-        ``y = sensor_gain D phi_res + noise``.
+        ``y = sensor_gain D phi_res + noise``. Gains that differ between the axes belong into
+        the sensor matrix of the loop.
 
     Raises
     ------
     ProblemError
         If a value is not finite or out of its range.
+    DimensionError
+        If a sequence is empty, or ``noise_nm`` has more than one dimension.
 
     Examples
     --------
@@ -209,19 +215,146 @@ class Truth:
     >>> calm = lbt.Truth(turbulence=None, noise_nm=15.5)
     >>> calm.sensor_gain
     1.0
+
+    Tip and tilt that differ:
+
+    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40, frame_rate_hz=800)
+    >>> uneven = lbt.Truth(turbulence=[slow, None], noise_nm=[15.5, 12.0])
+    >>> [modes for _, modes in uneven.turbulence_groups(2)]
+    [(0,)]
+    >>> uneven.noise_of(2).tolist()
+    [15.5, 12.0]
     """
 
-    turbulence: Spectrum | None
+    turbulence: Spectrum | Sequence[Spectrum | None] | None
     vibrations: tuple[TrueVibration, ...] = ()
-    noise_nm: float = 0.0
+    noise_nm: float | FloatArray = 0.0
     sensor_gain: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.turbulence is not None and not isinstance(self.turbulence, Spectrum):
-            raise ProblemError(
-                "turbulence must have a method psd(frequency_hz), or be None; "
-                f"got {type(self.turbulence).__name__}."
-            )
+        given = self.turbulence
+        if isinstance(given, Sequence):
+            object.__setattr__(self, "turbulence", tuple(given))
+            if len(given) == 0:
+                raise DimensionError(
+                    "turbulence must be one spectrum, or one a mode; got an empty sequence. For "
+                    "no turbulence give None."
+                )
+        for part in self._per_mode or (self.turbulence,):
+            if part is not None and not isinstance(part, Spectrum):
+                raise ProblemError(
+                    "turbulence must have a method psd(frequency_hz), or be None, or a sequence "
+                    f"of these, one a mode; got {type(part).__name__}."
+                )
         object.__setattr__(self, "vibrations", tuple(self.vibrations))
-        object.__setattr__(self, "noise_nm", number(self.noise_nm, "noise_nm", at_least=0))
+        object.__setattr__(self, "noise_nm", _deviations(self.noise_nm))
         object.__setattr__(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+
+    @property
+    def _per_mode(self) -> tuple[Spectrum | None, ...] | None:
+        """Spectra one a mode, None where one serves all modes."""
+        return self.turbulence if isinstance(self.turbulence, tuple) else None
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether one spectrum serves all modes."""
+        return self._per_mode is None
+
+    def turbulence_of(self, modes: int) -> tuple[Spectrum | None, ...]:
+        """Return the turbulence of each mode.
+
+        Parameters
+        ----------
+        modes : int
+            Number of modes n of the loop.
+
+        Returns
+        -------
+        tuple of Spectrum or None
+            One a mode.
+
+        Raises
+        ------
+        DimensionError
+            If there are spectra for another number of modes.
+        """
+        given = self._per_mode
+        if given is None:
+            return (self.turbulence,) * modes  # type: ignore[return-value]
+        if len(given) != modes:
+            raise DimensionError(
+                f"turbulence must be one spectrum, or one a mode ({modes}); got {len(given)}."
+            )
+        return given
+
+    def turbulence_groups(self, modes: int) -> tuple[tuple[Spectrum, tuple[int, ...]], ...]:
+        """Return the different spectra, each with the modes that have it.
+
+        Parameters
+        ----------
+        modes : int
+            Number of modes n of the loop.
+
+        Returns
+        -------
+        tuple of (Spectrum, tuple of int)
+            Modes without turbulence are left out; equal AR models are one spectrum.
+
+        Raises
+        ------
+        DimensionError
+            If there are spectra for another number of modes.
+        """
+        found: dict[object, tuple[Spectrum, list[int]]] = {}
+        for mode, spectrum in enumerate(self.turbulence_of(modes)):
+            if spectrum is not None:
+                found.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
+        return tuple((spectrum, tuple(own)) for spectrum, own in found.values())
+
+    def noise_of(self, measurements: int) -> FloatArray:
+        """Return the standard deviation of the noise on each measurement, (q,) [nm].
+
+        Parameters
+        ----------
+        measurements : int
+            Number of measurements q of the loop.
+
+        Returns
+        -------
+        (q,) ndarray
+            One a measurement.
+
+        Raises
+        ------
+        DimensionError
+            If there are deviations for another number of measurements.
+        """
+        if np.ndim(self.noise_nm) and np.size(self.noise_nm) != measurements:
+            raise DimensionError(
+                f"noise_nm must be one number, or one a measurement ({measurements}); "
+                f"got {np.size(self.noise_nm)}."
+            )
+        return frozen(np.broadcast_to(self.noise_nm, (measurements,)))
+
+
+def spectrum_key(spectrum: Spectrum | None) -> object:
+    """Return what two equal spectra share: the numbers of an AR model, else which object it is."""
+    if isinstance(spectrum, ARModel):
+        return (
+            spectrum.coefficients.tobytes(), repr(spectrum.driving_rms_nm), spectrum.frame_rate_hz,
+        )  # fmt: skip
+    return id(spectrum)
+
+
+def _deviations(noise_nm: Any) -> float | FloatArray:
+    """Return one deviation for all measurements, or one a measurement."""
+    if np.ndim(noise_nm) == 0:
+        return number(noise_nm, "noise_nm", at_least=0)
+    out = real_array(noise_nm, "noise_nm")
+    if out.ndim != 1 or out.size == 0:
+        raise DimensionError(
+            f"noise_nm must be one number, or a list of one a measurement; got shape {out.shape}."
+        )
+    for value in out:
+        number(value, "noise_nm", at_least=0)
+    return out

@@ -31,14 +31,21 @@ def draw_disturbance(
     """Draw the total phase, (cases, frames, n) [nm].
 
     Each part has a stream of its own: a truth with one vibration more keeps the
-    turbulence that it had. A vibration that drifts begins to in frame ``zero_frame``.
+    turbulence that it had. So has each mode where every mode has a spectrum of its own.
+    A vibration that drifts begins to in frame ``zero_frame``.
     """
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
     total = np.zeros((cases, frames, n))
-    if truth.turbulence is not None:
-        drawn = _draw(truth.turbulence, hardware, frames, cases * n, turbulence_rng)
-        total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
+    if truth.is_uniform:
+        for spectrum, _ in truth.turbulence_groups(n):
+            drawn = _draw(spectrum, hardware, frames, cases * n, turbulence_rng)
+            total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
+    else:
+        spectra = truth.turbulence_of(n)
+        for mode, (own, mode_rng) in enumerate(zip(spectra, turbulence_rng.spawn(n), strict=True)):
+            if own is not None:
+                total[:, :, mode] += _draw(own, hardware, frames, cases, mode_rng)
     for vibration, line_rng in zip(truth.vibrations, line_rngs, strict=True):
         direction = fitted_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
@@ -59,7 +66,8 @@ def draw_noise(
     truth: Truth, hardware: LoopHardware, *, frames: int, cases: int, rng: np.random.Generator
 ) -> FloatArray:
     """Draw the measurement noise, (cases, frames, q) [nm]."""
-    return truth.noise_nm * rng.standard_normal((cases, frames, hardware.n_measurements))
+    q = hardware.n_measurements
+    return truth.noise_of(q) * rng.standard_normal((cases, frames, q))
 
 
 def _draw(

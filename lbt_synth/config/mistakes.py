@@ -1,0 +1,64 @@
+"""What a configuration has wrong, in one sentence with the path of the key."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from lbt_synth.config.schema import EACH, ONE, FileSection
+
+
+def described(error: ValidationError) -> tuple[str, str]:
+    """Return one sentence on the first mistake, and the path of its key."""
+    details = error.errors()
+    # an unknown key tells more than the missing one that it was meant to be
+    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    location = tuple(p for p in first["loc"] if p not in ("ar1", "ar2", "ar", ONE, EACH))
+    key = _key_path(location)
+    more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
+    if first["type"] == "extra_forbidden":
+        known = _fields_at(FileSection, location[:-1])
+        close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
+        hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
+        return f"unknown key {key}; {hint}{more}", key
+    if first["type"] == "missing":
+        return f"the key {key} is missing.{more}", key
+    if first["type"] == "value_error":
+        return f"{key}: {first['ctx']['error']}.{more}", key
+    if first["type"] == "too_short" and key.endswith("vibrations"):
+        return f"{key} is empty; leave the key out for a model without vibrations.{more}", key
+    if first["type"] == "union_tag_invalid":
+        expected, got = first["ctx"]["expected_tags"], first["ctx"]["tag"]
+        return f"{key}.kind must be one of {expected}; got {got!r}.{more}", key
+    text = first["msg"][0].lower() + first["msg"][1:]
+    return f"{key}: {text}; got {first['input']!r}.{more}", key
+
+
+def _key_path(location: tuple[int | str, ...]) -> str:
+    out = ""
+    for part in location:
+        out += f"[{part}]" if isinstance(part, int) else f".{part}" if out else str(part)
+    return out
+
+
+def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """Names of the keys known at a place of the schema."""
+    here: list[type[BaseModel]] = [model]
+    for part in location:
+        if isinstance(part, int):
+            continue
+        found: list[type[BaseModel]] = []
+        for section in here:
+            field = section.model_fields.get(str(part))
+            if field is not None:
+                found += _models_in(field.annotation)
+        here = found
+    return sorted({name for section in here for name in section.model_fields})
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for arg in getattr(annotation, "__args__", ()) for m in _models_in(arg)]
