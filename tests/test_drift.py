@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import lbt_axis_plant
+from plants import LBT_YAML, lbt_axis_plant
+from ruamel.yaml import YAML
 from scipy.signal import hilbert
 
 import lbt_synth as lbt
+from lbt_synth.cli.main import main
+from lbt_synth.endtoend.cases import _vibration, case_of
 from lbt_synth.models.truth import fitted_direction
 from lbt_synth.simulation import draw_disturbance
 
@@ -171,3 +176,74 @@ def test_wrong_drifts_are_refused():
         fitted_direction(drifting(end_hz=500), PATH)
     with pytest.raises(lbt.DimensionError, match="must have 1 components"):
         fitted_direction(drifting(direction=(1, 0)), PATH)
+
+
+# --------------------------------------------------------------------------
+# In a configuration, and at the command line.
+# --------------------------------------------------------------------------
+def drift_file(tmp_path, keys="kind: drift\n      end_hz: 23\n      duration_s: 60"):
+    """examples/lbt.yaml with another true vibration."""
+    yaml = YAML()
+    settings = yaml.load(LBT_YAML.read_text())
+    entry = f"a:\n    - axis: tip\n      frequency_hz: 17\n      rms_nm: 797\n      {keys}\n"
+    settings["truth"]["vibrations"] = yaml.load(entry)["a"]
+    settings["simulation"] = {"frames": 2000, "cases": 1, "settle_frames": 500}
+    path = tmp_path / "drift.yaml"
+    with path.open("w") as file:
+        yaml.dump(settings, file)
+    return path
+
+
+def test_a_configuration_may_have_one(tmp_path):
+    (found,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
+    expected = lbt.DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    assert found == expected
+    damped = "kind: drift\n      end_hz: 16\n      duration_s: 9\n      damping: 0.01"
+    (found,) = lbt.load_config(drift_file(tmp_path, damped)).truth.vibrations
+    assert (found.damping, found.end_hz, found.duration_s) == (0.01, 16, 9)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ("kind: drift", "end_hz and duration_s go with kind: drift"),
+        ("kind: drift\n      end_hz: 23", "end_hz and duration_s go with kind: drift"),
+        ("kind: sinusoid\n      end_hz: 23", "end_hz and duration_s go with kind: drift"),
+        ("kind: sinusoid\n      damping: 0.1", "damping goes with kind: resonance"),
+        ("kind: drift\n      end_hz: 500\n      duration_s: 60", r"\[0\].end_hz: must lie below"),
+        ("kind: drift\n      end_hz: -3\n      duration_s: 60", "greater than 0"),
+        ("kind: drift\n      end_hz: 2\n      duration_s: 60\n      damping: 0.5",
+         r"truth.vibrations\[0\]: .* frequency above that"),
+    ],
+)  # fmt: skip
+def test_wrong_keys_are_refused(tmp_path, keys, words):
+    with pytest.raises(lbt.ConfigError, match=words):
+        lbt.load_config(drift_file(tmp_path, keys))
+
+
+def test_the_commands_simulate_it_or_refuse(tmp_path, capsys):
+    config, gain = str(drift_file(tmp_path)), str(tmp_path / "kalman.fits")
+    assert main(["design", config, "--method", "kalman", "-o", gain]) == 0
+    capsys.readouterr()
+    assert main(["simulate", config, gain]) == 0
+    out = capsys.readouterr().out
+    assert "a vibration drifts" in out
+    assert "least residual" not in out
+    assert main(["simulate", config, gain, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["strehl_exact"] is None
+    assert 0 < report["strehl"][0] < 1
+    for refused in (
+        ["limits", config, gain],
+        ["robustness", config, "-o", str(tmp_path / "r.csv")],
+        ["design", config, "--method", "integrator", "-o", str(tmp_path / "i.fits")],
+    ):
+        assert main(refused) == 2
+        assert "drifts from 17 to 23 Hz" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_case_of_an_end_to_end_run_keeps_it():
+    setup = lbt.load_config(LBT_YAML).end_to_end
+    line = drifting(direction=(1, 0), damping=0.01)
+    case = json.loads(json.dumps(case_of(setup, None, vibrations=[line])))
+    assert _vibration(case["vibrations"][0]) == line

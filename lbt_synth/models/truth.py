@@ -251,6 +251,11 @@ class Truth:
         object.__setattr__(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
 
     @property
+    def drifts(self) -> bool:
+        """Whether a vibration drifts: then it can be simulated, and nothing else."""
+        return any(isinstance(line, DriftingVibration) for line in self.vibrations)
+
+    @property
     def _per_mode(self) -> tuple[Spectrum | None, ...] | None:
         """Spectra one a mode, None where one serves all modes."""
         return self.turbulence if isinstance(self.turbulence, tuple) else None
