@@ -1,0 +1,423 @@
+"""From recorded series to turbulence, lines, noise and sensor gain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.components import PARAMETERS, coefficients
+from lbt_synth.identification.fitting import Grown, Rules, grow, has_corner
+from lbt_synth.identification.periodogram import (
+    SHORTEST_SEGMENT,
+    LoopPeriodogram,
+    loop_periodogram,
+)
+from lbt_synth.identification.result import (
+    IdentifiedAxis,
+    IdentifiedLine,
+    IdentifiedTurbulence,
+    Kind,
+)
+from lbt_synth.identification.whiteness import whiteness
+from lbt_synth.identification.whittle import (
+    CORNER,
+    FIRST,
+    GAIN,
+    NOISE,
+    Likelihood,
+    damping_ratio,
+)
+from lbt_synth.models import ARModel
+from lbt_synth.validation import FloatArray, frozen, integer, number, real_array
+
+LOWEST_LINE_HZ = 3.0
+MOST_LINES = 20
+GAIN_ERROR = 0.1  # relative; a gain that is known worse is not identifiable
+_WIDE = 0.1  # damping ratio
+
+
+def identify_axis(
+    measurement: Any,
+    correction: Any = None,
+    *,
+    frame_rate_hz: float,
+    stretches: Sequence[tuple[int, int]] | None = None,
+    sensor_gain: float | None = None,
+    assumed_gain: float = 1.0,
+    announced: Sequence[tuple[float, float]] = (),
+    lowest_line_hz: float = LOWEST_LINE_HZ,
+    most_lines: int = MOST_LINES,
+    start: IdentifiedAxis | None = None,
+) -> IdentifiedAxis:
+    """Identify one axis of a loop.
+
+    The pseudo-open-loop measurement ``y(k) + g c(k)``, with c(k) the correction that y(k)
+    contains and g the sensor gain, is g times the phase plus the noise. Its spectrum is that of
+    turbulence (a second-order process, behind a first-order low pass where the data ask for
+    it), of resonances, and of white noise; its Whittle likelihood chooses all parameters, the
+    sensor gain among them, and a penalised criterion the number of resonances.
+
+    Parameters
+    ----------
+    measurement : (frames,) array_like
+        Measurement y(k) [nm].
+    correction : (frames,) array_like, optional
+        Correction c(k) contained in y(k) [nm]; none for an open loop.
+    frame_rate_hz : float
+        Frame rate [Hz].
+    stretches : sequence of (start, stop), optional
+        Frames to use; all by default.
+    sensor_gain : float, optional
+        Sensor gain, if it is known; found from the data of a closed loop otherwise.
+    assumed_gain : float, optional
+        What to take where it can not be found.
+    announced : sequence of (frequency, error), optional
+        Frequencies of lines that are known beforehand, with their standard errors [Hz].
+    lowest_line_hz : float, optional
+        A resonance below is a part of the turbulence [Hz].
+    most_lines : int, optional
+        Number of resonances above it, at most.
+    start : IdentifiedAxis, optional
+        A result to begin with, for instance that of a moment ago.
+
+    Returns
+    -------
+    IdentifiedAxis
+        Parameters with standard errors, tests and spectra.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range or not finite, sizes clash, or there are less than 512 frames
+        in one stretch.
+    NumericalError
+        If the fit fails.
+
+    Notes
+    -----
+    Standard errors are those of the likelihood: of what the model leaves open, not of what it
+    cannot describe.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> line = lbt.Vibration(frequency_hz=40, damping=0.005, rms_nm=30, direction=(1.0,))
+    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=2.0, frame_rate_hz=500)
+    >>> truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    >>> loop = lbt.integrator(path, gain=0.4)
+    >>> run = lbt.simulate(loop.controller, truth, hardware=path, frames=20_000)
+    >>> y, u = run.measurements[0, :, 0], run.commands[0, :, 0]
+    >>> found = lbt.identify_axis(y[2:], u[:-2], frame_rate_hz=500)
+    >>> [round(line.frequency_hz) for line in found.lines], round(found.noise_nm)
+    ([40], 5)
+    """
+    y = real_array(measurement, "measurement")
+    if y.ndim != 1:
+        raise DimensionError(f"measurement must be a series (frames,); got shape {y.shape}.")
+    c = None
+    if correction is not None:
+        c = real_array(correction, "correction")
+        if c.shape != y.shape:
+            raise DimensionError(
+                f"correction must have shape {y.shape} like measurement; got {c.shape}."
+            )
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    pieces = [(0, y.size)] if stretches is None else [(int(a), int(b)) for a, b in stretches]
+    for begin, stop in pieces:
+        if not 0 <= begin < stop <= y.size:
+            raise ProblemError(
+                f"stretches must lie within the {y.size} frames; got ({begin}, {stop})."
+            )
+    longest = max((stop - begin for begin, stop in pieces), default=0)
+    if longest < 2 * SHORTEST_SEGMENT:
+        raise ProblemError(
+            f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "
+            f"longest has {longest}. Record more, or bridge short gaps."
+        )
+    data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
+    return identify_periodogram(
+        data,
+        sensor_gain=sensor_gain,
+        assumed_gain=assumed_gain,
+        announced=announced,
+        lowest_line_hz=lowest_line_hz,
+        most_lines=most_lines,
+        start=start,
+    )
+
+
+def identify_spectrum(
+    frequency_hz: Any,
+    density_nm2_hz: Any,
+    *,
+    frame_rate_hz: float,
+    averages: float | None = None,
+    **options: Any,
+) -> IdentifiedAxis:
+    """Identify one axis from its power spectrum.
+
+    Parameters
+    ----------
+    frequency_hz : (f,) array_like
+        Increasing frequencies above 0 and below half the frame rate [Hz], evenly spaced.
+    density_nm2_hz : (f,) array_like
+        One-sided density of the phase [nm^2/Hz], above 0.
+    frame_rate_hz : float
+        Frame rate of the loop to come [Hz].
+    averages : float, optional
+        Number of independent periodograms that the density is the mean of; by default found
+        from its scatter.
+    **options
+        ``announced``, ``lowest_line_hz`` and ``most_lines`` of :func:`identify_axis`.
+
+    Returns
+    -------
+    IdentifiedAxis
+        As from a series; the sensor gain is 1.
+
+    Raises
+    ------
+    ProblemError
+        If the table is no spectrum.
+    NumericalError
+        If the fit fails.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> f = np.arange(1, 400) * 1.0
+    >>> line = lbt.Vibration(frequency_hz=50, damping=0.05, rms_nm=30).ar_model(1000)
+    >>> chance = np.random.default_rng(0).gamma(8.0, 1 / 8.0, f.size)
+    >>> found = lbt.identify_spectrum(f, (line.psd(f) + 1.0) * chance, frame_rate_hz=1000)
+    >>> [round(line.frequency_hz) for line in found.lines]
+    [50]
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    f = real_array(frequency_hz, "frequency_hz")
+    density = real_array(density_nm2_hz, "density_nm2_hz")
+    if f.ndim != 1 or f.shape != density.shape or f.size < 32:
+        raise DimensionError(
+            "frequency_hz and density_nm2_hz must be lists of the same length, at least 32; got "
+            f"{f.shape} and {density.shape}."
+        )
+    steps = np.diff(f)
+    if np.any(steps <= 0) or f[0] <= 0 or f[-1] >= rate / 2:
+        raise ProblemError(
+            f"frequency_hz must increase from above 0 to below {rate / 2:.6g}; got {f[0]:.6g} to "
+            f"{f[-1]:.6g}. Leave the mean out, and what lies above the Nyquist frequency."
+        )
+    if np.max(steps) > 1.01 * np.min(steps):
+        raise ProblemError(
+            f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
+            f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
+        )
+    if np.any(density <= 0):
+        raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density):.6g}.")
+    many = _averages(density) if averages is None else number(averages, "averages", above=0)
+    zero = np.zeros_like(f)
+    data = LoopPeriodogram(
+        frequency_hz=f,
+        measured=density,
+        crossed=zero,
+        corrected=zero,
+        count=np.full(f.size, many),
+        frame_rate_hz=rate,
+        resolution_hz=float(np.median(steps)),
+    )
+    return identify_periodogram(data, sensor_gain=1.0, **options)
+
+
+def _averages(density: FloatArray) -> float:
+    """Shape of the gamma distribution that the density scatters with about a smooth curve."""
+    from scipy.optimize import brentq
+    from scipy.special import polygamma
+
+    log = np.log(density)
+    # a second difference at a distance hardly sees a curve, and not what neighbours share
+    bend = log[6:] - 2 * log[3:-3] + log[:-6]
+    scatter = (np.median(np.abs(bend - np.median(bend))) / 0.6745) ** 2 / 6
+    low, high = 0.25, 1e6
+    scatter = float(np.clip(scatter, polygamma(1, high), polygamma(1, low)))
+    return float(
+        np.exp(
+            brentq(
+                lambda x: float(polygamma(1, np.exp(x))) - scatter,
+                np.log(low) - 1e-6,
+                np.log(high) + 1e-6,
+            )
+        )
+    )
+
+
+def identify_periodogram(
+    data: LoopPeriodogram,
+    *,
+    sensor_gain: float | None = None,
+    assumed_gain: float = 1.0,
+    announced: Sequence[tuple[float, float]] = (),
+    lowest_line_hz: float = LOWEST_LINE_HZ,
+    most_lines: int = MOST_LINES,
+    start: IdentifiedAxis | None = None,
+) -> IdentifiedAxis:
+    """Identify one axis from its periodogram; the arguments are those of :func:`identify_axis`.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range.
+    NumericalError
+        If the fit fails.
+    """
+    if sensor_gain is not None:
+        sensor_gain = number(sensor_gain, "sensor_gain", above=0)
+    assumed = number(assumed_gain, "assumed_gain", above=0)
+    nyquist = data.frame_rate_hz / 2
+    for frequency, error in announced:
+        number(frequency, "an announced frequency", above=0, below=nyquist)
+        number(error, "the error of an announced frequency", at_least=0)
+    rules = Rules(
+        gain=sensor_gain,
+        lowest_line_hz=number(lowest_line_hz, "lowest_line_hz", at_least=0, below=nyquist),
+        most_lines=integer(most_lines, "most_lines", at_least=0),
+        announced=tuple(announced),
+    )
+    grown = grow(data, rules, None if start is None else start.grown)
+    if sensor_gain is not None:
+        return _described(data, rules, grown, None, "given")
+    if not data.closed:
+        return _described(data, rules, grown, None, "1: of an open loop it has no meaning")
+    error = float(np.sqrt(_covariance(grown)[GAIN, GAIN]))
+    if error <= GAIN_ERROR:
+        return _described(data, rules, grown, error, "found in the closed loop's data")
+    rules = replace(rules, gain=assumed)
+    note = (
+        f"assumed to be {assumed:g}: these data leave it open by {100 * error:.0f} % (the loop "
+        "hardly acts where the noise shows). Give it, or record with a higher loop gain"
+    )
+    return _described(data, rules, grow(data, rules, grown), None, note)
+
+
+def _covariance(grown: Grown) -> FloatArray:
+    """Inverse of the information over the parameters that moved."""
+    information = grown.fitted.information
+    moved = np.flatnonzero(np.diag(information) > 0)
+    out = np.zeros_like(information)
+    block = information[np.ix_(moved, moved)]
+    scale = 1 / np.sqrt(np.diag(block))
+    out[np.ix_(moved, moved)] = np.linalg.pinv(
+        block * np.outer(scale, scale), hermitian=True
+    ) * np.outer(scale, scale)
+    return np.asarray(out)
+
+
+def _turbulence(theta: FloatArray, rate: float) -> ARModel:
+    """The first component as a process of the phase."""
+    w, damping = float(np.exp(theta[FIRST])), float(np.exp(theta[FIRST + 1]))
+    a1, a2, drive = coefficients(w, damping)
+    polynomial = np.array([1.0, -a1, -a2])
+    size = np.exp(theta[FIRST + 2] / 2 - theta[GAIN]) * np.sqrt(drive)
+    if has_corner(theta):
+        pole = np.exp(-np.exp(theta[CORNER]))
+        polynomial = np.convolve(polynomial, [1.0, -pole])
+        size *= 1 - pole
+    return ARModel(coefficients=-polynomial[1:], driving_rms_nm=float(size), frame_rate_hz=rate)
+
+
+def _described(
+    data: LoopPeriodogram, rules: Rules, grown: Grown, gain_error: float | None, note: str
+) -> IdentifiedAxis:
+    """Return the fit in the units of the phase, with standard errors."""
+    theta, rate = grown.theta, data.frame_rate_hz
+    covariance = _covariance(grown)
+    error = np.sqrt(np.maximum(np.diag(covariance), 0))
+    gain = float(np.exp(theta[GAIN]))
+    to_hz = rate / (2 * np.pi)
+    density, _, _ = Likelihood(data).parts(theta)
+    fitted = density.sum(axis=0)
+    lines: list[IdentifiedLine] = []
+    background = fitted.copy()
+    for i, part in enumerate(grown.parts):
+        if i == 0:
+            continue
+        at = FIRST + PARAMETERS * i
+        frequency = float(np.exp(theta[at])) * to_hz
+        damping = damping_ratio(theta[at + 1], first=False)
+        rms = float(np.exp(theta[at + 2] / 2 - theta[GAIN]))
+        along = np.zeros(theta.size)
+        along[at + 2], along[GAIN] = 0.5, -1.0
+        own = float(np.interp(frequency, data.frequency_hz, density[1 + i]))
+        rest = float(np.interp(frequency, data.frequency_hz, fitted)) - own
+        narrow = damping < _WIDE and own > rest
+        kind: Kind = "line" if narrow else "broad"
+        if not part.line or frequency < rules.lowest_line_hz:
+            kind = "turbulence"
+        if kind == "line":
+            background -= density[1 + i]
+        lines.append(
+            IdentifiedLine(
+                kind=kind,
+                frequency_hz=frequency,
+                frequency_error_hz=frequency * float(error[at]),
+                damping=damping,
+                damping_error=damping * (1 - damping) * float(error[at + 1]),
+                rms_nm=rms,
+                rms_error_nm=rms * float(np.sqrt(along @ covariance @ along)),
+                prominence=own / rest,
+                evidence=grown.adds[i],
+                announced=part.frequency is not None,
+            )
+        )
+    noise = float(np.exp(theta[NOISE] / 2))
+    return IdentifiedAxis(
+        turbulence=_turbulence(theta, rate),
+        turbulence_fit=_turbulence_fit(theta, covariance, rate),
+        parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
+        noise_nm=noise,
+        noise_error_nm=noise * float(error[NOISE]) / 2,
+        sensor_gain=gain,
+        sensor_gain_error=None if gain_error is None else gain * gain_error,
+        sensor_gain_note=note,
+        whiteness=whiteness(data, data.power(gain), fitted),
+        frequency_hz=data.frequency_hz,
+        density_nm2_hz=frozen(data.power(gain) / gain**2),
+        fitted_nm2_hz=frozen(fitted / gain**2),
+        background_nm2_hz=frozen(background / gain**2),
+        frame_rate_hz=rate,
+        resolution_hz=data.resolution_hz,
+        grown=grown,
+        data=data,
+    )
+
+
+def _turbulence_fit(
+    theta: FloatArray, covariance: FloatArray, rate: float
+) -> IdentifiedTurbulence:
+    """Parameters of the turbulence; the error of its rms by differences."""
+    error = np.sqrt(np.maximum(np.diag(covariance), 0))
+    slope = np.zeros(theta.size)
+    for i in (GAIN, CORNER, FIRST, FIRST + 1, FIRST + 2):
+        step = np.zeros(theta.size)
+        step[i] = 1e-4
+        up, down = (np.log(_turbulence(theta + s * step, rate).rms_nm) for s in (1, -1))
+        slope[i] = (up - down) / 2e-4
+    rms = _turbulence(theta, rate).rms_nm
+    to_hz = rate / (2 * np.pi)
+    frequency, damping = float(np.exp(theta[FIRST])) * to_hz, float(np.exp(theta[FIRST + 1]))
+    corner = float(np.exp(theta[CORNER])) * to_hz if has_corner(theta) else None
+    return IdentifiedTurbulence(
+        frequency_hz=frequency,
+        frequency_error_hz=frequency * float(error[FIRST]),
+        damping=damping,
+        damping_error=damping * float(error[FIRST + 1]),
+        corner_hz=corner,
+        corner_error_hz=None if corner is None else corner * float(error[CORNER]),
+        rms_nm=rms,
+        rms_error_nm=rms * float(np.sqrt(slope @ covariance @ slope)),
+    )

@@ -1,0 +1,232 @@
+"""Whittle's likelihood of a spectrum of resonances over white noise, in a running loop.
+
+For a periodogram I(g) of n values and a spectrum S(theta)::
+
+    L(theta, g) = sum count (log S + I(g) / S) + sum ((theta - centre) / width)^2 / 2
+
+is minus the logarithm of the likelihood (P. Whittle, Ark. Mat. 2, 423 (1953),
+doi:10.1007/BF02590998) and of the priors. The measurement is ``y(k) = z(k) - g c(k)``, z of
+spectrum S, and c(k) follows from y up to k-1: the change of variables from z to y has a unit
+Jacobian, so the likelihood of what the closed loop recorded is that of ``z = y + g c``. The
+sensor gain g is one more parameter, which only the data depend on.
+
+Everything is in units of the measurement: a component's variance is g^2 times that of the phase.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import NumericalError
+from lbt_synth.identification.components import PARAMETERS, log_density, log_roll_off
+from lbt_synth.identification.periodogram import LoopPeriodogram, half_angle_square
+from lbt_synth.validation import FloatArray
+
+GAIN, NOISE, CORNER, FIRST = 0, 1, 2, 3  # places in the vector of parameters
+_FARTHEST = 60.0  # of a logarithm: exp stays finite
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Priors:
+    """Normal priors on the logarithms of the parameters; an infinite width is none.
+
+    Attributes
+    ----------
+    centre, width : (p,) ndarray
+        Mean and standard deviation.
+    """
+
+    centre: FloatArray
+    width: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fitted:
+    """A minimum of the likelihood.
+
+    Attributes
+    ----------
+    parameters : (p,) ndarray
+        Logarithms of sensor gain, noise variance, corner of the first component's roll-off, and
+        (frequency, damping, variance) of each component; frequencies as angles a frame. The
+        damping of all but the first is below 1: its parameter is ``log(zeta / (1 - zeta))``.
+    contrast : float
+        L without the priors.
+    information : (p, p) ndarray
+        Second derivatives of L, expected where the model's are.
+    left : float
+        What another step would still gain of L.
+    """
+
+    parameters: FloatArray
+    contrast: float
+    information: FloatArray
+    left: float
+
+
+def damping_ratio(parameter: float, *, first: bool) -> float:
+    """Damping ratio of a component from its parameter."""
+    return float(np.exp(parameter)) if first else float(1 / (1 + np.exp(-parameter)))
+
+
+def damping_parameter(ratio: float, *, first: bool) -> float:
+    """Parameter of a component from its damping ratio."""
+    return float(np.log(ratio if first else ratio / (1 - ratio)))
+
+
+class Likelihood:
+    """Value, gradient and information of L for one periodogram.
+
+    Parameters
+    ----------
+    data : LoopPeriodogram
+        The periodogram.
+    """
+
+    def __init__(self, data: LoopPeriodogram) -> None:
+        self.data = data
+        self._s = half_angle_square(data.frequency_hz, data.frame_rate_hz)
+        self._white = 2 / data.frame_rate_hz
+
+    def parts(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Density of the white noise and of each component, (1 + c, f), with log derivatives.
+
+        Those of component i by frequency and damping are slopes[i]; the last slope is that of
+        the first component by its corner.
+        """
+        count = (theta.size - FIRST) // PARAMETERS
+        density = np.empty((1 + count, self._s.size))
+        slopes = np.empty((count, 2, self._s.size))
+        fall, by_corner = log_roll_off(float(np.exp(theta[CORNER])), self._s)
+        density[0] = self._white * np.exp(theta[NOISE])
+        for i in range(count):
+            f, damping, variance = theta[FIRST + PARAMETERS * i : FIRST + PARAMETERS * (i + 1)]
+            ratio = damping_ratio(damping, first=i == 0)
+            value, slopes[i, 0], slopes[i, 1] = log_density(np.exp(f), ratio, self._s)
+            if i == 0:
+                value = value + fall
+            else:
+                slopes[i, 1] *= 1 - ratio
+            np.exp(value + (variance + np.log(self._white)), out=density[1 + i])
+        return density, slopes, by_corner
+
+    def model(self, theta: FloatArray) -> FloatArray:
+        """Density of the whole spectrum, (f,)."""
+        return np.asarray(self.parts(theta)[0].sum(axis=0))
+
+    def contrast(self, theta: FloatArray) -> float:
+        """L without the priors."""
+        model = self.model(theta)
+        power = self.data.power(float(np.exp(theta[GAIN])))
+        return float(np.sum(self.data.count * (np.log(model) + power / model)))
+
+    def derivatives(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """L without the priors, its gradient and its information matrix."""
+        data, count = self.data, self.data.count
+        gain = float(np.exp(theta[GAIN]))
+        density, slopes, by_corner = self.parts(theta)
+        model = density.sum(axis=0)
+        power = data.power(gain)
+        ratio = power / model
+        log_slopes = np.empty((theta.size, model.size))
+        log_slopes[GAIN] = 0
+        log_slopes[NOISE] = density[0] / model
+        log_slopes[CORNER] = by_corner * density[1] / model
+        for i in range(len(slopes)):
+            at = FIRST + PARAMETERS * i
+            share = density[1 + i] / model
+            np.multiply(slopes[i], share, out=log_slopes[at : at + 2])
+            log_slopes[at + 2] = share
+        weighted = log_slopes * count
+        gradient = weighted @ (1 - ratio)
+        information = weighted @ log_slopes.T
+        # the gain moves the data, not the model
+        cross, square = 2 * gain * data.crossed, 2 * gain**2 * data.corrected
+        by_gain = (cross + square) / model
+        gradient[GAIN] = np.sum(count * by_gain)
+        information[GAIN] = information[:, GAIN] = -weighted @ by_gain
+        information[GAIN, GAIN] = np.sum(count * (cross + 2 * square) / model)
+        value = float(np.sum(count * (np.log(model) + ratio)))
+        return value, gradient, information
+
+
+def fit(
+    likelihood: Likelihood,
+    start: FloatArray,
+    priors: Priors,
+    *,
+    free: Sequence[bool] | FloatArray,
+    steps: int = 40,
+) -> Fitted:
+    """Minimise L from a start, by scoring steps within a trust region.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        The likelihood.
+    start : (p,) ndarray
+        Where to begin.
+    priors : Priors
+        Normal priors.
+    free : (p,) sequence of bool
+        Which parameters move.
+    steps : int, optional
+        At most; ``left`` tells whether they were enough.
+
+    Returns
+    -------
+    Fitted
+        The minimum.
+
+    Raises
+    ------
+    NumericalError
+        If the likelihood is not finite.
+    """
+    from scipy.optimize import minimize
+
+    moves = np.flatnonzero(np.asarray(free))
+    precision = 1 / np.asarray(priors.width) ** 2
+    theta = start.copy()
+    last: dict[str, object] = {}
+
+    def at(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        key = x.tobytes()
+        if last.get("key") != key:
+            full = theta.copy()
+            full[moves] = np.clip(x, -_FARTHEST, _FARTHEST)
+            value, gradient, information = likelihood.derivatives(full)
+            away = full - priors.centre
+            value += 0.5 * float(np.sum(precision * away**2))
+            gradient = gradient + precision * away
+            information = information + np.diag(precision)
+            last["key"] = key
+            last["found"] = (value, gradient[moves], information[np.ix_(moves, moves)])
+        return last["found"]  # type: ignore[return-value]
+
+    found = minimize(
+        lambda x: at(x)[0],
+        start[moves],
+        jac=lambda x: at(x)[1],
+        hess=lambda x: at(x)[2],
+        method="trust-exact",
+        options={"maxiter": steps, "gtol": 1e-3, "initial_trust_radius": 1.0, "max_trust_radius": 8.0},
+    )
+    theta[moves] = found.x
+    _, gradient, reduced = at(found.x)
+    # what a Newton step would still gain
+    left = 0.5 * float(gradient @ np.linalg.lstsq(reduced, gradient, rcond=None)[0])
+    if not (np.isfinite(found.fun) and np.isfinite(left)):
+        raise NumericalError(
+            "the likelihood of the spectrum is not finite. Check the units of the series.",
+            status=str(found.message),
+        )
+    information = np.zeros((start.size, start.size))
+    information[np.ix_(moves, moves)] = reduced
+    return Fitted(
+        parameters=theta, contrast=likelihood.contrast(theta), information=information,
+        left=left,
+    )
