@@ -166,3 +166,164 @@ def test_sensor_gain_of_model_and_truth_are_relative(tmp_path):
 def test_a_plant_without_vibrations(tmp_path):
     config = lbt.load_config(write(tmp_path, changed(("model", "vibrations"), ...)))
     assert config.plant.vibrations == ()
+
+
+# --- what an identified system leaves out, and what differs between its axes
+
+AR = {"kind": "ar", "coefficients": [0.99], "driving_rms_nm": 40.0}
+OTHER = {"kind": "ar", "coefficients": [1.6, -0.65], "driving_rms_nm": 25.0}
+SMALL = {
+    "version": 1,
+    "sensor": {"noise_nm": 15.5},
+    "loop": {"frame_rate_hz": 800.0},
+    "model": {
+        "turbulence": AR,
+        "vibrations": [{"axis": "tip", "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 300.0}],
+    },
+}
+
+
+def small(**sections):
+    """The smallest configuration, some of its sections with other keys."""
+    out = copy.deepcopy(SMALL)
+    for name, keys in sections.items():
+        out[name] = {**out.get(name, {}), **keys}
+    return out
+
+
+def test_no_telescope_and_no_atmosphere(tmp_path):
+    config = lbt.load_config(write(tmp_path, SMALL))
+    assert config.atmosphere is None
+    assert config.truth.turbulence is config.plant.turbulence[0]  # the model, without an atmosphere
+    assert config.imaging.diameter_m is None
+    assert config.settings.true_turbulence == "model"
+    assert lbt.load_config(LBT_YAML).settings.true_turbulence == "frozen_flow"
+
+
+@pytest.mark.parametrize(
+    ("sections", "key", "text"),
+    [
+        ({"sensor": {"noise_nm": None, "noise_mas": 2.0}}, "telescope",
+         "telescope is missing: sensor.noise_mas is in mas"),
+        ({"sensor": {"noise_nm": None, "pyramid": GOOD["sensor"]["pyramid"]}}, "telescope",
+         "telescope is missing: the noise of sensor.pyramid"),
+        ({"model": {"turbulence": {"kind": "ar1"}}}, "atmosphere",
+         "atmosphere is missing: model.turbulence of kind ar1"),
+        ({"model": {"turbulence": [AR, {"kind": "ar2"}]}}, "atmosphere",
+         r"atmosphere is missing: model.turbulence\[1\] of kind ar2"),
+        ({"model": {"vibrations": [
+            {"axis": "tip", "frequency_hz": 20.0, "damping": 0.01, "rms_mas": 30.0}]}},
+         "telescope", r"telescope is missing: model.vibrations\[0\].rms_mas is in mas"),
+        ({"truth": {"vibrations": [
+            {"kind": "sinusoid", "axis": "tip", "frequency_hz": 20.0, "rms_mas": 30.0}]}},
+         "telescope", r"telescope is missing: truth.vibrations\[0\].rms_mas"),
+        ({"truth": {"turbulence": "frozen_flow"}}, "atmosphere",
+         "atmosphere is missing: truth.turbulence: frozen_flow"),
+        ({"atmosphere": GOOD["atmosphere"]}, "telescope", "telescope is missing: the turbulence"),
+        # lists of another length, or of other things
+        ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one a measurement \(2\); got 1"),
+        ({"sensor": {"noise_nm": []}}, "sensor.noise_nm", "at least 1 item"),
+        ({"sensor": {"noise_nm": [1.0, -1.0]}}, "sensor.noise_nm[1]", "greater than 0"),
+        ({"sensor": {"noise_nm": "15"}}, "sensor.noise_nm", "valid number"),
+        ({"model": {"turbulence": [AR]}}, "model.turbulence", r"one an axis \(2\); got 1"),
+        ({"model": {"turbulence": []}}, "model.turbulence", "at least 1 item"),
+        ({"model": {"turbulence": [AR, {**AR, "coefficients": [1.2]}]}},
+         "model.turbulence[1].coefficients", "must be stationary"),
+        ({"model": {"turbulence": [AR, {**AR, "coefficient": 1}]}},
+         "model.turbulence[1].coefficient", "did you mean coefficients"),
+        ({"model": {"sensor_gain": [1.0, 1.0, 1.0]}}, "model.sensor_gain", "got 3"),
+        ({"truth": {"sensor_gain": [1.0]}}, "truth.sensor_gain", "got 1"),
+        ({"truth": {"sensor_gain": [1.0, 0.9]}}, "truth.sensor_gain", "got the factors 1, 0.9"),
+        ({"truth": {"vibrations": "same"}}, "truth.vibrations", "model"),
+        ({"sensor": {"noise_nm": [1.0, 2.0, 3.0], "matrix": [[1, 0], [0, 1], [1, 1]]},
+          "model": {"turbulence": {"kind": "ar2"}}}, "model.turbulence", "3 for 2 axes"),
+        # one axis
+        ({"loop": {"axes": 3}}, "loop.axes", "less than or equal to 2"),
+        ({"loop": {"axes": 1}, "sensor": {"matrix": [[1, 0], [0, 1]]}}, "sensor.matrix",
+         "must have 1 columns, as loop.axes says; got 2"),
+        ({"loop": {"axes": 1}, "model": {"vibrations": [
+            {"axis": "tilt", "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 30.0}]}},
+         "model.vibrations[0]", "one axis: leave axis and direction_deg out"),
+        ({"loop": {"axes": 1}, "truth": {"vibrations": [
+            {"kind": "sinusoid", "direction_deg": 3.0, "frequency_hz": 20.0, "rms_nm": 30.0}]}},
+         "truth.vibrations[0]", "one axis"),
+        ({"model": {"vibrations": [{"frequency_hz": 20.0, "damping": 0.01, "rms_nm": 30.0}]}},
+         "model.vibrations[0]", "expected exactly one of axis, direction_deg"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_or_does_not_fit_is_said(tmp_path, sections, key, text):
+    content = small(**sections)
+    if content["sensor"]["noise_nm"] is None:
+        del content["sensor"]["noise_nm"]
+    with pytest.raises(lbt.ConfigError, match=text) as caught:
+        lbt.load_config(write(tmp_path, content))
+    assert caught.value.path == key
+    assert "c.yaml" in str(caught.value)
+
+
+def test_axes_that_differ(tmp_path):
+    content = small(
+        sensor={"noise_nm": [15.5, 6.0]},
+        model={"turbulence": [AR, OTHER], "sensor_gain": [0.9, 0.7]},
+        truth={"vibrations": "model", "sensor_gain": [0.45, 0.35]},
+    )
+    config = lbt.load_config(write(tmp_path, content))
+    assert [m.order for m in config.plant.turbulence] == [1, 2]
+    assert config.truth.turbulence == config.plant.turbulence
+    assert config.truth.vibrations == config.plant.vibrations
+    assert config.truth.noise_of(2).tolist() == config.noise_nm.tolist() == [15.5, 6.0]
+    assert config.truth.sensor_gain == pytest.approx(0.5)
+    assert config.sensor_gain == pytest.approx(0.8)
+    np.testing.assert_array_equal(config.hardware.sensor, np.diag([0.9, 0.7]))
+    # a single real gain is the mean over the axes, which keep their proportion
+    content["truth"]["sensor_gain"] = 0.4
+    assert lbt.load_config(write(tmp_path, content)).truth.sensor_gain == pytest.approx(0.5)
+
+
+def test_ar2_is_fitted_above_the_noise_of_its_axis(tmp_path, air):
+    content = changed(("sensor",), {"noise_nm": [15.5, 60.0]})
+    content["model"]["turbulence"] = {"kind": "ar2"}
+    models = lbt.load_config(write(tmp_path, content)).plant.turbulence
+    for model, noise in zip(models, (15.5, 60.0), strict=True):
+        alone = lbt.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise)
+        np.testing.assert_array_equal(model.coefficients, alone.coefficients)
+    content["model"]["turbulence"] = [{"kind": "ar1"}, AR]
+    first, second = lbt.load_config(write(tmp_path, content)).plant.turbulence
+    assert first.coefficients[0] == pytest.approx(0.98860, abs=5e-6)
+    assert second.coefficients.tolist() == [0.99]
+
+
+@pytest.mark.parametrize("direction", [{}, {"axis": "tip"}])
+def test_one_axis(tmp_path, direction):
+    line = {"frequency_hz": 20.0, "damping": 0.01, "rms_nm": 300.0, **direction}
+    content = small(loop={"axes": 1}, model={"vibrations": [line]})
+    config = lbt.load_config(write(tmp_path, content))
+    assert config.hardware.modes == 1
+    assert config.plant.vibrations[0].direction == (1.0,)
+    both = lbt.load_config(write(tmp_path, small(loop={"axes": 2})))
+    # tip of the two
+    truth = lbt.Truth(
+        turbulence=both.plant.turbulence, vibrations=both.plant.vibrations, noise_nm=15.5
+    )
+    limit = lbt.least_residual(both.hardware, truth)
+    assert lbt.kalman(config.plant).rms ** 2 == pytest.approx(limit.variance_nm2[0], rel=1e-6)
+
+
+def test_the_robust_design_of_an_identified_system(tmp_path):
+    band = {"low_hz": 18.0, "high_hz": 22.0, "rms_nm": 100.0}
+    robust = {"bands": [band], "functions": 8, "states": None, "modulus_margin": 0.3}
+    content = small(design={"robust": robust})
+    config = lbt.load_config(write(tmp_path, content))
+    lbt.config.robust_design(config)  # with the model's turbulence, as there is no atmosphere
+    for change, text in (
+        ({"turbulence": "frozen_flow"}, "atmosphere is missing: design.robust.turbulence"),
+        ({"bands": [{"low_hz": 18.0, "high_hz": 22.0, "rms_mas": 9.0}]},
+         r"telescope is missing: design.robust.bands\[0\].rms_mas"),
+    ):  # fmt: skip
+        content["design"] = {"robust": {**robust, **change}}
+        with pytest.raises(lbt.ConfigError, match=text):
+            lbt.config.robust_design(lbt.load_config(write(tmp_path, content)))
+    content["design"] = {"robust": {**robust, "command_step_nm": 500.0}}
+    content["model"]["turbulence"] = [AR, OTHER]
+    with pytest.raises(lbt.ConfigError, match="hold under one turbulence for all axes"):
+        lbt.config.robust_design(lbt.load_config(write(tmp_path, content)))

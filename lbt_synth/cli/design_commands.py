@@ -218,7 +218,7 @@ def _description(made: Design) -> Report:
             limit_nm, above = model_distance(made)
             facts += [
                 ("least residual of any linear controller", limit_nm, unit),
-                (f"{error} above it", round(above, 6), "%"),
+                (f"{error} above it", round(above, 6) + 0.0, "%"),
             ]
             data |= {"limit_nm": limit_nm, "above_limit_percent": above}
     if isinstance(made, PolytopicDesign):

@@ -169,7 +169,7 @@ def _exact(loop: ClosedLoop, config: Config, truth: Truth) -> dict[str, float | 
     limit_nm = limit_or_nan(lambda: least_residual(config.hardware, truth))
     values = (
         strehl(budget, config.imaging), budget.rms_nm, budget.turbulence_nm, budget.vibration_nm,
-        budget.noise_nm, limit_nm, above_percent(budget.rms_nm, limit_nm),
+        budget.noise_nm, limit_nm, round(above_percent(budget.rms_nm, limit_nm), 6) + 0.0,
     )  # fmt: skip
     return dict(zip(names, values, strict=True))
 

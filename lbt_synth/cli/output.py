@@ -90,7 +90,7 @@ def cell(value: Any) -> str:
 
 def fixed(value: float, digits: int) -> str:
     """Return a number with a fixed count of decimals, a dash where there is none."""
-    return "-" if np.isnan(value) else f"{value:.{digits}f}"
+    return "-" if np.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def plain(value: Any) -> Any:

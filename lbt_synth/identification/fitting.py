@@ -213,7 +213,9 @@ class _Search:
         data = self.data
         f, d, weight = smooth_background(data.power(gain), data.frequency_hz, data.count)
         zero = np.zeros_like(f)
-        smooth = replace(data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight)
+        smooth = replace(
+            data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight
+        )
         white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
         total = float(np.sum(np.diff(f) * (d[1:] + d[:-1]) / 2))
         slow = max(total - white, 0.1 * white)
@@ -223,8 +225,12 @@ class _Search:
         for corner in (0.5, 5.0):
             theta = np.array(
                 [
-                    np.log(gain), np.log(white), np.log(50.0 * self.angle),
-                    np.log(corner * self.angle), np.log(0.5), np.log(slow),
+                    np.log(gain),
+                    np.log(white),
+                    np.log(50.0 * self.angle),
+                    np.log(corner * self.angle),
+                    np.log(0.5),
+                    np.log(slow),
                 ]
             )
             free = np.ones(theta.size, dtype=bool)
@@ -255,7 +261,8 @@ class _Search:
                 width = max(error, self.step)
                 known = (float(np.log(f * self.angle)), max(error, 0.1 * self.step) / f)
                 near = [
-                    i for i, p in enumerate(parts)
+                    i
+                    for i, p in enumerate(parts)
                     if p.line and abs(np.exp(self._at(theta, i)[0]) / self.angle - f) < 3 * width
                 ]
                 if near:
@@ -310,7 +317,11 @@ class _Search:
             less = self.fitted(theta, current.parts)
         except NumericalError:
             return current
-        return less if less.fitted.contrast - current.fitted.contrast < self.need / PARAMETERS else current
+        return (
+            less
+            if less.fitted.contrast - current.fitted.contrast < self.need / PARAMETERS
+            else current
+        )
 
     def moved(self, current: Grown) -> Grown | None:
         """Return the model with a line begun anew, or split in two; None if none is better."""
@@ -336,7 +347,9 @@ class _Search:
                 )
                 trials.append((anew, current.parts))
             if half > 3 * self.step:
-                pair = theta[at : at + 3] + np.log([[1 - half / centre, 0.5, 0.5], [1 + half / centre, 0.5, 0.5]])
+                pair = theta[at : at + 3] + np.log(
+                    [[1 - half / centre, 0.5, 0.5], [1 + half / centre, 0.5, 0.5]]
+                )
                 split = np.concatenate([theta, pair[1]])
                 split[at : at + 3] = pair[0]
                 trials.append((split, (*current.parts, Part(line=True))))
@@ -431,6 +444,8 @@ class _Search:
                 continue
             centre, half_width = self._place(theta, i)
             away = np.maximum(np.abs(f - centre) - 10 * self.step, 0)
-            np.minimum(size, np.maximum(self.step, 0.1 * np.maximum(half_width, 2 * away)), out=size)
+            np.minimum(
+                size, np.maximum(self.step, 0.1 * np.maximum(half_width, 2 * away)), out=size
+            )
         place = np.floor(np.cumsum(self.step / size) - 1e-9)
         return np.flatnonzero(np.concatenate([[True], np.diff(place) > 0]))

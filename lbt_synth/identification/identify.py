@@ -396,9 +396,7 @@ def _described(
     )
 
 
-def _turbulence_fit(
-    theta: FloatArray, covariance: FloatArray, rate: float
-) -> IdentifiedTurbulence:
+def _turbulence_fit(theta: FloatArray, covariance: FloatArray, rate: float) -> IdentifiedTurbulence:
     """Parameters of the turbulence; the error of its rms by differences."""
     error = np.sqrt(np.maximum(np.diag(covariance), 0))
     slope = np.zeros(theta.size)

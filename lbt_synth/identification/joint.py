@@ -162,7 +162,9 @@ def _pooled(
     weight = 1 / error**2
     mean = float(np.sum(weight * log) / np.sum(weight))
     if np.any(np.abs(log - mean) > _APART * error):
-        values = ", ".join(f"{np.exp(v):.3f} +- {np.exp(v) * e:.3f}" for v, e in zip(log, error, strict=True))
+        values = ", ".join(
+            f"{np.exp(v):.3f} +- {np.exp(v) * e:.3f}" for v, e in zip(log, error, strict=True)
+        )
         return axes, f"the axes have different sensor gains: {values}"
     gain = float(np.exp(mean))
     spread = gain / float(np.sqrt(np.sum(weight)))
@@ -171,8 +173,11 @@ def _pooled(
             one(i, gain, axis),
             sensor_gain_error=spread,
             sensor_gain_note=(
-                "mean of the axes" if len(told) == len(axes) else
-                "found in the closed loop's data" if i in told else "that of the other axis"
+                "mean of the axes"
+                if len(told) == len(axes)
+                else "found in the closed loop's data"
+                if i in told
+                else "that of the other axis"
             ),
         )
         for i, axis in enumerate(axes)

@@ -153,7 +153,9 @@ def _segment_length(lengths: list[int]) -> int:
     used = [sum(length // c * c for length in lengths) for c in candidates]
     most = max(used)
     # a tenth of the data is a fair price for a resolution twice as fine
-    worth = [u / most + 0.1 * np.log2(c / LONGEST_SEGMENT) for u, c in zip(used, candidates, strict=True)]
+    worth = [
+        u / most + 0.1 * np.log2(c / LONGEST_SEGMENT) for u, c in zip(used, candidates, strict=True)
+    ]
     return candidates[int(np.argmax(worth))]
 
 

@@ -127,7 +127,9 @@ def shape_of(
     )
 
 
-def smooth_background(power: FloatArray, frequency_hz: FloatArray, count: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def smooth_background(
+    power: FloatArray, frequency_hz: FloatArray, count: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Medians of a density over bands of equal ratio: a background without its lines.
 
     Returns
@@ -138,9 +140,7 @@ def smooth_background(power: FloatArray, frequency_hz: FloatArray, count: FloatA
     from scipy.special import gammaincinv
 
     low, high = frequency_hz[0], frequency_hz[-1]
-    edges = np.unique(
-        np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80))
-    )
+    edges = np.unique(np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80)))
     edges = np.append(edges[np.concatenate([[True], np.diff(edges) >= 1])], frequency_hz.size)
     edges = np.unique(edges)
     shape = max(float(np.median(count)), 0.5)

@@ -213,7 +213,12 @@ def fit(
         jac=lambda x: at(x)[1],
         hess=lambda x: at(x)[2],
         method="trust-exact",
-        options={"maxiter": steps, "gtol": 1e-3, "initial_trust_radius": 1.0, "max_trust_radius": 8.0},
+        options={
+            "maxiter": steps,
+            "gtol": 1e-3,
+            "initial_trust_radius": 1.0,
+            "max_trust_radius": 8.0,
+        },
     )
     theta[moves] = found.x
     _, gradient, reduced = at(found.x)
@@ -227,6 +232,8 @@ def fit(
     information = np.zeros((start.size, start.size))
     information[np.ix_(moves, moves)] = reduced
     return Fitted(
-        parameters=theta, contrast=likelihood.contrast(theta), information=information,
+        parameters=theta,
+        contrast=likelihood.contrast(theta),
+        information=information,
         left=left,
     )
