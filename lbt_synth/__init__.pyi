@@ -169,6 +169,7 @@ from .telemetry import save_telemetry as save_telemetry
 from .telemetry import telemetry_of as telemetry_of
 from .tracking import Identifier as Identifier
 from .tracking import LineFollower as LineFollower
+from .tracking import LoopIdentifier as LoopIdentifier
 from .tracking import SwitchedController as SwitchedController
 from .tracking import SwitchReport as SwitchReport
 from .tracking import TrackingController as TrackingController
