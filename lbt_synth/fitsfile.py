@@ -8,6 +8,20 @@ from typing import Any
 
 import numpy as np
 
+_CARD, _HEADER = 80, 2880 * 36
+
+
+def has_card(content: bytes, keyword: str) -> bool:
+    """Whether the first header of a FITS file has a card of that keyword."""
+    mark = keyword.ljust(8).encode() + b"="
+    for start in range(0, min(len(content), _HEADER), _CARD):
+        card = content[start : start + _CARD]
+        if card.startswith(mark):
+            return True
+        if card.startswith(b"END "):
+            return False
+    return False
+
 
 def fits_bytes(
     cards: Mapping[str, Any],

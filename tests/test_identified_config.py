@@ -180,6 +180,16 @@ def test_models_that_no_configuration_can_hold(model, options, text):
         lbt.identified_config(model, **options)
 
 
+def test_the_smallest_file_of_the_documentation(tmp_path):
+    page = (ROOT / "docs" / "configuration.md").read_text()
+    path = tmp_path / "page.yaml"
+    path.write_text(page.split("```yaml\n")[1].split("```")[0])
+    config = lbt.load_config(path)
+    design = lbt.kalman(config.plant)
+    loop = lbt.close_loop(config.hardware, design.controller)
+    assert lbt.residual_budget(loop, config.truth).rms_nm == pytest.approx(design.rms, rel=1e-8)
+
+
 # --- the writer
 
 
@@ -336,6 +346,11 @@ def test_commands_that_need_more_say_so(tmp_path, capsys):
     config = saved(tmp_path, TWO)
     error = run(capsys, "modal", config, "--modes", "20", "-o", tmp_path / "m.png", expect=2)
     assert "the key atmosphere is missing" in error
+    uneven = lbt.load_config(ROOT / "examples" / "lbt.yaml").settings.model_dump(exclude_unset=True)
+    uneven["sensor"] = {"noise_nm": [15.5, 9.0]}
+    lbt.save_config(tmp_path / "u.yaml", FileSection.model_validate(uneven))
+    error = run(capsys, "modal", tmp_path / "u.yaml", "-o", tmp_path / "m.png", expect=2)
+    assert "sensor.noise_nm must be one number for hundreds of modes" in error
     error = run(capsys, "mirror", config, "-o", tmp_path / "m.png", expect=2)
     assert "mirror.local_loop is missing" in error
     error = run(capsys, "design", config, "--method", "robust", "-o", tmp_path / "m.fits", expect=2)

@@ -54,9 +54,14 @@ def test_public_fields_say_which_gain_they_are(name):
 @pytest.mark.parametrize(
     "page",
     [
-        "README.md", "docs/tutorial.md", "docs/robustness.md", "docs/mirror.md", "docs/modal.md",
+        "README.md",
+        "docs/tutorial.md",
+        "docs/robustness.md",
+        "docs/mirror.md",
+        "docs/modal.md",
+        "docs/replay.md",
         "docs/tracking.md",
-    ],  # fmt: skip
+    ],
 )
 def test_examples_on_pages_run(page, monkeypatch):
     monkeypatch.chdir(ROOT)

@@ -2,7 +2,12 @@
 
 from lbt_synth.design.central import central
 from lbt_synth.design.hinf import hinf
-from lbt_synth.design.integrator import integrator, integrator_gain_limit, optimal_integrator
+from lbt_synth.design.integrator import (
+    integrator,
+    integrator_gain_limit,
+    model_integrator,
+    optimal_integrator,
+)
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.lqg import lqg
 from lbt_synth.design.lqg_result import LqgDesign
@@ -35,6 +40,7 @@ __all__ = [
     "kalman",
     "lqg",
     "mixed",
+    "model_integrator",
     "optimal_integrator",
     "polytopic",
     "robust",

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth.certify import certify_loop
 from lbt_synth.design.result import IntegratorDesign, SolverReport, loop_certificate
 from lbt_synth.errors import ProblemError, UnstableLoopError
-from lbt_synth.loop import close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.loop import (
+    ClosedLoop,
+    ResidualBudget,
+    close_loop,
+    model_budget,
+    residual_budget,
+    stable_sensor_gains,
+)
 from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.plant import TipTiltPlant
 from lbt_synth.models.truth import Truth
 from lbt_synth.statespace import Controller
-from lbt_synth.validation import frozen, number
+from lbt_synth.validation import frozen, instance, number
 
 _TRIALS = 32
 TRIED_GAINS = 1e-4, 0.999  # parts of the limit between which the best gain is looked for
@@ -147,21 +157,59 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     >>> 0.2 < design.gain < 0.6
     True
     """
-    limit = hardware_gain_limit(hardware) / max(1.0, truth.sensor_gain)
-
-    def variance(log_gain: float) -> float:
-        controller = _controller(hardware, float(np.exp(log_gain)))
-        loop = close_loop(hardware, controller, sensor_gain=truth.sensor_gain)
-        try:
-            return residual_budget(loop, truth).rms_nm ** 2
-        except UnstableLoopError:
-            return np.inf
-
     turbulence = truth.turbulence_groups(hardware.modes)
     if not turbulence and not truth.vibrations and not np.any(truth.noise_nm):
         raise ProblemError(
             "the truth must disturb the loop; got no turbulence, vibration or noise."
         )
+    return _least(hardware, lambda loop: residual_budget(loop, truth), truth.sensor_gain)
+
+
+def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
+    """Integrator whose gain leaves the least residual where a plant's model is the truth.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        Turbulence of each mode, vibrations, noise and loop.
+
+    Returns
+    -------
+    IntegratorDesign
+        Certified design, as that of :func:`optimal_integrator`.
+
+    Raises
+    ------
+    CertificateError
+        If the design does not pass its checks.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0)
+    >>> truth = lbt.Truth(turbulence=slow, noise_nm=20.0)
+    >>> same = lbt.optimal_integrator(plant.hardware, truth)
+    >>> bool(abs(lbt.model_integrator(plant).gain / same.gain - 1) < 1e-6)
+    True
+    """
+    instance(plant, TipTiltPlant)
+    return _least(plant.hardware, lambda loop: model_budget(loop, plant), 1.0)
+
+
+def _least(
+    hardware: LoopHardware, budget: Callable[[ClosedLoop], ResidualBudget], sensor_gain: float
+) -> IntegratorDesign:
+    limit = hardware_gain_limit(hardware) / max(1.0, sensor_gain)
+
+    def variance(log_gain: float) -> float:
+        controller = _controller(hardware, float(np.exp(log_gain)))
+        try:
+            loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
+            return budget(loop).rms_nm ** 2
+        except UnstableLoopError:
+            return np.inf
+
     trials = np.log(np.geomspace(*TRIED_GAINS, _TRIALS) * limit)
     values = [variance(trial) for trial in trials]
     best = int(np.argmin(values))

@@ -22,7 +22,6 @@ from lbt_synth.identification.whittle import (
     CORNER,
     FIRST,
     GAIN,
-    NOISE,
     Fitted,
     Likelihood,
     Priors,
@@ -30,7 +29,7 @@ from lbt_synth.identification.whittle import (
     damping_ratio,
     fit,
 )
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, IntArray
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)
 _GAIN_PRIOR = (np.log(0.7), 1.0)
@@ -159,7 +158,7 @@ class _Search:
         self.free_gain = rules.gain is None and data.closed
 
     def asked(self, grown: Grown, i: int, *, earlier: bool = False) -> float:
-        """What a component must add to the logarithm of the likelihood.
+        """Return what a component must add to the logarithm of the likelihood.
 
         Less, where its place was not searched for: a line that was announced, or one of a pair
         (of those before it only, where ``earlier``).
@@ -435,8 +434,8 @@ class _Search:
                 centre[at], width[at] = np.log(self.angle), _SLOWEST
         return Priors(centre=centre, width=width)
 
-    def _groups(self, theta: FloatArray, parts: tuple[Part, ...]) -> FloatArray:
-        """Begin of groups of bins over which the model is nearly constant."""
+    def _groups(self, theta: FloatArray, parts: tuple[Part, ...]) -> IntArray:
+        """Return the begin of groups of bins over which the model is nearly constant."""
         f = self.data.frequency_hz
         size = np.maximum(self.step, np.minimum(0.02 * f, 3.0))
         for i, part in enumerate(parts):

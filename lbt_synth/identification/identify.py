@@ -140,7 +140,16 @@ def identify_axis(
             f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "
             f"longest has {longest}. Record more, or bridge short gaps."
         )
-    data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
+    if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
+        raise ProblemError("the measurement is constant: there is nothing to identify.")
+    with np.errstate(over="ignore", invalid="ignore"):
+        data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
+        power = data.power(1.0)
+    if not (np.all(np.isfinite(power)) and np.min(data.measured) > 0):
+        raise ProblemError(
+            "the spectrum of the series overflows or vanishes; got values up to "
+            f"{np.max(np.abs(y)):.6g} nm. Check the units."
+        )
     return identify_periodogram(
         data,
         sensor_gain=sensor_gain,
@@ -318,7 +327,7 @@ def _covariance(grown: Grown) -> FloatArray:
 
 
 def _turbulence(theta: FloatArray, rate: float) -> ARModel:
-    """The first component as a process of the phase."""
+    """Return the first component as a process of the phase."""
     w, damping = float(np.exp(theta[FIRST])), float(np.exp(theta[FIRST + 1]))
     a1, a2, drive = coefficients(w, damping)
     polynomial = np.array([1.0, -a1, -a2])

@@ -83,7 +83,7 @@ def identify(
     >>> loop = lbt.integrator(path, gain=0.4)
     >>> run = lbt.simulate(loop.controller, truth, hardware=path, frames=20_000)
     >>> record = lbt.loop_record(run.measurements[0], run.commands[0], frame_rate_hz=500,
-    ...                          delay_frames=2)
+    ...                          delay_frames=2, unit="nm")
     >>> found = lbt.identify(record)
     >>> [[round(line.frequency_hz) for line in axis.lines] for axis in found.axes]
     [[40], []]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, IntArray
 
 _TAPER = 0.1  # of a segment, both ends together
 LONGEST_SEGMENT = 1 << 16
@@ -58,7 +58,7 @@ class LoopPeriodogram:
         """Density of ``y + gain c`` [nm^2/Hz], (f,)."""
         return np.asarray(self.measured + gain * (2 * self.crossed + gain * self.corrected))
 
-    def merged(self, starts: FloatArray) -> LoopPeriodogram:
+    def merged(self, starts: IntArray) -> LoopPeriodogram:
         """Means over groups of neighbours that begin at these indices."""
         size = np.diff(np.append(starts, len(self.frequency_hz)))
 
@@ -117,7 +117,7 @@ def loop_periodogram(
     rows = np.array(starts)[:, None] + np.arange(length)[None, :]
     taper = _taper(length - 1)
     size = _fast(length - 1)
-    frequency = np.arange(1, (size + 1) // 2) * (frame_rate_hz / size)
+    frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
     scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
 
     def transform(series: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -81,14 +82,14 @@ def candidates(
     found.sort(reverse=True)
     out: list[Candidate] = []
     taken: list[tuple[int, int]] = []
-    for gain, start, stop in found:
+    for worth, start, stop in found:
         if len(out) == most:
             break
         reach = max(3, stop - start)
         if any(start < b + reach and stop > a - reach for a, b in taken):
             continue
         taken.append((start, stop))
-        out.append(shape_of(data, power, model, start, stop, gain))
+        out.append(shape_of(data, power, model, start, stop, worth))
     return out
 
 
@@ -146,7 +147,7 @@ def smooth_background(
     shape = max(float(np.median(count)), 0.5)
     to_mean = shape / float(gammaincinv(shape, 0.5))
     f, d, w = [], [], []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         f.append(float(np.mean(frequency_hz[a:b])))
         d.append(float(np.median(power[a:b])) * (to_mean if b - a > 2 else 1.0))
         w.append(float(np.sum(count[a:b])))

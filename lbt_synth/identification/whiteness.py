@@ -1,4 +1,4 @@
-"""Are the innovations of a fitted spectrum white?"""
+"""Tests whether the innovations of a fitted spectrum are white."""
 
 from __future__ import annotations
 

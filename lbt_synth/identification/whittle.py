@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -191,11 +192,11 @@ def fit(
     moves = np.flatnonzero(np.asarray(free))
     precision = 1 / np.asarray(priors.width) ** 2
     theta = start.copy()
-    last: dict[str, object] = {}
+    seen: dict[bytes, tuple[float, FloatArray, FloatArray]] = {}
 
     def at(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         key = x.tobytes()
-        if last.get("key") != key:
+        if key not in seen:
             full = theta.copy()
             full[moves] = np.clip(x, -_FARTHEST, _FARTHEST)
             value, gradient, information = likelihood.derivatives(full)
@@ -203,22 +204,23 @@ def fit(
             value += 0.5 * float(np.sum(precision * away**2))
             gradient = gradient + precision * away
             information = information + np.diag(precision)
-            last["key"] = key
-            last["found"] = (value, gradient[moves], information[np.ix_(moves, moves)])
-        return last["found"]  # type: ignore[return-value]
+            seen.clear()
+            seen[key] = value, gradient[moves], information[np.ix_(moves, moves)]
+        return seen[key]
 
-    found = minimize(
+    options: dict[str, Any] = {
+        "maxiter": steps,
+        "gtol": 1e-3,
+        "initial_trust_radius": 1.0,
+        "max_trust_radius": 8.0,
+    }
+    found = minimize(  # type: ignore[call-overload]
         lambda x: at(x)[0],
         start[moves],
         jac=lambda x: at(x)[1],
         hess=lambda x: at(x)[2],
         method="trust-exact",
-        options={
-            "maxiter": steps,
-            "gtol": 1e-3,
-            "initial_trust_radius": 1.0,
-            "max_trust_radius": 8.0,
-        },
+        options=options,
     )
     theta[moves] = found.x
     _, gradient, reduced = at(found.x)

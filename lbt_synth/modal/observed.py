@@ -19,7 +19,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.modal.gains import ModalGains, least_residuals
 from lbt_synth.modal.plants import per_mode_number
-from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.hardware import LoopHardware, past_corrections
 from lbt_synth.models.local_loop import PositionLoop
 from lbt_synth.validation import FloatArray, integer, real_array
 
@@ -123,9 +123,7 @@ def modal_gains_from_telemetry(
             f"the series must be longer than a segment, {segment} frames and {first} of delay and "
             f"mirror; got {frames}. Record more, or shorten segment_frames."
         )
-    open_loop = y[:, first:] / gain[:, None]
-    for i, tap in enumerate(taps):
-        open_loop = open_loop + tap * u[:, first - 1 - i : frames - 1 - i]
+    open_loop = y[:, first:] / gain[:, None] + past_corrections(taps, u.T)[first:].T
     frequency, power = welch(
         np.diff(open_loop, axis=1), fs=rate, nperseg=segment, axis=1, detrend=False
     )

@@ -158,3 +158,28 @@ def same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
     if one.mirror is None or other.mirror is None:
         return one.mirror is other.mirror
     return astuple(one.mirror) == astuple(other.mirror)
+
+
+def past_corrections(taps: FloatArray, commands: FloatArray) -> FloatArray:
+    """Return ``c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...``, which measurement k sees.
+
+    Commands before the first row count as zero: the first ``len(taps)`` rows are not known.
+
+    Parameters
+    ----------
+    taps : (t,) ndarray
+        Weights of the commands, as in :attr:`LoopHardware.mirror_taps`.
+    commands : (frames, m) ndarray
+        Commands u(k), a row a frame.
+
+    Returns
+    -------
+    (frames, m) ndarray
+        The corrections.
+    """
+    frames = len(commands)
+    out = np.zeros(commands.shape)
+    for i in np.flatnonzero(taps):
+        if i + 1 < frames:
+            out[i + 1 :] += taps[i] * commands[: frames - 1 - i]
+    return out

@@ -8,6 +8,7 @@ from lbt_synth.plotting.figures import (
     simulation_figure,
 )
 from lbt_synth.plotting.front import tradeoff_figure
+from lbt_synth.plotting.identification import identification_figure as identification_figure
 from lbt_synth.plotting.limits import limits_figure
 from lbt_synth.plotting.mirror import mirror_figure
 from lbt_synth.plotting.modal import modal_figure

@@ -20,14 +20,13 @@ import numpy.typing as npt
 
 from lbt_synth.archive import reason
 from lbt_synth.errors import OutputError, TelemetryError
+from lbt_synth.fitsfile import has_card
 from lbt_synth.models import PositionLoop
 from lbt_synth.telemetry.filters import TimeFilters, integrator_gains, time_filters
 from lbt_synth.telemetry.layout import with_same_taps
 from lbt_synth.telemetry.record import Telemetry
 from lbt_synth.validation import FloatArray
 
-_MARK = b"AOT-VERS="
-_CARD = 80
 _CARD_OF_OURS = "LBTSYNTH"  # one card with what the standard has no field for, JSON
 _IN_OURS = ("seed", "name", "controller_name", "controller_digest", "metadata")
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
@@ -39,13 +38,7 @@ _INSTALL = 'it needs aotpy: pip install "lbt-synth[aot]"'
 
 def is_aot(content: bytes) -> bool:
     """Whether the first header of a FITS file says that it is of the standard."""
-    for start in range(0, min(len(content), 2880 * 36), _CARD):
-        card = content[start : start + _CARD]
-        if card.startswith(_MARK):
-            return True
-        if card.startswith(b"END "):
-            return False
-    return False
+    return has_card(content, "AOT-VERS")
 
 
 def losses(telemetry: Telemetry) -> tuple[str, ...]:

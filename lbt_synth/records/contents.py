@@ -1,0 +1,190 @@
+"""Files of recorded series: FITS, NPY, NPZ and CSV as named columns and facts."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lbt_synth.archive import reason
+from lbt_synth.errors import TelemetryError
+from lbt_synth.records.columns import Column, column, fact_of, indexed
+from lbt_synth.records.csvfile import read_csv
+from lbt_synth.validation import FloatArray
+
+FITS = (".fits", ".fit", ".fts")
+TEXTS = (".csv", ".tsv", ".txt", ".dat")
+ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
+_DELAY_CARD = "DELAY"
+
+
+@dataclass(slots=True, eq=False)
+class Contents:
+    """What a file holds.
+
+    Attributes
+    ----------
+    columns : list of Column
+        The series, in their order.
+    facts : dict
+        Frame rate, delay and the like, each with the places that tell it.
+    notes : list of str
+        What was taken for what.
+    """
+
+    columns: list[Column] = field(default_factory=list)
+    facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def tell(self, fact: str, value: Any, where: str) -> None:
+        """Add what a place of the file says."""
+        self.facts.setdefault(fact, {})[where] = value
+
+    def add(self, name: str, values: npt.NDArray[Any], unit: str | None = None) -> None:
+        """Add an array; one that is no series of one or several columns is passed over."""
+        if values.dtype.kind not in "fiub" or values.size == 0:
+            self.notes.append(f"{name or 'an array'} holds no real numbers and was left out")
+            return
+        table = np.squeeze(values) if values.size > 1 else values.reshape(1)
+        if table.ndim not in (1, 2):
+            self.notes.append(f"{name or 'an array'} has {table.ndim} dimensions; it was left out")
+            return
+        numbers: FloatArray = np.asarray(table, dtype=np.float64)
+        if numbers.ndim == 1:
+            numbers = numbers[:, None]
+        elif numbers.shape[1] > numbers.shape[0]:
+            numbers = numbers.T
+            said = f"{name or 'the array'} {values.shape}: its longer side was taken for the frames"
+            self.notes.append(said)
+        self.columns += indexed(name, numbers, unit=unit)
+
+
+def read_contents(path: Path, content: bytes) -> Contents:
+    """Read a file of a known ending.
+
+    Raises
+    ------
+    TelemetryError
+        If it is none of these, or damaged.
+    """
+    ending = path.suffix.lower()
+    try:
+        if ending in FITS:
+            return _fits(content)
+        if ending == ".npy":
+            return _npy(content)
+        if ending == ".npz":
+            return _npz(content)
+        return _text(content)
+    except TelemetryError as error:
+        raise TelemetryError(f"{path}: {error}", path=path) from error
+    except Exception as error:  # foreign bytes: the decoders raise whatever they like
+        raise TelemetryError(
+            f"cannot read {path} as {ending}: {reason(error)}.", path=path
+        ) from error
+
+
+def _fits(content: bytes) -> Contents:
+    from astropy.io import fits
+
+    out = Contents()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # foreign headers deviate in many small ways
+        with fits.open(io.BytesIO(content), memmap=False) as units:
+            for place, unit in enumerate(units):
+                name = unit.name if unit.name and unit.name != "PRIMARY" else ""
+                where = name or f"HDU {place}"
+                for card in unit.header.cards:
+                    _tell_card(out, card, where)
+                if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
+                    _table(out, unit)
+                elif unit.is_image and unit.data is not None:
+                    own = unit.header.get("BUNIT")
+                    out.add(name, _native(unit.data), str(own) if own is not None else None)
+    return out
+
+
+def _tell_card(out: Contents, card: Any, where: str) -> None:
+    keyword = str(card.keyword)
+    fact = fact_of(keyword)
+    if keyword == _DELAY_CARD and "frame" in str(card.comment).lower():
+        fact = "delay_frames"
+    if fact is not None and fact != "unit" and not isinstance(card.value, bool | str):
+        out.tell(fact, card.value, f"{keyword} of {where}")
+
+
+def _table(out: Contents, unit: Any) -> None:
+    for described in unit.columns:
+        out.add(described.name, _native(np.asarray(unit.data[described.name])), described.unit)
+
+
+def _native(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return data.astype(data.dtype.newbyteorder("="))
+
+
+def _npy(content: bytes) -> Contents:
+    out = Contents()
+    _named(out, "", _plain(np.load(io.BytesIO(content), allow_pickle=False)))
+    return out
+
+
+def _npz(content: bytes) -> Contents:
+    out = Contents()
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        for name in archive.files:
+            _named(out, name, _plain(archive[name]))
+    return out
+
+
+def _plain(array: Any) -> npt.NDArray[Any]:
+    return np.asarray(array)
+
+
+def _named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
+    """Add an array, a field of a structured one each, or a number or text as a fact."""
+    if array.dtype.names:
+        for each in array.dtype.names:
+            out.add(each, array[each])
+        return
+    if array.size == 1 and (array.ndim == 0 or array.dtype.kind in "US"):
+        fact = fact_of(name)
+        if fact is not None:
+            value = array.reshape(-1)[0]
+            text = array.dtype.kind in "US"
+            out.tell(fact, str(value) if text else float(value), name)
+        return
+    out.add(name, array)
+
+
+def _text(content: bytes) -> Contents:
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise TelemetryError("it is no text in UTF-8.") from error
+    table = read_csv(text)
+    out = Contents(notes=list(table.notes))
+    out.columns = [column(n, v) for n, v in zip(table.names, table.values.T, strict=True)]
+    _tell_comments(out, table.comments)
+    return out
+
+
+def _tell_comments(out: Contents, comments: Iterable[str]) -> None:
+    """Read lines such as ``# frame_rate_hz = 1000``."""
+    for line in comments:
+        match = re.match(r"^\s*([A-Za-z][\w .\-]*?)\s*[:=]\s*(\S+)\s*$", line)
+        if match is None or (fact := fact_of(match[1])) is None:
+            continue
+        value: Any = match[2]
+        if fact != "unit":
+            try:
+                value = float(value)
+            except ValueError:
+                continue
+        out.tell(fact, value, f"the comment {match[1].strip()}")

@@ -1,0 +1,181 @@
+"""Faults of one recorded series: stuck, saturated, outlying values.
+
+Each finder takes a series (frames,) and the frames that count so far, and returns the
+frames that are at fault. Nothing is known of the sensor, so thresholds come from the series:
+a clean record, with or without strong narrow lines, quantised or not, shows none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.validation import BoolArray, FloatArray, IntArray
+
+_SHORTEST_RUN = 5  # equal values, a stuck sensor
+_RARE = 1e-3  # runs of chance allowed in a record
+_QUANTISED = 2**20  # levels at most, where equal neighbours say little
+_MANY_RUNS = 100  # that a chance is computed from
+_SAME_LEVEL = 1e-9  # of the range
+_LEAST_AT_LIMIT = 4  # values at an end of the range
+_LIMIT_RATIO = 4  # over the next values inside
+_LEVELS = 3
+_OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
+_MAD = 1.482602218505602  # standard deviation of a normal law over its median deviation
+_BLOCK = 256  # frames of a local scale
+_PASSES = 6
+
+
+def runs(flags: BoolArray) -> IntArray:
+    """Return (start, stop) of each stretch of True, (r, 2)."""
+    edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
+    return np.column_stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)])
+
+
+def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
+    """Return (start, stop) of each run of one value, single values included, (r, 2)."""
+    same = (series[1:] == series[:-1]) & good[1:] & good[:-1]
+    starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
+    stops = np.concatenate([starts[1:], [len(series)]])
+    return np.asarray(np.column_stack([starts, stops])[good[starts]], dtype=np.int64)
+
+
+def stuck(series: FloatArray, good: BoolArray) -> BoolArray:
+    """Frames of a value that is held for longer than chance or quantisation hold it."""
+    out = np.zeros(len(series), dtype=np.bool_)
+    if not good.any():
+        return out
+    each = equal_runs(series, good)
+    lengths = each[:, 1] - each[:, 0]
+    repeated = float(np.mean(lengths > 1))  # chance that a value is seen again
+    if _quantised(series[good]):
+        # a slow series stays on a level longer than the mean run tells: the largest such chance
+        longer = np.cumsum(np.bincount(lengths)[::-1])[::-1]  # runs of at least that length
+        many = longer[1:] >= _MANY_RUNS
+        chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
+        repeated = max(repeated, float(np.max(chances, initial=0.0)))
+    if repeated >= 1:
+        least = np.inf if len(lengths) > 1 else 0.0
+    elif repeated > 0:
+        least = 1 + np.log(_RARE / len(series)) / np.log(repeated)
+    else:
+        least = 0.0
+    for start, stop in each[lengths >= max(least, _SHORTEST_RUN)]:
+        out[start:stop] = True
+    return out
+
+
+def _quantised(values: FloatArray) -> bool:
+    """Whether all values are whole multiples of a step that is not tiny."""
+    steps = np.abs(np.diff(values))
+    steps = steps[steps > 0]
+    if steps.size == 0:
+        return False
+    step = float(steps.min())
+    if float(np.ptp(values)) > _QUANTISED * step:
+        return False
+    counts = steps / step
+    return bool(np.all(np.abs(counts - np.round(counts)) < 1e-3))
+
+
+def saturated(series: FloatArray, good: BoolArray) -> BoolArray:
+    """Frames at an end of the range that is reached far more often than what is next to it.
+
+    The end of a sinusoid's range is reached often, too, but not by a factor of 4 more often
+    than the next values; an end that is cut off is.
+    """
+    out = np.zeros(len(series), dtype=np.bool_)
+    values = series[good]
+    if values.size <= _LEAST_AT_LIMIT:
+        return out
+    span = float(np.ptp(values))
+    if span == 0:
+        return out
+    tolerance = _SAME_LEVEL * span
+    for sign in (1.0, -1.0):
+        end = float(np.max(sign * values))
+        near = np.sort(sign * values[sign * values > end - 0.25 * span])[::-1]
+        ends = np.flatnonzero(-np.diff(near) > tolerance) + 1  # where a next level begins
+        counts = np.diff(np.concatenate([[0], ends, [near.size]]))[: _LEVELS + 1]
+        inside = int(np.max(counts[1:], initial=1))
+        if counts[0] >= max(_LEAST_AT_LIMIT, _LIMIT_RATIO * inside):
+            out |= good & (sign * series >= end - tolerance)
+    return out
+
+
+def outliers(series: FloatArray, good: BoolArray) -> BoolArray:
+    """Frames whose second difference is beyond what the series around shows.
+
+    The scale is the median deviation of the second differences, that of the whole record or
+    of the 256 frames around, whichever is larger: a burst of vibration is no outlier, and one
+    value cannot raise the median. A strong sinusoid stays below 1.4 of its own scale.
+    """
+    good = good.copy()
+    out = np.zeros(len(series), dtype=np.bool_)
+    smallest = _resolution(series, good)
+    for _ in range(_PASSES):
+        bend, valid = _second_difference(series, good)
+        if not valid.any():
+            break
+        size = np.abs(bend)
+        scale = np.maximum(_local_scale(size, valid), smallest)
+        beside = np.maximum(np.append(size[1:], 0.0), np.concatenate([[0.0], size[:-1]]))
+        found = good & (size > _OUTLIER * scale) & (size >= 0.9 * beside)
+        if not found.any():
+            break
+        out |= found
+        good &= ~found
+    if out.any():  # frames between outliers that are too few to be judged
+        beside = np.append(out[1:], False) | np.append(False, out[:-1])
+        for start, stop in runs(good):
+            if stop - start < 3 and beside[start:stop].any():
+                out[start:stop] = True
+    return out
+
+
+def _resolution(series: FloatArray, good: BoolArray) -> float:
+    steps = np.abs(np.diff(series))[good[1:] & good[:-1]]
+    steps = steps[steps > 0]
+    return float(steps.min()) / 2 if steps.size else 0.0
+
+
+def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Second differences; a good frame at an edge has that of its neighbour."""
+    bend = np.zeros(len(series))
+    valid = np.zeros(len(series), dtype=np.bool_)
+    if len(series) < 3:
+        return bend, valid
+    valid[1:-1] = good[:-2] & good[1:-1] & good[2:]
+    inner = series[:-2] - 2 * series[1:-1] + series[2:]
+    bend[1:-1] = np.where(valid[1:-1], inner, 0.0)
+    full = bend.copy()
+    edge = good & ~valid
+    right = np.flatnonzero(edge[:-1] & valid[1:])
+    full[right] = bend[right + 1]
+    left = np.flatnonzero(edge[1:] & valid[:-1]) + 1
+    full[left] = np.where(np.abs(full[left]) > np.abs(bend[left - 1]), full[left], bend[left - 1])
+    return full, valid
+
+
+def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
+    """Scale of the second difference at each frame, never below that of the record."""
+    frames = len(size)
+    whole = _MAD * float(np.median(size[valid]))
+    blocks = -(-frames // _BLOCK)
+    padded = np.full(blocks * _BLOCK, np.nan)
+    padded[:frames] = np.where(valid, size, np.nan)
+    table = padded.reshape(blocks, _BLOCK)
+    enough = np.sum(np.isfinite(table), axis=1) >= _BLOCK // 4
+    local = np.full(blocks, whole)
+    if enough.any():
+        local[enough] = np.maximum(whole, _MAD * np.nanmedian(table[enough], axis=1))
+    wide = np.maximum(local, np.maximum(np.append(local[1:], 0), np.append(0, local[:-1])))
+    return np.asarray(np.repeat(wide, _BLOCK)[:frames])
+
+
+def fill(series: FloatArray, good: BoolArray) -> FloatArray:
+    """Return the series with finite fillers, by linear interpolation, where it is not good."""
+    out = np.where(good, series, 0.0)
+    if good.any() and not good.all():
+        frames = np.arange(len(series))
+        out[~good] = np.interp(frames[~good], frames[good], series[good])
+    return out

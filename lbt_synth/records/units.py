@@ -1,0 +1,89 @@
+"""Units of recorded tip and tilt, and what makes nanometres of wavefront of them."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.models import nm_per_mas
+from lbt_synth.validation import choice
+
+_NM = {"nm": 1.0, "um": 1e3, "m": 1e9}
+_MAS = {
+    "mas": 1.0,
+    "arcsec": 1e3,
+    "urad": math.degrees(1e-6) * 3600e3,
+    "rad": math.degrees(1.0) * 3600e3,
+}
+UNITS = (*_NM, *_MAS)
+_ALIASES = {
+    "nanometer": "nm", "nanometre": "nm", "micron": "um", "micrometer": "um", "micrometre": "um",
+    "µm": "um", "μm": "um", "meter": "m", "metre": "m", "µrad": "urad", "μrad": "urad",
+    "microrad": "urad", "radian": "rad", "arcsecond": "arcsec", "asec": "arcsec", '"': "arcsec",
+    "milliarcsec": "mas", "milliarcsecond": "mas",
+}  # fmt: skip
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": 1e-3}
+_SQUARED = re.compile(r"^(?P<unit>.+?)(?:\^2|\*\*2|²|2)\s*(?:/|_|\s|per)\s*hz$", re.IGNORECASE)
+_ROOT = re.compile(
+    r"^(?P<unit>.+?)\s*(?:/|_|per)\s*(?:sqrt\(?hz\)?|rthz|√hz|hz\^?(?:0\.5|\(1/2\)))$",
+    re.IGNORECASE,
+)
+
+
+def unit_word(text: str) -> str | None:
+    """Return the name that this package has for a unit; None if it knows none such."""
+    word = text.strip()
+    lower = word.lower()
+    found = _ALIASES.get(lower) or _ALIASES.get(lower.removesuffix("s")) or lower
+    return found if found in UNITS else None
+
+
+def nm_per(unit: str, *, diameter_m: float | None = None) -> float:
+    """Return the nanometres of wavefront, rms over the pupil, of one unit.
+
+    Parameters
+    ----------
+    unit : str
+        nm, um or m of wavefront rms; mas, arcsec, urad or rad of tilt.
+    diameter_m : float, optional
+        Telescope diameter [m], for angles.
+
+    Returns
+    -------
+    float
+        The factor.
+
+    Raises
+    ------
+    ProblemError
+        If the unit is unknown, or an angle comes without a diameter.
+    """
+    word = unit_word(unit) if isinstance(unit, str) else None
+    if word is None:
+        choice(unit, "unit", UNITS)
+        raise AssertionError  # choice refuses
+    if word in _NM:
+        return _NM[word]
+    if diameter_m is None:
+        raise ProblemError(
+            f"angles of tilt ({word}) become nm of wavefront by the telescope's diameter; give "
+            "diameter_m."
+        )
+    return _MAS[word] * nm_per_mas(diameter_m)
+
+
+def density_unit(text: str) -> tuple[str, int] | None:
+    """Part a unit of a spectrum: the unit and the power that the density has of it.
+
+    Returns
+    -------
+    tuple of str and int, or None
+        2 for a power density (nm^2/Hz), 1 for an amplitude density (nm/sqrt(Hz)).
+    """
+    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
+        if match := pattern.match(text.strip()):
+            unit = unit_word(match["unit"])
+            return None if unit is None else (unit, power)
+    return None

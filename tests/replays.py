@@ -1,0 +1,66 @@
+"""Loops and records that the tests of replays share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+
+RATE = 800
+CAMERA = lbt.Imaging(diameter_m=8.22)
+SLOW = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
+SHELL = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5, bandwidth_hz=300)
+LINES = (
+    lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 0)),
+    lbt.Vibration(frequency_hz=33, damping=0.02, rms_nm=100, direction=(0, 1)),
+)
+
+
+def a_plant(*, delay=2.0, gain=1.0, mirror=None, sensor=None):
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=RATE,
+        turbulence=SLOW,
+        vibrations=LINES,
+        noise_nm=15.5,
+        delay_frames=delay,
+        sensor_gain=gain,
+        sensor_matrix=sensor,
+        mirror=mirror,
+    )
+
+
+def a_truth(gain=1.0, noise_nm=15.5):
+    return lbt.Truth(turbulence=SLOW, vibrations=LINES, noise_nm=noise_nm, sensor_gain=gain)
+
+
+def pseudo_open_loop(y, u, hardware, gain=1.0):
+    """Textbook: z(k) = y(k) / g + c[0] u(k-1) + c[1] u(k-2) + ..., from a loop at rest."""
+    z = y @ np.linalg.inv(gain * hardware.sensor).T
+    for i, tap in enumerate(hardware.mirror_taps):
+        z[1 + i :] += tap * u[: len(u) - 1 - i] @ hardware.influence.T
+    return z
+
+
+def a_series(model, frames, rng, more=4000):
+    from scipy.signal import lfilter
+
+    white = rng.standard_normal(frames + more)
+    return lfilter([model.driving_rms_nm], np.r_[1, -model.coefficients], white)[more:]
+
+
+TILTED = np.array([[1.0, 0.3], [-0.2, 0.8]])
+CASES = [
+    pytest.param(2.0, 1.0, None, None, id="delay 2"),
+    pytest.param(1.0, 0.6, None, None, id="delay 1"),
+    pytest.param(2.4, 0.5, None, None, id="fraction"),
+    pytest.param(3.0, 1.3, None, None, id="delay 3"),
+    pytest.param(2.0, 0.6, SHELL, None, id="moving mirror"),
+    pytest.param(2.25, 0.8, SHELL, TILTED, id="moving mirror, fraction, crossed sensor"),
+]
+
+GOOD = np.random.default_rng(0).standard_normal((2000, 2))
+SPOILT = np.where(np.arange(2000)[:, None] == 77, np.nan, GOOD)
+PATH = lbt.LoopHardware(frame_rate_hz=RATE)
+FLAT = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[1, 0], [1, 0]])
+STUCK = lbt.LoopHardware(frame_rate_hz=RATE, influence_matrix=[[1, 1], [1, 1]])

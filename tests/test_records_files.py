@@ -1,0 +1,499 @@
+"""Records from files of others: what names, headers and options tell, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import lbt_synth as lbt
+from lbt_synth.records.csvfile import read_csv
+
+RATE = 500.0
+
+
+@pytest.fixture
+def series():
+    rng = np.random.default_rng(0)
+    return 20 * rng.standard_normal((60, 2)), 20 * rng.standard_normal((60, 2))
+
+
+def write_csv(path, names, columns, *, sign=",", comments=()):
+    rows = [*(f"# {line}" for line in comments), sign.join(names)] if names else []
+    rows += [sign.join(repr(float(v)) for v in row) for row in np.column_stack(columns)]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def hdus(path, *units, **cards):
+    primary = fits.PrimaryHDU()
+    for key, value in cards.items():
+        primary.header[key] = value
+    fits.HDUList([primary, *units]).writeto(path)
+    return path
+
+
+def image(name, data, unit=None, **cards):
+    unit_hdu = fits.ImageHDU(np.asarray(data), name=name)
+    if unit:
+        unit_hdu.header["BUNIT"] = unit
+    for key, value in cards.items():
+        unit_hdu.header[key] = value
+    return unit_hdu
+
+
+# ---------------------------------------------------------- every format alike
+@pytest.mark.parametrize(
+    "kind",
+    ["csv", "tsv", "semicolon", "blanks", "fits images", "turned", "fits table", "npz", "npy"],
+)
+def test_every_format_gives_the_same_record(tmp_path, series, kind):
+    y, u = series
+    options = {"delay_frames": 2}
+    names = ["time_s", "y0_nm", "y1_nm", "u0_nm", "u1_nm"]
+    columns = [np.arange(60) / RATE, *y.T, *u.T]
+    if kind in ("csv", "tsv", "semicolon", "blanks"):
+        sign = {"csv": ",", "tsv": "\t", "semicolon": ";", "blanks": " "}[kind]
+        path = write_csv(tmp_path / "a.csv", names, columns, sign=sign)
+    elif kind in ("fits images", "turned"):
+        turn = (lambda a: a.T) if kind == "turned" else (lambda a: a)
+        path = hdus(
+            tmp_path / "a.fits",
+            image("RESIDUALS", turn(y), "nm"),
+            image("COMMANDS", turn(u).astype(">f8"), "nm"),
+            FRAMRATE=RATE,
+        )
+    elif kind == "fits table":
+        table = fits.BinTableHDU.from_columns(
+            [
+                fits.Column(name="TIME", format="D", array=columns[0], unit="s"),
+                fits.Column(name="Residuals", format="2D", array=y, unit="nm"),
+                fits.Column(name="Commands", format="2D", array=u, unit="nm"),
+            ]
+        )
+        path = hdus(tmp_path / "a.fits", table)
+    elif kind == "npz":
+        path = tmp_path / "a.npz"
+        np.savez(path, measurements=y, commands=u.T, frame_rate_hz=RATE, unit="nm")
+    else:
+        path = tmp_path / "a.npy"
+        np.save(path, np.hstack([y, u]))
+        options |= {
+            "unit": "nm",
+            "frame_rate_hz": RATE,
+            "columns": {"measurements": (0, 1), "commands": (2, 3)},
+        }
+    seen = lbt.load_record(path, **options)
+    assert isinstance(seen, lbt.LoopRecord)
+    assert np.array_equal(seen.measurements, y)
+    assert np.array_equal(seen.commands, u)
+    assert (seen.frame_rate_hz, seen.delay_frames, seen.source) == (RATE, 2.0, str(path))
+    assert np.flatnonzero(~seen.usable).tolist() == [0, 1]
+    text = " | ".join(seen.health.notes)
+    assert "measurements: " in text
+    assert "commands: " in text
+
+
+def test_telemetry_of_ours(tmp_path):
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.4)
+    truth = lbt.Truth(
+        turbulence=None, vibrations=(lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100),)
+    )
+    run = lbt.simulate(lbt.integrator(path, gain=0.2).controller, truth, hardware=path, frames=99)
+    for name in ("a.fits", "a.npz"):
+        file = lbt.save_telemetry(tmp_path / name, lbt.telemetry_of(run, path))
+        seen = lbt.load_record(file)
+        assert np.array_equal(seen.measurements, run.measurements[0])
+        assert np.array_equal(seen.mirror_taps, path.mirror_taps)
+        assert seen.source == str(file)
+        assert lbt.load_record(file, axes=[1]).axes == 1
+        for options, words in (
+            ({"frame_rate_hz": 801}, f"{name}: frame_rate_hz must be that of the telemetry, 800"),
+            ({"kind": "open_loop"}, "kind must be closed_loop"),
+            ({"columns": {"measurements": 0}}, "neither columns nor commands"),
+        ):
+            with pytest.raises(lbt.ProblemError, match=words):
+                lbt.load_record(file, **options)
+    damaged = bytearray((tmp_path / "a.fits").read_bytes())
+    damaged[12_000] ^= 1
+    (tmp_path / "b.fits").write_bytes(damaged)
+    with pytest.raises(lbt.TelemetryError, match=r"b\.fits"):
+        lbt.load_record(tmp_path / "b.fits")
+
+
+@pytest.mark.e2e
+def test_telemetry_of_the_standard(tmp_path):
+    rng = np.random.default_rng(0)
+    seen = lbt.Telemetry(
+        frame_rate_hz=800, delay_frames=2, commands=rng.standard_normal((50, 2)),
+        measurements=rng.standard_normal((50, 2)),
+    )  # fmt: skip
+    back = lbt.load_record(lbt.save_telemetry(tmp_path / "a.aot.fits", seen))
+    assert np.allclose(back.measurements, seen.measurements)
+    assert np.allclose(back.commands, seen.commands)
+    assert np.flatnonzero(~back.usable).tolist() == [0, 1]
+
+
+# --------------------------------------------------------------------- names
+@pytest.mark.parametrize(
+    ("names", "axes"),
+    [
+        (["y_nm"], 1),
+        (["Y [nm]"], 1),
+        (["Residual (nm)"], 1),
+        (["tip_nm", "tilt_nm"], 2),
+        (["tilt_nm", "tip_nm"], 2),
+        (["slopes_tip_nm", "slopes_tilt_nm"], 2),
+        (["residual_x_nm", "residual_y_nm"], 2),
+        (["measurement 1 [nm]", "measurement 2 [nm]"], 2),
+        (["y1_nm", "y0_nm"], 2),
+    ],
+)
+def test_names_of_measurements(tmp_path, series, names, axes):
+    y, u = series
+    commands = ["u_nm"] if axes == 1 else ["cmd_tip_nm", "cmd_tilt_nm"]
+    path = write_csv(tmp_path / "a.csv", [*names, *commands], [*y.T[:axes], *u.T[:axes]])
+    seen = lbt.load_record(path, frame_rate_hz=RATE)
+    order = [1, 0] if names[0] in ("tilt_nm", "y1_nm") else [0, 1][:axes]
+    assert np.array_equal(seen.measurements, y[:, order])
+    assert np.array_equal(seen.commands, u[:, :axes])
+
+
+@pytest.mark.parametrize(
+    ("names", "kind"),
+    [
+        (["pol_tip_nm", "pol_tilt_nm"], None),
+        (["open_loop_0_nm", "open_loop_1_nm"], None),
+        (["disturbance_x [nm]", "disturbance_y [nm]"], None),
+        (["y0_nm", "y1_nm"], "open_loop"),
+    ],
+)
+def test_open_loops(tmp_path, series, names, kind):
+    y, _ = series
+    path = write_csv(tmp_path / "a.csv", names, y.T)
+    seen = lbt.load_record(path, kind=kind, frame_rate_hz=RATE)
+    assert seen.commands is None
+    assert np.array_equal(seen.pseudo_open_loop(), y)
+    assert seen.usable.all()
+
+
+def test_measurements_alone_are_not_taken_for_an_open_loop(tmp_path, series):
+    path = write_csv(tmp_path / "a.csv", ["y0_nm", "y1_nm"], series[0].T)
+    with pytest.raises(lbt.ProblemError, match="Residuals of a closed loop need its commands"):
+        lbt.load_record(path, frame_rate_hz=RATE)
+
+
+def test_open_loop_and_commands(tmp_path, series):
+    y, u = series
+    path = write_csv(tmp_path / "a.csv", ["y_nm", "u_nm"], [y[:, 0], u[:, 0]])
+    seen = lbt.load_record(path, kind="open_loop", frame_rate_hz=RATE)
+    assert seen.commands is None
+    assert "commands were left out: the record is of an open loop" in seen.health.notes
+    both = write_csv(tmp_path / "b.csv", ["y_nm", "u_nm", "pol_nm"], [*y.T, u[:, 0]])
+    with pytest.raises(lbt.ProblemError, match="more than one record; say kind: open_loop or clos"):
+        lbt.load_record(both, frame_rate_hz=RATE)
+    assert lbt.load_record(both, kind="open_loop", frame_rate_hz=RATE).measurements[
+        :, 0
+    ] == pytest.approx(u[:, 0])
+
+
+def test_columns_are_chosen(tmp_path, series):
+    y, u = series
+    path = write_csv(
+        tmp_path / "a.csv", ["a", "b", "c", "d", "stamp"], [*y.T, *u.T, np.arange(60) / RATE]
+    )
+    choice = {"measurements": ["a", 1], "commands": ("C", "d"), "times": "stamp"}
+    seen = lbt.load_record(path, columns=choice, unit="mas", diameter_m=8, command_unit="nm")
+    assert np.allclose(seen.measurements, lbt.nm_per_mas(8) * y)
+    assert np.array_equal(seen.commands, u)
+    assert seen.frame_rate_hz == RATE
+    one = lbt.load_record(path, columns={"open_loop": "b"}, unit="nm", frame_rate_hz=RATE)
+    assert np.array_equal(one.measurements[:, 0], y[:, 1])
+    assert "not used: a, c, d, stamp" in one.health.notes
+
+
+def test_axes_of_many_columns(tmp_path):
+    y, u = np.random.default_rng(0).standard_normal((2, 60, 5))
+    path = tmp_path / "a.npz"
+    np.savez(path, y=y, u=u, fs=RATE)
+    with pytest.raises(lbt.ProblemError, match="5 columns of measurements; say which.*axes="):
+        lbt.load_record(path, unit="nm")
+    seen = lbt.load_record(path, unit="nm", axes=(3, 1))
+    assert np.array_equal(seen.measurements, y[:, [3, 1]])
+    assert np.array_equal(seen.commands, u[:, [3, 1]])
+    with pytest.raises(lbt.ProblemError, match="axes must be one or two different numbers below 5"):
+        lbt.load_record(path, unit="nm", axes=(0, 5))
+
+
+def test_commands_from_another_file(tmp_path, series):
+    y, u = series
+    np.save(tmp_path / "y.npy", y)
+    np.save(tmp_path / "u.npy", u)
+    seen = lbt.load_record(
+        tmp_path / "y.npy", commands=tmp_path / "u.npy", frame_rate_hz=RATE, unit="nm"
+    )
+    assert np.array_equal(seen.measurements, y)
+    assert np.array_equal(seen.commands, u)
+    assert f"commands are from {tmp_path / 'u.npy'}" in seen.health.notes
+    np.save(tmp_path / "v.npy", u[:-1])
+    with pytest.raises(lbt.TelemetryError, match="as many frames as the measurements; got 59, 60"):
+        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "v.npy", unit="nm")
+    with pytest.raises(lbt.TelemetryError, match="cannot read .*w.npy: No such file"):
+        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "w.npy", unit="nm")
+
+
+# --------------------------------------------------------------------- clocks
+def test_gaps_times_and_counters(tmp_path):
+    path = tmp_path / "a.csv"
+    rng = np.random.default_rng(0)
+    rows = ["frame,timestamp_ms,y_nm"]
+    for k in np.delete(np.arange(50), [7, 8]):
+        value = "" if k == 20 else "NaN" if k == 30 else f"{rng.standard_normal():.6f}"
+        rows.append(f"{100 + k},{2.0 * k},{value}")
+    path.write_text("\n".join(rows))
+    seen = lbt.load_record(path, kind="open_loop")
+    assert seen.frame_rate_hz == 500
+    assert np.flatnonzero(~seen.usable).tolist() == [7, 8, 20, 30]
+    assert [row[0] for row in seen.health.rows()] == ["missing", "not finite"]
+    with pytest.raises(lbt.ProblemError, match=r"a\.csv: frame_rate_hz must be that of the times"):
+        lbt.load_record(path, kind="open_loop", frame_rate_hz=800)
+
+
+@pytest.mark.parametrize(
+    "card", ["FRAMRATE", "FRAMERAT", "RATE_HZ", "LOOPFREQ", "FPS", "HIERARCH frame_rate_hz"]
+)
+def test_rates_in_headers(tmp_path, series, card):
+    path = hdus(tmp_path / "a.fits", image("POL", series[0], "nm", **{card: RATE}))
+    seen = lbt.load_record(path)
+    assert seen.frame_rate_hz == RATE
+    assert any(note.startswith("frame_rate_hz 500, by") for note in seen.health.notes)
+    with pytest.raises(lbt.ProblemError, match="frame_rate_hz must be that of the file, 500 by"):
+        lbt.load_record(path, frame_rate_hz=1000)
+
+
+def test_delays_and_diameters_in_headers(tmp_path, series):
+    y, u = series
+    path = hdus(
+        tmp_path / "a.fits", image("Y", y, "mas"), image("U", u, "mas"),
+        FRAMRATE=RATE, DELAY=(2.5, "[frames] of the loop"), DIAMETER=8.0, OBSTRUCT=0.11,
+    )  # fmt: skip
+    seen = lbt.load_record(path)
+    assert (seen.delay_frames, seen.diameter_m, seen.obstruction) == (2.5, 8.0, 0.11)
+    assert np.allclose(seen.measurements, lbt.nm_per_mas(8.0) * y)
+    other = lbt.load_record(path, delay_frames=3, diameter_m=8.4)
+    assert (other.delay_frames, other.diameter_m) == (3.0, 8.4)
+    assert any("3 was given; the file has 2.5" in note for note in other.health.notes)
+    # a delay of unknown unit is not taken
+    unsure = hdus(tmp_path / "b.fits", image("Y", y, "nm"), image("U", u, "nm"), DELAY=0.002)
+    assert lbt.load_record(unsure, frame_rate_hz=RATE).delay_frames is None
+    twice = hdus(tmp_path / "c.fits", image("POL", y, "nm", FPS=400.0), FRAMRATE=RATE)
+    with pytest.raises(lbt.ProblemError, match="frame_rate_hz is told twice"):
+        lbt.load_record(twice)
+
+
+def test_facts_in_comments(tmp_path, series):
+    path = write_csv(
+        tmp_path / "a.csv",
+        ["y", "u"],
+        [series[0][:, 0], series[1][:, 0]],
+        comments=("frame_rate_hz = 500", "unit: um", "delay frames: 2", "by night"),
+    )
+    seen = lbt.load_record(path)
+    assert (seen.frame_rate_hz, seen.delay_frames) == (RATE, 2.0)
+    assert np.allclose(seen.measurements, 1e3 * series[0][:, :1])
+
+
+# ---------------------------------------------------------------------- units
+def test_units_have_to_be_told(tmp_path, series):
+    y, _ = series
+    path = write_csv(tmp_path / "a.csv", ["pol"], [y[:, 0]])
+    with pytest.raises(
+        lbt.ProblemError, match="does not tell the unit of the measurements; give u"
+    ):
+        lbt.load_record(path, frame_rate_hz=RATE)
+    assert lbt.load_record(path, frame_rate_hz=RATE, unit="um").measurements[0, 0] == pytest.approx(
+        1e3 * y[0, 0]
+    )
+    told = write_csv(tmp_path / "b.csv", ["pol_nm"], [y[:, 0]])
+    with pytest.raises(lbt.ProblemError, match="unit must be that of the file, 'nm'; got 'mas'"):
+        lbt.load_record(told, frame_rate_hz=RATE, unit="mas", diameter_m=8)
+    assert lbt.load_record(told, frame_rate_hz=RATE, unit="nanometer").axes == 1
+    mixed = write_csv(tmp_path / "c.csv", ["pol0_nm", "pol1_um"], y.T)
+    with pytest.raises(lbt.ProblemError, match="must all have the same unit; got nm, um"):
+        lbt.load_record(mixed, frame_rate_hz=RATE)
+    pixels = hdus(tmp_path / "d.fits", image("POL", y, "pixel"), FPS=RATE)
+    with pytest.raises(lbt.ProblemError, match="unit must be one of nm.*got 'pixel'"):
+        lbt.load_record(pixels)
+    angle = hdus(tmp_path / "e.fits", image("POL", y, "arcsec"), FPS=RATE)
+    with pytest.raises(lbt.ProblemError, match=r"e\.fits: angles of tilt.*give diameter_m"):
+        lbt.load_record(angle)
+
+
+# -------------------------------------------------------------------- spectra
+@pytest.mark.parametrize("form", ["csv", "fits", "array"])
+def test_spectra(tmp_path, form):
+    f = np.linspace(5, 100, 300)
+    s = 90 / (1 + ((f[:, None] - [20, 45]) / 2) ** 2)
+    options = {}
+    if form == "csv":
+        path = write_csv(
+            tmp_path / "a.csv", ["freq_hz", "psd_x [nm^2/Hz]", "psd_y [nm^2/Hz]"], [f, *s.T]
+        )
+    elif form == "fits":
+        path = hdus(tmp_path / "a.fits", image("FREQUENCY", f, "Hz"), image("PSD", s.T, "nm2/Hz"))
+    else:  # rows frequency, axis, axis: of no names at all
+        path = tmp_path / "a.fits"
+        fits.PrimaryHDU(np.vstack([f, s.T])).writeto(path)
+        options = {"kind": "spectrum", "unit": "nm**2/Hz"}
+    seen = lbt.load_record(path, averages=12, frame_rate_hz=RATE, **options)
+    assert isinstance(seen, lbt.SpectrumRecord)
+    assert np.array_equal(seen.frequency_hz, f)
+    assert np.allclose(seen.density_nm2_hz, s)
+    assert (seen.averages, seen.frame_rate_hz, seen.axes) == (12, RATE, 2)
+    # a Lorentzian's integral, arctan
+    exact = [90 * 2 * (np.arctan((100 - c) / 2) - np.arctan((5 - c) / 2)) for c in (20, 45)]
+    assert seen.rms_nm**2 == pytest.approx(exact, rel=1e-3)
+    assert seen.spectra[1].psd([45.0])[0] == pytest.approx(90, rel=0.02)
+
+
+def test_amplitude_spectra_and_angles(tmp_path):
+    f = np.linspace(1, 50, 40)
+    path = write_csv(tmp_path / "a.csv", ["f_hz", "asd_mas_rthz"], [f, 0 * f + 3])
+    seen = lbt.load_record(path, diameter_m=8.0)
+    assert np.allclose(seen.density_nm2_hz, (3 * lbt.nm_per_mas(8.0)) ** 2)
+    power = write_csv(tmp_path / "b.csv", ["f_hz", "psd"], [f, 0 * f + 3])
+    seen = lbt.load_record(power, unit="mas^2/Hz", diameter_m=8.0)
+    assert np.allclose(seen.density_nm2_hz, 3 * lbt.nm_per_mas(8.0) ** 2)
+    with pytest.raises(lbt.ProblemError, match="unit of a density is a square over Hz.*got 'nm'"):
+        lbt.load_record(power, unit="nm")
+    assert any(note.startswith("2 rows with gaps") for note in gapped(tmp_path).notes)
+    wrong = write_csv(tmp_path / "c.csv", ["f_hz", "asd_nm2_hz"], [f, f])
+    with pytest.raises(lbt.ProblemError, match="named as an amplitude"):
+        lbt.load_record(wrong)
+    back = write_csv(tmp_path / "d.csv", ["f_hz", "psd_nm2_hz"], [f[::-1], f])
+    with pytest.raises(lbt.ProblemError, match="must increase"):
+        lbt.load_record(back)
+    with pytest.raises(lbt.ProblemError, match="below half the frame rate, 30 Hz; got 50"):
+        lbt.load_record(
+            write_csv(tmp_path / "e.csv", ["f_hz", "psd_nm2_hz"], [f, f]), frame_rate_hz=60
+        )
+
+
+def gapped(folder):
+    path = folder / "gaps.csv"
+    path.write_text("f_hz,psd_nm2_hz\n1,2\n2,\n3,5\n4,-\n5,6\n")
+    return lbt.load_record(path)
+
+
+# -------------------------------------------------------------------- refusals
+@pytest.mark.parametrize(
+    ("names", "options", "words"),
+    [
+        ([], {}, "names do not tell what the columns are.*Choose by columns="),
+        (["a", "b", "c", "d"], {}, "names do not tell what the columns are; got a, b, c, d"),
+        (
+            ["y_nm", "a", "b", "c"],
+            {"kind": "closed_loop"},
+            "needs measurements and commands; got y",
+        ),
+        (["y_nm", "meas_nm", "u_nm", "u_nm"], {}, "not each of an axis of its own"),
+        (["y0_nm", "y1_nm", "u0_nm", "t"], {}, r"commands must match measurements \(60, 2\)"),
+        (["y_nm", "u_nm", "t", "time"], {}, "t, time are all named as times; choose by columns="),
+        (["y_nm", "u_nm", "time_h", "b"], {"columns": {"times": 9}}, "no column 9; the file has 4"),
+        (["y_nm", "u_nm", "a", "b"], {"columns": {"times": "q"}}, "no column 'q'; got y_nm, u_nm"),
+        (["y_nm", "u_nm", "a", "b"], {"columns": {"clock": 2}}, "a key of columns must be one of"),
+        (["y_nm", "u_nm", "a", "b"], {"columns": ["a"]}, "columns must be a mapping"),
+        (
+            ["a", "b", "c", "d"],
+            {"columns": {"measurements": "a", "commands": "a"}},
+            "a column was chosen twice",
+        ),
+        (["y_nm", "u_nm", "a", "b"], {"kind": "video"}, "kind must be one of closed_loop"),
+        (["y_nm", "u_nm", "a", "b"], {"kind": "spectrum"}, "needs columns of frequencies and dens"),
+        (["y_nm", "u_nm", "a", "b"], {"delay_frames": 0}, "delay_frames must be at least 1; got 0"),
+        (["y_nm", "u_nm", "a", "b"], {"delay_frames": "two"}, "delay_frames must be a number"),
+        (["y_nm", "u_nm", "a", "b"], {"frame_rate_hz": None}, "frame rate is not known; give fra"),
+        (["y_nm", "u_nm", "t [h]", "b"], {}, "times must be in one of s, ms, us, ns; got 'h'"),
+    ],
+)
+def test_what_is_refused(tmp_path, series, names, options, words):
+    y, u = series
+    path = write_csv(tmp_path / "night.csv", names, [*y.T, *u.T])
+    with pytest.raises(lbt.ProblemError, match=words) as caught:
+        lbt.load_record(path, **{"frame_rate_hz": RATE, **options})
+    if "kind must" not in words and "columns must" not in words:
+        assert "night.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.xls", b"", "must end in one of .fits"),
+        ("a.csv", b"", "has no rows"),
+        ("a.csv", b"y_nm,u_nm\n", "a heading and no rows"),
+        ("a.csv", b"y_nm,u_nm\n1,2\n3\n", "line 3 must have 2 cells; got 1"),
+        ("a.csv", b"# x\ny_nm,u_nm\n1,2\n3,up\n", "cell 2 of line 4 must be a number; got 'up'"),
+        ("a.csv", b"\xff\xfe\x00", "no text in UTF-8"),
+        ("a.npy", b"\x93NUMPY garbage", "cannot read .*a.npy as .npy"),
+        ("a.npz", b"PK garbage", "cannot read .*a.npz as .npz"),
+        ("a.fits", b"SIMPLE", "cannot read .*a.fits as .fits"),
+        ("a.fits", b"", "cannot read .*a.fits as .fits"),
+    ],
+)
+def test_damage(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(lbt.TelemetryError, match=words) as caught:
+        lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
+    assert "Traceback" not in str(caught.value)
+
+
+def test_no_pickle_is_opened(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([{"y": 1}], dtype=object), allow_pickle=True)
+    np.savez(tmp_path / "b.npz", y=np.array([{"y": 1}], dtype=object))
+    for name in ("a.npy", "b.npz"):
+        with pytest.raises(lbt.TelemetryError, match="cannot read"):
+            lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
+
+
+def test_a_missing_file():
+    with pytest.raises(lbt.TelemetryError, match=r"cannot read nowhere\.csv: No such file"):
+        lbt.load_record("nowhere.csv")
+
+
+def test_files_without_series(tmp_path):
+    np.savez(tmp_path / "a.npz", frame_rate_hz=3.0)
+    with pytest.raises(lbt.ProblemError, match="holds no series of numbers"):
+        lbt.load_record(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", cube=np.ones((3, 4, 5)), text=np.array(["a", "b"]))
+    with pytest.raises(lbt.ProblemError, match="holds no series of numbers"):
+        lbt.load_record(tmp_path / "b.npz")
+
+
+# ------------------------------------------------------------------------ CSV
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    rows=st.lists(
+        st.tuples(*[st.one_of(st.none(), st.floats(allow_nan=False, allow_infinity=False))] * 3),
+        min_size=1,
+        max_size=8,
+    ),
+    sign=st.sampled_from([",", ";", "\t", "|"]),
+    heading=st.booleans(),
+)
+def test_any_table_comes_back(rows, sign, heading):
+    head = [sign.join(["alpha", "beta", "gamma"])] if heading else []
+    lines = [sign.join("" if v is None else repr(v) for v in row) for row in rows]
+    table = read_csv("\n".join(head + lines))
+    expected = np.array([[np.nan if v is None else v for v in row] for row in rows])
+    assert np.array_equal(table.values, expected, equal_nan=True)
+    assert table.names == (["alpha", "beta", "gamma"] if heading else [""] * 3)
+
+
+def test_headings_in_comments_and_decimal_commas():
+    table = read_csv("# time_s y_nm\n0.0 1.5\n0.1 2.5\n")
+    assert table.names == ["time_s", "y_nm"]
+    table = read_csv("t_s;y_nm\n0,5;1,25\n1,0;-2\n")
+    assert table.values.tolist() == [[0.5, 1.25], [1.0, -2.0]]
+    assert table.notes == ["commas were taken for decimal points"]

@@ -1,0 +1,460 @@
+"""Controllers replayed on recorded data, against runs of the same controllers under the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from replays import (
+    CAMERA,
+    CASES,
+    FLAT,
+    GOOD,
+    PATH,
+    RATE,
+    SPOILT,
+    STUCK,
+    TILTED,
+    a_plant,
+    a_series,
+    a_truth,
+    pseudo_open_loop,
+)
+
+import lbt_synth as lbt
+from lbt_synth.replay.estimate import residual_estimate
+
+
+@pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
+@pytest.mark.parametrize("method", ["lqg", "integrator"])
+def test_a_replay_is_the_run_that_there_would_have_been(delay, gain, mirror, sensor, method):
+    """Another controller's record gives the residual and noise of a run under the same truth."""
+    path = a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
+    ran = lbt.integrator(path, gain=0.15).controller
+    if method == "lqg":
+        new = lbt.lqg(a_plant(delay=delay, gain=gain, mirror=mirror, sensor=sensor)).controller
+    else:
+        new = lbt.integrator(path, gain=0.25).controller
+    truth, size = a_truth(gain), {"hardware": path, "frames": 400, "seed": 3, "settle_frames": 0}
+    night = lbt.simulate(ran, truth, **size)
+    would = lbt.simulate(new.start(), truth, **size)  # stepped frame by frame
+    assert np.array_equal(night.total_nm, would.total_nm)
+    z = pseudo_open_loop(night.measurements[0], night.commands[0], path, gain)
+    found = lbt.replayed_residual(z, new, path, noise_nm=15.5, sensor_gain=gain, settle_frames=0)
+    wanted = would.measurements[0] @ np.linalg.inv(gain * path.sensor).T
+    scale = np.max(np.abs(wanted))
+    np.testing.assert_allclose(found.measured_nm, wanted, rtol=0, atol=1e-9 * scale)
+    # and that residual is the phase of the frame before, with its noise
+    phase = would.residual_nm[0, :-1]
+    noise = (would.measurements[0, 1:] - gain * phase @ path.sensor.T) @ np.linalg.inv(
+        gain * path.sensor
+    ).T
+    np.testing.assert_allclose(found.measured_nm[1:], phase + noise, rtol=0, atol=1e-9 * scale)
+    back = np.linalg.inv(gain * path.sensor)
+    np.testing.assert_allclose(
+        found.covariance_nm2,
+        wanted.T @ wanted / 400 - 15.5**2 * back @ back.T,
+        rtol=0,
+        atol=1e-9 * scale**2,
+    )
+
+
+def test_without_noise_the_residual_itself_is_found():
+    path = a_plant().hardware
+    new = lbt.kalman(a_plant()).controller
+    truth = a_truth(noise_nm=0.0)
+    size = {"hardware": path, "frames": 3000, "seed": 1, "settle_frames": 0}
+    night = lbt.simulate(lbt.integrator(path, gain=0.1).controller, truth, **size)
+    z = pseudo_open_loop(night.measurements[0], night.commands[0], path)
+    np.testing.assert_allclose(z[1:], night.total_nm[0, :-1], rtol=0, atol=1e-8)
+    found = lbt.replayed_residual(z, new, path, noise_nm=0.0)
+    begin, end = found.stretches[0]
+    would = lbt.simulate(new, truth, **size).residual_nm[0, begin - 1 : end - 1]
+    np.testing.assert_allclose(found.covariance_nm2, would.T @ would / len(would), rtol=1e-9)
+
+
+@settings(max_examples=15)
+@given(
+    st.integers(0, 2**31),
+    st.floats(1e-3, 1e3),
+    st.integers(0, 300),
+    st.sampled_from([1.0, 1.7, 2.0, 2.5]),
+)
+def test_scale_and_beginning(seed, scale, start, delay):
+    """A replay is linear, and each stretch begins anew: what lies outside is not read."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
+    new = lbt.integrator(path, gain=0.3).controller
+    z = np.random.default_rng(seed).standard_normal((700, 2))
+    whole = lbt.replayed_residual(z[start:], new, path, noise_nm=0.1, settle_frames=7)
+    torn = np.full_like(z, np.nan)
+    torn[start:] = scale * z[start:]
+    part = lbt.replayed_residual(
+        torn, new, path, noise_nm=0.1 * scale, settle_frames=7, stretches=[(start, 700)]
+    )
+    assert part.stretches == ((start + 7, 700),)
+    np.testing.assert_allclose(
+        part.measured_nm, scale * whole.measured_nm, rtol=0, atol=1e-12 * scale
+    )
+    np.testing.assert_allclose(
+        part.covariance_nm2, scale**2 * whole.covariance_nm2, rtol=1e-9, atol=1e-9 * scale**2
+    )
+    assert part.total_error_nm2 == pytest.approx(scale**2 * whole.total_error_nm2, rel=1e-9)
+
+
+def test_the_default_settling_is_long_enough():
+    path = a_plant().hardware
+    z = 1e3 + np.zeros((5000, 2))  # a step: an integrator forgets it at the loop's own pace
+    new = lbt.integrator(path, gain=0.02).controller
+    found = lbt.replayed_residual(z, new, path, noise_nm=0.0)
+    assert 0.01 < np.max(np.abs(found.measured_nm)) < 0.2
+    radius = lbt.close_loop(path, new).spectral_radius
+    assert found.stretches[0][0] == int(np.ceil(np.log(1e-4) / np.log(radius)))
+
+
+# --- the estimate -------------------------------------------------------------------------------
+def test_the_standard_errors_are_those_of_many_nights():
+    """Correlated axes, coloured residuals, two stretches: errors per axis, in total, and paired."""
+    rng = np.random.default_rng(7)
+    stretches = ((0, 700), (900, 1500))
+    rows = np.r_[0:700, 900:1500]
+    noise = np.diag([1.0, 4.0])
+    mixing = np.array([[1.0, 0.0], [0.8, 0.6]])
+    model = lbt.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    # of y = 0.4 x and of x itself, both with the same noise
+    exact = np.array([1, 0.16])[:, None, None] * mixing @ mixing.T * model.rms_nm**2
+    seen, errors, paired, paired_errors = [], [], [], []
+    for _ in range(300):
+        x = np.column_stack([a_series(model, 1500, rng, 200) for _ in range(2)]) @ mixing.T
+        w = rng.standard_normal((1500, 2)) @ np.sqrt(noise)
+        one, other = (
+            residual_estimate(
+                (part * x + w)[rows], stretches, noise_nm2=noise, noise_error_nm2=np.zeros(2)
+            )
+            for part in (1.0, 0.4)
+        )
+        seen.append([*one.variance_nm2, one.total_nm2])
+        errors.append([*one.variance_error_nm2, one.total_error_nm2])
+        difference, error = one.above(other)
+        paired.append(difference)
+        paired_errors.append(error)
+    wanted = np.array([*np.diag(exact[0]), np.trace(exact[0])])
+    seen, errors = np.array(seen), np.sqrt(np.mean(np.square(errors), axis=0))
+    scatter = np.std(seen, axis=0)
+    # 300 nights know their scatter to 4 %, and their mean to scatter / 17
+    np.testing.assert_allclose(scatter, errors, rtol=0.15)
+    assert np.all(np.abs(np.mean(seen, axis=0) - wanted) < 4 * scatter / np.sqrt(300))
+    # without the correlation of the axes the error of the total would be too small
+    assert errors[2] > 1.1 * np.hypot(errors[0], errors[1])
+    rms = np.sqrt(np.mean(np.square(paired_errors)))
+    assert np.std(paired) == pytest.approx(rms, rel=0.15)
+    assert abs(np.mean(paired) - np.trace(exact[0] - exact[1])) < 4 * rms / np.sqrt(300)
+    backwards, error = other.above(one)
+    assert (backwards, error) == (-paired[-1], pytest.approx(paired_errors[-1], rel=1e-12))
+
+
+def test_the_noise_of_the_noise_is_added():
+    path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=0.5 * np.eye(2))
+    z = np.random.default_rng(0).standard_normal((1000, 2))
+    new = lbt.integrator(path, gain=0.3).controller
+    plain = lbt.replayed_residual(z, new, path, noise_nm=[0.2, 0.3])
+    given_ = lbt.replayed_residual(z, new, path, noise_nm=[0.2, 0.3], noise_error_nm=[0.01, 0.02])
+    added = np.sqrt(given_.variance_error_nm2**2 - plain.variance_error_nm2**2)
+    np.testing.assert_allclose(added, [2 * 0.2 * 0.01 / 0.25, 2 * 0.3 * 0.02 / 0.25], rtol=1e-9)
+    np.testing.assert_allclose(np.diag(given_.noise_nm2), [0.04 / 0.25, 0.09 / 0.25], rtol=1e-12)
+
+
+def test_a_residual_below_its_noise_is_not_cut_off():
+    path = lbt.LoopHardware(frame_rate_hz=RATE)
+    idle = lbt.Controller(
+        A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=np.zeros((2, 2)), dt_s=1 / RATE
+    )
+    signs = []
+    for seed in range(40):
+        z = 10 * np.random.default_rng(seed).standard_normal((400, 2))
+        found = lbt.replayed_residual(z, idle, path, noise_nm=10.0, settle_frames=0)
+        assert found.total_nm2 == pytest.approx(np.sum(np.mean(z**2, axis=0)) - 200, abs=1e-9)
+        assert abs(found.total_nm2) < 5 * found.total_error_nm2
+        negative = found.total_nm2 < 0
+        assert np.isnan(found.rms_nm) == np.isnan(found.rms_error_nm) == negative
+        assert found.upper_nm**2 == pytest.approx(
+            max(found.total_nm2 + 2 * found.total_error_nm2, 0)
+        )
+        if np.any(found.variance_nm2 < 0):
+            assert np.isnan(found.strehl(CAMERA))
+            assert np.isnan(found.axis_rms_nm).any()
+            assert np.isnan(found.axis_rms_error_nm).any()
+        signs.append(negative)
+    assert 10 < sum(signs) < 30  # there is nothing: either sign
+
+
+# --- the predictor ------------------------------------------------------------------------------
+def textbook_regression(z, mirror_taps, taps, axes):
+    m, rows, wanted = len(mirror_taps), [], []
+    for k in range(m - 1 + taps, len(z)):
+        row = []
+        for axis in axes:
+            row += [
+                sum(c * z[k - late - i, axis] for i, c in enumerate(mirror_taps))
+                for late in range(1, taps + 1)
+            ]
+        rows.append(row)
+        wanted.append(z[k])
+    return np.array(rows), np.array(wanted)
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.3])
+@pytest.mark.parametrize("coupled", [False, True])
+def test_the_predictor_is_the_least_squares_of_a_textbook(delay, coupled):
+    rng = np.random.default_rng(1)
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
+    z = np.cumsum(rng.standard_normal((300, 2)), axis=0) @ TILTED
+    stretches = [(0, 130), (140, 300)]
+    fit = lbt.least_squares_predictor(z, path, taps=5, stretches=stretches, coupled=coupled)
+    for i in range(2):
+        axes = (0, 1) if coupled else (i,)
+        parts = [textbook_regression(z[a:b], path.mirror_taps, 5, axes) for a, b in stretches]
+        X, wanted = (np.concatenate([part[j] for part in parts]) for j in (0, 1))
+        found, rest, *_ = np.linalg.lstsq(X, wanted[:, i], rcond=None)
+        np.testing.assert_allclose(
+            fit.coefficients[i, list(axes)].ravel(), found, rtol=1e-9, atol=1e-10
+        )
+        assert fit.fitted_nm2[i] == pytest.approx(rest[0] / len(X), rel=1e-10)
+        assert fit.frames == len(X)
+        if not coupled:
+            assert not fit.coefficients[i, 1 - i].any()
+
+
+def test_a_ridge_is_that_of_the_normal_equations():
+    z = np.cumsum(np.random.default_rng(2).standard_normal((400, 1)), axis=0)
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    X, wanted = textbook_regression(z, path.mirror_taps, 6, (0,))
+    gram = X.T @ X
+    found = np.linalg.solve(gram + 0.01 * np.trace(gram) / 6 * np.eye(6), X.T @ wanted)
+    fit = lbt.least_squares_predictor(z, path, taps=6, ridge=0.01)
+    np.testing.assert_allclose(fit.coefficients.ravel(), found.ravel(), rtol=1e-8)
+    assert fit.fitted_nm2[0] == pytest.approx(np.mean((wanted - X @ found) ** 2), rel=1e-9)
+
+
+@pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
+def test_the_controller_of_the_predictor_gives_its_residual(delay, gain, mirror, sensor):
+    """The loop around it leaves z less the FIR prediction: in a replay, to rounding."""
+    rng = np.random.default_rng(4)
+    path = a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
+    z = np.cumsum(rng.standard_normal((900, 2)), axis=0)
+    fit = lbt.least_squares_predictor(z, path, taps=7, sensor_gain=gain, coupled=True)
+    found = lbt.replayed_residual(
+        z, fit.controller, path, noise_nm=1.0, sensor_gain=gain, settle_frames=0
+    )
+    commands = np.zeros_like(z)
+    for late in range(7):
+        commands[late:] += z[: len(z) - late] @ fit.coefficients[:, :, late].T
+    wanted = z.copy()
+    for i, tap in enumerate(path.mirror_taps):
+        wanted[1 + i :] -= tap * commands[: len(z) - 1 - i]
+    np.testing.assert_allclose(found.measured_nm, wanted, rtol=0, atol=1e-8)
+    begin = len(path.mirror_taps) - 1 + 7
+    np.testing.assert_allclose(
+        fit.fitted_nm2, np.mean(found.measured_nm[begin:] ** 2, axis=0), rtol=1e-8
+    )
+    assert lbt.certify_loop(path, fit.controller).passed or gain != 1
+
+
+def test_ar_processes_are_predicted_as_in_closed_form():
+    """Two frames ahead: a1 x(k+1) + a2 x(k) with x(k+1) = a1 x(k) + a2 x(k-1)."""
+    a1, a2 = 1.6, -0.8
+    model = lbt.ARModel(coefficients=[a1, a2], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    z = a_series(model, 60_000, np.random.default_rng(0))[:, None]
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    fit = lbt.least_squares_predictor(z, path, taps=4)
+    np.testing.assert_allclose(
+        fit.coefficients.ravel(), [a1**2 + a2, a1 * a2, 0, 0], rtol=0, atol=0.02
+    )
+    assert fit.fitted_nm2[0] == pytest.approx(1 + a1**2, rel=0.02)
+    # one frame ahead the coefficients are those of Yule and Walker: the process's own
+    near = lbt.LoopHardware(frame_rate_hz=RATE, modes=1, delay_frames=1)
+    fit = lbt.least_squares_predictor(z, near, taps=2)
+    np.testing.assert_allclose(fit.coefficients.ravel(), [a1, a2], rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("delay", [2.0, 2.4])
+def test_more_taps_come_to_the_limit_and_none_passes_it(delay):
+    """By the model, exactly: a predictor that was fitted to a long series, over its length."""
+    line = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=100, direction=(1,))
+    fast = lbt.ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=RATE)
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=fast, vibrations=[line], noise_nm=20.0, modes=1,
+        delay_frames=delay,
+    )  # fmt: skip
+    path, rng = plant.hardware, np.random.default_rng(5)
+    z = a_series(fast, 50_000, rng) + a_series(line.ar_model(RATE), 50_000, rng)
+    z = (z + 20 * rng.standard_normal(z.size))[:, None]
+    limit = lbt.lqg(plant).rms
+    left = []
+    for taps in (1, 4, 16, 64):
+        fit = lbt.least_squares_predictor(z, path, taps=taps)
+        loop = lbt.close_loop(path, fit.controller)
+        left.append(lbt.model_budget(loop, plant).rms_nm / limit)
+    assert np.all(np.diff(left) < 0)
+    assert left[0] > 1.2
+    assert 1 < left[-1] < 1.01
+
+
+def test_regressors_that_depend_on_each_other():
+    """A sinusoid without noise: two values say all; the coefficients of least norm are taken."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    z = 100 * np.sin(2 * np.pi * 20 / RATE * np.arange(3000))[:, None]
+    fit = lbt.least_squares_predictor(z, path, taps=32)
+    X, wanted = textbook_regression(z, path.mirror_taps, 32, (0,))
+    found = np.linalg.pinv(X, rcond=1e-9) @ wanted[:, 0]
+    np.testing.assert_allclose(fit.coefficients.ravel(), found, rtol=0, atol=1e-9)
+    assert np.sum(fit.coefficients**2) < 1
+    left = lbt.replayed_residual(z, fit.controller, path, noise_nm=0.0)
+    assert np.max(np.abs(left.measured_nm)) < 1e-9
+
+
+def test_on_held_out_data_no_predictor_beats_the_limit():
+    plant = a_plant(gain=0.5)
+    limit = lbt.kalman(plant).rms
+    for seed in range(4):
+        night = lbt.simulate(
+            lbt.integrator(plant.hardware, gain=0.2).controller,
+            a_truth(),
+            hardware=plant.hardware,
+            frames=12_000,
+            seed=seed,
+            settle_frames=0,
+        )
+        z = pseudo_open_loop(night.measurements[0], night.commands[0], plant.hardware)
+        table = lbt.prediction_against_data(plant, z, {}, taps=24)
+        row = table["least-squares predictor"].replayed
+        assert row.total_nm2 > limit**2 - 4 * row.total_error_nm2
+
+
+# --- halves -------------------------------------------------------------------------------------
+@given(
+    st.lists(st.integers(1, 50), min_size=2, max_size=12),
+    st.integers(0, 30),
+    st.floats(0.05, 0.95),
+)
+def test_halves_are_apart_and_in_order(lengths, gap, share):
+    ends = np.cumsum(lengths)
+    stretches = [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=False)]
+    frames = int(ends[-1])
+    usable = np.zeros(frames, dtype=bool)
+    for a, b in stretches:
+        usable[a:b] = True
+    arguments = {"gap_frames": gap, "fit_share": share}
+    first = np.flatnonzero(usable)[: int(share * usable.sum())]
+    # nothing to fit, or everything after the fit lies in the gap
+    if first.size == 0 or not usable[first[-1] + 1 + gap :].any():
+        with pytest.raises(lbt.ProblemError, match="must leave frames to fit and to test on"):
+            lbt.split_halves(stretches, frames, **arguments)
+        return
+    fit, test = lbt.split_halves(stretches, frames, **arguments)
+    fitted, tested = np.zeros((2, frames), dtype=bool)
+    for mask, parts in ((fitted, fit), (tested, test)):
+        for a, b in parts:
+            assert a < b
+            assert not mask[a:b].any()
+            mask[a:b] = True
+    assert not np.any(~usable & (fitted | tested))
+    np.testing.assert_array_equal(np.flatnonzero(fitted), first)
+    last = first[-1]
+    np.testing.assert_array_equal(
+        np.flatnonzero(tested), np.flatnonzero(usable[last + 1 + gap :]) + last + 1 + gap
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([(0, 20), (10, 30)], 40), "in order, apart"),
+        (([(0, 50)], 40), "within 40 frames"),
+        (([(5, 5)], 40), "not empty"),
+        (([(-1, 5)], 40), "at least 0"),
+        (([(0.0, 5)], 40), "must be an integer"),
+        (([7], 40), "a pair \\(start, stop\\)"),
+        (([], 40), "at least one stretch"),
+        ((None, 0), "frames must be at least 1"),
+    ],
+)
+def test_stretches_that_are_refused(arguments, message):
+    with pytest.raises(lbt.ProblemError, match=message):
+        lbt.split_halves(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"gap_frames": -1}, "gap_frames must be at least 0"),
+        ({"gap_frames": 30}, "must leave frames to fit and to test on"),
+        ({"fit_share": 0.0}, "fit_share must be above 0"),
+        ({"fit_share": 1.0}, "fit_share must be below 1"),
+    ],
+)
+def test_halves_that_are_refused(more, message):
+    with pytest.raises(lbt.ProblemError, match=message):
+        lbt.split_halves(None, 40, **more)
+
+
+# --- what is refused ----------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("series", "more", "message"),
+    [
+        (GOOD[:, :1], {}, r"open_loop must be \(frames, 2\)"),
+        (GOOD[0], {}, r"open_loop must be \(frames, 2\)"),
+        (GOOD[:0], {}, r"open_loop must be \(frames, 2\)"),
+        (GOOD + 0j, {}, "open_loop must be real"),
+        (SPOILT, {}, r"open_loop, frames 0 to 2000, must be finite; got nan at index \(77, 0\)"),
+        (SPOILT, {"stretches": [(50, 900)]}, r"frames 50 to 900, .* index \(27, 0\)"),
+        (GOOD, {"noise_nm": -1.0}, "noise_nm must be at least 0"),
+        (GOOD, {"noise_nm": [1.0, 2.0, 3.0]}, "noise_nm must be a number or 2"),
+        (GOOD, {"noise_nm": np.nan}, "noise_nm must be finite"),
+        (GOOD, {"noise_error_nm": -0.1}, "noise_error_nm must be at least 0"),
+        (GOOD, {"sensor_gain": 0.0}, "sensor_gain must be above 0"),
+        (GOOD, {"settle_frames": -1}, "settle_frames must be at least 0"),
+        (GOOD, {"settle_frames": 2000}, "longer than the 2000 frames in which the loop settles"),
+        (GOOD, {"settle_frames": 1950}, "at least 100 frames after settling; got 50"),
+        (GOOD, {"stretches": [(0, 2001)]}, "within 2000 frames"),
+    ],
+)
+def test_replays_that_are_refused(series, more, message):
+    new = lbt.integrator(PATH, gain=0.3).controller
+    with pytest.raises(lbt.ProblemError, match=message):
+        lbt.replayed_residual(series, new, PATH, **({"noise_nm": 1.0} | more))
+
+
+def test_loops_that_cannot_be_replayed():
+    new = lbt.integrator(PATH, gain=0.3).controller
+    with pytest.raises(lbt.ProblemError, match="can be inverted; got \\(2, 2\\) of rank 1"):
+        lbt.replayed_residual(GOOD, new, FLAT, noise_nm=1.0)
+    with pytest.raises(lbt.UnstableLoopError, match="must be stable"):
+        lbt.replayed_residual(GOOD, new, PATH, noise_nm=1.0, sensor_gain=4.0)
+    with pytest.raises(lbt.ProblemError, match="expected a LoopHardware"):
+        lbt.replayed_residual(GOOD, new, a_plant(), noise_nm=1.0)
+    one = lbt.replayed_residual(GOOD, new, PATH, noise_nm=1.0)
+    other = lbt.replayed_residual(GOOD, new, PATH, noise_nm=1.0, settle_frames=500)
+    with pytest.raises(lbt.ProblemError, match="on the same frames only"):
+        one.above(other)
+
+
+@pytest.mark.parametrize(
+    ("path", "more", "message"),
+    [
+        (PATH, {"taps": 0}, "taps must be at least 1"),
+        (PATH, {"taps": 1001}, "taps must be at most 1000"),
+        (PATH, {"taps": 2.0}, "taps must be an integer"),
+        (PATH, {"ridge": -1e-3}, "ridge must be at least 0"),
+        (PATH, {"sensor_gain": -1}, "sensor_gain must be above 0"),
+        (PATH, {"taps": 500}, "500 coefficients needs at least 2000 frames"),
+        (PATH, {"taps": 250, "coupled": True}, "500 coefficients needs at least 2000 frames"),
+        (PATH, {"stretches": [(0, 20), (30, 50)]}, "at least 128 frames to fit.* got 0"),
+        (FLAT, {}, "sensor matrix that can be inverted"),
+        (STUCK, {}, "influence matrix that can be inverted; got \\(2, 2\\) of rank 1"),
+        (a_plant(), {}, "expected a LoopHardware"),
+    ],
+)
+def test_predictors_that_are_refused(path, more, message):
+    with pytest.raises(lbt.ProblemError, match=message):
+        lbt.least_squares_predictor(GOOD, path, **more)

@@ -1,0 +1,258 @@
+"""Prediction against data: the table, and the model's own residual."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from replays import (
+    CAMERA,
+    CASES,
+    GOOD,
+    LINES,
+    PATH,
+    RATE,
+    SHELL,
+    SLOW,
+    SPOILT,
+    a_plant,
+    a_series,
+    a_truth,
+    pseudo_open_loop,
+)
+
+import lbt_synth as lbt
+
+
+# --- the table ----------------------------------------------------------------------------------
+def two_different_axes():
+    turbulence = [
+        lbt.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE),
+        lbt.ARModel(coefficients=[0.9886], driving_rms_nm=50.0, frame_rate_hz=RATE),
+    ]
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=turbulence, vibrations=LINES,
+        noise_nm=np.diag([15.0, 10.0]) ** 2, sensor_gain=0.6,
+    )  # fmt: skip
+    frames, rng = 30_000, np.random.default_rng(6)
+    total = np.column_stack(
+        [
+            a_series(model, frames, rng) + a_series(line.ar_model(RATE), frames, rng)
+            for model, line in zip(turbulence, LINES, strict=True)
+        ]
+    )
+    noise = rng.standard_normal((frames, 2)) * [15.0, 10.0]
+    ran = lbt.integrator(plant.hardware, gain=0.25)
+    loop = lbt.close_loop(plant.hardware, ran.controller)
+    series = lbt.filter_series(loop.system, np.hstack([total, noise]))
+    y, u = series[:, 4:], series[:, 2:4]
+    return plant, ran, y, pseudo_open_loop(y, u, plant.hardware)
+
+
+def test_the_table():
+    plant, ran, y, z = two_different_axes()
+    kalman, hinf = lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.2, method="riccati")
+    given_ = {"Kalman": kalman, "H-infinity": hinf.controller}
+    table = lbt.prediction_against_data(
+        plant, z, given_, measurements=y, running=ran, imaging=CAMERA
+    )
+    names = [entry.name for entry in table.entries]
+    assert names == [
+        "what ran", "best integrator", "Kalman", "H-infinity", "least-squares predictor",
+        "limit of performance",
+    ]  # fmt: skip
+    assert table.notes == ()
+    for entry in table.entries[:-1]:
+        assert abs(entry.deviations) < 4, entry.name
+        assert 0.8 < entry.ratio < 1.2
+        assert entry.replayed.stretches == table.test
+        assert entry.strehl == pytest.approx(entry.model_strehl, abs=0.1)
+    assert table["Kalman"].model_nm == pytest.approx(kalman.rms, rel=1e-9)
+    assert table["H-infinity"].model_nm == pytest.approx(hinf.rms, rel=1e-9)
+    limit = table["limit of performance"]
+    assert limit.model_nm == pytest.approx(kalman.rms, rel=1e-9)
+    np.testing.assert_allclose(limit.model_axis_nm, kalman.certificate.rms_per_output, rtol=1e-9)
+    assert (limit.replayed, limit.replayed_nm is np.nan) == (None, True)
+    assert np.isnan([limit.ratio, limit.deviations, limit.strehl]).all()
+    # what ran: its own measurements on the same frames
+    begin, end = table.test[0]
+    assert begin == 15_000 + table.settle_frames
+    part = y[begin:end] / 0.6
+    np.testing.assert_allclose(
+        table["what ran"].replayed.variance_nm2,
+        np.mean(part**2, axis=0) - np.array([15.0, 10.0]) ** 2 / 0.36,
+        rtol=1e-9,
+    )
+    # and its replay is what it measured
+    again = lbt.replayed_residual(
+        z, ran.controller, plant.hardware, noise_nm=[15.0, 10.0], stretches=[(0, end)],
+        settle_frames=begin,
+    )  # fmt: skip
+    np.testing.assert_allclose(again.measured_nm, part, rtol=0, atol=1e-7)
+    gained, error = table["what ran"].replayed.above(table["Kalman"].replayed)
+    assert gained > 4 * error
+    rows = table.rows()
+    assert all(len(row) == len(table.headings) for row in rows)
+    assert table.headings[:3] == ("controller", "tip_nm", "tilt_nm")
+    assert rows[2][3] == table["Kalman"].replayed.rms_nm
+    np.testing.assert_allclose(rows[-1][1:3], limit.model_axis_nm)
+    best = lbt.model_integrator(plant)
+    loop = lbt.close_loop(plant.hardware, best.controller)
+    assert table["best integrator"].model_nm == lbt.model_budget(loop, plant).rms_nm
+    unknown = lbt.prediction_against_data(plant, z, {}, measurements=y)["what ran"]
+    assert unknown.model_nm2 is None
+    assert np.isnan([unknown.model_nm, unknown.ratio, unknown.deviations]).all()
+
+
+def test_a_table_of_one_axis():
+    line = lbt.Vibration(frequency_hz=20, damping=0.02, rms_nm=60, direction=(1,))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=SLOW, vibrations=[line], noise_nm=15.5, modes=1
+    )
+    rng = np.random.default_rng(8)
+    z = a_series(SLOW, 9000, rng) + a_series(line.ar_model(RATE), 9000, rng)
+    z = (z + 15.5 * rng.standard_normal(z.size))[:, None]
+    table = lbt.prediction_against_data(
+        plant, z, {"Kalman": lbt.kalman(plant)}, imaging=CAMERA, fit=[(0, 3000)],
+        test=[(3000, 5000), (5100, 9000)], settle_frames=500,
+    )  # fmt: skip
+    assert table.headings[:3] == ("controller", "tip_nm", "data_nm")
+    assert table.fit == ((0, 3000),)
+    assert table.test == ((3500, 5000), (5600, 9000))
+    row = table["Kalman"]
+    assert abs(row.deviations) < 4
+    assert row.strehl == pytest.approx(
+        lbt.jitter_strehl([[row.replayed_nm**2]], imaging=CAMERA), rel=1e-12
+    )
+
+
+def test_a_wrong_model_is_found_out():
+    """A filter for another frequency: its model promises what the data does not show."""
+    plant, _, _, z = two_different_axes()
+    wrong = lbt.retuned_plant(plant, 6.0)
+    table = lbt.prediction_against_data(wrong, z, {"Kalman": lbt.kalman(wrong)})
+    row, right = table["Kalman"], lbt.kalman(plant).rms
+    assert row.deviations > 5
+    assert row.model_nm < 1.05 * right < row.replayed_nm / 1.1
+    assert table["least-squares predictor"].replayed_nm < table["Kalman"].replayed_nm
+
+
+def test_replays_are_quick():
+    plant, _, _, z = two_different_axes()
+    controllers = [
+        lbt.kalman(plant).controller,
+        lbt.integrator(plant.hardware, gain=0.3).controller,
+    ]
+    best = np.inf
+    for _ in range(3):
+        start = time.process_time()
+        for controller in controllers * 2:
+            lbt.replayed_residual(z, controller, plant.hardware, noise_nm=[15.0, 10.0])
+        best = min(best, time.process_time() - start)
+    assert best < 0.3
+
+
+def test_a_limit_that_is_not_known_is_a_note():
+    crossed = lbt.Vibration(frequency_hz=25, damping=0.01, rms_nm=50, direction=(1, 1))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=SLOW, vibrations=[LINES[0], crossed], noise_nm=15.5
+    )
+    z = np.random.default_rng(0).standard_normal((4000, 2)).cumsum(axis=0)
+    table = lbt.prediction_against_data(plant, z, {})
+    assert [entry.name for entry in table.entries] == [
+        "best integrator", "least-squares predictor"
+    ]  # fmt: skip
+    assert "no limit of performance: a limit needs modes that decouple" in table.notes[0]
+
+
+# --- the model's own residual -------------------------------------------------------------------
+@pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
+def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor):
+    plant = a_plant(delay=delay, gain=gain, mirror=mirror, sensor=sensor)
+    controller = lbt.integrator(plant.hardware, gain=0.2).controller
+    loop = lbt.close_loop(plant.hardware, controller)
+    own, other = lbt.model_budget(loop, plant), lbt.residual_budget(loop, a_truth())
+    for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "total_nm2"):
+        np.testing.assert_allclose(getattr(own, name), getattr(other, name), rtol=1e-9, atol=1e-9)
+    bare = a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
+    again = lbt.model_budget(lbt.close_loop(bare, controller, sensor_gain=gain), plant)
+    np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
+
+
+def test_noise_that_is_correlated_between_axes():
+    noise = np.array([[200.0, 60.0], [60.0, 100.0]])
+    plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, noise_nm=noise)
+    design = lbt.kalman(plant)
+    budget = lbt.model_budget(lbt.close_loop(plant.hardware, design.controller), plant)
+    assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
+
+
+def test_the_integrator_of_a_plant_is_that_of_its_truth():
+    plant = a_plant()
+    own, other = lbt.model_integrator(plant), lbt.optimal_integrator(plant.hardware, a_truth())
+    assert own.gain == pytest.approx(other.gain, rel=1e-5)
+    assert own.certificate.passed
+
+
+def test_a_budget_of_another_loop_is_refused():
+    plant = a_plant()
+    for other in (a_plant(delay=3.0), a_plant(gain=0.5), a_plant(mirror=SHELL)):
+        loop = lbt.close_loop(other.hardware, lbt.integrator(other.hardware, gain=0.1).controller)
+        with pytest.raises(lbt.ProblemError, match="plant's sensor, mirror and delay; got another"):
+            lbt.model_budget(loop, plant)
+    unstable = lbt.close_loop(
+        plant.hardware, lbt.integrator(plant.hardware, gain=0.9).controller, sensor_gain=1.0
+    )
+    wild = lbt.Controller(
+        A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
+    )
+    assert unstable.is_stable
+    with pytest.raises(lbt.UnstableLoopError):
+        lbt.model_budget(lbt.close_loop(plant.hardware, wild), plant)
+    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
+        lbt.model_budget(unstable, a_truth())
+    with pytest.raises(lbt.ProblemError, match="expected a ClosedLoop"):
+        lbt.model_budget(unstable.system, plant)
+    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
+        lbt.model_integrator(a_truth())
+
+
+# --- what is refused ----------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"controllers": {"best integrator": lbt.integrator(PATH, gain=0.3)}}, "may not be called"),
+        ({"controllers": {1: lbt.integrator(PATH, gain=0.3)}}, "may not be called 1"),
+        ({"controllers": {"mine": PATH}}, "expected a Controller; got LoopHardware"),
+        ({"fit": [(0, 900)]}, "fit and test must both be given"),
+        ({"fit": [(0, 900)], "test": [(800, 2000)]}, "frames that the fit has not"),
+        ({"fit": [(0, 900)], "test": [(900, 2001)]}, "within 2000 frames"),
+        ({"measurements": GOOD[:1999]}, "within 1999 frames"),
+        ({"measurements": GOOD[:, :1]}, r"measurements must be \(frames, 2\)"),
+        ({"measurements": np.vstack([GOOD, GOOD])}, "must have the 2000 frames of open_loop"),
+        ({"measurements": SPOILT[::-1]}, "measurements, frames 1000 to 2000, must be finite"),
+        ({"running": lbt.integrator(PATH, gain=0.3)}, "needs its measurements"),
+        ({"imaging": 2.2}, "expected an Imaging"),
+        ({"settle_frames": 1000}, "longer than the 1000 frames"),
+        ({"noise_error_nm": -1.0}, "noise_error_nm must be at least 0"),
+        ({"taps": 300}, "at least 1200 frames to fit"),
+    ],
+)
+def test_tables_that_are_refused(more, message):
+    arguments = {"controllers": {}} | more
+    with pytest.raises(lbt.ProblemError, match=message):
+        lbt.prediction_against_data(a_plant(), GOOD, **arguments)
+
+
+def test_tables_of_what_does_not_hold():
+    wild = lbt.Controller(
+        A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
+    )
+    with pytest.raises(lbt.UnstableLoopError, match="mine: the closed loop must be stable"):
+        lbt.prediction_against_data(a_plant(), GOOD, {"mine": wild})
+    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
+        lbt.prediction_against_data(PATH, GOOD, {})
+    table = lbt.prediction_against_data(a_plant(), GOOD, {})
+    with pytest.raises(lbt.ProblemError, match="the table has the rows best integrator, .*'mine'"):
+        table["mine"]
