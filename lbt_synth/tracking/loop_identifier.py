@@ -10,24 +10,24 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel, identify_axis
 from lbt_synth.models.plant import TipTiltPlant
-from lbt_synth.validation import FloatArray, instance
+from lbt_synth.validation import FloatArray, instance, integer
 
 
 class LoopIdentifier:
     """Identify turbulence, lines and noise of each axis in a window (:func:`identify_axis`).
 
-    Each window begins with what the last one gave. The sensor gain is that of the plant, or
-    found in the data: a window of some seconds seldom tells it well, and takes the plant's where
-    it does not.
+    Each window begins with what the last one gave. The sensor gain is found in the data, too; a
+    window that does not tell it takes the plant's.
 
     Parameters
     ----------
     plant : TipTiltPlant
         Loop, and sensor gains in its sensor matrix: one measurement an axis, each of its own.
     find_gain : bool, optional
-        Whether the sensor gain is found in each window.
+        Whether the sensor gain is found; otherwise it is the plant's.
     most_lines : int, optional
-        Number of resonances of an axis, at most.
+        Number of resonances of an axis, at most. A line that drifts within the window looks like
+        several; many of them take long and change nothing.
 
     Raises
     ------
@@ -49,9 +49,7 @@ class LoopIdentifier:
     43
     """
 
-    def __init__(
-        self, plant: TipTiltPlant, *, find_gain: bool = False, most_lines: int = 8
-    ) -> None:
+    def __init__(self, plant: TipTiltPlant, *, find_gain: bool = True, most_lines: int = 2) -> None:
         instance(plant, TipTiltPlant)
         sensor = plant.hardware.sensor
         gains = np.diag(sensor)
@@ -61,7 +59,7 @@ class LoopIdentifier:
                 f"{sensor.tolist()}. Recombine the measurements into axes before the controller."
             )
         self._plant, self._gains, self._find_gain = plant, gains, bool(find_gain)
-        self._most_lines = most_lines
+        self._most_lines = integer(most_lines, "most_lines", at_least=0)
         self.reset()
 
     def reset(self) -> None:

@@ -14,12 +14,14 @@ from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import TipTiltPlant, with_vibrations
 from lbt_synth.models.vibration import Vibration
+from lbt_synth.tracking.loop_identifier import LoopIdentifier
 from lbt_synth.tracking.switching import SwitchedController, require_same_loop
 from lbt_synth.tracking.trend import LineTrack, matched_tracks
 from lbt_synth.validation import FloatArray, instance, number
 
 _MOST_SPOILT = 0.01  # of a window; what the filter expected stands in for the measurements
 _LEAST_FRAMES = 16
+_NARROW = 0.1  # damping ratio; a wide resonance is a part of the background and has no trend
 
 
 @runtime_checkable
@@ -94,8 +96,9 @@ class TrackingController:
     ----------
     plant : TipTiltPlant
         The plant of the first filter.
-    identifier : Identifier
-        Makes a plant of a window; :class:`LineFollower` is the quickest.
+    identifier : Identifier, optional
+        Makes a plant of a window: :class:`LoopIdentifier` by default, which finds the whole
+        model; :class:`LineFollower` is the quickest.
     window_s : float, optional
         Length of the window [s], at least 16 frames.
     update_s : float, optional
@@ -134,7 +137,7 @@ class TrackingController:
     def __init__(
         self,
         plant: TipTiltPlant,
-        identifier: Identifier,
+        identifier: Identifier | None = None,
         *,
         window_s: float = 4.0,
         update_s: float = 1.0,
@@ -143,6 +146,8 @@ class TrackingController:
         design: Callable[[TipTiltPlant], FilterDesign] = kalman,
     ) -> None:
         instance(plant, TipTiltPlant)
+        if identifier is None:
+            identifier = LoopIdentifier(plant)
         if not callable(identifier):
             raise ProblemError(
                 "identifier must be a callable (measurements, corrections) -> plant or None; "
@@ -300,6 +305,8 @@ class TrackingController:
 
 
 def _moved(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:
-    """Vibration at an extrapolated frequency; where there can be none, as it is."""
+    """Vibration at an extrapolated frequency; a wide one, or where there can be none, as it is."""
     lowest = line.damping * line.frequency_hz
+    if line.damping > _NARROW:
+        return line
     return line.moved(frequency_hz) if lowest < frequency_hz < frame_rate_hz / 2 else line
