@@ -377,11 +377,11 @@ def test_axes_share_a_sensor_gain_where_they_agree() -> None:
 def test_identify_needs_what_it_needs() -> None:
     y = np.random.default_rng(0).standard_normal((6000, 1))
     without = lbt.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
-    with pytest.raises(ProblemError, match="Give delay_frames"):
+    with pytest.raises(ProblemError, match="with_delay"):
         lbt.identify(without)
     with pytest.raises(ProblemError, match="one number, or 1"):
         lbt.identify(lbt.loop_record(y, frame_rate_hz=RATE, unit="nm"), sensor_gain=[1.0, 2.0])
-    with pytest.raises(ProblemError, match="must be"):
+    with pytest.raises(ProblemError, match="expected an IdentifiedModel"):
         lbt.identification_figure("model")
 
 

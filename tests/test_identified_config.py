@@ -27,12 +27,13 @@ class Line:
     frequency_error_hz: float = 0.01
     damping_error: float = 0.0004
     rms_error_nm: float = 1.5
+    kind: str = "line"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
     turbulence: lbt.ARModel
-    lines: tuple = ()
+    parts: tuple = ()
     noise_nm: float = 15.5
     noise_error_nm: float = 0.12
     sensor_gain: float = 1.0
@@ -53,7 +54,7 @@ def ar(*coefficients, driving):
 
 TIP = Axis(
     turbulence=ar(1.9960123456789, -0.99602, driving=0.123456789012345),
-    lines=(
+    parts=(
         Line(frequency_hz=20.123456789, damping=0.0051, rms_nm=300.0),
         Line(frequency_hz=47.0, damping=0.01, rms_nm=40.0),
     ),
@@ -62,7 +63,7 @@ TIP = Axis(
 )
 TILT = Axis(
     turbulence=ar(0.9899, driving=31.0),
-    lines=(Line(frequency_hz=13.7, damping=0.02, rms_nm=120.0),),
+    parts=(Line(frequency_hz=13.7, damping=0.02, rms_nm=120.0),),
     noise_nm=9.25,
     sensor_gain=0.71,
     sensor_gain_error=float("nan"),
@@ -98,7 +99,7 @@ def test_what_was_identified_is_what_is_read(tmp_path, model):
         assert own.driving_rms_nm == axis.turbulence.driving_rms_nm
     noise = [axis.noise_nm for axis in model.axes]
     np.testing.assert_allclose(np.sqrt(np.diag(plant.R)), noise, rtol=1e-14)
-    lines = [(i, line) for i, axis in enumerate(model.axes) for line in axis.lines]
+    lines = [(i, line) for i, axis in enumerate(model.axes) for line in axis.parts]
     assert len(plant.vibrations) == len(lines)
     for made, (i, line) in zip(plant.vibrations, lines, strict=True):
         assert made.direction == tuple(np.eye(len(model.axes))[i])
@@ -150,7 +151,7 @@ def test_a_telescope_is_written_where_it_is_known(tmp_path):
 
 
 def test_quiet_axes_have_no_vibrations(tmp_path):
-    calm = Model(axes=(replace(TIP, lines=()), replace(TILT, lines=())))
+    calm = Model(axes=(replace(TIP, parts=()), replace(TILT, parts=())))
     config = lbt.load_config(saved(tmp_path, calm))
     assert config.plant.vibrations == ()
     assert config.truth.vibrations == ()
@@ -169,7 +170,7 @@ def test_quiet_axes_have_no_vibrations(tmp_path):
         (Model(axes=(replace(TIP, noise_nm=0.0),)), {}, "sensor.noise_nm"),
         (Model(axes=(replace(TIP, sensor_gain=-1.0),)), {}, "model.sensor_gain"),
         (
-            Model(axes=(replace(TIP, lines=(Line(frequency_hz=3, damping=1.0, rms_nm=1),)),)),
+            Model(axes=(replace(TIP, parts=(Line(frequency_hz=3, damping=1.0, rms_nm=1),)),)),
             {},
             r"model.vibrations\[0\].damping",
         ),

@@ -5,113 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any, Protocol
+from typing import Any
 
 from pydantic import ValidationError
 
 from lbt_synth.config.mistakes import described
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ProblemError
-from lbt_synth.models import ARModel, PositionLoop
+from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
+from lbt_synth.models import ARModel
 from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")
 
 
-class IdentifiedLineLike(Protocol):
-    """One line of a spectrum, with the standard errors of what is known of it."""
-
-    @property
-    def frequency_hz(self) -> float:
-        """Frequency [Hz]."""
-        ...
-
-    @property
-    def frequency_error_hz(self) -> float:
-        """Standard error of the frequency [Hz]."""
-        ...
-
-    @property
-    def damping(self) -> float:
-        """Damping ratio."""
-        ...
-
-    @property
-    def damping_error(self) -> float:
-        """Standard error of the damping ratio."""
-        ...
-
-    @property
-    def rms_nm(self) -> float:
-        """Standard deviation [nm rms wavefront]."""
-        ...
-
-    @property
-    def rms_error_nm(self) -> float:
-        """Standard error of the standard deviation [nm]."""
-        ...
-
-
-class IdentifiedAxisLike(Protocol):
-    """One axis: turbulence, lines, noise and sensor gain."""
-
-    @property
-    def turbulence(self) -> ARModel:
-        """Model of all but the lines."""
-        ...
-
-    @property
-    def lines(self) -> Sequence[IdentifiedLineLike]:
-        """The lines."""
-        ...
-
-    @property
-    def noise_nm(self) -> float:
-        """Noise of the measurement, per frame [nm]."""
-        ...
-
-    @property
-    def noise_error_nm(self) -> float:
-        """Its standard error [nm]."""
-        ...
-
-    @property
-    def sensor_gain(self) -> float:
-        """Sensor gain."""
-        ...
-
-    @property
-    def sensor_gain_error(self) -> float:
-        """Its standard error; 0 or nan where the gain was given."""
-        ...
-
-
-class IdentifiedModelLike(Protocol):
-    """A whole identified loop of one or two axes."""
-
-    @property
-    def axes(self) -> Sequence[IdentifiedAxisLike]:
-        """Tip, or tip and tilt."""
-        ...
-
-    @property
-    def frame_rate_hz(self) -> float:
-        """Frame rate [Hz]."""
-        ...
-
-    @property
-    def delay_frames(self) -> float:
-        """Total delay [frames]."""
-        ...
-
-    @property
-    def mirror(self) -> PositionLoop | None:
-        """Dynamics of the mirror, None for one that settles at once."""
-        ...
-
-
 def identified_config(
-    model: IdentifiedModelLike,
+    model: IdentifiedModel,
     *,
     diameter_m: float | None = None,
     obstruction: float | None = None,
@@ -150,15 +59,13 @@ def identified_config(
 
     Examples
     --------
+    >>> import numpy as np
     >>> import lbt_synth as lbt
-    >>> from types import SimpleNamespace as Model
-    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    >>> axis = Model(turbulence=slow, lines=(), noise_nm=15.5, noise_error_nm=0.1,
-    ...              sensor_gain=1.0, sensor_gain_error=0.0)
-    >>> model = Model(axes=(axis,), frame_rate_hz=800.0, delay_frames=2.0, mirror=None)
-    >>> settings, comments = lbt.identified_config(model)
-    >>> settings.sensor.noise_nm, comments["sensor.noise_nm"]
-    ([15.5], 'standard error 0.1 nm')
+    >>> noise = 3 * np.random.default_rng(0).standard_normal((8192, 1))
+    >>> record = lbt.loop_record(noise, frame_rate_hz=800, unit="nm")
+    >>> settings, comments = lbt.identified_config(lbt.identify(record))
+    >>> [round(value) for value in settings.sensor.noise_nm], comments["sensor.noise_nm"]
+    ([3], 'standard error 0.024 nm')
     """
     axes = tuple(model.axes)
     if len(axes) not in (1, 2):
@@ -193,7 +100,9 @@ def identified_config(
     gains = [float(axis.sensor_gain) for axis in axes]
     if any(gain != 1 for gain in gains):
         content["model"]["sensor_gain"] = content["truth"]["sensor_gain"] = gains
-        comments["model.sensor_gain"] = _errors("", [axis.sensor_gain_error for axis in axes])
+        comments["model.sensor_gain"] = _errors(
+            "", [axis.sensor_gain_error or 0.0 for axis in axes]
+        )
     content["imaging"] = {"wavelength_um": wavelength_um}
     if other_modes_strehl != 1:
         content["imaging"]["other_modes_strehl"] = other_modes_strehl
@@ -214,15 +123,15 @@ def _turbulence(model: ARModel) -> dict[str, Any]:
     }
 
 
-def _vibrations(
-    axes: Sequence[IdentifiedAxisLike], comments: dict[str, str]
-) -> list[dict[str, Any]]:
+def _vibrations(axes: Sequence[IdentifiedAxis], comments: dict[str, str]) -> list[dict[str, Any]]:
     """Return the lines of all axes, tip first, and comment on their errors."""
     out: list[dict[str, Any]] = []
     for name, axis in zip(_AXES, axes, strict=False):
-        for line in axis.lines:
+        for line in axis.parts:
             path = f"model.vibrations[{len(out)}]"
-            comments[f"{path}.frequency_hz"] = _errors("Hz", [line.frequency_error_hz])
+            comments[f"{path}.frequency_hz"] = _of_kind(line.kind) + _errors(
+                "Hz", [line.frequency_error_hz]
+            )
             comments[f"{path}.damping"] = _errors("", [line.damping_error])
             comments[f"{path}.rms_nm"] = _errors("nm", [line.rms_error_nm])
             entry: dict[str, Any] = {} if len(axes) == 1 else {"axis": name}
@@ -235,6 +144,11 @@ def _vibrations(
                 }
             )
     return out
+
+
+def _of_kind(kind: str) -> str:
+    """Return what a resonance that is no narrow line is."""
+    return {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}[kind]
 
 
 def _errors(unit: str, errors: Sequence[float]) -> str:

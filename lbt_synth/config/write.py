@@ -90,7 +90,7 @@ def save_config(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = lbt.save_config(pathlib.Path(folder) / "again.yaml", settings,
     ...                            comments={"telescope.diameter_m": "Table I"})
-    ...     print(path.read_text().splitlines()[2])
+    ...     print(path.read_text().splitlines()[3])
     ...     lbt.load_config(path).settings == settings
       diameter_m: 8.22                      # Table I
     True

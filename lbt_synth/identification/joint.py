@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,18 +13,21 @@ from lbt_synth.identification.identify import (
     LOWEST_LINE_HZ,
     MOST_LINES,
     identify_axis,
+    identify_spectrum,
 )
 from lbt_synth.identification.result import IdentifiedAxis, IdentifiedModel
+from lbt_synth.records import LinePrior, LoopRecord, SpectrumRecord
+from lbt_synth.validation import instance
 
-if TYPE_CHECKING:
-    from lbt_synth.records import LinePrior, LoopRecord
-
+_DELAY = 2.0  # frames, where nothing is said
 _APART = 3.0  # standard errors between gains that are not the same
 
 
 def identify(
-    record: LoopRecord,
+    record: LoopRecord | SpectrumRecord,
     *,
+    frame_rate_hz: float | None = None,
+    delay_frames: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
     assumed_gain: float = 1.0,
     announced: Sequence[LinePrior] = (),
@@ -42,8 +45,13 @@ def identify(
 
     Parameters
     ----------
-    record : LoopRecord
-        What the loop recorded, in closed or open loop; the delay must be known in closed loop.
+    record : LoopRecord or SpectrumRecord
+        What the loop recorded, in closed or open loop, or spectra; the delay must be known in
+        closed loop.
+    frame_rate_hz : float, optional
+        Frame rate of the loop to come [Hz], where the record is of spectra and does not tell it.
+    delay_frames : float, optional
+        Total delay of the loop to come [frames], where the record does not tell it; 2 by default.
     sensor_gain : float or one an axis, optional
         Sensor gain, if it is known.
     assumed_gain : float, optional
@@ -90,19 +98,35 @@ def identify(
     >>> lbt.kalman(found.plant()).certificate.passed
     True
     """
-    count = record.measurements.shape[1]
+    known = [(line.frequency_hz, line.frequency_error_hz) for line in announced]
+    options: dict[str, Any] = {
+        "announced": known, "lowest_line_hz": lowest_line_hz, "most_lines": most_lines,
+    }  # fmt: skip
+    if isinstance(record, SpectrumRecord):
+        return _of_spectra(record, frame_rate_hz, delay_frames, options)
+    instance(record, LoopRecord)
+    if frame_rate_hz is not None and frame_rate_hz != record.frame_rate_hz:
+        raise ProblemError(
+            f"the record has {record.frame_rate_hz:.9g} frames a second; got frame_rate_hz="
+            f"{frame_rate_hz!r}. It is for spectra only."
+        )
+    delay = record.delay_frames
+    if None not in (delay_frames, delay) and delay_frames != delay:
+        raise ProblemError(
+            f"the record has a delay of {delay:g} frames; got {delay_frames!r}. Try "
+            "record.with_delay(...)."
+        )
+    count = record.axes
     gains = _gains(sensor_gain, count)
     corrections = None
-    delay = record.delay_frames
     if record.commands is not None:
         if delay is None:
             raise ProblemError(
                 "the delay of a closed loop is needed to know what the mirror did; got a record "
-                "without one. Give delay_frames."
+                "without one. Try record.with_delay(...)."
             )
         corrections = record.corrections()
     pieces = record.stretches() if stretches is None else stretches
-    known = [(line.frequency_hz, line.frequency_error_hz) for line in announced]
     total, done = 2 * count, 0
 
     def one(i: int, gain: float | None, begin: IdentifiedAxis | None) -> IdentifiedAxis:
@@ -114,10 +138,8 @@ def identify(
             stretches=pieces,
             sensor_gain=gain,
             assumed_gain=assumed_gain,
-            announced=known,
-            lowest_line_hz=lowest_line_hz,
-            most_lines=most_lines,
             start=begin,
+            **options,
         )
         done += 1
         if progress is not None:
@@ -135,9 +157,40 @@ def identify(
     return IdentifiedModel(
         axes=tuple(axes),
         frame_rate_hz=record.frame_rate_hz,
-        delay_frames=2.0 if delay is None else delay,
+        delay_frames=next(d for d in (delay, delay_frames, _DELAY) if d is not None),
         mirror=record.mirror,
         notes=tuple(notes),
+    )
+
+
+def _of_spectra(
+    record: SpectrumRecord,
+    frame_rate_hz: float | None,
+    delay_frames: float | None,
+    options: dict[str, Any],
+) -> IdentifiedModel:
+    """Identify each spectrum, between 0 and the Nyquist frequency of the loop."""
+    rate = frame_rate_hz if frame_rate_hz is not None else record.frame_rate_hz
+    if rate is None:
+        raise ProblemError(
+            "the frame rate of the loop is needed to sample a spectrum's processes; got a record "
+            "without one. Give frame_rate_hz."
+        )
+    f = record.frequency_hz
+    inside = (f > 0) & (f < rate / 2)
+    axes = [
+        identify_spectrum(
+            f[inside], column[inside], frame_rate_hz=rate, averages=record.averages, **options
+        )
+        for column in record.density_nm2_hz.T
+    ]
+    left = int(np.sum(f >= rate / 2))
+    notes = (f"{left} frequencies beyond {rate / 2:g} Hz were left out",) if left else ()
+    return IdentifiedModel(
+        axes=tuple(axes),
+        frame_rate_hz=rate,
+        delay_frames=_DELAY if delay_frames is None else delay_frames,
+        notes=notes,
     )
 
 
