@@ -149,6 +149,8 @@ from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
 from .plotting import tracking_figure as tracking_figure
 from .plotting import tradeoff_figure as tradeoff_figure
+from .recorded import RecordedDesign as RecordedDesign
+from .recorded import design_from_record as design_from_record
 from .records import Finding as Finding
 from .records import LinePrior as LinePrior
 from .records import LoopRecord as LoopRecord

@@ -9,6 +9,7 @@ from lbt_synth.cli.design_commands import design, show, verify
 from lbt_synth.cli.end_to_end_commands import end_to_end, end_to_end_table
 from lbt_synth.cli.export_command import export
 from lbt_synth.cli.front_command import tradeoff_command
+from lbt_synth.cli.identify_command import auto, identify_command
 from lbt_synth.cli.limits_command import limits
 from lbt_synth.cli.loop_commands import sigma, simulate
 from lbt_synth.cli.mirror_command import mirror
@@ -19,10 +20,12 @@ from lbt_synth.cli.robustness_command import robustness
 from lbt_synth.cli.telemetry_command import telemetry
 
 COMMANDS: dict[str, Callable[[Namespace], Report]] = {
+    "auto": auto,
     "design": design,
     "e2e": end_to_end,
     "e2e-table": end_to_end_table,
     "export": export,
+    "identify": identify_command,
     "limits": limits,
     "mirror": mirror,
     "modal": modal,

@@ -11,7 +11,7 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import lbt_synth
@@ -170,6 +170,8 @@ def build_parser() -> argparse.ArgumentParser:
         help="of the series written (default float64)",
     )
 
+    _add_record_commands(command)
+
     robustness = command(
         "robustness",
         "Strehl ratio over an error of all vibration frequencies of the model: of filters designed "
@@ -309,6 +311,90 @@ def build_parser() -> argparse.ArgumentParser:
     paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")
     paper.add_argument("-o", "--output", required=True, help="directory to write into")
     return parser
+
+
+def _add_record_commands(command: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the commands that read what a loop recorded."""
+    identify = command(
+        "identify", "Identify turbulence, vibrations, noise and sensor gain from a record"
+    )
+    auto = command(
+        "auto", "From a record to a gain file: identify, design, certify, test on unseen data"
+    )
+    for sub in (identify, auto):
+        sub.add_argument(
+            "file",
+            help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
+            "and commands, or an open-loop series (identify: or a spectrum)",
+        )
+        facts = sub.add_argument_group("what the file does not tell")
+        facts.add_argument("--kind", choices=("closed-loop", "open-loop", "spectrum"))
+        facts.add_argument("--frame-rate-hz", type=float, help="frame rate [Hz]")
+        facts.add_argument("--delay-frames", type=float, help="total delay [frames]")
+        facts.add_argument("--unit", help="of the measurements: nm, um, m, mas, arcsec, urad, rad")
+        facts.add_argument("--command-unit", help="of the commands (default: --unit)")
+        facts.add_argument("--diameter-m", type=float, help="telescope diameter [m], for angles")
+        facts.add_argument("--obstruction", type=float, help="as a fraction of the diameter")
+        facts.add_argument("--commands", help="another file, with the commands")
+        facts.add_argument(
+            "--columns",
+            nargs="+",
+            metavar="ROLE=NAME",
+            help="columns by name or number from 0, as in measurements=tip,tilt commands=3,4",
+        )
+        facts.add_argument(
+            "--axes", nargs="+", type=int, help="which of several columns or modes, from 0"
+        )
+        known = sub.add_argument_group("what is known beforehand")
+        known.add_argument(
+            "--sensor-gain", nargs="+", type=float, help="sensor gain, of both axes or of each"
+        )
+        known.add_argument(
+            "--assumed-gain",
+            type=float,
+            default=1.0,
+            help="sensor gain where the data do not tell it (default 1)",
+        )
+        known.add_argument(
+            "--lines-hz", nargs="+", type=float, help="frequencies of vibrations [Hz]"
+        )
+        known.add_argument(
+            "--lines-error-hz",
+            type=float,
+            default=0.1,
+            help="standard error of --lines-hz [Hz] (default 0.1)",
+        )
+        known.add_argument("--lines-file", help="text file with a frequency a row [Hz]")
+        known.add_argument(
+            "--accelerometers",
+            help="NPY or CSV with a column a sensor, frame by frame beside the record: what is "
+            "coherent with it is expected as a line",
+        )
+        known.add_argument(
+            "--lowest-line-hz",
+            type=float,
+            default=3.0,
+            help="what is below counts as turbulence [Hz] (default 3)",
+        )
+        known.add_argument(
+            "--most-lines", type=int, default=20, help="vibrations an axis, at most (default 20)"
+        )
+        sub.add_argument(
+            "--wavelength-um", type=float, default=2.2, help="of Strehl ratios (default 2.2)"
+        )
+        sub.add_argument("--figure", help="figure to write (default: the output's name, .png)")
+        sub.add_argument("--no-figure", action="store_true", help="write none")
+    identify.add_argument("-o", "--output", required=True, help="configuration to write (.yaml)")
+    auto.add_argument(
+        "--method", choices=("kalman", "hinf", "lqg"), default="kalman", help="default kalman"
+    )
+    auto.add_argument(
+        "--gamma-ratio", type=float, default=1.2, help="hinf: norm over the least (default 1.2)"
+    )
+    auto.add_argument("--model", help="configuration to write (default: the output's name, .yaml)")
+    auto.add_argument(
+        "-o", "--output", required=True, help="gain file to write (.fits, .npz or .json)"
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:

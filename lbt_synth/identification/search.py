@@ -72,12 +72,9 @@ def candidates(
             mean = (ratio[starts + width] - ratio[starts]) / width
             n = weight[starts + width] - weight[starts]
             gain = np.where(mean > 1, n * (mean - 1 - np.log(np.maximum(mean, 1))), 0)
-            best = np.argsort(gain)[::-1][: 8 * most]
-            found += [
-                (float(gain[i]), int(starts[i]), int(starts[i]) + width)
-                for i in best
-                if gain[i] > least
-            ]
+            worthy = np.flatnonzero(gain > least)
+            best = worthy[np.argsort(gain[worthy])[::-1][: 8 * most]]
+            found += [(float(gain[i]), int(starts[i]), int(starts[i]) + width) for i in best]
         width *= 2
     found.sort(reverse=True)
     out: list[Candidate] = []

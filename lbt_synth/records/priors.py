@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, TelemetryError
+from lbt_synth.records.contents import read_contents
 from lbt_synth.records.csvfile import read_csv
-from lbt_synth.validation import BoolArray, FloatArray, integer, number, real_array
+from lbt_synth.validation import BoolArray, FloatArray, frozen, integer, number, real_array
 
 _FEWEST_AVERAGES = 8
 _AVERAGES = 32  # that a segment is chosen for
@@ -132,6 +133,43 @@ def _lines_of_file(path: Path) -> list[LinePrior]:
         raise TelemetryError(f"{path} is no text in UTF-8.", path=path) from error
     except LbtSynthError as error:
         raise TelemetryError(f"{path}: {error}", path=path) from error
+
+
+def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
+    """Read a column a sensor from a file of any format that records have.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, NPY, NPZ or CSV, with a row a frame.
+
+    Returns
+    -------
+    (frames, sensors) ndarray
+        The columns, but for those of time.
+
+    Raises
+    ------
+    TelemetryError
+        If the file cannot be read or holds no columns.
+    """
+    source = Path(path)
+    try:
+        content = source.read_bytes()
+    except OSError as error:
+        raise TelemetryError(f"cannot read {source}: {error.strerror}.", path=source) from error
+    found = [
+        column.values
+        for column in read_contents(source, content).columns
+        if column.role not in ("times", "frame_numbers")
+    ]
+    if not found or len({values.size for values in found}) > 1:
+        raise TelemetryError(
+            f"{source} must hold columns of one length, a sensor each; got "
+            f"{len(found)} of {sorted({values.size for values in found})} rows.",
+            path=source,
+        )
+    return frozen(np.stack(found, axis=1))
 
 
 def lines_of_accelerometer(

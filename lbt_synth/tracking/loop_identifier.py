@@ -36,6 +36,7 @@ class LoopIdentifier:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import lbt_synth as lbt
     >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10, frame_rate_hz=500)
     >>> line = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=100, direction=(1,))
@@ -45,8 +46,8 @@ class LoopIdentifier:
     >>> truth = lbt.Truth(turbulence=slow, vibrations=(moved,), noise_nm=15.5)
     >>> tracker = lbt.TrackingController(plant, lbt.LoopIdentifier(plant), window_s=4)
     >>> run = lbt.simulate(tracker, truth, hardware=plant.hardware, frames=2000)
-    >>> round(tracker.history[-1].frequencies_hz[0])
-    43
+    >>> bool(min(abs(np.array(tracker.history[-1].frequencies_hz) - 43)) < 0.5)
+    True
     """
 
     def __init__(self, plant: TipTiltPlant, *, find_gain: bool = True, most_lines: int = 2) -> None:
