@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from plants import lbt_axis_plant
 
@@ -657,7 +657,6 @@ def test_the_figure_has_the_frequencies_and_the_residuals():
 
 
 @pytest.mark.study
-@settings(deadline=None)
 @pytest.mark.parametrize("damping", [None, 0.01])
 def test_tracking_is_within_two_points_of_knowing(damping):
     """17 to 23 Hz in a minute; docs/tracking.md prints the numbers."""
