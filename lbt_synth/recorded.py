@@ -13,7 +13,7 @@ from lbt_synth.loop import Imaging
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.records import LinePrior, LoopRecord, require_length
 from lbt_synth.replay import PredictionTable, prediction_against_data, split_halves
-from lbt_synth.validation import choice, instance
+from lbt_synth.validation import choice, instance, number
 
 METHODS = ("kalman", "hinf", "lqg")
 _GAMMA_RATIO = 1.2
@@ -114,6 +114,10 @@ def design_from_record(
     """
     instance(record, LoopRecord)
     choice(method, "method", METHODS)
+    number(
+        gamma_ratio, "gamma_ratio", at_least=1,
+        hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
+    )  # fmt: skip
     if record.delay_frames is None:
         raise ProblemError(
             "a design needs the delay of the loop; got a record without one. Try "

@@ -60,6 +60,7 @@ def test_public_fields_say_which_gain_they_are(name):
         "docs/mirror.md",
         "docs/modal.md",
         "docs/replay.md",
+        "docs/records.md",
         "docs/tracking.md",
     ],
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -205,18 +203,23 @@ def test_resonances_and_closed_loops_are_no_faults():
 
 
 @settings(max_examples=30)
-@given(seed=st.integers(0, 2**31), at=st.integers(0, 4999), sign=st.sampled_from([-1, 1]))
+@given(
+    seed=st.integers(0, 2**31),
+    at=st.one_of(st.integers(0, 3), st.integers(0, 4999)),
+    sign=st.sampled_from([-1, 1]),
+)
 def test_one_spike_is_one_outlier(seed, at, sign):
     rng = np.random.default_rng(seed)
     y = 15 * rng.standard_normal((5000, 2))
-    y[at, 1] += sign * 300
+    y[at, 1] += sign * 450  # half of it bends the frame beside an end
     seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
     found = np.flatnonzero(~seen.usable)
     assert at in found
-    assert len(found) <= (2 if at in (0, 1, 4998, 4999) else 1)
+    # beside an end the frames that nothing can judge go with it
+    assert len(found) == {0: 2, 1: 2, 2: 3}.get(min(at, 4999 - at), 1)
     assert kinds(seen) == {("outlier", "measurements", 1)}
     assert np.array_equal(seen.measurements[seen.usable], y[seen.usable])
-    assert np.max(np.abs(seen.measurements)) < 200  # the filler is not the spike
+    assert np.max(np.abs(seen.measurements)) < 300  # the filler is not the spike
 
 
 @pytest.mark.parametrize("length", [2, 3, 4])
@@ -249,6 +252,17 @@ def test_gaps_of_every_kind():
         "1956 of 2000 frames are usable; 1 not finite (measurements), 40 stuck (measurements), "
         "3 not finite (measurements)."
     )
+
+
+def test_masked_and_absurd_values_are_gaps():
+    y = np.random.default_rng(0).standard_normal((100, 1))
+    y[20] = 1e308
+    y[30] = -3e105
+    masked = np.ma.masked_array(y, mask=np.arange(100)[:, None] == 50)
+    for unit in ("nm", "m"):
+        seen = lbt.loop_record(masked, frame_rate_hz=RATE, unit=unit)
+        assert np.flatnonzero(~seen.usable).tolist() == [20, 30, 50]
+        assert np.all(np.abs(seen.measurements) < 1e11)
 
 
 def test_a_dead_axis_leaves_nothing():
@@ -362,7 +376,7 @@ def test_rows_that_come_twice():
         ({"times_s": [1, 1, 1, 1, 1, 1]}, "times_s must rise"),
         ({"times_s": [0, 1, 2.4, 4.3, 5.3, 6.3]}, "lie on no regular grid of 1 Hz"),
         ({"times_s": np.arange(6), "frame_rate_hz": 2}, "must be that of the times, 1 Hz; got 2"),
-        ({"times_s": [0, 1, 2, 3, 4, 500]}, "% of the frames would be missing"),
+        ({"times_s": [0, 1, 2, 3, 4, 500]}, "495 of 501 frames would be missing"),
         (
             {"times_s": [0, 1, 2, 3, 4, 500], "frame_rate_hz": 1},
             "495 of 501 frames would be missing",
@@ -447,196 +461,3 @@ def test_length():
     quick = lbt.loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
     with pytest.raises(lbt.ProblemError, match="needs 8000 usable frames"):
         lbt.require_length(quick)
-
-
-# -------------------------------------------------------------------- units
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [
-        ("nm", 1.0),
-        ("um", 1e3),
-        ("µm", 1e3),
-        ("m", 1e9),
-        ("mas", 9.96292),
-        ("arcsec", 9962.92),
-        ("urad", 2055.0),  # D/4 = 2.055 m a radian
-        ("rad", 2.055e9),
-    ],
-)
-def test_units(unit, factor):
-    y = np.array([1.0, 2.0, -1.0])
-    seen = lbt.loop_record(y / factor, frame_rate_hz=RATE, unit=unit, diameter_m=8.22)
-    assert seen.measurements[:, 0] == pytest.approx(y, rel=1e-5)
-    if unit in ("mas", "arcsec", "urad", "rad"):
-        with pytest.raises(lbt.ProblemError, match="give diameter_m"):
-            lbt.loop_record(y, frame_rate_hz=RATE, unit=unit)
-
-
-def test_commands_may_have_a_unit_of_their_own():
-    y = np.random.default_rng(0).standard_normal((30, 1))
-    seen = lbt.loop_record(y, y, frame_rate_hz=RATE, unit="nm", command_unit="um")
-    assert np.allclose(seen.commands, 1e3 * y)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"unit": "volt"}, "unit must be one of nm, um, m, mas"),
-        ({"unit": 3}, "unit must be one of"),
-        ({"command_unit": "pixel"}, "unit must be one of"),
-        ({"measurements": np.ones((3, 5))}, "one or two axes.*Choose tip and tilt"),
-        ({"measurements": np.ones((2, 50))}, "one or two axes.*Transpose it"),
-        ({"measurements": []}, "not empty"),
-        ({"measurements": [["a"]]}, "array of numbers"),
-        ({"commands": np.ones((30, 1))}, "commands must match measurements"),
-        ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
-        ({"diameter_m": -1}, "diameter_m must be above 0"),
-        ({"obstruction": 1}, "obstruction must be below 1"),
-        ({"mirror": "shell"}, "expected a PositionLoop"),
-    ],
-)
-def test_arrays_that_are_refused(change, words):
-    y = np.random.default_rng(0).standard_normal((30, 2))
-    fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE, "unit": "nm"}
-    with pytest.raises(lbt.ProblemError, match=words):
-        lbt.loop_record(**{**fields, **change})
-
-
-def test_a_mirror_that_does_not_fit_the_rate_is_refused():
-    y = np.random.default_rng(0).standard_normal((30, 1))
-    with pytest.raises(lbt.ProblemError, match="whole number of samples a frame"):
-        lbt.loop_record(y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm")
-
-
-def test_records_are_frozen():
-    seen = lbt.loop_record([1.0, 2.0], [1.0, 3.0], frame_rate_hz=RATE, unit="nm")
-    for name in ("measurements", "commands", "usable", "measured", "commanded"):
-        assert not getattr(seen, name).flags.writeable
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        seen.source = "x"
-    with pytest.raises(lbt.DimensionError, match="usable must be 2 truth values"):
-        dataclasses.replace(seen, usable=np.ones(3, dtype=bool))
-    with pytest.raises(lbt.DimensionError, match="commands must have 2 rows"):
-        dataclasses.replace(seen, commands=np.ones((3, 1)))
-
-
-# ---------------------------------------------------------------- telemetry
-def telemetry(frames=60, **changes):
-    rng = np.random.default_rng(2)
-    fields = {
-        "frame_rate_hz": RATE,
-        "delay_frames": 2.0,
-        "commands": rng.standard_normal((frames, 2)),
-        "measurements": rng.standard_normal((frames, 2)),
-    }
-    return lbt.Telemetry(**{**fields, **changes})
-
-
-@pytest.mark.parametrize("axes", [1, 2])
-def test_telemetry_of_a_simulation_with_matrices(axes):
-    rng = np.random.default_rng(3)
-    path = lbt.LoopHardware(
-        frame_rate_hz=RATE,
-        delay_frames=2.25,
-        sensor_matrix=rng.standard_normal((3, axes)),
-        influence_matrix=np.eye(axes) + 0.1 * rng.standard_normal((axes, axes)),
-        mirror=SHELL,
-    )
-    truth = lbt.Truth(turbulence=SLOW, sensor_gain=0.7)
-    design = lbt.integrator(path, gain=0.1)
-    run = lbt.simulate(design.controller, truth, hardware=path, frames=400, seed=5)
-    seen = lbt.record_of(lbt.telemetry_of(run, path))
-    assert seen.axes == axes
-    first = len(path.mirror_taps)
-    z = seen.pseudo_open_loop(0.7)[first:]
-    assert np.allclose(z, run.total_nm[0, first - 1 : -1], rtol=1e-9, atol=1e-8)
-    assert "measurements: the inverse of the interaction matrix times what was recorded" in (
-        seen.health.notes
-    )
-
-
-def test_modes_of_many():
-    rng = np.random.default_rng(0)
-    y, u = rng.standard_normal((2, 60, 5))
-    many = telemetry(measurements=y, commands=u, diameter_m=8.0, name="night")
-    with pytest.raises(lbt.ProblemError, match=r"has 5 modes; say which are tip and tilt: modes="):
-        lbt.record_of(many)
-    seen = lbt.record_of(many, modes=(1, 0))
-    assert np.array_equal(seen.measurements, y[:, [1, 0]])
-    assert np.array_equal(seen.commands, u[:, [1, 0]])
-    assert "axes are modes 1, 0 of 5" in seen.health.notes
-    assert (seen.diameter_m, seen.source) == (8.0, "night")
-    assert lbt.record_of(many, modes=[3]).axes == 1
-    for bad in ((0, 0), (5,), (0, 1, 2), ()):
-        with pytest.raises(lbt.ProblemError, match="one or two different modes below 5"):
-            lbt.record_of(many, modes=bad)
-
-
-def test_slopes_with_their_modes_and_without():
-    rng = np.random.default_rng(0)
-    S = rng.standard_normal((8, 3))
-    phase = rng.standard_normal((60, 3))
-    slopes = phase @ S.T
-    R = np.linalg.pinv(S)
-    seen = lbt.record_of(
-        telemetry(
-            measurements=slopes @ R.T,
-            slopes=slopes,
-            interaction_matrix=S,
-            reconstructor=R,
-            commands=phase,
-        ),
-        modes=(0, 1),
-    )
-    assert np.allclose(seen.measurements, phase[:, :2])
-    # a reconstructor of another gain is taken out
-    half = lbt.record_of(
-        telemetry(
-            measurements=slopes @ R.T / 2, slopes=slopes, interaction_matrix=S,
-            reconstructor=R / 2, commands=phase,
-        ),
-        modes=(0, 1),
-    )  # fmt: skip
-    assert np.allclose(half.measurements, phase[:, :2])
-    with pytest.raises(lbt.ProblemError, match=r"slopes without modal coefficients.*slopes @ R.T"):
-        lbt.record_of(
-            telemetry(measurements=slopes, interaction_matrix=S, commands=phase), modes=(0, 1)
-        )
-    with pytest.raises(lbt.ProblemError, match="slopes without modal coefficients"):
-        lbt.record_of(telemetry(measurements=slopes, influence_matrix=np.eye(2)))
-
-
-@pytest.mark.parametrize(
-    ("telemetry_changes", "options", "words"),
-    [
-        ({}, {"frame_rate_hz": 999}, "frame_rate_hz must be that of the telemetry, 1000 Hz"),
-        ({}, {"unit": "mas"}, "unit must be that of the measurements, nm"),
-        ({"measurement_unit": "pixel"}, {}, "unit of the measurements is 'pixel'.*give unit"),
-        ({"command_unit": "V"}, {}, "unit of the commands is 'V'"),
-        (
-            {"commands": np.ones((60, 3)), "interaction_matrix": np.eye(2)},
-            {},
-            "3 commands of 2 modes, and no influence matrix",
-        ),
-        ({"interaction_matrix": [[1.0, 1.0], [1.0, 1.0]]}, {}, "has no inverse"),
-        ({"delay_frames": 0.5}, {}, "delay_frames must be at least 1"),
-    ],
-)
-def test_telemetry_that_is_refused(telemetry_changes, options, words):
-    with pytest.raises(lbt.ProblemError, match=words):
-        lbt.record_of(telemetry(**telemetry_changes), **options)
-
-
-def test_what_telemetry_does_not_tell_is_given():
-    seen = lbt.record_of(
-        telemetry(measurement_unit="px", command_unit="V", delay_frames=None),
-        delay_frames=2.5, diameter_m=8.0, unit="mas", command_unit="nm",
-    )  # fmt: skip
-    assert seen.delay_frames == 2.5
-    assert np.allclose(seen.measurements, lbt.nm_per_mas(8.0) * telemetry().measurements)
-    assert np.array_equal(seen.commands, telemetry().commands)
-    other = lbt.record_of(telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5)
-    assert (other.delay_frames, other.diameter_m) == (3.0, 6.5)
-    assert "delay_frames 3 was given; the telemetry has 2" in other.health.notes
-    with pytest.raises(lbt.ProblemError, match="expected a Telemetry"):
-        lbt.record_of("night.fits")

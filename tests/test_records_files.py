@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from astropy.io import fits
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.records.csvfile import read_csv
 
 RATE = 500.0
 
@@ -287,7 +284,9 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     assert any("3 was given; the file has 2.5" in note for note in other.health.notes)
     # a delay of unknown unit is not taken
     unsure = hdus(tmp_path / "b.fits", image("Y", y, "nm"), image("U", u, "nm"), DELAY=0.002)
-    assert lbt.load_record(unsure, frame_rate_hz=RATE).delay_frames is None
+    seen = lbt.load_record(unsure, frame_rate_hz=RATE)
+    assert seen.delay_frames is None
+    assert any("does not say that it is in frames" in note for note in seen.health.notes)
     twice = hdus(tmp_path / "c.fits", image("POL", y, "nm", FPS=400.0), FRAMRATE=RATE)
     with pytest.raises(lbt.ProblemError, match="frame_rate_hz is told twice"):
         lbt.load_record(twice)
@@ -449,6 +448,25 @@ def test_damage(tmp_path, name, content, words):
     assert "Traceback" not in str(caught.value)
 
 
+@pytest.mark.parametrize("size", [2000, 4000, 6000])
+def test_truncated_files(tmp_path, series, size):
+    path = hdus(tmp_path / "a.fits", image("POL", np.tile(series[0], (10, 1)), "nm"))
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(lbt.LbtSynthError, match=r"a\.fits"):
+        lbt.load_record(path, frame_rate_hz=RATE)
+
+
+def test_nulls_of_integer_columns(tmp_path):
+    values = np.random.default_rng(0).integers(-500, 500, 40).astype(np.int32)
+    values[7] = -99999
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column("POL", "J", array=values, null=-99999, unit="nm")]
+    )
+    seen = lbt.load_record(hdus(tmp_path / "a.fits", table), frame_rate_hz=RATE)
+    assert np.flatnonzero(~seen.usable).tolist() == [7]
+    assert np.array_equal(seen.measurements[8:, 0], values[8:])
+
+
 def test_no_pickle_is_opened(tmp_path):
     np.save(tmp_path / "a.npy", np.array([{"y": 1}], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "b.npz", y=np.array([{"y": 1}], dtype=object))
@@ -469,31 +487,3 @@ def test_files_without_series(tmp_path):
     np.savez(tmp_path / "b.npz", cube=np.ones((3, 4, 5)), text=np.array(["a", "b"]))
     with pytest.raises(lbt.ProblemError, match="holds no series of numbers"):
         lbt.load_record(tmp_path / "b.npz")
-
-
-# ------------------------------------------------------------------------ CSV
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    rows=st.lists(
-        st.tuples(*[st.one_of(st.none(), st.floats(allow_nan=False, allow_infinity=False))] * 3),
-        min_size=1,
-        max_size=8,
-    ),
-    sign=st.sampled_from([",", ";", "\t", "|"]),
-    heading=st.booleans(),
-)
-def test_any_table_comes_back(rows, sign, heading):
-    head = [sign.join(["alpha", "beta", "gamma"])] if heading else []
-    lines = [sign.join("" if v is None else repr(v) for v in row) for row in rows]
-    table = read_csv("\n".join(head + lines))
-    expected = np.array([[np.nan if v is None else v for v in row] for row in rows])
-    assert np.array_equal(table.values, expected, equal_nan=True)
-    assert table.names == (["alpha", "beta", "gamma"] if heading else [""] * 3)
-
-
-def test_headings_in_comments_and_decimal_commas():
-    table = read_csv("# time_s y_nm\n0.0 1.5\n0.1 2.5\n")
-    assert table.names == ["time_s", "y_nm"]
-    table = read_csv("t_s;y_nm\n0,5;1,25\n1,0;-2\n")
-    assert table.values.tolist() == [[0.5, 1.25], [1.0, -2.0]]
-    assert table.notes == ["commas were taken for decimal points"]

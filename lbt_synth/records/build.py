@@ -19,6 +19,7 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array, i
 _LEAST_FRAMES = 4096
 _LEAST_SECONDS = 4.0
 _SHORTEST_STRETCH = 256  # frames of a stretch that counts
+_LARGEST_NM = 1e100  # beyond it a number is none, and its square overflows
 _OPEN_FRAMES = 20  # of zero commands
 _TREND = 2.0
 _LEAST_QUARTER = 64  # pairs of frames, to speak of a trend
@@ -106,13 +107,13 @@ def loop_record(
     9.963
     """
     scale = nm_per(unit, diameter_m=diameter_m)
-    y = scale * _columns(measurements, "measurements")
+    y = _columns(measurements, "measurements", scale)
     u = None
     if commands is not None:
         command_scale = nm_per(
             unit if command_unit is None else command_unit, diameter_m=diameter_m
         )
-        u = command_scale * _columns(commands, "commands")
+        u = _columns(commands, "commands", command_scale)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
     clock = clock_of(
@@ -246,8 +247,10 @@ def require_length(
     return count
 
 
-def _columns(value: Any, name: str) -> FloatArray:
-    """Return a series as (frames, axes), not finite values included."""
+def _columns(value: Any, name: str, scale: float) -> FloatArray:
+    """Return a series as (frames, axes) in nm; NaN is what is masked, not finite or absurd."""
+    if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "fiub":
+        value = np.ma.filled(value.astype(np.float64), np.nan)
     out = float_array(value, name)
     if out.ndim == 1:
         out = out[:, None]
@@ -256,7 +259,9 @@ def _columns(value: Any, name: str) -> FloatArray:
     if out.shape[1] > 2:
         turn = " Transpose it." if out.shape[0] <= 2 else " Choose tip and tilt."
         raise DimensionError(f"{name} must have one or two axes; got {out.shape}.{turn}")
-    return out
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = scale * out
+        return np.where(np.abs(scaled) < _LARGEST_NM, scaled, np.nan)
 
 
 def _laid_out(rows: FloatArray, at: IntArray, frames: int) -> FloatArray:

@@ -13,7 +13,8 @@ from lbt_synth.validation import FloatArray, IntArray, number, real_array
 _SAME_RATE = 5e-3  # by which a stated rate may differ from that of the times
 _CLEAR = 0.3  # of a frame: how far a step may be from a whole number of frames
 _LATE = 0.45  # of a frame, for times with a jitter
-_MOST_GUESSED_HOLES = 0.1  # of the frames, where the rate is found from the times
+_MOST_UNEVEN = 0.1  # of the steps over more than a frame, where the times tell the rate
+_FEW_ROWS = 20  # of which no share is taken
 _MOST_HOLES = 9  # missing frames over those that are there
 
 
@@ -83,11 +84,11 @@ def clock_of(
         if rate is None:
             rate = found
             notes.append(f"frame rate {rate:.9g} Hz, from the times")
-            holes = 1 - rows / (frame[-1] + 1)
-            if frame_numbers is None and holes > _MOST_GUESSED_HOLES:
+            uneven = float(np.mean(np.diff(frame) > 1))
+            if frame_numbers is None and rows > _FEW_ROWS and uneven > _MOST_UNEVEN:
                 raise ProblemError(
-                    f"the median step of the times is {1 / rate:.6g} s, and {100 * holes:.3g} % of "
-                    f"the frames would be missing at {rate:.6g} Hz: the times may be rounded. Give "
+                    f"{100 * uneven:.3g} % of the steps in time would leave frames out at "
+                    f"{rate:.6g} Hz, the rate by the median step: the times may be rounded. Give "
                     "frame_rate_hz."
                 )
         elif abs(found / rate - 1) > _SAME_RATE:

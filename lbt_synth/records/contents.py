@@ -97,6 +97,8 @@ def _fits(content: bytes) -> Contents:
     out = Contents()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # foreign headers deviate in many small ways
+        for damage in (".*truncated.*", ".*Error validating header.*"):
+            warnings.filterwarnings("error", message=damage)
         with fits.open(io.BytesIO(content), memmap=False) as units:
             for place, unit in enumerate(units):
                 name = unit.name if unit.name and unit.name != "PRIMARY" else ""
@@ -116,13 +118,18 @@ def _tell_card(out: Contents, card: Any, where: str) -> None:
     fact = fact_of(keyword)
     if keyword == _DELAY_CARD and "frame" in str(card.comment).lower():
         fact = "delay_frames"
+    elif keyword == _DELAY_CARD:
+        out.notes.append("DELAY of the header was not taken: it does not say that it is in frames")
     if fact is not None and fact != "unit" and not isinstance(card.value, bool | str):
         out.tell(fact, card.value, f"{keyword} of {where}")
 
 
 def _table(out: Contents, unit: Any) -> None:
     for described in unit.columns:
-        out.add(described.name, _native(np.asarray(unit.data[described.name])), described.unit)
+        data = _native(np.asarray(unit.data[described.name]))
+        if described.null is not None and data.dtype.kind in "iu":
+            data = np.where(data == int(described.null), np.nan, data)
+        out.add(described.name, data, described.unit)
 
 
 def _native(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -159,6 +166,8 @@ def _named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
             value = array.reshape(-1)[0]
             text = array.dtype.kind in "US"
             out.tell(fact, str(value) if text else float(value), name)
+        else:
+            out.notes.append(f"not used: {name}, a single value")
         return
     out.add(name, array)
 

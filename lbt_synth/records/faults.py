@@ -107,7 +107,7 @@ def outliers(series: FloatArray, good: BoolArray) -> BoolArray:
 
     The scale is the median deviation of the second differences, that of the whole record or
     of the 256 frames around, whichever is larger: a burst of vibration is no outlier, and one
-    value cannot raise the median. A strong sinusoid stays below 1.4 of its own scale.
+    value cannot raise the median. A strong sinusoid stays below its own scale.
     """
     good = good.copy()
     out = np.zeros(len(series), dtype=np.bool_)
@@ -118,10 +118,13 @@ def outliers(series: FloatArray, good: BoolArray) -> BoolArray:
             break
         size = np.abs(bend)
         scale = np.maximum(_local_scale(size, valid), smallest)
-        beside = np.maximum(np.append(size[1:], 0.0), np.concatenate([[0.0], size[:-1]]))
-        found = good & (size > _OUTLIER * scale) & (size >= 0.9 * beside)
+        beside = np.maximum(np.append(size[1:], 0.0), np.append(0.0, size[:-1]))
+        found = valid & (size > _OUTLIER * scale) & (size >= 0.9 * beside)
         if not found.any():
             break
+        # a frame at an edge has no second difference: it may be the one that bends its neighbour
+        near = np.append(found[1:], False) | np.append(False, found[:-1])
+        found |= good & ~valid & near
         out |= found
         good &= ~found
     if out.any():  # frames between outliers that are too few to be judged
@@ -139,21 +142,13 @@ def _resolution(series: FloatArray, good: BoolArray) -> float:
 
 
 def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Second differences; a good frame at an edge has that of its neighbour."""
+    """Second differences, and where there are some: between two good frames."""
     bend = np.zeros(len(series))
     valid = np.zeros(len(series), dtype=np.bool_)
-    if len(series) < 3:
-        return bend, valid
-    valid[1:-1] = good[:-2] & good[1:-1] & good[2:]
-    inner = series[:-2] - 2 * series[1:-1] + series[2:]
-    bend[1:-1] = np.where(valid[1:-1], inner, 0.0)
-    full = bend.copy()
-    edge = good & ~valid
-    right = np.flatnonzero(edge[:-1] & valid[1:])
-    full[right] = bend[right + 1]
-    left = np.flatnonzero(edge[1:] & valid[:-1]) + 1
-    full[left] = np.where(np.abs(full[left]) > np.abs(bend[left - 1]), full[left], bend[left - 1])
-    return full, valid
+    if len(series) > 2:
+        valid[1:-1] = good[:-2] & good[1:-1] & good[2:]
+        bend[1:-1] = np.where(valid[1:-1], series[:-2] - 2 * series[1:-1] + series[2:], 0.0)
+    return bend, valid
 
 
 def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
