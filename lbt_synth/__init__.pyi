@@ -107,6 +107,7 @@ from .modal import project_out as project_out
 from .modal import reconstructor as reconstructor
 from .models import ARModel as ARModel
 from .models import Atmosphere as Atmosphere
+from .models import DriftingVibration as DriftingVibration
 from .models import EstimationProblem as EstimationProblem
 from .models import FullStatePlant as FullStatePlant
 from .models import LoopHardware as LoopHardware
@@ -146,6 +147,7 @@ from .plotting import modal_figure as modal_figure
 from .plotting import robustness_figure as robustness_figure
 from .plotting import sigma_figure as sigma_figure
 from .plotting import simulation_figure as simulation_figure
+from .plotting import tracking_figure as tracking_figure
 from .plotting import tradeoff_figure as tradeoff_figure
 from .recorded import RecordedDesign as RecordedDesign
 from .recorded import design_from_record as design_from_record
@@ -197,6 +199,13 @@ from .telemetry import Telemetry as Telemetry
 from .telemetry import load_telemetry as load_telemetry
 from .telemetry import save_telemetry as save_telemetry
 from .telemetry import telemetry_of as telemetry_of
+from .tracking import Identifier as Identifier
+from .tracking import LineFollower as LineFollower
+from .tracking import LoopIdentifier as LoopIdentifier
+from .tracking import SwitchedController as SwitchedController
+from .tracking import SwitchReport as SwitchReport
+from .tracking import TrackingController as TrackingController
+from .tracking import TrackingUpdate as TrackingUpdate
 from .witness import Witness as Witness
 from .witness import infeasible_level as infeasible_level
 

@@ -20,6 +20,7 @@ from lbt_synth.limits import (
 )
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.models import FullStatePlant, LoopHardware, SinusoidalVibration, TipTiltPlant, Truth
+from lbt_synth.models.truth import stationary_vibrations
 from lbt_synth.shaping import ResidualVariance, VibrationBand
 from lbt_synth.shaping.measured import mode_hardware, mode_loop
 from lbt_synth.shaping.terms import leaves
@@ -147,12 +148,13 @@ def limit_study(
     errors = [number(error, "errors_hz") for error in errors_hz]
     if not errors:
         raise ProblemError("errors_hz must hold at least one error; got none.")
+    vibrations = stationary_vibrations(truth.vibrations)
     shifts = _shifts(truth, errors)
     limit = _limit_or_none(lambda: least_residual(hardware, truth))
     band_hz = _band(truth, shifts)
     band = None
     if band_hz is not None:
-        line = truth.vibrations[0]
+        line = vibrations[0]
         band = _limit_or_none(
             lambda: least_worst_residual(
                 hardware, truth, band_hz=band_hz, rms_nm=line.rms_nm, direction=line.direction
@@ -168,7 +170,7 @@ def limit_study(
             row = replace(row, above_band_limit_percent=above)
         rows.append(row)
         curves.append(curve)
-    frequencies = {line.frequency_hz for line in truth.vibrations}
+    frequencies = {line.frequency_hz for line in vibrations}
     return LimitStudy(
         rows=tuple(rows),
         limit=limit,
@@ -220,7 +222,7 @@ def _examined(
     for i, shift in enumerate(shifts):
         moved = tuple(
             replace(line, frequency_hz=line.frequency_hz + float(shift))
-            for line in truth.vibrations
+            for line in stationary_vibrations(truth.vibrations)
         )
         own = residual_budget(loop, replace(still, vibrations=moved))
         variance[i] = rest + np.trace(own.vibration_nm2)

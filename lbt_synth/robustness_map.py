@@ -16,7 +16,7 @@ from lbt_synth.loop.closed_loop import STABILITY_MARGIN, close_loops, loop_poles
 from lbt_synth.loop.sensor_gains import rejections, spectrum_covariances
 from lbt_synth.loop.strehl import jitter_spread_nm, jitter_strehls, widest_jitter_nm
 from lbt_synth.models import ARModel, LoopHardware, Truth, Vibration
-from lbt_synth.models.truth import fitted_direction
+from lbt_synth.models.truth import fitted_direction, stationary_vibrations
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import (
     BoolArray,
@@ -189,7 +189,7 @@ def _moved(truth: Truth, error_hz: float, hardware: LoopHardware) -> Truth:
         )
     nyquist = hardware.frame_rate_hz / 2
     moved = []
-    for vibration in truth.vibrations:
+    for vibration in stationary_vibrations(truth.vibrations):
         fitted_direction(vibration, hardware)
         frequency = vibration.frequency_hz - float(error_hz)
         if not 0 < frequency < nyquist:
@@ -225,7 +225,8 @@ def _evaluated(
 
     gaussian = np.repeat(common[:, None], len(truths), axis=1)
     lines = []
-    for same in zip(*(truth.vibrations for truth in truths), strict=True):  # one vibration, moved
+    moved = (stationary_vibrations(truth.vibrations) for truth in truths)
+    for same in zip(*moved, strict=True):  # one vibration, moved
         direction = fitted_direction(same[0], hardware)
         if isinstance(same[0], Vibration):
             models = [line.ar_model(hardware.frame_rate_hz) for line in same]

@@ -93,7 +93,7 @@ def simulate(arguments: Namespace) -> Report:
 
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
     _require_fitting_loop(loop, design)
-    budget = residual_budget(loop, truth)
+    loop.require_stable()
     # the same settling for all controllers, so that one seed is one weather
     settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
     with working("closing the loop", quiet=arguments.json):
@@ -107,32 +107,24 @@ def simulate(arguments: Namespace) -> Report:
             settle_frames=settle,
         )
         strehls = run.strehl(config.imaging)
-    exact = strehl(budget, config.imaging)
-    limit_nm = limit_or_nan(lambda: least_residual(config.hardware, truth))
-    above = above_percent(budget.rms_nm, limit_nm)
     command_rms = np.sqrt(np.sum(np.mean(run.commands**2, axis=(0, 1))))
     scatter = float(np.std(strehls, ddof=1)) if len(strehls) > 1 else float("nan")
+    exact = _exact(loop, config, truth)
     rows = [
-        ("Strehl ratio", 100 * float(np.mean(strehls)), 100 * exact, "%"),
-        ("residual", float(np.sqrt(np.mean(run.rms_nm**2))), budget.rms_nm, "nm rms"),
-        ("  turbulence", None, budget.turbulence_nm, "nm rms"),
-        ("  vibration", None, budget.vibration_nm, "nm rms"),
-        ("  noise", None, budget.noise_nm, "nm rms"),
+        ("Strehl ratio", 100 * float(np.mean(strehls)), _percent(exact["strehl_exact"]), "%"),
+        ("residual", float(np.sqrt(np.mean(run.rms_nm**2))), exact["residual_exact_nm"], "nm rms"),
+        ("  turbulence", None, exact["turbulence_nm"], "nm rms"),
+        ("  vibration", None, exact["vibration_nm"], "nm rms"),
+        ("  noise", None, exact["noise_nm"], "nm rms"),
         ("commands", float(command_rms), None, "nm rms"),
-        ("least residual of any linear controller", None, limit_nm, "nm rms"),
-        ("  residual above it", None, round(above, 6) + 0.0, "%"),
+        ("least residual of any linear controller", None, exact["limit_nm"], "nm rms"),
+        ("  residual above it", None, exact["above_limit_percent"], "%"),
     ]
     report = Report(
         data={
             "strehl": strehls,
-            "strehl_exact": exact,
             "residual_nm": run.rms_nm,
-            "residual_exact_nm": budget.rms_nm,
-            "turbulence_nm": budget.turbulence_nm,
-            "vibration_nm": budget.vibration_nm,
-            "noise_nm": budget.noise_nm,
-            "limit_nm": limit_nm,
-            "above_limit_percent": above,
+            **exact,
             "command_rms": command_rms,
             "frames": run.residual_nm.shape[1],
             "cases": len(strehls),
@@ -144,10 +136,10 @@ def simulate(arguments: Namespace) -> Report:
                 title=f"{design.method} in the loop: {len(strehls)} "
                 f"run{'s' if len(strehls) > 1 else ''} of {run.residual_nm.shape[1]} frames",
                 headings=("quantity", "simulated", "exact", "unit"),
-                rows=rows,
+                rows=[row for row in rows if row[1:3] != (None, None)],
             )
         ],
-        notes=_simulation_notes(config, design, scatter, settle),
+        notes=_simulation_notes(config, design, scatter, settle, drifts=truth.drifts),
     )
     if arguments.output is not None:
         path = save_figure(
@@ -163,6 +155,27 @@ def simulate(arguments: Namespace) -> Report:
             report, arguments.telemetry, run, replace(config, truth=truth), design, arguments.gain
         )
     return report
+
+
+def _exact(loop: ClosedLoop, config: Config, truth: Truth) -> dict[str, float | None]:
+    """Return the exact answers, all None where the truth drifts: it has none."""
+    names = (
+        "strehl_exact", "residual_exact_nm", "turbulence_nm", "vibration_nm", "noise_nm",
+        "limit_nm", "above_limit_percent",
+    )  # fmt: skip
+    if truth.drifts:
+        return dict.fromkeys(names)
+    budget = residual_budget(loop, truth)
+    limit_nm = limit_or_nan(lambda: least_residual(config.hardware, truth))
+    values = (
+        strehl(budget, config.imaging), budget.rms_nm, budget.turbulence_nm, budget.vibration_nm,
+        budget.noise_nm, limit_nm, round(above_percent(budget.rms_nm, limit_nm), 6) + 0.0,
+    )  # fmt: skip
+    return dict(zip(names, values, strict=True))
+
+
+def _percent(value: float | None) -> float | None:
+    return None if value is None else 100 * value
 
 
 def _require_fitting_loop(loop: ClosedLoop, design: Design) -> None:
@@ -187,8 +200,12 @@ def _require_fitting_loop(loop: ClosedLoop, design: Design) -> None:
     )
 
 
-def _simulation_notes(config: Config, design: Design, scatter: float, settle: int) -> list[str]:
+def _simulation_notes(
+    config: Config, design: Design, scatter: float, settle: int, *, drifts: bool
+) -> list[str]:
     notes = []
+    if drifts:
+        notes.append("note: a vibration drifts, so there is no exact answer beside the simulation.")
     if not np.isnan(scatter):
         notes.append(f"scatter of the Strehl ratio between runs: {100 * scatter:.2f} points")
     usual = config.settings.simulation.settle_frames

@@ -22,6 +22,7 @@ from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.models import (
     ARModel,
     Atmosphere,
+    DriftingVibration,
     PositionLoop,
     SinusoidalVibration,
     Spectrum,
@@ -35,6 +36,7 @@ from lbt_synth.models import (
     tip_tilt_plant,
 )
 from lbt_synth.models.prior import line_frequencies, spread_lines
+from lbt_synth.models.truth import TrueVibration
 from lbt_synth.validation import FloatArray, frozen
 
 
@@ -227,12 +229,10 @@ def truth_of(
     )
 
 
-def _true_vibrations(
-    settings: FileSection, plant: TipTiltPlant
-) -> tuple[Vibration | SinusoidalVibration, ...]:
+def _true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVibration, ...]:
     if not isinstance(settings.truth.vibrations, list):
         return plant.vibrations
-    lines: list[Vibration | SinusoidalVibration] = []
+    lines: list[TrueVibration] = []
     for i, section in enumerate(settings.truth.vibrations):
         key = f"truth.vibrations[{i}]"
         _below_nyquist(section.frequency_hz, settings.loop.frame_rate_hz, f"{key}.frequency_hz")
@@ -242,11 +242,33 @@ def _true_vibrations(
                 "rms_nm": rms_nm(section, settings, key),
                 "direction": direction,
             }
-            if section.damping is None:
+            if section.kind == "drift":
+                lines.append(_drifting(section, size, settings.loop.frame_rate_hz, key))
+            elif section.damping is None:
                 lines.append(SinusoidalVibration(**size))
             else:
                 lines.append(Vibration(**size, damping=section.damping))
     return tuple(lines)
+
+
+def _drifting(
+    section: TrueVibrationSection, size: dict[str, Any], frame_rate_hz: float, key: str
+) -> DriftingVibration:
+    """Return a vibration that drifts from frequency_hz to end_hz."""
+    assert section.end_hz is not None  # the schema wants both with this kind
+    assert section.duration_s is not None
+    _below_nyquist(section.end_hz, frame_rate_hz, f"{key}.end_hz")
+    given = {name: value for name, value in size.items() if name != "frequency_hz"}
+    try:
+        return DriftingVibration(
+            **given,
+            start_hz=section.frequency_hz,
+            end_hz=section.end_hz,
+            duration_s=section.duration_s,
+            damping=section.damping,
+        )
+    except ProblemError as error:
+        raise ConfigError(f"{key}: {error}", path=key) from error
 
 
 def _relative_gain(settings: FileSection) -> float:

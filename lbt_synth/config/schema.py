@@ -143,15 +143,22 @@ class VibrationSection(_Line):
 
 
 class TrueVibrationSection(_Line):
-    """A vibration of the truth: a sinusoid, or a resonance with its damping."""
+    """A vibration of the truth: a sinusoid, a resonance with its damping, or one that drifts."""
 
-    kind: Literal["sinusoid", "resonance"]
+    kind: Literal["sinusoid", "resonance", "drift"]
     damping: Damping | None = None
+    end_hz: Positive | None = None
+    duration_s: Positive | None = None
 
     @model_validator(mode="after")
     def _damping_of_a_resonance(self) -> TrueVibrationSection:
-        if (self.kind == "resonance") != (self.damping is not None):
-            raise ValueError("damping goes with kind: resonance, and only with it")
+        if self.kind != "drift" and (self.kind == "resonance") != (self.damping is not None):
+            raise ValueError(
+                "damping goes with kind: resonance, and only with it or with kind: drift"
+            )
+        for given in (self.end_hz, self.duration_s):
+            if (self.kind == "drift") != (given is not None):
+                raise ValueError("end_hz and duration_s go with kind: drift, and only with it")
         return self
 
 

@@ -12,7 +12,14 @@ from typing import Any
 from lbt_synth.endtoend.result import EndToEndRun
 from lbt_synth.endtoend.setup import EndToEndSetup
 from lbt_synth.endtoend.system import EndToEndSystem
-from lbt_synth.models import LoopHardware, PositionLoop, SinusoidalVibration, Vibration
+from lbt_synth.models import (
+    DriftingVibration,
+    LoopHardware,
+    PositionLoop,
+    SinusoidalVibration,
+    Vibration,
+)
+from lbt_synth.models.truth import TrueVibration
 from lbt_synth.statespace import Controller
 
 _SETUP = ("frames", "settle_frames", "seed", "gain", "leak", "leak_from_mode")
@@ -23,7 +30,7 @@ def case_of(
     setup: EndToEndSetup,
     controller: Controller | None,
     *,
-    vibrations: Sequence[Vibration | SinusoidalVibration] = (),
+    vibrations: Sequence[TrueVibration] = (),
     seed: int = 0,
 ) -> dict[str, Any]:
     """Return the case of one run: other vibrations and another seed than the set-up's.
@@ -34,7 +41,7 @@ def case_of(
         System, length and integrators.
     controller : Controller or None
         Controller of tip and tilt; None for integrators.
-    vibrations : sequence of Vibration or SinusoidalVibration, optional
+    vibrations : sequence of Vibration, SinusoidalVibration or DriftingVibration, optional
         Vibrations of tip and tilt.
     seed : int, optional
         Seed of the run.
@@ -139,6 +146,8 @@ def _hardware(path: Mapping[str, Any]) -> LoopHardware:
     return LoopHardware(**{**path, "mirror": None if mirror is None else PositionLoop(**mirror)})
 
 
-def _vibration(line: Mapping[str, Any]) -> Vibration | SinusoidalVibration:
-    kind = Vibration if "damping" in line else SinusoidalVibration
-    return kind(**{**line, "direction": tuple(line["direction"])})
+def _vibration(line: Mapping[str, Any]) -> TrueVibration:
+    values = {**line, "direction": tuple(line["direction"])}
+    if "start_hz" in line:
+        return DriftingVibration(**values)
+    return Vibration(**values) if "damping" in line else SinusoidalVibration(**values)

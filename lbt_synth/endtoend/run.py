@@ -13,7 +13,8 @@ from lbt_synth.endtoend.optics import Modes, Optics
 from lbt_synth.endtoend.result import EndToEndRun
 from lbt_synth.endtoend.system import EndToEndSystem
 from lbt_synth.errors import ProblemError
-from lbt_synth.models import SinusoidalVibration, Truth, Vibration
+from lbt_synth.models import Truth
+from lbt_synth.models.truth import TrueVibration
 from lbt_synth.simulation import draw_disturbance
 from lbt_synth.simulation.run import SteppedController, stepped
 from lbt_synth.validation import FloatArray, instance, integer
@@ -27,7 +28,7 @@ def run_end_to_end(
     system: EndToEndSystem,
     controller: SteppedController,
     *,
-    vibrations: Sequence[Vibration | SinusoidalVibration] = (),
+    vibrations: Sequence[TrueVibration] = (),
     frames: int = 1600,
     settle_frames: int = 400,
     seed: int = 0,
@@ -53,8 +54,9 @@ def run_end_to_end(
         Telescope, air, pyramid, mirror and camera.
     controller : object with ``step(y)`` and ``reset()``
         From modal measurements to modal commands, (modes,), such as :class:`MixedController`.
-    vibrations : sequence of Vibration or SinusoidalVibration, optional
-        Vibrations of tip and tilt; their direction has two components.
+    vibrations : sequence of Vibration, SinusoidalVibration or DriftingVibration, optional
+        Vibrations of tip and tilt; their direction has two components. One that drifts
+        begins to with the exposure.
     frames : int, optional
         Frames of the exposure.
     settle_frames : int, optional
@@ -111,8 +113,9 @@ has; got FilterDesign.
     shaken = Truth(turbulence=None, vibrations=tuple(vibrations))
     total = settle + frames
     tilts = draw_disturbance(
-        shaken, system.hardware, frames=total, cases=1, rng=np.random.default_rng(seed)
-    )[0]
+        shaken, system.hardware, frames=total, cases=1, rng=np.random.default_rng(seed),
+        zero_frame=settle,
+    )[0]  # fmt: skip
     if calibration is None:
         calibration = calibrate(system, cache=cache)
     screens = cache_directory(cache) / _SCREENS

@@ -14,8 +14,8 @@ from lbt_synth.endtoend.run import RAMP_FRAMES, checked_seed, run_end_to_end
 from lbt_synth.endtoend.system import EndToEndSystem
 from lbt_synth.errors import ProblemError
 from lbt_synth.modal import MixedController
-from lbt_synth.models import SinusoidalVibration, Vibration
 from lbt_synth.models.hardware import same_mirror
+from lbt_synth.models.truth import TrueVibration
 from lbt_synth.validation import FloatArray, instance, integer, number
 
 
@@ -27,7 +27,7 @@ class EndToEndSetup:
     ----------
     system : EndToEndSystem
         Telescope, air, pyramid, mirror and camera.
-    vibrations : tuple of Vibration or SinusoidalVibration
+    vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration
         Vibrations of tip and tilt.
     frames, settle_frames, seed : int
         Length of a run, and its seed.
@@ -54,7 +54,7 @@ class EndToEndSetup:
     """
 
     system: EndToEndSystem
-    vibrations: tuple[Vibration | SinusoidalVibration, ...] = ()
+    vibrations: tuple[TrueVibration, ...] = ()
     frames: int = 1600
     settle_frames: int = 400
     seed: int = 0

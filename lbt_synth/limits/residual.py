@@ -12,7 +12,7 @@ from lbt_synth.limits.spectra import DecoupledModes, ModeSpectrum, decoupled_mod
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import TipTiltPlant
-from lbt_synth.models.truth import Truth, fitted_direction
+from lbt_synth.models.truth import Truth, fitted_direction, stationary_vibrations
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, frozen, instance
 
@@ -122,7 +122,7 @@ def truth_modes(
     instance(hardware, LoopHardware)
     instance(truth, Truth)
     lines = []
-    for vibration in truth.vibrations:
+    for vibration in stationary_vibrations(truth.vibrations):
         along = fitted_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
             lines.append((along, vibration))

@@ -15,7 +15,13 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.ar import ARModel
-from lbt_synth.models.truth import Spectrum, Truth, breakpoints_below, fitted_direction
+from lbt_synth.models.truth import (
+    Spectrum,
+    Truth,
+    breakpoints_below,
+    fitted_direction,
+    stationary_vibrations,
+)
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.quadrature import adaptive_integral
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
@@ -130,7 +136,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
 
     random_vibration = np.zeros((n, n))
     lines = []
-    for vibration in truth.vibrations:
+    for vibration in stationary_vibrations(truth.vibrations):
         direction = fitted_direction(vibration, loop.hardware)
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(loop.hardware.frame_rate_hz)

@@ -2,6 +2,7 @@
 
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.models.drift import DriftingVibration
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.local_loop import PositionLoop, StepResponse
@@ -23,6 +24,7 @@ from lbt_synth.models.zernike import noll_orders
 __all__ = [
     "ARModel",
     "Atmosphere",
+    "DriftingVibration",
     "EstimationProblem",
     "FullStatePlant",
     "LoopHardware",

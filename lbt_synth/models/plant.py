@@ -375,16 +375,31 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
     16.5
     """
     shift = number(shift_hz, "shift_hz")
+    rate = plant.hardware.frame_rate_hz
+    return with_vibrations(
+        plant,
+        [
+            line.retuned(line.frequency_hz + shift, frame_rate_hz=rate, hold=hold)
+            for line in plant.vibrations
+        ],
+    )
+
+
+def with_vibrations(plant: TipTiltPlant, vibrations: Sequence[Vibration]) -> TipTiltPlant:
+    """Return a plant with other vibrations, all else being the same.
+
+    Raises
+    ------
+    ProblemError
+        If a vibration does not fit the loop, or the plant cannot be assembled anew.
+    """
     require_no_memory(plant)
     hw = plant.hardware
     return tip_tilt_plant(
         frame_rate_hz=hw.frame_rate_hz,
         turbulence=plant.turbulence,
         noise_nm=plant.R,
-        vibrations=[
-            line.retuned(line.frequency_hz + shift, frame_rate_hz=hw.frame_rate_hz, hold=hold)
-            for line in plant.vibrations
-        ],
+        vibrations=vibrations or None,
         delay_frames=hw.delay_frames,
         sensor_matrix=hw.sensor,
         influence_matrix=hw.influence,

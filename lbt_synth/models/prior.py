@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.plant import TipTiltPlant, require_no_memory, tip_tilt_plant
+from lbt_synth.models.plant import TipTiltPlant, require_no_memory, with_vibrations
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, integer, number, real_array
 
@@ -91,17 +91,7 @@ def spread_plant(
         else:
             given = line_frequencies(line.frequency_hz, half_width_hz, lines)
         made += spread_lines(line, given, weights)
-    hw = plant.hardware
-    return tip_tilt_plant(
-        frame_rate_hz=hw.frame_rate_hz,
-        turbulence=plant.turbulence,
-        noise_nm=plant.R,
-        vibrations=made,
-        delay_frames=hw.delay_frames,
-        sensor_matrix=hw.sensor,
-        influence_matrix=hw.influence,
-        mirror=hw.mirror,
-    )
+    return with_vibrations(plant, made)
 
 
 def line_frequencies(

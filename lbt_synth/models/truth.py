@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar import ARModel
+from lbt_synth.models.drift import DriftingVibration
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, frozen, number, real_array
@@ -123,15 +124,16 @@ class SinusoidalVibration:
         return float(np.sqrt(2) * self.rms_nm)
 
 
+TrueVibration: TypeAlias = Vibration | SinusoidalVibration | DriftingVibration
+
+
 def breakpoints_below(spectrum: Spectrum, limit_hz: float) -> FloatArray:
     """Frequencies in (0, limit) at which a spectrum says that it has kinks [Hz]."""
     points = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
     return points[(points > 0) & (points < limit_hz)]
 
 
-def fitted_direction(
-    vibration: Vibration | SinusoidalVibration, hardware: LoopHardware
-) -> FloatArray:
+def fitted_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
     """Return the direction (n,) of a vibration that fits a loop.
 
     Raises
@@ -141,18 +143,44 @@ def fitted_direction(
     ProblemError
         If it does not lie below the Nyquist frequency.
     """
+    if isinstance(vibration, DriftingVibration):
+        frequency_hz = vibration.highest_hz
+    else:
+        frequency_hz = vibration.frequency_hz
     if len(vibration.direction) != hardware.modes:
         raise DimensionError(
             f"the direction of a vibration must have {hardware.modes} components, one a mode; "
-            f"got {len(vibration.direction)} at {vibration.frequency_hz:.6g} Hz."
+            f"got {len(vibration.direction)} at {frequency_hz:.6g} Hz."
         )
     nyquist = hardware.frame_rate_hz / 2
-    if not vibration.frequency_hz < nyquist:
+    if not frequency_hz < nyquist:
         raise ProblemError(
             f"a vibration must lie below the Nyquist frequency {nyquist:.6g} Hz; "
-            f"got {vibration.frequency_hz:.6g} Hz."
+            f"got {frequency_hz:.6g} Hz."
         )
     return np.array(vibration.direction)
+
+
+def stationary_vibrations(
+    vibrations: Iterable[TrueVibration],
+) -> tuple[Vibration | SinusoidalVibration, ...]:
+    """Return vibrations, none of which drifts.
+
+    Raises
+    ------
+    ProblemError
+        If one drifts.
+    """
+    still = []
+    for vibration in vibrations:
+        if isinstance(vibration, DriftingVibration):
+            raise ProblemError(
+                "this needs a truth that is stationary; got a vibration that drifts from "
+                f"{vibration.start_hz:.6g} to {vibration.end_hz:.6g} Hz. Simulate it, or take a "
+                "Vibration or SinusoidalVibration at the frequencies in question."
+            )
+        still.append(vibration)
+    return tuple(still)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,8 +192,8 @@ class Truth:
     turbulence : Spectrum, sequence of (Spectrum or None), or None
         Spectrum of each mode, the modes independent: one for all of them, or one a mode; None
         for no turbulence.
-    vibrations : tuple of Vibration or SinusoidalVibration, optional
-        The vibrations that are really there.
+    vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration, optional
+        The vibrations that are really there. One that drifts can be simulated only.
     noise_nm : float or (q,) array_like, optional
         Standard deviation of the noise on each measurement, per frame [nm]: one for all of
         them, or one a measurement.
@@ -199,7 +227,7 @@ class Truth:
     """
 
     turbulence: Spectrum | Sequence[Spectrum | None] | None
-    vibrations: tuple[Vibration | SinusoidalVibration, ...] = ()
+    vibrations: tuple[TrueVibration, ...] = ()
     noise_nm: float | FloatArray = 0.0
     sensor_gain: float = 1.0
 
@@ -221,6 +249,11 @@ class Truth:
         object.__setattr__(self, "vibrations", tuple(self.vibrations))
         object.__setattr__(self, "noise_nm", _deviations(self.noise_nm))
         object.__setattr__(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+
+    @property
+    def drifts(self) -> bool:
+        """Whether a vibration drifts: then it can be simulated, and nothing else."""
+        return any(isinstance(line, DriftingVibration) for line in self.vibrations)
 
     @property
     def _per_mode(self) -> tuple[Spectrum | None, ...] | None:

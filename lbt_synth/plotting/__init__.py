@@ -14,6 +14,7 @@ from lbt_synth.plotting.mirror import mirror_figure
 from lbt_synth.plotting.modal import modal_figure
 from lbt_synth.plotting.strehl_map import map_figure
 from lbt_synth.plotting.style import FIGURE_ENDINGS, require_figure_name, save_figure
+from lbt_synth.plotting.tracking import tracking_figure
 
 __all__ = [
     "FIGURE_ENDINGS",
@@ -28,5 +29,6 @@ __all__ = [
     "save_figure",
     "sigma_figure",
     "simulation_figure",
+    "tracking_figure",
     "tradeoff_figure",
 ]

@@ -88,6 +88,39 @@ def _filter_batch(operators: _BlockOperators, u: FloatArray) -> FloatArray:
     return np.asarray(out.reshape(cases, blocks * _BLOCK, -1)[:, :frames])
 
 
+def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
+    """Compute the state after the last frame of ``x(k+1) = A x(k) + drive(k)``, from zero.
+
+    By halves: two steps of A with two drives are one step of A^2 with ``A drive + drive``.
+
+    Parameters
+    ----------
+    A : (n, n) ndarray
+        State matrix.
+    drive : (frames, n) ndarray
+        What enters in each frame, none or more of them.
+
+    Returns
+    -------
+    (n,) ndarray
+        The state.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.simulation.linear import last_state
+    >>> last_state(np.array([[0.5]]), np.array([[4.0], [2.0], [1.0]])).tolist()
+    [3.0]
+    """
+    step = A
+    while len(drive) > 1:
+        if len(drive) % 2:
+            drive = np.concatenate([np.zeros((1, drive.shape[1])), drive])
+        drive = drive[0::2] @ step.T + drive[1::2]
+        step = step @ step
+    return drive[0] if len(drive) else np.zeros(len(A))
+
+
 class SystemStack:
     """Small systems of the same sizes, ready to be driven by one series each.
 

@@ -84,7 +84,8 @@ def simulate(
 
     The random series depend on the seed, the truth and the number of frames
     only: controllers that are given the same ones meet the same disturbances,
-    if ``settle_frames`` is the same too.
+    if ``settle_frames`` is the same too. Time 0 of a vibration that drifts is the first frame
+    that is kept.
 
     Parameters
     ----------
@@ -155,7 +156,7 @@ def simulate(
         )
     disturbance_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     size = {"frames": settle + frames, "cases": cases}
-    total = draw_disturbance(truth, hardware, rng=disturbance_rng, **size)
+    total = draw_disturbance(truth, hardware, rng=disturbance_rng, zero_frame=settle, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
     if loop is not None:
         outputs = filter_series(loop.system, np.concatenate([total, noise], axis=2))

@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 
 from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.ar import ARModel
+from lbt_synth.models.drift import DriftingVibration
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.truth import Spectrum, Truth, breakpoints_below, fitted_direction
 from lbt_synth.models.vibration import Vibration
@@ -19,12 +20,19 @@ _PERIODS = 4
 
 
 def draw_disturbance(
-    truth: Truth, hardware: LoopHardware, *, frames: int, cases: int, rng: np.random.Generator
+    truth: Truth,
+    hardware: LoopHardware,
+    *,
+    frames: int,
+    cases: int,
+    rng: np.random.Generator,
+    zero_frame: int = 0,
 ) -> FloatArray:
     """Draw the total phase, (cases, frames, n) [nm].
 
     Each part has a stream of its own: a truth with one vibration more keeps the
     turbulence that it had. So has each mode where every mode has a spectrum of its own.
+    A vibration that drifts begins to in frame ``zero_frame``.
     """
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
@@ -43,6 +51,9 @@ def draw_disturbance(
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(hardware.frame_rate_hz)
             motion = _draw_ar(model, frames, cases, line_rng)
+        elif isinstance(vibration, DriftingVibration):
+            time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
+            motion = _draw_drift(vibration, time_s, hardware.frame_rate_hz, cases, line_rng)
         else:
             turns = vibration.frequency_hz / hardware.frame_rate_hz * np.arange(frames)
             phase = line_rng.uniform(0, 2 * np.pi, (cases, 1))
@@ -90,6 +101,25 @@ def _bin_powers(spectrum: Spectrum, rate: float, length: int) -> FloatArray:
     panels = (spectrum.psd(nodes) * weights).reshape(-1, 4).sum(axis=1)
     first = np.searchsorted(edges, ends[:-1])
     return np.asarray(np.add.reduceat(panels, first))
+
+
+def _draw_drift(
+    line: DriftingVibration, time_s: FloatArray, rate: float, cases: int, rng: np.random.Generator
+) -> FloatArray:
+    if line.damping is None:
+        phase = rng.uniform(0, 2 * np.pi, (cases, 1))
+        return np.asarray(line.amplitude_nm * np.cos(2 * np.pi * line.turns_at(time_s) + phase))
+    a1, a2, driving = line.ar_process(time_s, rate)
+    # two frames of the past at the first frequency: E x(-1) x(-2) = a1 / (1 - a2) of the variance
+    together = a1[0] / (1 - a2)
+    past = line.rms_nm * rng.standard_normal((2, cases))
+    past[1] = together * past[0] + np.sqrt((1 - together) * (1 + together)) * past[1]
+    series = driving[:, None] * rng.standard_normal((len(time_s), cases))
+    older, newer = past
+    for k, now in enumerate(series):
+        now += a1[k] * newer + a2 * older
+        older, newer = newer, series[k]
+    return series.T
 
 
 def _draw_ar(model: ARModel, frames: int, cases: int, rng: np.random.Generator) -> FloatArray:
