@@ -34,6 +34,12 @@ CASES = {
         ("config.yaml", "gain.fits", "--frames", "50", "--telemetry", "OUT.fits"),
     ),
     "telemetry": ("series.fits", ("series.fits", "-o", "OUT.fits")),
+    "auto": ("series.fits", ("series.fits", "-o", "OUT.fits")),
+    "identify": ("series.fits", ("series.fits", "-o", "a.yaml", "--figure", "OUT.png")),
+    "identify commands": (
+        "config.yaml",
+        ("series.fits", "--commands", "config.yaml", "-o", "OUT.yaml"),
+    ),
     "robustness": ("config.yaml", ("config.yaml", "-o", "OUT.csv")),
     "robustness gain": ("gain.fits", ("config.yaml", "gain.fits", "-o", "a.csv", "-o", "OUT.png")),
     "tradeoff": ("config.yaml", ("config.yaml", "-o", "OUT.csv")),

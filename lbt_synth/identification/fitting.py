@@ -42,6 +42,7 @@ _STARTING_GAINS = (0.35, 0.6, 1.0)
 _MOST_TURBULENCES = 3
 _ANNOUNCED = 5.0  # log-likelihood that a line whose frequency is known must add
 _SPLIT = 9.0  # and the second of two that lie in each other's skirts
+_HIGHEST = float(np.log(0.999 * np.pi))  # angle a frame of a line
 _MOST_ROUNDS = 12
 
 
@@ -325,9 +326,18 @@ class _Search:
             return None
 
     def fitted(self, theta: FloatArray, parts: tuple[Part, ...]) -> Grown:
-        """Fit all parameters."""
+        """Fit all parameters; what leaves the band below the Nyquist frequency is dropped."""
         merged = Likelihood(self.data.merged(self.layout.groups(theta, parts)))
         got = fit(merged, theta, self.layout.priors(theta, parts), free=self._free(theta))
+        gone = [
+            i for i in range(1, len(parts)) if got.parameters[FIRST + PARAMETERS * i] >= _HIGHEST
+        ]
+        if gone:
+            left = [i for i in range(len(parts)) if i not in gone]
+            kept = got.parameters
+            for i in reversed(gone):
+                kept = without(kept, i)
+            return self.fitted(kept, tuple(parts[i] for i in left))
         got = replace(got, contrast=self.full.contrast(got.parameters))
         return Grown(fitted=got, parts=parts)
 

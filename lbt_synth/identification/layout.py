@@ -22,7 +22,7 @@ from lbt_synth.validation import FloatArray, IntArray
 _GAIN_PRIOR = (np.log(0.7), 1.0)
 _TURBULENCE_DAMPING = (np.log(0.5), 0.7)  # of the first component; of others the odds
 _PART_DAMPING = (0.0, 1.0)
-_LINE_DAMPING = (np.log(0.01 / 0.99), 2.0)
+_LINE_DAMPING = (np.log(0.01 / 0.99), 3.0)
 NO_CORNER = 50.0  # angle a frame of a corner that is none
 _CORNER = (np.log(50.0), 2.0)  # of its frequency [Hz]
 _SLOWEST = 1.5  # width of the prior on the logarithm of a turbulence's frequency
