@@ -288,7 +288,7 @@ def test_what_the_loop_does_not_show_is_said() -> None:
     found = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, assumed_gain=0.7)
     assert found.sensor_gain == pytest.approx(0.7, rel=1e-12)
     assert found.sensor_gain_error is None
-    assert "assumed to be 0.7" in found.sensor_gain_note
+    assert "assumed to be 0.7, not found" in found.sensor_gain_note
     open_loop = lbt.identify_axis(y[:, 0] + 0.6 * c[:, 0], frame_rate_hz=RATE)
     assert open_loop.sensor_gain == 1
     assert "open loop" in open_loop.sensor_gain_note

@@ -37,7 +37,8 @@ from lbt_synth.validation import FloatArray, frozen, integer, number, real_array
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
-GAIN_ERROR = 0.1  # relative; a gain that is known worse is not identifiable
+GAIN_ERROR = 0.3  # relative; a gain that is known worse is not identifiable
+_POOR_GAIN = 0.1  # is said to be known poorly
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 _WIDE = 0.1  # damping ratio
 
@@ -307,11 +308,12 @@ def identify_periodogram(
     variance = float(_covariance(grown)[GAIN, GAIN])
     error = float(np.sqrt(variance)) if variance > 0 else float("inf")
     if error <= GAIN_ERROR:
-        return _described(data, rules, grown, error, "found in the closed loop's data")
+        poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
+        return _described(data, rules, grown, error, f"found in the closed loop's data{poor}")
     rules = replace(rules, gain=assumed)
     by = f" by {100 * error:.0f} %" if error < 10 else ""
     note = (
-        f"assumed to be {assumed:g}: these data leave it open{by} (the loop "
+        f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
     return _described(data, rules, grow(data, rules, grown), None, note)
