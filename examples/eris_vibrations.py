@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.plotting.style import save_figure
+from lbt_synth.plotting.style import house_style, looks, new_figure, number_ticks, save_figure
 
 FILE = Path(__file__).parent / "data" / "eris_vibrations_psd.fits"
 BACKGROUND_NM2_HZ = 4e4  # at 1 Hz, falling with the square of the frequency; see docs/eris.md
@@ -67,29 +67,29 @@ class Disturbance:
 
 
 def record() -> lbt.SpectrumRecord:
-    """Read the file; its columns have no names, and it does not tell their unit."""
+    """Read the file; its columns have no names, and it does not tell their unit.
+
+    The second row is called tip here, the third tilt.
+    """
     found = lbt.load_record(FILE, kind="spectrum", unit="nm^2/Hz", averages=AVERAGES)
     assert isinstance(found, lbt.SpectrumRecord)
     return found
 
 
-def peaks(
-    frequency_hz: np.ndarray, density_nm2_hz: np.ndarray, *, count: int
-) -> list[tuple[float, float]]:
-    """Centres [Hz] and rms [nm] of the strongest runs of bins above the background."""
+def peaks(frequency_hz: np.ndarray, density_nm2_hz: np.ndarray) -> list[tuple[float, float]]:
+    """Centres [Hz] and rms [nm] of all runs of bins above the background."""
     step = float(np.median(np.diff(frequency_hz)))
     excess = (density_nm2_hz - BACKGROUND_NM2_HZ / frequency_hz**2) * step
     above = excess > 0.01 * step * density_nm2_hz
     edges = np.flatnonzero(np.diff(np.concatenate([[0], above.astype(int), [0]])))
     runs = [slice(start, stop) for start, stop in edges.reshape(-1, 2)]
-    found = [
+    return [
         (
             float(np.average(frequency_hz[run], weights=excess[run])),
             float(np.sqrt(np.sum(excess[run]))),
         )
         for run in runs
     ]
-    return sorted(sorted(found, key=lambda peak: -peak[1])[:count])
 
 
 def disturbance(seen: lbt.SpectrumRecord, *, shift_hz: float = 0.0) -> Disturbance:
@@ -143,12 +143,14 @@ def composed(model: lbt.IdentifiedModel) -> lbt.TipTiltPlant:
 
 def designs(plant: lbt.TipTiltPlant, met: Disturbance) -> dict[str, lbt.Design]:
     """Design for the model; only the robust one takes bands and the spectra without lines."""
-    slow = lbt.SumSpectrum(parts=[met.turbulence[0], met.background[0]])
+    f = np.geomspace(0.02, 0.499 * FRAME_RATE_HZ, 300)  # a gain file keeps tables, no sums
+    slow = lbt.SumSpectrum(parts=[met.turbulence[0], met.background[0]]).psd(f)
+    table = lbt.TabulatedSpectrum(frequency_hz=f, density_nm2_hz=slow)
     return {
         "integrator": lbt.model_integrator(plant),
         "Kalman": lbt.kalman(plant),
-        "H-infinity": lbt.hinf(plant, gamma_ratio=1.2),
-        "robust": lbt.robust(plant, bands=BANDS, turbulence=slow),
+        "H-infinity": lbt.hinf(plant, gamma_ratio=1.2, method="riccati"),
+        "robust": lbt.robust(plant, bands=BANDS, turbulence=table),
     }
 
 
@@ -186,16 +188,14 @@ def strehls(covariance_nm2: np.ndarray) -> list[float]:
 
 def print_lines(seen: lbt.SpectrumRecord, model: lbt.IdentifiedModel) -> None:
     """Print identified lines beside the peaks of the file."""
-    inside = [
-        float(np.sqrt(np.sum(np.diff(seen.frequency_hz) * (formula[1:] + formula[:-1]) / 2)))
-        for formula in [BACKGROUND_NM2_HZ / seen.frequency_hz**2]
-    ][0]
+    f = seen.frequency_hz
+    inside = float(np.sqrt(accumulated(f, BACKGROUND_NM2_HZ / f**2)[-1]))
     for i, axis in enumerate(model.axes):
         column = seen.density_nm2_hz[:, i]
-        found = peaks(seen.frequency_hz, column, count=200)
+        found = peaks(seen.frequency_hz, column)
         beyond = np.sqrt(sum(size**2 for _, size in found))
         print(
-            f"axis {i}: {seen.rms_nm[i]:.1f} nm in the file, of which the formula {inside:.1f} nm, "
+            f"{('tip', 'tilt')[i]}: {seen.rms_nm[i]:.1f} nm in the file: the formula {inside:.1f} nm, "
             f"{len(found)} runs of bins above it {beyond:.1f} nm"
         )
         slow = axis.turbulence_fit
@@ -203,22 +203,18 @@ def print_lines(seen: lbt.SpectrumRecord, model: lbt.IdentifiedModel) -> None:
             f"  slow part {slow.rms_nm:.0f} +- {slow.rms_error_nm:.0f} nm, white part "
             f"{axis.noise_nm:.1f} +- {axis.noise_error_nm:.1f} nm a frame"
         )
-        strongest = peaks(seen.frequency_hz, column, count=14)
-        print("  peak of the file [Hz, nm]   identified [Hz, nm]")
-        shown = [(f, size, "") for f, size in strongest]
+        names: dict[int, str] = {}
         for line in axis.lines:
-            text = (
-                f"{line.frequency_hz:8.3f} +- {line.frequency_error_hz:.3f} "
+            nearest = min(range(len(found)), key=lambda j: abs(found[j][0] - line.frequency_hz))
+            names[nearest] = names.get(nearest, "") + (
+                f"{line.frequency_hz:12.3f} +- {line.frequency_error_hz:.3f} "
                 f"{line.rms_nm:6.1f} +- {line.rms_error_nm:.1f}"
             )
-            near = min(shown, key=lambda row: abs(row[0] - line.frequency_hz))
-            if abs(near[0] - line.frequency_hz) < 0.1 and not near[2]:
-                shown[shown.index(near)] = (near[0], near[1], text)
-            else:
-                shown.append((line.frequency_hz, np.nan, text))
-        for f, size, text in sorted(shown):
-            peak = f"{f:9.3f} {size:6.1f}" if np.isfinite(size) else " " * 16
-            print(f"  {peak}            {text or '-'}")
+        strongest = sorted(size for _, size in found)[-14:]
+        print("  peak of the file [Hz, nm]   identified [Hz, nm]")
+        for j, (place, size) in enumerate(found):
+            if size in strongest or j in names:
+                print(f"  {place:9.3f} {size:6.1f}        {names.get(j, '         -')}")
     for note in model.notes:
         print(f"note: {note}")
 
@@ -233,41 +229,39 @@ def print_table(rows: Mapping[str, Mapping[str, np.ndarray]]) -> None:
         print("".join(f"{value:9.1f}" for value in strehls(parts["total"])))
 
 
-def figure(
-    seen: lbt.SpectrumRecord, loops: Mapping[str, lbt.ClosedLoop], met: Disturbance
-) -> Any:
-    """Draw what the designs leave of the file's spectrum, accumulated over the frequencies."""
-    from matplotlib.figure import Figure
-
-    f = np.union1d(np.geomspace(0.05, 499.0, 1500), seen.frequency_hz)
-    drawn = Figure(figsize=(9.5, 7.2), layout="constrained", dpi=150)
-    grid = drawn.subplots(2, seen.axes, sharex=True, sharey="row", squeeze=False)
-    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+def figure(seen: lbt.SpectrumRecord, loops: Mapping[str, lbt.ClosedLoop], met: Disturbance) -> Any:
+    """Draw what the loops reject, and what they leave accumulated over the frequencies."""
+    f = np.union1d(np.geomspace(0.5, 499.0, 1500), seen.frequency_hz)
     whole = met.whole.turbulence_of(seen.axes)
-    for i in range(seen.axes):
-        spectrum, total = grid[:, i]
-        density = whole[i].psd(f)
-        spectrum.loglog(f, density, color="0.6", linewidth=0.7, label="turbulence and file")
-        total.loglog(
-            f, np.sqrt(accumulated(f, density)), color="0.6", label="turbulence and file"
+    with house_style():
+        drawn = new_figure(9.5, 7.2)
+        grid = drawn.subplots(
+            3, seen.axes, sharex=True, sharey="row", squeeze=False, height_ratios=(2, 2, 3)
         )
-        for (name, loop), colour in zip(loops.items(), colours, strict=False):
-            rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
-            passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
-            left = rejected * density + passed * 2 * NOISE_NM**2 / FRAME_RATE_HZ
-            spectrum.loglog(f, rejected, color=colour, linewidth=1.0, label=f"rejection, {name}")
-            total.loglog(f, np.sqrt(accumulated(f, left)), color=colour, label=name)
-        spectrum.set_title(f"axis {i}")
-        spectrum.set_ylim(1e-5, 1e6)
-        total.set_ylim(1, 2e3)
-        total.set_xlim(0.5, 500)
-        total.set_xlabel("frequency [Hz]")
-        for plot in (spectrum, total):
-            plot.grid(color="0.9")
-    grid[0, 0].set_ylabel("disturbance [nm$^2$/Hz], rejection of power")
-    grid[1, 0].set_ylabel("rms up to the frequency, with noise [nm]")
-    grid[0, 0].legend(fontsize=7, loc="lower left")
-    grid[1, 0].legend(fontsize=7, loc="upper left")
+        for i in range(seen.axes):
+            spectrum, rejection, total = grid[:, i]
+            density = whole[i].psd(f)
+            lowest = 2 * NOISE_NM**2 / FRAME_RATE_HZ
+            spectrum.loglog(f, np.maximum(density, 1e-9), color="0.35", linewidth=0.7)
+            spectrum.axhline(lowest, color="0.6", linestyle=":", linewidth=1.0)
+            spectrum.set_ylim(0.1, 1e6)
+            spectrum.set_title(("tip", "tilt")[i])
+            for (name, loop), look in zip(loops.items(), looks(), strict=False):
+                rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
+                passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
+                rejection.loglog(f, np.sqrt(rejected), **(look | {"linewidth": 0.9}))
+                left = accumulated(f, rejected * density + passed * lowest)
+                total.semilogx(f, np.sqrt(left), **look, label=name)
+            rejection.set_ylim(5e-3, 5)
+            rejection.axhline(1.0, color="0.6", linewidth=0.6)
+            total.set_xlim(0.5, 499)
+            total.set_xlabel("frequency [Hz]")
+            number_ticks(total.xaxis)
+        grid[0, 0].set_ylabel("disturbance, and noise\n(dots) [nm$^2$/Hz]")
+        grid[1, 0].set_ylabel("rejection")
+        grid[2, 0].set_ylabel("residual up to the\nfrequency [nm rms]")
+        grid[2, 0].set_ylim(bottom=0)
+        grid[2, 0].legend(loc="upper left")
     return drawn
 
 

@@ -110,8 +110,7 @@ class SumSpectrum:
         for part in given:
             if not isinstance(part, Spectrum):
                 raise ProblemError(
-                    "parts must have a method psd(frequency_hz); got "
-                    f"{type(part).__name__}."
+                    f"parts must have a method psd(frequency_hz); got {type(part).__name__}."
                 )
         if not given:
             raise ProblemError("parts must hold at least one spectrum; got none.")
