@@ -195,8 +195,8 @@ def print_lines(seen: lbt.SpectrumRecord, model: lbt.IdentifiedModel) -> None:
         found = peaks(seen.frequency_hz, column)
         beyond = np.sqrt(sum(size**2 for _, size in found))
         print(
-            f"{('tip', 'tilt')[i]}: {seen.rms_nm[i]:.1f} nm in the file: the formula {inside:.1f} nm, "
-            f"{len(found)} runs of bins above it {beyond:.1f} nm"
+            f"{('tip', 'tilt')[i]}: {seen.rms_nm[i]:.1f} nm in the file: the formula "
+            f"{inside:.1f} nm, {len(found)} runs of bins above it {beyond:.1f} nm"
         )
         slow = axis.turbulence_fit
         print(
