@@ -151,14 +151,15 @@ def test_figure_of_a_short_spectrum(model):
     for plot, axis in zip(figure.axes[:2], model.axes, strict=True):
         assert len(plot.texts) == len(axis.lines)
         edges = plot.get_window_extent()
-        places = [text.get_transform().transform(text.get_position())[0] for text in plot.texts]
+        blended = plot.get_xaxis_transform()
+        places = [blended.transform(text.get_position())[0] for text in plot.texts]
         # 6.5 points of type, and a little more
         assert np.all(np.diff(places) > 1.1 * 6.5 / 72 * figure.dpi)
         highest = np.max(np.interp([x.frequency_hz for x in axis.lines],
                                    axis.frequency_hz, axis.fitted_nm2_hz))  # fmt: skip
         top = plot.transData.transform((10, highest))[1]
         for text in plot.texts:
-            x, y = plot.get_xaxis_transform().transform(text.get_position())
+            x, y = blended.transform(text.get_position())
             assert edges.x0 < x < edges.x1
             assert y > top
 
