@@ -69,7 +69,7 @@ class Disturbance:
 def record() -> lbt.SpectrumRecord:
     """Read the file; its columns have no names, and it does not tell their unit.
 
-    The second row is called tip here, the third tilt.
+    The rows are taken for frequency, tip and tilt.
     """
     found = lbt.load_record(FILE, kind="spectrum", unit="nm^2/Hz", averages=AVERAGES)
     assert isinstance(found, lbt.SpectrumRecord)
