@@ -116,6 +116,7 @@ from .models import PositionLoop as PositionLoop
 from .models import SinusoidalVibration as SinusoidalVibration
 from .models import Spectrum as Spectrum
 from .models import StepResponse as StepResponse
+from .models import SumSpectrum as SumSpectrum
 from .models import TabulatedSpectrum as TabulatedSpectrum
 from .models import TipTiltPlant as TipTiltPlant
 from .models import Truth as Truth

@@ -41,6 +41,7 @@ GAIN_ERROR = 0.3  # relative; a gain that is known worse is not identifiable
 _POOR_GAIN = 0.1  # is said to be known poorly
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 _WIDE = 0.1  # damping ratio
+_MOST_AVERAGES = 1000.0
 
 
 def identify_axis(
@@ -184,7 +185,8 @@ def identify_spectrum(
         Frame rate of the loop to come [Hz].
     averages : float, optional
         Number of independent periodograms that the density is the mean of; by default found
-        from its scatter.
+        from its scatter. One that scatters less than the mean of 1000 was smoothed, interpolated
+        or computed: its scatter tells nothing, and it is taken for one periodogram.
     **options
         ``announced``, ``lowest_line_hz`` and ``most_lines`` of :func:`identify_axis`.
 
@@ -232,7 +234,10 @@ def identify_spectrum(
         )
     if np.any(density <= 0):
         raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density):.6g}.")
-    many = _averages(density) if averages is None else number(averages, "averages", above=0)
+    if averages is None:
+        many = scattered(density) or 1.0
+    else:
+        many = number(averages, "averages", above=0)
     zero = np.zeros_like(f)
     data = LoopPeriodogram(
         frequency_hz=f,
@@ -246,8 +251,12 @@ def identify_spectrum(
     return identify_periodogram(data, sensor_gain=1.0, **options)
 
 
-def _averages(density: FloatArray) -> float:
-    """Shape of the gamma distribution that the density scatters with about a smooth curve."""
+def scattered(density: FloatArray) -> float | None:
+    """Shape of the gamma distribution that a density scatters with about a smooth curve.
+
+    None if it is above what anybody averages: whatever the model leaves would count as evidence
+    for one more line, and standard errors would vanish.
+    """
     from scipy.optimize import brentq
     from scipy.special import polygamma
 
@@ -255,8 +264,10 @@ def _averages(density: FloatArray) -> float:
     # a second difference at a distance hardly sees a curve, and not what neighbours share
     bend = log[6:] - 2 * log[3:-3] + log[:-6]
     scatter = (np.median(np.abs(bend - np.median(bend))) / 0.6745) ** 2 / 6
-    low, high = 0.25, 1e6
-    scatter = float(np.clip(scatter, polygamma(1, high), polygamma(1, low)))
+    low, high = 0.25, _MOST_AVERAGES
+    if scatter < polygamma(1, high):
+        return None
+    scatter = float(min(scatter, polygamma(1, low)))
     return float(
         np.exp(
             brentq(

@@ -14,6 +14,7 @@ from lbt_synth.identification.identify import (
     MOST_LINES,
     identify_axis,
     identify_spectrum,
+    scattered,
 )
 from lbt_synth.identification.result import IdentifiedAxis, IdentifiedModel
 from lbt_synth.records import LinePrior, LoopRecord, SpectrumRecord
@@ -185,12 +186,19 @@ def _of_spectra(
         for column in record.density_nm2_hz.T
     ]
     left = int(np.sum(f >= rate / 2))
-    notes = (f"{left} frequencies beyond {rate / 2:g} Hz were left out",) if left else ()
+    notes = [f"{left} frequencies beyond {rate / 2:g} Hz were left out"] if left else []
+    if record.averages is None:
+        notes += [
+            f"the density of axis {i} does not scatter as periodograms do (smoothed, interpolated "
+            "or computed?) and was taken for one of them. Give averages to find weaker lines"
+            for i, column in enumerate(record.density_nm2_hz.T)
+            if scattered(column[inside]) is None
+        ]
     return IdentifiedModel(
         axes=tuple(axes),
         frame_rate_hz=rate,
         delay_frames=_DELAY if delay_frames is None else delay_frames,
-        notes=notes,
+        notes=tuple(notes),
     )
 
 

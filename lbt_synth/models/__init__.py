@@ -15,7 +15,13 @@ from lbt_synth.models.sensor import (
     pyramid_modal_noise_nm,
     pyramid_tilt_noise_nm,
 )
-from lbt_synth.models.truth import SinusoidalVibration, Spectrum, TabulatedSpectrum, Truth
+from lbt_synth.models.truth import (
+    SinusoidalVibration,
+    Spectrum,
+    SumSpectrum,
+    TabulatedSpectrum,
+    Truth,
+)
 from lbt_synth.models.turbulence import ar1_turbulence, ar2_turbulence, le_roux_pole
 from lbt_synth.models.units import nm_per_mas
 from lbt_synth.models.vibration import Vibration
@@ -33,6 +39,7 @@ __all__ = [
     "SinusoidalVibration",
     "Spectrum",
     "StepResponse",
+    "SumSpectrum",
     "TabulatedSpectrum",
     "TipTiltPlant",
     "Truth",

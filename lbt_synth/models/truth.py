@@ -13,7 +13,7 @@ from lbt_synth.models.ar import ARModel
 from lbt_synth.models.drift import DriftingVibration
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.vibration import Vibration
-from lbt_synth.validation import FloatArray, frozen, number, real_array
+from lbt_synth.validation import FloatArray, frozen, number, real_array, sequence
 
 
 @runtime_checkable
@@ -76,6 +76,60 @@ class TabulatedSpectrum:
         """Return the spectrum at frequencies [Hz] by linear interpolation [nm^2/Hz]."""
         x = real_array(frequency_hz, "frequency_hz")
         return np.asarray(np.interp(x, self.frequency_hz, self.density_nm2_hz, left=0, right=0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SumSpectrum:
+    """The spectrum of several independent disturbances together.
+
+    Parameters
+    ----------
+    parts : sequence of Spectrum
+        Their spectra, at least one; spectra that are sums themselves are taken apart.
+
+    Raises
+    ------
+    ProblemError
+        If there is none, or one has no method ``psd(frequency_hz)``.
+
+    Examples
+    --------
+    A measured spectrum upon turbulence that it does not hold:
+
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=10,
+    ...                      diameter_m=8)
+    >>> hum = lbt.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])
+    >>> [float(v) for v in lbt.SumSpectrum(parts=[air, hum]).psd([50.0]).round(1)]
+    [100.0]
+    """
+
+    parts: tuple[Spectrum, ...]
+
+    def __post_init__(self) -> None:
+        given = sequence(self.parts, "parts")
+        for part in given:
+            if not isinstance(part, Spectrum):
+                raise ProblemError(
+                    f"parts must have a method psd(frequency_hz); got {type(part).__name__}."
+                )
+        if not given:
+            raise ProblemError("parts must hold at least one spectrum; got none.")
+        flat: list[Spectrum] = []
+        for part in given:
+            flat += part.parts if isinstance(part, SumSpectrum) else (part,)
+        object.__setattr__(self, "parts", tuple(flat))
+
+    @property
+    def breakpoints_hz(self) -> FloatArray:
+        """Frequencies where one of the parts says that it has kinks [Hz]."""
+        kinks = [breakpoints_below(part, np.inf) for part in self.parts]
+        return frozen(np.unique(np.concatenate(kinks)))
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """Return the spectrum at frequencies [Hz], the sum of the parts' [nm^2/Hz]."""
+        x = real_array(frequency_hz, "frequency_hz")
+        return np.asarray(sum(part.psd(x) for part in self.parts), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -84,7 +84,7 @@ def tradeoff_figure(points: Sequence[TradeoffPoint]) -> Any:
                 0.99, 1, "nominal ", transform=axes[1].get_yaxis_transform(), ha="right",
                 va="bottom", fontsize=8, color="0.3",
             )  # fmt: skip
-            number_ticks(axes[1])
+            number_ticks(axes[1].yaxis)
     return figure
 
 

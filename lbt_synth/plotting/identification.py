@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,16 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
 from lbt_synth.loop import close_loop
-from lbt_synth.plotting.style import COLOURS, LINES, house_style, new_figure
+from lbt_synth.plotting.style import COLOURS, LINES, house_style, new_figure, number_ticks
 from lbt_synth.statespace import Controller
 from lbt_synth.validation import FloatArray, instance
 
 _BANDS = 240  # of the smoothed density
 _REFUSED = 1.6276  # of Kolmogorov's statistic at 1 %
 _NAMES = ("tip", "tilt")
+_LABEL = 0.045  # width of a label, of that of the plot
+_FEW_DECADES = 40.0  # an axis of less has plain numbers
+_FEW_CURVES = 2
 
 
 def identification_figure(
@@ -71,12 +74,15 @@ def identification_figure(
             _draw_cumulative(cumulative, axis, {k: v[i] for k, v in residuals.items()})
             _draw_innovations(white, axis)
             white.set_xlabel("frequency [Hz]")
+            if axis.frequency_hz[-1] / axis.frequency_hz[0] < _FEW_DECADES:
+                number_ticks(white.xaxis)
         _scale_spectra(grid[0, 0], model)
         grid[0, 0].set_ylabel("density [nm$^2$/Hz]")
         grid[1, 0].set_ylabel("rms up to the frequency [nm]")
-        grid[2, 0].set_ylabel("innovations:\ncumulative power - white")
+        grid[2, 0].set_ylabel("innovations:\ncumulative\npower - white")
         grid[0, -1].legend(loc="lower left", fontsize=7)
-        grid[1, -1].legend(loc="upper left", ncols=2, fontsize=7)
+        few = len(grid[1, -1].get_lines()) <= _FEW_CURVES
+        grid[1, -1].legend(loc="lower right" if few else "upper left", ncols=2, fontsize=7)
         grid[2, -1].legend(loc="upper left", fontsize=7)
     return figure
 
@@ -135,30 +141,50 @@ def _draw_spectrum(plot: Any, axis: IdentifiedAxis, *, title: str) -> None:
     )  # fmt: skip
     plot.set_xlim(f[0], f[-1])
     plot.set_title(title)
-    last = -np.inf
-    for line in axis.lines:
-        # labels that would lie upon each other step aside
-        place = max(np.log(line.frequency_hz), last + 0.045 * np.log(f[-1] / f[0]))
-        last = place
+    span = float(np.log(f[-1] / f[0]))
+    peaks = [line.frequency_hz for line in axis.lines]
+    places = f[0] * np.exp(span * _apart([float(np.log(x / f[0])) / span for x in peaks]))
+    for line, place in zip(axis.lines, places, strict=True):
         height = float(np.interp(line.frequency_hz, f, axis.fitted_nm2_hz))
         plot.annotate(
             f"{line.frequency_hz:.2f} Hz, {line.rms_nm:.3g} nm",
             xy=(line.frequency_hz, height),
-            xytext=(float(np.exp(place)), 0.985),
+            xytext=(float(place), 0.985),
             textcoords=plot.get_xaxis_transform(),
             fontsize=6.5,
             rotation=90,
             ha="center",
             va="top",
             color="0.15",
-            arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5},
-        )
+            arrowprops={
+                "arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "relpos": (0.5, 0.0),
+                "shrinkA": 0, "shrinkB": 0,
+            },
+        )  # fmt: skip
+
+
+def _apart(places: Sequence[float]) -> FloatArray:
+    """Places of labels in (0, 1) near increasing ones, so that none lies upon another."""
+    if not places:
+        return np.zeros(0)
+    gap = min(_LABEL, 1 / len(places))
+    least = gap / 2 + gap * np.arange(len(places))
+    steps = gap * np.arange(len(places))
+    # pushed to the right where they are crowded, and back from the end
+    right = np.maximum.accumulate(np.maximum(places, least) - steps) + steps
+    ends = 1 - least[::-1]
+    left = np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps
+    return np.asarray(left)
 
 
 def _scale_spectra(plot: Any, model: IdentifiedModel) -> None:
     """Limits for all axes, with room for the labels of lines."""
     smooth = [_banded(axis.frequency_hz, axis.density_nm2_hz)[1] for axis in model.axes]
     top = max(float(np.max(values)) for values in smooth)
+    for axis in model.axes:
+        peaks = [line.frequency_hz for line in axis.lines]
+        heights = np.interp(peaks, axis.frequency_hz, axis.fitted_nm2_hz) if peaks else [top]
+        top = max(top, float(np.max(heights)))
     low = 0.2 * min(float(np.min(values)) for values in smooth)
     labelled = any(axis.lines for axis in model.axes)
     plot.set_ylim(low, top * (top / low) ** (0.45 if labelled else 0.1))
@@ -205,7 +231,11 @@ def _draw_cumulative(plot: Any, axis: IdentifiedAxis, residuals: dict[str, Float
     last = [float(values[-1]) for values in curves.values() if values[-1] > 0]
     if last:
         low, high = 0.2 * min(last), max(last)
-        plot.set_ylim(low, high * max(10.0, (high / low) ** 0.6))
+        # room for the legend above many curves
+        room = max(10.0, (high / low) ** 0.6) if len(curves) > _FEW_CURVES else 1.5
+        plot.set_ylim(low, high * room)
+        if high * room / low < _FEW_DECADES:
+            number_ticks(plot.yaxis)
 
 
 def _draw_innovations(plot: Any, axis: IdentifiedAxis) -> None:

@@ -69,7 +69,7 @@ def limits_figure(study: LimitStudy) -> Any:
                 zorder=1.5, label="limit, frequency known",
             )  # fmt: skip
         axis.set_yscale("log")
-        number_ticks(axis)
+        number_ticks(axis.yaxis)
         axis.set_xlim(float(x[0]), float(x[-1]))
         low, high = axis.get_ylim()
         drawn = study.residual_nm[np.isfinite(study.residual_nm)]

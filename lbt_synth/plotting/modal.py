@@ -79,7 +79,7 @@ def modal_figure(
             axis.plot(modes, values, label=name, drawstyle=_STEPS, **style)
         axis.set_xscale("log")
         axis.set_yscale("log")
-        number_ticks(axis)
+        number_ticks(axis.yaxis)
         axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_xlim(1, max(count, 2))
         axis.set_xlabel("mode, in Noll's order from tip on")

@@ -68,16 +68,16 @@ def plain_ticks(axis: Any) -> None:
     if high / low < 3:
         axis.set_yscale("linear")
     elif high / low < 30:
-        number_ticks(axis)
+        number_ticks(axis.yaxis)
 
 
-def number_ticks(axis: Any) -> None:
-    """Label a logarithmic axis with plain numbers: 0.1, 0.2, 0.5 and so on."""
+def number_ticks(scale: Any) -> None:
+    """Label a logarithmic x or y axis with plain numbers: 0.1, 0.2, 0.5 and so on."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.yaxis.set_minor_formatter(NullFormatter())
+    scale.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    scale.set_minor_formatter(NullFormatter())
 
 
 def require_figure_name(path: str | os.PathLike[str]) -> Path:

@@ -285,9 +285,13 @@ def _unit(
     option = "command_unit" if what == "commands" else "unit"
     if not own:
         if given is None:
+            choices = (
+                "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude"
+                if what == "density"
+                else "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt"
+            )
             raise ProblemError(
-                f"the file does not tell the unit of the {what}; give {option} (nm, um, m of "
-                "wavefront, or mas, arcsec, urad, rad of tilt)."
+                f"the file does not tell the unit of the {what}; give {option} ({choices})."
             )
         return given
     if given is not None and _same_unit(own) != _same_unit(given):
