@@ -22,12 +22,15 @@ from lbt_synth.validation import FloatArray, IntArray
 _GAIN_PRIOR = (np.log(0.7), 1.0)
 _TURBULENCE_DAMPING = (np.log(0.5), 0.7)  # of the first component; of others the odds
 _PART_DAMPING = (0.0, 1.0)
-_LINE_DAMPING = (np.log(0.01 / 0.99), 3.0)
+_LINE_DAMPING = (np.log(0.01 / 0.99), 8.0)
 NO_CORNER = 50.0  # angle a frame of a corner that is none
 _CORNER = (np.log(50.0), 2.0)  # of its frequency [Hz]
 _SLOWEST = 1.5  # width of the prior on the logarithm of a turbulence's frequency
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
 _WIDEST_HZ = 3.0
+_BINS = 10  # on either side of a line that are not taken together
+_SIDELOBES = 64  # the same of a line narrower than this many bins, with the taper's sidelobes
+_SMEARED = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +158,8 @@ class Layout:
             if not part.line:
                 continue
             centre, half_width = self.place(theta, i)
-            away = np.maximum(np.abs(f - centre) - 10 * self.step, 0)
+            fine = _SIDELOBES if half_width < _SMEARED * self.step else _BINS
+            away = np.maximum(np.abs(f - centre) - fine * self.step, 0)
             np.minimum(
                 size, np.maximum(self.step, 0.1 * np.maximum(half_width, 2 * away)), out=size
             )
