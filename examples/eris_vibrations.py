@@ -6,7 +6,10 @@ make a model; an integrator, a Kalman filter, an H-infinity filter and a control
 frequencies are designed for it. Each meets the spectrum of the file itself, not the
 model's, as it is and with all lines shifted by half a hertz.
 
-Run: python examples/eris_vibrations.py [folder]     # writes eris_*.png there, out/ by default
+Run: python examples/eris_vibrations.py [folder] [averages]
+
+It writes eris_*.png into the folder, out/ by default; averages says how much a line has to stand
+out, 2 by default.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ BACKGROUND_NM2_HZ = 4e4  # at 1 Hz, falling with the square of the frequency; se
 FRAME_RATE_HZ = 1000.0
 DELAY_FRAMES = 2.0
 NOISE_NM = 15.0  # a frame and axis
-AVERAGES = 2  # how much a line has to stand out; see docs/eris.md
+AVERAGES = 2  # periodograms; see docs/eris.md
 AIR = lbt.Atmosphere(
     seeing_arcsec=0.8, outer_scale_m=22.0, wind_speed_m_s=10.0, diameter_m=8.0, obstruction=0.14
 )
@@ -66,12 +69,12 @@ class Disturbance:
         )
 
 
-def record() -> lbt.SpectrumRecord:
+def record(averages: int = AVERAGES) -> lbt.SpectrumRecord:
     """Read the file; its columns have no names, and it does not tell their unit.
 
     The rows are taken for frequency, tip and tilt.
     """
-    found = lbt.load_record(FILE, kind="spectrum", unit="nm^2/Hz", averages=AVERAGES)
+    found = lbt.load_record(FILE, kind="spectrum", unit="nm^2/Hz", averages=averages)
     assert isinstance(found, lbt.SpectrumRecord)
     return found
 
@@ -271,9 +274,9 @@ def accumulated(f: np.ndarray, density: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def main(folder: str = "out") -> None:
+def main(folder: str = "out", averages: int = AVERAGES) -> None:
     """Print the tables and draw the figures."""
-    seen = record()
+    seen = record(averages)
     model = lbt.identify(seen, frame_rate_hz=FRAME_RATE_HZ, delay_frames=DELAY_FRAMES)
     print_lines(seen, model)
     met, moved = disturbance(seen), disturbance(seen, shift_hz=SHIFT_HZ)
@@ -308,4 +311,4 @@ def main(folder: str = "out") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    main(*sys.argv[1:2], *map(int, sys.argv[2:3]))

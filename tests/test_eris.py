@@ -66,13 +66,16 @@ def test_background_of_the_file_is_a_formula(seen, example):
     assert same.all(axis=1).mean() == pytest.approx(0.963, abs=0.001)
 
 
-def test_spectrum_without_scatter_is_taken_for_one_periodogram():
+def test_spectrum_without_scatter_is_taken_for_one_periodogram(example):
     plain = lbt.load_record(FILE, kind="spectrum", unit="nm^2/Hz")
     found = lbt.identify(plain, frame_rate_hz=1000)
     assert len(found.notes) == 2
     assert all("does not scatter" in note for note in found.notes)
-    for axis in found.axes:
+    for column, axis in zip(plain.density_nm2_hz.T, found.axes, strict=True):
         assert axis.data.count[0] == 1
+        assert len(axis.lines) >= 8
+        peaks = np.array(example.peaks(plain.frequency_hz, column))[:, 0]
+        assert all(np.min(np.abs(peaks - line.frequency_hz)) < 0.06 for line in axis.lines)
         assert all(line.rms_nm < 30 for line in axis.lines)  # 332 where it counts as a million
 
 
