@@ -305,3 +305,21 @@ def test_a_variance_that_rounding_has_spoilt_is_not_certified():
         check = next(c for c in design.certificate.checks if "adjoint" in c.name)
         assert check.value < 1e-6
     assert 0 < spoilt
+
+
+def test_many_states_take_the_equation_by_default():
+    lines = [
+        lbt.Vibration(frequency_hz=12.0 + 3 * i, damping=0.01, rms_nm=20.0) for i in range(9)
+    ]
+    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    routes = {}
+    for count in (2, 9):
+        plant = lbt.tip_tilt_plant(
+            frame_rate_hz=800, turbulence=slow, vibrations=lines[:count], noise_nm=15.0
+        )
+        design = lbt.hinf(plant, gamma_ratio=1.2)
+        routes[plant.A.shape[0]] = design.solver.route
+        assert design.certificate.passed
+    small, large = sorted(routes)
+    assert small <= 20 < large
+    assert (routes[small], routes[large]) == ("lmi", "riccati")

@@ -140,7 +140,7 @@ def _synthesise(config: Config, arguments: Namespace) -> Design:
         gamma=arguments.gamma,
         gamma_ratio=ratio,
         horizon=arguments.horizon,
-        method=arguments.route or "lmi",
+        method=arguments.route,
     )
 
 

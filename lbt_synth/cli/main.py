@@ -48,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     design.add_argument(
         "--route",
         choices=("riccati", "sdp", "lmi"),
-        help="kalman: riccati (default) or sdp; hinf: lmi (default) or riccati",
+        help="kalman: riccati (default) or sdp; hinf: lmi (default up to 20 states) or riccati",
     )
     bound = design.add_mutually_exclusive_group()
     bound.add_argument("--gamma", type=float, help="bound of the H-infinity norm [nm]")

@@ -25,6 +25,7 @@ from lbt_synth.witness import Witness, infeasible_level
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9
 _CONTRADICTION = 1e-9  # what rounding may take from a proof
+_LARGEST_LMI = 20  # states
 _GREATEST = 1e100
 _GREATEST_RATIO = 1e6
 
@@ -57,7 +58,7 @@ def hinf(
     gamma: float | None = None,
     gamma_ratio: float | None = None,
     horizon: int = 1,
-    method: str = "lmi",
+    method: str | None = None,
 ) -> FilterDesign:
     """Design an H-infinity filter of an estimation problem.
 
@@ -78,7 +79,8 @@ def hinf(
         filter (a-posteriori), 2 and more predict further, as ``problem.ahead``.
     method : {"lmi", "riccati"}, optional
         Linear matrix inequality, or the gamma-Riccati equation. For a given
-        bound both give the central filter.
+        bound both give the central filter. By default the inequality up to 20 states, and
+        the equation beyond: the inequality takes minutes there.
 
     Returns
     -------
@@ -110,6 +112,8 @@ def hinf(
     True
     """
     require_problem(problem)
+    if method is None:
+        method = "lmi" if problem.A.shape[0] <= _LARGEST_LMI else "riccati"
     choice(method, "method", ("lmi", "riccati"))
     if gamma is not None and gamma_ratio is not None:
         raise ProblemError(
