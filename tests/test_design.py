@@ -308,9 +308,7 @@ def test_a_variance_that_rounding_has_spoilt_is_not_certified():
 
 
 def test_many_states_take_the_equation_by_default():
-    lines = [
-        lbt.Vibration(frequency_hz=12.0 + 3 * i, damping=0.01, rms_nm=20.0) for i in range(9)
-    ]
+    lines = [lbt.Vibration(frequency_hz=12.0 + 3 * i, damping=0.01, rms_nm=20.0) for i in range(9)]
     slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
     routes = {}
     for count in (2, 9):

@@ -156,7 +156,7 @@ def test_a_spectrum(tmp_path, capsys):
         header="frequency_hz,psd_nm2/Hz",
     )  # fmt: skip
     options = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm^2/Hz")
-    status, text, error = run(
+    status, _, error = run(
         capsys, "identify", file, "-o", tmp_path / "m.yaml", *options, "--kind", "spectrum"
     )
     assert (status, error) == (0, "")

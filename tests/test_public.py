@@ -61,6 +61,7 @@ def test_public_fields_say_which_gain_they_are(name):
         "docs/modal.md",
         "docs/replay.md",
         "docs/records.md",
+        "docs/identification.md",
         "docs/tracking.md",
     ],
 )

@@ -1,6 +1,7 @@
 """Identification of random closed loops: lines found, filters designed, gains, times.
 
     python docs/measure/identification.py [--records 200] [--jobs 2] [--seconds 60]
+    python docs/measure/identification.py --times
 
 One axis at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain 0.4 to
 1, noise 2 to 30 nm a frame (evenly in its logarithm). Even records: second-order turbulence of
@@ -251,6 +252,38 @@ def table(results: list[dict]) -> None:
     )
 
 
+def times() -> None:
+    """Print the processor time of two axes of a minute with five lines."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2)
+    lines = tuple(
+        lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=r, direction=d)
+        for f, r, d in (
+            (13.0, 40.0, (1.0, 0.0)), (31.0, 80.0, (1.0, 0.0)), (74.0, 15.0, (1.0, 0.0)),
+            (22.0, 60.0, (0.0, 1.0)), (110.0, 20.0, (0.0, 1.0)),
+        )
+    )  # fmt: skip
+    air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
+    truth = lbt.Truth(turbulence=air, vibrations=lines, noise_nm=10.0, sensor_gain=0.6)
+    run = lbt.simulate(
+        lbt.integrator(path, gain=0.5).controller, truth, hardware=path, frames=60_000
+    )
+    record = lbt.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+    )
+    lbt.identify(record)  # imports
+    begin = time.process_time()
+    model = lbt.identify(record)
+    middle = time.process_time()
+    lbt.kalman(model.plant())
+    end = time.process_time()
+    lbt.design_from_record(record)
+    last = time.process_time()
+    print(f"lines found              {[len(axis.lines) for axis in model.axes]}")
+    print(f"identify, two axes       {middle - begin:.2f} s")
+    print(f"design                   {end - middle:.3f} s")
+    print(f"halves, test and design  {last - end:.2f} s")
+
+
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -258,7 +291,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--times", action="store_true", help="only the time of two axes")
     asked = parser.parse_args()
+    if asked.times:
+        times()
+        return
     one = partial(studied, frames=int(asked.seconds * RATE))
     with ProcessPoolExecutor(asked.jobs) as pool:
         seeds = range(asked.first, asked.first + asked.records)
