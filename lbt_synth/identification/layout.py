@@ -22,7 +22,8 @@ from lbt_synth.validation import FloatArray, IntArray
 _GAIN_PRIOR = (np.log(0.7), 1.0)
 _TURBULENCE_DAMPING = (np.log(0.5), 0.7)  # of the first component; of others the odds
 _PART_DAMPING = (0.0, 1.0)
-_LINE_DAMPING = (np.log(0.01 / 0.99), 8.0)
+_LINE_DAMPING = (np.log(0.01 / 0.99), 4.0)
+_UNKNOWN_TAPER = 2.0  # width of that prior where nothing tells a narrow line from a narrower one
 NO_CORNER = 50.0  # angle a frame of a corner that is none
 _CORNER = (np.log(50.0), 2.0)  # of its frequency [Hz]
 _SLOWEST = 1.5  # width of the prior on the logarithm of a turbulence's frequency
@@ -144,6 +145,8 @@ class Layout:
             at = FIRST + PARAMETERS * i
             slow = _PART_DAMPING if i else _TURBULENCE_DAMPING
             centre[at + 1], width[at + 1] = _LINE_DAMPING if part.line else slow
+            if part.line and self.data.duration_s is None:
+                width[at + 1] = _UNKNOWN_TAPER
             if part.frequency is not None:
                 centre[at], width[at] = part.frequency
             elif not part.line:

@@ -66,7 +66,12 @@ def coefficients(frequency: float, damping: float) -> tuple[float, float, float]
     """Return a1, a2 and var v / P of a sampled resonance."""
     b, p, _ = recursion(frequency, damping)
     q = 1 - p
-    return 1 - b + q, -q, p * b * (2 * (1 + q) - b) / (1 + q)
+    drive = p * b * (2 * (1 + q) - b) / (1 + q)
+    if damping >= 1:
+        return 1 - b + q, -q, drive
+    decay = np.exp(-damping * frequency)
+    turn = frequency * np.sqrt((1 - damping) * (1 + damping))
+    return float(2 * decay * np.cos(turn)), -float(decay**2), drive
 
 
 def log_density(

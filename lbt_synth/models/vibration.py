@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.ar import ARModel
+from lbt_synth.models.ar import ARModel, variance_ratio
 from lbt_synth.models.resonance import coefficients
 from lbt_synth.validation import choice, frozen, number, real_array
 
@@ -88,8 +88,9 @@ class Vibration:
                 f"a vibration must lie below the Nyquist frequency {rate / 2:.6g} Hz; "
                 f"got {self.frequency_hz:.6g} Hz. Give the frequency it is aliased to."
             )
-        a1, a2, drive = coefficients(2 * np.pi * self.frequency_hz / rate, self.damping)
-        driving = self.rms_nm * np.sqrt(drive)
+        a1, a2, _ = coefficients(2 * np.pi * self.frequency_hz / rate, self.damping)
+        # of the coefficients as they are rounded: the process has this rms exactly
+        driving = self.rms_nm / np.sqrt(variance_ratio(frozen([a1, a2])))
         return ARModel(
             coefficients=frozen([a1, a2]), driving_rms_nm=float(driving), frame_rate_hz=rate
         )
