@@ -1,0 +1,122 @@
+"""What a taper makes of a narrow line, and lines that a record does not resolve."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import ROOT
+from scipy.integrate import quad
+from test_identification import RATE, loop_of
+
+import lbt_synth as lbt
+from lbt_synth.identification.periodogram import loop_periodogram
+from lbt_synth.identification.window import TAPER, WIDE, log_smearing
+
+
+def correlation(t: float) -> float:
+    """Autocorrelation of the taper at a lag, by its definition."""
+
+    def h(x: float) -> float:
+        edge = min(x, 1 - x)
+        if edge < 0:
+            return 0.0
+        return 1.0 if edge >= TAPER / 2 else 0.5 * (1 - np.cos(2 * np.pi * edge / TAPER))
+
+    value = quad(lambda x: h(x) * h(x + t), 0, 1 - t, limit=400)[0]
+    return float(value / quad(lambda x: h(x) ** 2, 0, 1, limit=200)[0])
+
+
+@pytest.mark.parametrize(("width", "distance"), [(0.02, 0.4), (0.3, 1.3), (2.0, 0.0), (8.0, 5.0)])
+def test_smearing_is_the_integral_that_defines_it(width: float, distance: float) -> None:
+    t = np.linspace(0, 1, 1201)
+    r = np.array([correlation(float(x)) for x in t])
+    kernel = r * np.exp(-2 * np.pi * width * t) * np.cos(2 * np.pi * distance * t)
+    smeared = 2 * np.trapezoid(kernel, t)
+    line = width / np.pi / (width**2 + distance**2)
+    found = log_smearing(width, np.array([distance]))[0][0]
+    assert found == pytest.approx(np.log(smeared / line), abs=5e-3)
+
+
+@given(width=st.floats(1e-8, 25), distance=st.floats(0.02, 390))
+@settings(max_examples=60, deadline=None)
+def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
+    d = np.array([-distance, distance])
+    _, by_width, by_distance = log_smearing(width, d)
+    h = 1e-6
+    numeric = (log_smearing(width * np.exp(h), d)[0] - log_smearing(width * np.exp(-h), d)[0]) / (
+        2 * h
+    )
+    assert by_width == pytest.approx(numeric, abs=1e-4)
+    numeric = (log_smearing(width, d + h)[0] - log_smearing(width, d - h)[0]) / (2 * h)
+    # the cubics of neighbours meet with the same slope, but not with the same bend
+    assert by_distance == pytest.approx(numeric, rel=1e-3, abs=2e-2)
+    assert by_distance[0] == pytest.approx(-by_distance[1])
+
+
+def test_wide_lines_are_as_they_are() -> None:
+    value, _, _ = log_smearing(WIDE, np.linspace(-100, 100, 201))
+    assert np.max(np.abs(value)) < 0.02
+
+
+@pytest.mark.parametrize("frequency", [20.0, 123.4567])
+def test_periodogram_of_a_sinusoid_is_the_taper(frequency: float) -> None:
+    n, rate, rms = 48_000, 800.0, 100.0
+    k = np.arange(n)
+    y = rms * np.sqrt(2) * np.cos(2 * np.pi * frequency * k / rate + 0.3)
+    data = loop_periodogram(y, None, frame_rate_hz=rate, stretches=[(0, n)])
+    assert data.duration_s is not None
+    d = (data.frequency_hz - frequency) * data.duration_s
+    width = 1e-8
+    for low, high in ((0, 1.5), (1.5, 4), (4, 10), (10, 20), (20, 40)):
+        inside = (np.abs(d) >= low) & (np.abs(d) < high)
+        line = width / np.pi / (width**2 + d[inside] ** 2)
+        model = line * np.exp(log_smearing(width, d[inside])[0]) * rms**2 * data.duration_s
+        assert np.mean(data.power(1.0)[inside]) == pytest.approx(np.mean(model), rel=0.06)
+
+
+def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:
+    rng = np.random.default_rng(0)
+    k = np.arange(40_000)
+    wave = 300 * np.sqrt(2) * np.cos(2 * np.pi * 20.0037 * k / RATE)
+    slow = np.cumsum(rng.standard_normal(k.size))
+    found = lbt.identify_axis(wave + slow + 5 * rng.standard_normal(k.size), frame_rate_hz=RATE)
+    (line,) = found.lines
+    assert not line.resolved
+    assert line.damping * line.frequency_hz * 40 == pytest.approx(0.01, rel=1e-2)
+    assert line.frequency_hz == pytest.approx(20.0037, abs=0.002)
+    assert line.rms_nm == pytest.approx(300, abs=3 * line.rms_error_nm)
+    assert line.rms_error_nm < 40
+    assert found.noise_nm == pytest.approx(5, rel=0.02)
+
+
+def test_a_line_that_is_resolved_says_so() -> None:
+    y, c = loop_of(lines=((40, 0.01, 30),), frames=20_000)
+    (line,) = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE).lines
+    assert line.resolved
+    assert line.damping == pytest.approx(0.01, abs=5 * line.damping_error)
+
+
+@pytest.mark.study
+def test_random_closed_loops_reach_what_the_page_says() -> None:
+    sys.path.insert(0, str(Path(ROOT) / "docs" / "measure"))
+    try:
+        from identification import studied
+    finally:
+        sys.path.pop(0)
+    results = [studied(seed, 60_000) for seed in range(40)]
+    found, missed, false = (
+        sum(len(r[key]) for r in results) for key in ("found", "missed", "false")
+    )
+    assert found / (found + missed) > 0.95
+    assert false / len(results) < 0.2
+    ratio = np.array([r["ratio"] for r in results])
+    assert np.median(ratio) < 1.03
+    assert np.percentile(ratio, 95) < 1.10
+    half = np.array([r["half_ratio"] for r in results])
+    assert np.median(half) < 1.01
+    assert np.mean(half < 1) > 0.5
