@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import ROOT
 from scipy.integrate import quad
+from scipy.signal import lfilter
 from test_identification import RATE, loop_of
 
 import lbt_synth as lbt
@@ -120,3 +121,18 @@ def test_random_closed_loops_reach_what_the_page_says() -> None:
     half = np.array([r["half_ratio"] for r in results])
     assert np.median(half) < 1.01
     assert np.mean(half < 1) > 0.5
+
+
+@pytest.mark.parametrize(("frequency", "stretch"), [(60.0, 667), (30.0, 667), (51.603, 1000)])
+def test_short_stretches_do_not_lead_to_a_sidelobe(frequency: float, stretch: int) -> None:
+    rng = np.random.default_rng(3)
+    k = np.arange(20_000)
+    slow = lfilter([1], [1, -0.99], 4 * rng.standard_normal(k.size))
+    z = slow + 5 * rng.standard_normal(k.size)
+    z += 50 * np.sqrt(2) * np.cos(2 * np.pi * frequency * k / RATE + 1)
+    pieces = [(j, j + stretch) for j in range(0, k.size - stretch, stretch + 5)]
+    found = lbt.identify_axis(z, frame_rate_hz=RATE, stretches=pieces)
+    (line,) = found.lines
+    assert line.frequency_hz == pytest.approx(frequency, abs=0.1)
+    assert line.rms_nm == pytest.approx(50, rel=0.15)
+    assert found.turbulence_fit.damping > 0.05

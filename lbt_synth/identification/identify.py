@@ -30,6 +30,7 @@ from lbt_synth.identification.whittle import (
     NOISE,
     Likelihood,
     damping_ratio,
+    damping_slope,
 )
 from lbt_synth.models import ARModel
 from lbt_synth.models.resonance import PARAMETERS, coefficients
@@ -345,7 +346,7 @@ def _covariance(grown: Grown) -> FloatArray:
 
 def _turbulence(theta: FloatArray, rate: float) -> ARModel:
     """Return the first component as a process of the phase."""
-    w, damping = float(np.exp(theta[FIRST])), float(np.exp(theta[FIRST + 1]))
+    w, damping = float(np.exp(theta[FIRST])), damping_ratio(theta[FIRST + 1], first=True)
     a1, a2, drive = coefficients(w, damping)
     polynomial = np.array([1.0, -a1, -a2])
     size = np.exp(theta[FIRST + 2] / 2 - theta[GAIN]) * np.sqrt(drive)
@@ -375,7 +376,7 @@ def _described(
         at = FIRST + PARAMETERS * i
         frequency = float(np.exp(theta[at])) * to_hz
         damping = damping_ratio(theta[at + 1], first=False)
-        damping_error = damping * (1 - damping) * float(error[at + 1])
+        damping_error = damping * damping_slope(damping, first=False) * float(error[at + 1])
         finest = 0.0 if data.duration_s is None else UNRESOLVED / data.duration_s / frequency
         resolved = damping >= finest
         if not resolved:
@@ -439,13 +440,14 @@ def _turbulence_fit(theta: FloatArray, covariance: FloatArray, rate: float) -> I
         slope[i] = (up - down) / 2e-4
     rms = _turbulence(theta, rate).rms_nm
     to_hz = rate / (2 * np.pi)
-    frequency, damping = float(np.exp(theta[FIRST])) * to_hz, float(np.exp(theta[FIRST + 1]))
+    frequency = float(np.exp(theta[FIRST])) * to_hz
+    damping = damping_ratio(theta[FIRST + 1], first=True)
     corner = float(np.exp(theta[CORNER])) * to_hz if has_corner(theta) else None
     return IdentifiedTurbulence(
         frequency_hz=frequency,
         frequency_error_hz=frequency * float(error[FIRST]),
         damping=damping,
-        damping_error=damping * float(error[FIRST + 1]),
+        damping_error=damping * damping_slope(damping, first=True) * float(error[FIRST + 1]),
         corner_hz=corner,
         corner_error_hz=None if corner is None else corner * float(error[CORNER]),
         rms_nm=rms,

@@ -20,7 +20,7 @@ from lbt_synth.models.resonance import PARAMETERS
 from lbt_synth.validation import FloatArray, IntArray
 
 _GAIN_PRIOR = (np.log(0.7), 1.0)
-_TURBULENCE_DAMPING = (np.log(0.5), 0.7)  # of the first component; of others the odds
+_TURBULENCE_DAMPING = (np.log(0.45), 0.7)  # of the first component; of others the odds
 _PART_DAMPING = (0.0, 1.0)
 _LINE_DAMPING = (np.log(0.01 / 0.99), 4.0)
 _UNKNOWN_TAPER = 2.0  # width of that prior where nothing tells a narrow line from a narrower one

@@ -27,6 +27,8 @@ from lbt_synth.models.resonance import PARAMETERS, log_density, log_roll_off
 from lbt_synth.validation import BoolArray, FloatArray
 
 GAIN, NOISE, CORNER, FIRST = 0, 1, 2, 3  # places in the vector of parameters
+LEAST = 0.05  # damping ratio of turbulence: what is narrower is a line
+_JUST_ABOVE = 1e-3
 _DIFFERENCE = 1e-4  # of a logarithm
 _FARTHEST = 60.0  # of a logarithm: exp stays finite
 
@@ -54,7 +56,8 @@ class Fitted:
     parameters : (p,) ndarray
         Logarithms of sensor gain, noise variance, corner of the first component's roll-off, and
         (frequency, damping, variance) of each component; frequencies as angles a frame. The
-        damping of all but the first is below 1: its parameter is ``log(zeta / (1 - zeta))``.
+        damping of the first, the turbulence, is above 0.05: its parameter is
+        ``log(zeta - 0.05)``; that of all others is below 1: ``log(zeta / (1 - zeta))``.
     contrast : float
         L without the priors.
     information : (p, p) ndarray
@@ -71,12 +74,19 @@ class Fitted:
 
 def damping_ratio(parameter: float, *, first: bool) -> float:
     """Damping ratio of a component from its parameter."""
-    return float(np.exp(parameter)) if first else float(1 / (1 + np.exp(-parameter)))
+    return float(LEAST + np.exp(parameter)) if first else float(1 / (1 + np.exp(-parameter)))
+
+
+def damping_slope(ratio: float, *, first: bool) -> float:
+    """Return the derivative of the logarithm of a damping ratio by its parameter."""
+    return 1 - LEAST / ratio if first else 1 - ratio
 
 
 def damping_parameter(ratio: float, *, first: bool) -> float:
     """Parameter of a component from its damping ratio."""
-    return float(np.log(ratio if first else ratio / (1 - ratio)))
+    if first:
+        return float(np.log(max(ratio - LEAST, _JUST_ABOVE)))
+    return float(np.log(ratio / (1 - ratio)))
 
 
 class Likelihood:
@@ -112,7 +122,7 @@ class Likelihood:
                 value = value + fall
             else:
                 self._smear(float(np.exp(f)), ratio, value, slopes[i])
-                slopes[i, 1] *= 1 - ratio
+            slopes[i, 1] *= damping_slope(ratio, first=i == 0)
             np.exp(value + (variance + np.log(self._white)), out=density[1 + i])
         return density, slopes, by_corner
 
