@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
+
+import numpy as np
 
 from lbt_synth.design import Design, hinf, kalman, lqg
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedModel, identify
-from lbt_synth.loop import Imaging
+from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.records import LinePrior, LoopRecord, require_length
 from lbt_synth.replay import PredictionTable, prediction_against_data, split_halves
@@ -17,6 +19,7 @@ from lbt_synth.validation import choice, instance, number
 
 METHODS = ("kalman", "hinf", "lqg")
 _GAMMA_RATIO = 1.2
+_APART = 3.0  # standard errors
 _NAMES = {"kalman": "Kalman filter", "hinf": "H-infinity filter", "lqg": "LQG controller"}
 
 
@@ -37,6 +40,8 @@ class RecordedDesign:
         the same method, of the best integrator and of a predictor by least squares.
     name : str
         Row of the design in ``held_out``.
+    notes : tuple of str
+        What speaks against the design.
     """
 
     model: IdentifiedModel
@@ -44,6 +49,7 @@ class RecordedDesign:
     half_model: IdentifiedModel
     held_out: PredictionTable
     name: str
+    notes: tuple[str, ...]
 
 
 def design_from_record(
@@ -152,7 +158,36 @@ def design_from_record(
     model = identify(record, start=half, **found)
     design = _designed(model.plant(), method, gamma_ratio)
     step()
-    return RecordedDesign(model=model, design=design, half_model=half, held_out=held_out, name=name)
+    return RecordedDesign(
+        model=model,
+        design=design,
+        half_model=half,
+        held_out=held_out,
+        name=name,
+        notes=_doubts(model, half, design),
+    )
+
+
+def _doubts(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:
+    """Return warnings of sensor gains that do not agree, and of loops that would not hold."""
+    out = []
+    for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
+        if whole.sensor_gain_error is None or first.sensor_gain_error is None:
+            continue
+        apart = abs(whole.sensor_gain - first.sensor_gain)
+        if apart > _APART * float(np.hypot(whole.sensor_gain_error, first.sensor_gain_error)):
+            out.append(
+                f"warning: axis {i} has a sensor gain of {first.sensor_gain:.3f} in the first half "
+                f"of the record, and of {whole.sensor_gain:.3f} in all of it"
+            )
+    for gain in sorted({*half.sensor_gains, *model.sensor_gains}):
+        path = replace(model.hardware, sensor_matrix=gain * np.eye(len(model.axes)))
+        if not close_loop(path, design.controller).is_stable:
+            out.append(
+                f"warning: with the sensor gain {gain:.3f}, which was found as well, the loop of "
+                "the design is unstable. Do not use it before the gains are understood"
+            )
+    return tuple(out)
 
 
 def _designed(plant: TipTiltPlant, method: str, gamma_ratio: float) -> Design:

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from lbt_synth.cli.output import Report, TableText, counting, fixed, working
-from lbt_synth.config import identified_config, save_config
+from lbt_synth.config import identified_config
+from lbt_synth.config.write import config_text
 from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.files import require_writable
+from lbt_synth.files import require_writable, write_atomically
 from lbt_synth.gainfile import require_gain_name, save_gain
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel, identify
 from lbt_synth.loop import Imaging, close_loop, loop_margins
@@ -47,9 +48,12 @@ def identify_command(arguments: Namespace) -> Report:
     report = Report(data={"source": str(arguments.file)})
     _tell_record(report, record)
     _tell_model(report, model)
-    _write_model(report, model, arguments, record, output)
+    text = _model_text(model, arguments, record)
+    drawn = None if figure is None else identification_figure(model)
+    write_atomically(output, text)
+    _note_written(report, "model", output)
     if figure is not None:
-        save_figure(identification_figure(model), figure)
+        save_figure(drawn, figure)
         _note_written(report, "figure", figure)
     return report
 
@@ -83,11 +87,17 @@ def auto(arguments: Namespace) -> Report:
     _tell_record(report, record)
     _tell_model(report, made.model)
     _tell_test(report, made, record)
+    # all is made before the first file is written
+    text = _model_text(made.model, arguments, record)
+    drawn = None
+    if figure is not None:
+        drawn = identification_figure(made.model, designs={made.name: made.design})
     save_gain(output, made.design)
     _note_written(report, "file", output)
-    _write_model(report, made.model, arguments, record, model_file)
+    write_atomically(model_file, text)
+    _note_written(report, "model", model_file)
     if figure is not None:
-        save_figure(identification_figure(made.model, designs={made.name: made.design}), figure)
+        save_figure(drawn, figure)
         _note_written(report, "figure", figure)
     return report
 
@@ -295,13 +305,17 @@ def _tell_model(report: Report, model: IdentifiedModel) -> None:
         )  # fmt: skip
     else:
         report.notes.append("no vibration stands out of the turbulence and the noise.")
-    report.notes += [f"note: {note}" for note in model.notes]
+    report.notes += [_marked(note) for note in model.notes]
     for i, axis in enumerate(model.axes):
         where = f"{_AXES[i]}: " if count == len(_AXES) else ""
         report.notes.append(f"{where}sensor gain {axis.sensor_gain_note}.")
         report.notes.append(f"{where}{_whiteness(axis)}")
     report.data["axes"] = [_axis_data(axis) for axis in model.axes]
     report.data["model_notes"] = model.notes
+
+
+def _marked(note: str) -> str:
+    return note if note.startswith("warning") else f"note: {note}"
 
 
 def _background_rows(name: str, axis: IdentifiedAxis) -> list[tuple[Any, ...]]:
@@ -422,6 +436,7 @@ def _tell_test(report: Report, made: RecordedDesign, record: LoopRecord) -> None
             "standard errors from what the model promises: the disturbance changed, or the model "
             "leaves something out."
         )
+    report.notes += [_marked(note) for note in made.notes]
     loop = close_loop(made.model.hardware, made.design.controller)
     margins = loop_margins(loop)
     report.data["certificate"] = made.design.certificate.passed
@@ -431,24 +446,22 @@ def _tell_test(report: Report, made: RecordedDesign, record: LoopRecord) -> None
     )
 
 
-def _write_model(
-    report: Report,
-    model: IdentifiedModel,
-    arguments: Namespace,
-    record: LoopRecord | SpectrumRecord,
-    path: Path,
-) -> None:
-    source = Path(arguments.file).name
+def _model_text(
+    model: IdentifiedModel, arguments: Namespace, record: LoopRecord | SpectrumRecord
+) -> bytes:
+    """Return the configuration of what was identified."""
     obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
+    if obstruction is not None and record.diameter_m is None:
+        raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
+    source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
         diameter_m=record.diameter_m,
-        obstruction=obstruction if record.diameter_m is not None else None,
+        obstruction=obstruction,
         wavelength_um=arguments.wavelength_um,
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
     )
-    save_config(path, settings, comments=comments)
-    _note_written(report, "model", path)
+    return config_text(settings, comments).encode()
 
 
 def _note_written(report: Report, key: str, path: Path) -> None:

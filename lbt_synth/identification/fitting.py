@@ -32,6 +32,8 @@ from lbt_synth.identification.whittle import (
     GAIN,
     Fitted,
     Likelihood,
+    damping_parameter,
+    damping_ratio,
     fit,
     observed,
 )
@@ -39,6 +41,9 @@ from lbt_synth.models.resonance import PARAMETERS
 from lbt_synth.validation import BoolArray, FloatArray
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)
+_OTHER_GAINS = (0.35, 0.6, 1.0)
+_FEW_ROUNDS = 3
+_SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
 _ANNOUNCED = 5.0  # log-likelihood that a line whose frequency is known must add
 _SPLIT = 9.0  # and the second of two that lie in each other's skirts
@@ -93,17 +98,43 @@ def grow(data: LoopPeriodogram, rules: Rules, start: Grown | None = None) -> Gro
         If no start leads to a minimum.
     """
     search = _Search(data, rules)
-    current = search.refitted(start) if start is not None else None
-    if current is None:
-        current = search.begun()
-    current = search.announced(search.pruned(current))
-    for _ in range(_MOST_ROUNDS):
-        found = search.excesses(current)
-        better = search.extended(current, found) or search.moved(current)
-        if better is None:
-            break
-        current = better
-    return search.measured(search.pruned(search.plain(current)))
+    return search.measured(search.grown(start))
+
+
+def kept(data: LoopPeriodogram, rules: Rules, model: Grown) -> Grown | None:
+    """Fit the parts of a model to other data, no more and no less; None if that fails."""
+    return _Search(data, rules).refitted(model)
+
+
+def other_gain(data: LoopPeriodogram, rules: Rules, best: Grown) -> float:
+    """Find how far another model with another sensor gain is, that is nearly as likely.
+
+    Wide resonances can stand for what a wrong gain leaves. Models are grown at other gains,
+    which are then set free.
+
+    Returns
+    -------
+    float
+        Largest distance of the logarithm of such a gain; 0 if there is none.
+    """
+    free = _Search(data, rules)
+    least, gain = free.cost(best), float(best.theta[GAIN])
+    away = 0.0
+    for trial in _OTHER_GAINS:
+        if abs(float(np.log(trial)) - gain) < _SAME_GAIN:
+            continue
+        fixed = _Search(data, replace(rules, gain=trial))
+        try:
+            made = free.fitted(*_parameters(fixed.grown(None, rounds=_FEW_ROUNDS)))
+        except NumericalError:
+            continue
+        if free.cost(made) < least + free.need:
+            away = max(away, abs(float(made.theta[GAIN]) - gain))
+    return away
+
+
+def _parameters(grown: Grown) -> tuple[FloatArray, tuple[Part, ...]]:
+    return grown.theta, grown.parts
 
 
 class _Search:
@@ -113,6 +144,20 @@ class _Search:
         self.layout = Layout(data)
         self.need = 0.5 * PARAMETERS * float(np.log(max(2.0, np.sum(data.count))))
         self.free_gain = rules.gain is None and data.closed
+
+    def grown(self, start: Grown | None, *, rounds: int = _MOST_ROUNDS) -> Grown:
+        """Find the model: grow, move, prune."""
+        current = None if start is None else self.refitted(start)
+        if current is None:
+            current = self.begun()
+        current = self.announced(self.pruned(current))
+        for _ in range(rounds):
+            found = self.excesses(current)
+            better = self.extended(current, found) or self.moved(current)
+            if better is None:
+                break
+            current = better
+        return self.named(self.pruned(self.plain(current)))
 
     def asked(self, grown: Grown, i: int, *, earlier: bool = False) -> float:
         """Return what a component must add to the logarithm of the likelihood.
@@ -258,18 +303,51 @@ class _Search:
         """Bands with too much power: the few best, or at first all clear ones."""
         theta = current.theta
         power = self.data.power(float(np.exp(theta[GAIN])))
-        lines = sum(p.line for p in current.parts)
-        room = self.rules.most_lines - lines
+        room = self._room(current)
         if room <= 0:
             return []
         found = candidates(
             self.data, power, self.full.model(theta), least=self.need, most=max(1, room)
         )
-        full = len(current.parts) - lines >= _MOST_TURBULENCES
+        slow = sum(not part.line for part in current.parts)
+        full = slow >= _MOST_TURBULENCES
         found = [c for c in found if not (full and c.frequency_hz < self.rules.lowest_line_hz)]
         if first:
             return [c for c in found if c.gain > max(2 * self.need, 0.02 * found[0].gain)]
         return [c for c in found if c.gain > 0.25 * found[0].gain]
+
+    def _room(self, current: Grown) -> int:
+        """How many lines more there may be."""
+        return self.rules.most_lines - sum(part.line for part in current.parts)
+
+    def named(self, current: Grown) -> Grown:
+        """Let the first component be the turbulence, where a resonance took its place."""
+        theta, lowest = current.theta, self.rules.lowest_line_hz * self.layout.angle
+        slow = [
+            i
+            for i in range(1, len(current.parts))
+            if np.exp(theta[FIRST + PARAMETERS * i]) < lowest
+        ]
+        ratio = damping_ratio(theta[FIRST + 1], first=True)
+        if np.exp(theta[FIRST]) < lowest or not slow or has_corner(theta) or ratio > 0.98:
+            return current
+        i = max(slow, key=lambda i: float(theta[FIRST + PARAMETERS * i + 2]))
+        at = FIRST + PARAMETERS * i
+        swapped = theta.copy()
+        swapped[FIRST : FIRST + 3], swapped[at : at + 3] = (
+            theta[at : at + 3],
+            theta[FIRST : FIRST + 3],
+        )
+        other = damping_ratio(theta[at + 1], first=False)
+        swapped[FIRST + 1] = damping_parameter(other, first=True)
+        swapped[at + 1] = damping_parameter(ratio, first=False)
+        parts = list(current.parts)
+        parts[i] = Part(line=True)
+        try:
+            made = self.fitted(swapped, tuple(parts))
+        except NumericalError:
+            return current
+        return made if self.cost(made) < self.cost(current) + self.need else current
 
     def extended(self, current: Grown, found: list[Candidate]) -> Grown | None:
         """Return the model with the candidates that are worth it; None if none is."""
@@ -278,7 +356,7 @@ class _Search:
                 made = self.pruned(self.fitted(*self._with(current, found)))
             except NumericalError:
                 made = None
-            if made is not None and self._cost(made) < self._cost(current):
+            if made is not None and self.cost(made) < self.cost(current):
                 return made
             found = found[: len(found) // 2]
         return None
@@ -321,7 +399,7 @@ class _Search:
                     seen.variance_nm2,
                 )
                 trials.append((anew, current.parts))
-            if half > 3 * self.layout.step:
+            if half > 3 * self.layout.step and self._room(current) > 0:
                 pair = theta[at : at + 3] + np.log(
                     [[1 - half / centre, 0.5, 0.5], [1 + half / centre, 0.5, 0.5]]
                 )
@@ -333,11 +411,12 @@ class _Search:
                     made = self.pruned(self.fitted(trial, parts))
                 except NumericalError:
                     continue
-                if self._cost(made) < self._cost(current) - 1:
+                if self.cost(made) < self.cost(current) - 1:
                     return made
         return None
 
-    def _cost(self, grown: Grown) -> float:
+    def cost(self, grown: Grown) -> float:
+        """Contrast and what the criterion asks for all parts."""
         return grown.fitted.contrast + sum(
             self.asked(grown, i, earlier=True) for i in range(1, len(grown.parts))
         )

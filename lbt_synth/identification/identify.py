@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.fitting import Rules, grow
+from lbt_synth.identification.fitting import Rules, grow, other_gain
 from lbt_synth.identification.layout import Grown, has_corner
 from lbt_synth.identification.periodogram import (
     SHORTEST_SEGMENT,
@@ -34,7 +34,7 @@ from lbt_synth.identification.whittle import (
 )
 from lbt_synth.models import ARModel
 from lbt_synth.models.resonance import PARAMETERS, coefficients
-from lbt_synth.validation import FloatArray, frozen, integer, number, real_array
+from lbt_synth.validation import FloatArray, frozen, instance, integer, number, real_array
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
@@ -42,6 +42,9 @@ GAIN_ERROR = 0.3  # relative; a gain that is known worse is not identifiable
 _POOR_GAIN = 0.1  # is said to be known poorly
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 _WIDE = 0.1  # damping ratio
+_APART = 3.0  # standard errors
+_LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
+_GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}
 _MOST_AVERAGES = 1000.0
 
 
@@ -52,6 +55,7 @@ def identify_axis(
     frame_rate_hz: float,
     stretches: Sequence[tuple[int, int]] | None = None,
     sensor_gain: float | None = None,
+    sensor_gain_error: float = 0.0,
     assumed_gain: float = 1.0,
     announced: Sequence[tuple[float, float]] = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
@@ -78,6 +82,8 @@ def identify_axis(
         Frames to use; all by default.
     sensor_gain : float, optional
         Sensor gain, if it is known; found from the data of a closed loop otherwise.
+    sensor_gain_error : float, optional
+        Standard error of a gain that is given: it is in the errors of all that it moves.
     assumed_gain : float, optional
         What to take where it can not be found.
     announced : sequence of (frequency, error), optional
@@ -158,6 +164,7 @@ def identify_axis(
     return identify_periodogram(
         data,
         sensor_gain=sensor_gain,
+        sensor_gain_error=sensor_gain_error,
         assumed_gain=assumed_gain,
         announced=announced,
         lowest_line_hz=lowest_line_hz,
@@ -284,6 +291,7 @@ def identify_periodogram(
     data: LoopPeriodogram,
     *,
     sensor_gain: float | None = None,
+    sensor_gain_error: float = 0.0,
     assumed_gain: float = 1.0,
     announced: Sequence[tuple[float, float]] = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
@@ -300,8 +308,11 @@ def identify_periodogram(
         If the fit fails.
     """
     if sensor_gain is not None:
-        sensor_gain = number(sensor_gain, "sensor_gain", above=0)
-    assumed = number(assumed_gain, "assumed_gain", above=0)
+        sensor_gain = number(sensor_gain, "sensor_gain", **_GAINS)
+    given_error = number(sensor_gain_error, "sensor_gain_error", at_least=0)
+    assumed = number(assumed_gain, "assumed_gain", **_GAINS)
+    if start is not None:
+        instance(start, IdentifiedAxis)
     nyquist = data.frame_rate_hz / 2
     for frequency, error in announced:
         number(frequency, "an announced frequency", above=0, below=nyquist)
@@ -314,28 +325,56 @@ def identify_periodogram(
     )
     grown = grow(data, rules, None if start is None else start.grown)
     if sensor_gain is not None:
-        return _described(data, rules, grown, None, "given")
+        relative = given_error / sensor_gain
+        return _described(data, rules, grown, relative or None, "given", known=relative)
     if not data.closed:
-        return _described(data, rules, grown, None, "1: of an open loop it has no meaning")
+        note = "1: of an open loop it has no meaning"
+        return _described(data, rules, grown, None, note, known=0.0)
     variance = float(_covariance(grown)[GAIN, GAIN])
     error = float(np.sqrt(variance)) if variance > 0 else float("inf")
+    if _wide(grown) and error <= GAIN_ERROR:
+        # such a model may stand for another gain
+        away = other_gain(data, rules, grown)
+        if away > _APART * error:
+            error = away
     if error <= GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
         return _described(data, rules, grown, error, f"found in the closed loop's data{poor}")
     rules = replace(rules, gain=assumed)
-    by = f" by {100 * error:.0f} %" if error < 10 else ""
+    by = f" by {100 * error:.0f} %" if error < 1 else ""
     note = (
         f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
-    return _described(data, rules, grow(data, rules, grown), None, note)
+    return _described(data, rules, grow(data, rules, grown), None, note, known=0.0)
 
 
-def _covariance(grown: Grown) -> FloatArray:
-    """Inverse of the information over the parameters that moved."""
+def _wide(grown: Grown) -> bool:
+    """Whether there is a resonance that is no narrow line."""
+    return any(
+        part.line and damping_ratio(grown.theta[FIRST + PARAMETERS * i + 1], first=False) > _WIDE
+        for i, part in enumerate(grown.parts)
+    )
+
+
+def _covariance(grown: Grown, known: float | None = None) -> FloatArray:
+    """Inverse of the information over the parameters that moved.
+
+    With a gain that is known with a standard error of its logarithm, what that moves is added to
+    the covariance at that gain.
+    """
     information = grown.fitted.information
     moved = np.flatnonzero(np.diag(information) > 0)
     out = np.zeros_like(information)
+    if known is not None:
+        moved = moved[moved != GAIN]
+        there = information.copy()
+        there[GAIN] = there[:, GAIN] = 0
+        fixed = replace(grown, fitted=replace(grown.fitted, information=there))
+        out = _covariance(fixed)
+        slope = -out @ information[:, GAIN]
+        slope[GAIN] = 1
+        return np.asarray(out + np.outer(slope, slope) * known**2)
     block = information[np.ix_(moved, moved)]
     scale = 1 / np.sqrt(np.diag(block))
     out[np.ix_(moved, moved)] = np.linalg.pinv(
@@ -358,11 +397,17 @@ def _turbulence(theta: FloatArray, rate: float) -> ARModel:
 
 
 def _described(
-    data: LoopPeriodogram, rules: Rules, grown: Grown, gain_error: float | None, note: str
+    data: LoopPeriodogram,
+    rules: Rules,
+    grown: Grown,
+    gain_error: float | None,
+    note: str,
+    *,
+    known: float | None = None,
 ) -> IdentifiedAxis:
     """Return the fit in the units of the phase, with standard errors."""
     theta, rate = grown.theta, data.frame_rate_hz
-    covariance = _covariance(grown)
+    covariance = _covariance(grown, known)
     error = np.sqrt(np.maximum(np.diag(covariance), 0))
     gain = float(np.exp(theta[GAIN]))
     to_hz = rate / (2 * np.pi)
@@ -388,7 +433,7 @@ def _described(
         rest = float(np.interp(frequency, data.frequency_hz, fitted)) - own
         narrow = damping < _WIDE and own > rest
         kind: Kind = "line" if narrow else "broad"
-        if not part.line or frequency < rules.lowest_line_hz:
+        if frequency < rules.lowest_line_hz:
             kind = "turbulence"
         if kind == "line":
             background -= density[1 + i]
@@ -402,12 +447,13 @@ def _described(
                 resolved=resolved,
                 rms_nm=rms,
                 rms_error_nm=rms * float(np.sqrt(along @ covariance @ along)),
-                prominence=own / rest,
+                prominence=own / rest if rest > 0 else float("inf"),
                 evidence=grown.adds[i],
                 announced=part.frequency is not None,
             )
         )
-    noise = float(np.exp(theta[NOISE] / 2))
+    innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
+    noise = max(float(np.exp(theta[NOISE] / 2)), _LEAST_NOISE * innovation)
     return IdentifiedAxis(
         turbulence=_turbulence(theta, rate),
         turbulence_fit=_turbulence_fit(theta, covariance, rate),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification.checks import Jump, better_delay, cut, jumps
 from lbt_synth.identification.identify import (
     LOWEST_LINE_HZ,
     MOST_LINES,
@@ -21,6 +22,9 @@ from lbt_synth.records import LinePrior, LoopRecord, SpectrumRecord
 from lbt_synth.validation import instance
 
 _DELAY = 2.0  # frames, where nothing is said
+_MOST_JUMPS = 20
+_SAME_JUMP = 50  # frames
+_UNSEEN = 0.5
 _APART = 3.0  # standard errors between gains that are not the same
 
 
@@ -99,7 +103,11 @@ def identify(
     >>> lbt.kalman(found.plant()).certificate.passed
     True
     """
+    for line in announced:
+        instance(line, LinePrior)
     known = [(line.frequency_hz, line.frequency_error_hz) for line in announced]
+    if start is not None:
+        instance(start, IdentifiedModel)
     options: dict[str, Any] = {
         "announced": known, "lowest_line_hz": lowest_line_hz, "most_lines": most_lines,
     }  # fmt: skip
@@ -118,6 +126,8 @@ def identify(
             "record.with_delay(...)."
         )
     count = record.axes
+    if start is not None and len(start.axes) != count:
+        raise ProblemError(f"start must have {count} axes; got {len(start.axes)}.")
     gains = _gains(sensor_gain, count)
     corrections = None
     if record.commands is not None:
@@ -127,10 +137,18 @@ def identify(
                 "without one. Try record.with_delay(...)."
             )
         corrections = record.corrections()
-    pieces = record.stretches() if stretches is None else stretches
+    pieces = list(record.stretches() if stretches is None else _pieces(stretches, record))
+    dead = [i for i in range(count) if np.ptp(record.measurements[record.usable, i]) == 0]
+    if dead and record.usable.any():
+        raise ProblemError(
+            f"axis {dead[0]} of the record is constant: there is nothing to identify. Choose the "
+            "other axis."
+        )
     total, done = 2 * count, 0
 
-    def one(i: int, gain: float | None, begin: IdentifiedAxis | None) -> IdentifiedAxis:
+    def one(
+        i: int, gain: float | None, begin: IdentifiedAxis | None, error: float = 0.0
+    ) -> IdentifiedAxis:
         nonlocal done
         found = identify_axis(
             record.measurements[:, i],
@@ -138,6 +156,7 @@ def identify(
             frame_rate_hz=record.frame_rate_hz,
             stretches=pieces,
             sensor_gain=gain,
+            sensor_gain_error=error,
             assumed_gain=assumed_gain,
             start=begin,
             **options,
@@ -149,10 +168,23 @@ def identify(
 
     axes = [one(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
     notes: list[str] = []
+    broken = _jumps(record, axes, pieces)
+    if broken:
+        notes.append(_told(broken))
+        if len(broken) <= _MOST_JUMPS:
+            pieces[:] = cut(pieces, [jump.frame for jump in broken])
+            axes = [one(i, gains[i], axes[i]) for i in range(count)]
     told = [i for i in range(count) if axes[i].sensor_gain_error is not None]
     if count > 1 and told and all(gain is None for gain in gains):
         axes, note = _pooled(axes, told, one)
         notes.append(note)
+    notes += _doubts(record, axes, told, pieces)
+    notes += [
+        f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and the "
+        "rest of the model suffers"
+        for i, axis in enumerate(axes)
+        if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0
+    ]
     if progress is not None and done < total:
         progress(total, total)
     return IdentifiedModel(
@@ -202,11 +234,76 @@ def _of_spectra(
     )
 
 
+def _pieces(stretches: Sequence[tuple[int, int]], record: LoopRecord) -> list[tuple[int, int]]:
+    """Return stretches that lie apart and hold usable frames only."""
+    out = sorted((int(a), int(b)) for a, b in stretches)
+    for i, (a, b) in enumerate(out):
+        after = out[i - 1][1] if i else 0
+        if not after <= a < b <= record.frames or not np.all(record.usable[a:b]):
+            raise ProblemError(
+                f"stretches must lie apart and within the usable frames; got ({a}, {b})."
+            )
+    return out
+
+
+def _jumps(
+    record: LoopRecord, axes: Sequence[IdentifiedAxis], pieces: Sequence[tuple[int, int]]
+) -> list[Jump]:
+    """Return the jumps of all axes, each place once."""
+    found: list[Jump] = []
+    for i, axis in enumerate(axes):
+        gains = [axis.sensor_gain] * len(axes)
+        found += jumps(record.pseudo_open_loop(gains)[:, i], axis, pieces)
+    out: list[Jump] = []
+    for jump in sorted(found, key=lambda jump: jump.frame):
+        if not out or jump.frame - out[-1].frame > _SAME_JUMP:
+            out.append(jump)
+    return out
+
+
+def _told(broken: Sequence[Jump]) -> str:
+    """Return what is said of jumps."""
+    first = max(broken, key=lambda jump: jump.size)
+    text = (
+        f"warning: {len(broken)} jump{'s' if len(broken) > 1 else ''} of the pseudo-open loop, the "
+        f"largest at frame {first.frame} with {first.size:.0f} deviations of the innovations"
+    )
+    if len(broken) <= _MOST_JUMPS:
+        return f"{text}; the record was cut there"
+    return f"{text}; too many to cut the record there, and the model suffers"
+
+
+def _doubts(
+    record: LoopRecord,
+    axes: Sequence[IdentifiedAxis],
+    told: Sequence[int],
+    pieces: Sequence[tuple[int, int]],
+) -> list[str]:
+    """Return warnings of a delay that does not fit, and of noise that is not seen."""
+    out = []
+    if told and record.commands is not None:
+        other = better_delay(record, told[0], axes[told[0]], pieces)
+        if other is not None:
+            out.append(
+                f"warning: a delay of {other[0]:g} frames fits better than {record.delay_frames:g} "
+                f"(its criterion is better by {other[1]:.0f}). Check the delay"
+            )
+    out += [
+        f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
+        for i, axis in enumerate(axes)
+        if axis.noise_error_nm > _UNSEEN * axis.noise_nm
+    ]
+    return out
+
+
 def _gains(given: Any, count: int) -> list[float | None]:
     """One gain an axis, or None."""
     if given is None:
         return [None] * count
-    values = np.atleast_1d(np.asarray(given, dtype=float))
+    try:
+        values = np.atleast_1d(np.asarray(given, dtype=float))
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"sensor_gain must be numbers; got {given!r}.") from error
     if values.shape not in ((1,), (count,)):
         raise ProblemError(f"sensor_gain must be one number, or {count}; got {given!r}.")
     return [float(v) for v in np.broadcast_to(values, (count,))]
@@ -215,7 +312,7 @@ def _gains(given: Any, count: int) -> list[float | None]:
 def _pooled(
     axes: list[IdentifiedAxis],
     told: list[int],
-    one: Callable[[int, float | None, IdentifiedAxis | None], IdentifiedAxis],
+    one: Callable[[int, float | None, IdentifiedAxis | None, float], IdentifiedAxis],
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of the gains, where there is one."""
     log = np.array([np.log(axes[i].sensor_gain) for i in told])
@@ -226,13 +323,12 @@ def _pooled(
         values = ", ".join(
             f"{np.exp(v):.3f} +- {np.exp(v) * e:.3f}" for v, e in zip(log, error, strict=True)
         )
-        return axes, f"the axes have different sensor gains: {values}"
+        return axes, f"warning: the axes have different sensor gains, {values}"
     gain = float(np.exp(mean))
     spread = gain / float(np.sqrt(np.sum(weight)))
     out = [
         replace(
-            one(i, gain, axis),
-            sensor_gain_error=spread,
+            one(i, gain, axis, spread),
             sensor_gain_note=(
                 "mean of the axes"
                 if len(told) == len(axes)

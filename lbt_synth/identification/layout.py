@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -72,6 +72,16 @@ class Grown:
     def theta(self) -> FloatArray:
         """The parameters."""
         return self.fitted.parameters
+
+    def narrow(self, most: float) -> Grown:
+        """Return the model without resonances of a larger damping ratio; not fitted again."""
+        theta, parts = self.theta, list(self.parts)
+        for i in reversed(range(1, len(parts))):
+            place = FIRST + PARAMETERS * i + 1
+            if parts[i].line and damping_ratio(self.theta[place], first=False) > most:
+                theta = without(theta, i)
+                del parts[i]
+        return replace(self, fitted=replace(self.fitted, parameters=theta), parts=tuple(parts))
 
 
 def has_corner(theta: FloatArray) -> bool:

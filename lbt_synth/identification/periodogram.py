@@ -19,6 +19,7 @@ import numpy as np
 from lbt_synth.identification.window import tukey
 from lbt_synth.validation import FloatArray, IntArray
 
+_FLOOR = 1e-12  # of the mean density: below, there is nothing but rounding
 LONGEST_SEGMENT = 1 << 16
 SHORTEST_SEGMENT = 256
 
@@ -133,11 +134,13 @@ def loop_periodogram(
     y = transform(measurement)
     c = None if correction is None else transform(correction)
     zero = np.zeros(frequency.size)
+    measured = scale * np.mean(np.abs(y) ** 2, axis=0)
+    measured += _FLOOR * np.mean(measured)
     # neighbours of a padded or tapered transform are not independent
     independent = len(starts) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
     return LoopPeriodogram(
         frequency_hz=frequency,
-        measured=scale * np.mean(np.abs(y) ** 2, axis=0),
+        measured=measured,
         crossed=zero if c is None else scale * np.mean((y * c.conj()).real, axis=0),
         corrected=zero if c is None else scale * np.mean(np.abs(c) ** 2, axis=0),
         count=np.full(frequency.size, independent),

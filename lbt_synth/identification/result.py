@@ -122,7 +122,8 @@ class IdentifiedAxis:
     parts : tuple of IdentifiedLine
         All other resonances, by frequency.
     noise_nm, noise_error_nm : float
-        Measurement noise per frame, as it is on y, and its standard error [nm].
+        Measurement noise per frame, as it is on y, and its standard error [nm]; at least a
+        hundredth of the innovations' deviation.
     sensor_gain : float
         Sensor gain: found, given or assumed.
     sensor_gain_error : float or None

@@ -10,6 +10,7 @@ from lbt_synth.identification.periodogram import LoopPeriodogram
 from lbt_synth.validation import FloatArray, frozen
 
 LAGS = 100
+_LOWEST = 3  # bins, in which the ends of the taper show
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,13 +75,14 @@ def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Wh
     even = np.arange(1, ratio.size + 1) / ratio.size
     deviation = float(np.max(np.abs(cumulative - even)))
     # a periodogram of n frames has n / 2 values; bins count as they are independent
-    size = 2 * ratio.size
+    size = 2 * (ratio.size + 1)
     whole = data.frequency_hz.size / data.frequency_hz[-1] * data.frame_rate_hz / 2
     complete = ratio.size > 0.95 * whole  # up to the Nyquist frequency
-    lags = min(LAGS, ratio.size // 4)
+    lags = min(LAGS, ratio.size // 16)
     if complete:
-        filled = np.zeros(size // 2 + 2)
-        filled[1:-1] = ratio - np.mean(ratio)
+        filled = np.zeros(size // 2 + 1)  # from 0 to the Nyquist frequency
+        filled[1:-1] = ratio - np.mean(ratio[_LOWEST:])
+        filled[: 1 + _LOWEST] = 0
         correlation = np.fft.irfft(filled, size)[1 : lags + 1] * size / (2 * np.sum(ratio))
         statistic = 2 * effective * float(np.sum(correlation**2))
         p_value = float(chdtrc(lags, statistic))
