@@ -588,6 +588,53 @@ def test_a_window_with_holes_is_not_identified():
     assert tracker.history[-1].frequencies_hz[0] == pytest.approx(19, abs=0.1)
 
 
+@pytest.mark.parametrize("size_nm", [1e4, 1e6])
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_glitch_is_no_noise(size_nm, whole):
+    """One measurement that is off by far, in the first windows."""
+    plant = axis(18)
+    tracker = lbt.TrackingController(
+        plant, lbt.LoopIdentifier(plant) if whole else lbt.LineFollower(plant), window_s=2,
+        update_s=0.5, extrapolate=False,
+    )  # fmt: skip
+    total, noise = disturbed(plant, frames=4000, hz=19)
+    run(tracker, plant, (total, noise))
+    clean = tracker.history
+    # the disturbance begins with a jump from zero
+    assert [u.left_out for u in clean] == [2] + [0] * (len(clean) - 1)
+    hit = noise.copy()
+    hit[0, 1700] += size_nm
+    run(tracker, plant, (total, hit))
+    kept = [u for u in tracker.history if not u.switched]
+    # a gain that was found a little off shows the glitch's way through the loop: windows wait
+    assert all(whole and size_nm == 1e6 and "do not stand alone" in u.reason for u in kept)
+    assert len(kept) <= 4
+    assert kept or [u.left_out for u in tracker.history][1:5] == [1] * 4
+    assert [u.left_out for u in tracker.history][-1] == 0
+    assert tracker.spoilt == 0
+    for update, before in zip(tracker.history, clean, strict=True):
+        assert update.noise_nm[0] == pytest.approx(before.noise_nm[0], rel=0.2)
+        assert min(abs(hz - 19) for hz in update.frequencies_hz) < 0.1
+
+
+def test_glitches_that_come_often_keep_the_filter():
+    plant = axis(18)
+    tracker = lbt.TrackingController(plant, lbt.LineFollower(plant), window_s=1, update_s=0.5)
+    total, noise = disturbed(plant, frames=2400, hz=19)
+    few, many, near = noise.copy(), noise.copy(), noise.copy()
+    few[0, 100:800:120] += 5e3  # 6, and 2 of the beginning
+    many[0, 100:800:60] += 5e3  # 12 of 800
+    near[0, [400, 405]] += 5e3
+    reasons = []
+    for series in (few, many, near):
+        run(tracker, plant, (total, series))
+        reasons.append((tracker.history[0].left_out, tracker.history[0].reason))
+        assert tracker.history[-1].switched
+    assert reasons[0] == (8, "")
+    assert reasons[1] == (14, "1.75 % of the window's measurements are not finite or outliers")
+    assert reasons[2] == (4, "4 of the window's measurements are outliers that do not stand alone")
+
+
 def test_two_lines_are_followed_each_for_itself():
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=800, turbulence=AIR, noise_nm=15.5,
@@ -623,6 +670,7 @@ def test_wrong_trackers_are_refused():
         ({"update_s": 0}, "update_s must be at least"),
         ({"trend_s": -1}, "trend_s must be at least 0"),
         ({"design": lambda p: lbt.integrator(p.hardware, gain=0.3)}, "only filters of"),
+        ({"design": 3}, "design must be a callable plant -> FilterDesign.*got int"),
     ):
         with pytest.raises(lbt.ProblemError, match=words):
             lbt.TrackingController(plant, follow, **wrong)
@@ -632,6 +680,18 @@ def test_wrong_trackers_are_refused():
         lbt.TrackingController(plant.hardware, follow)
     with pytest.raises(lbt.DimensionError, match=r"y must have shape \(1,\)"):
         lbt.TrackingController(plant, follow).step([0.0, 0.0])
+    for running in (
+        lbt.TrackingController(plant, follow), lbt.SwitchedController(lbt.kalman(plant))
+    ):  # fmt: skip
+        for wrong, words in (
+            (["a"], "y must be an array of numbers; got list"),
+            ([1j], "y must be real; got complex numbers"),
+            ([None], "y must be an array of numbers"),
+            ([[1.0], [1.0, 2.0]], "y must be a rectangular array"),
+        ):
+            with pytest.raises(lbt.ProblemError, match=words):
+                running.step(wrong)
+        assert np.array_equal(running.step([0]), [0.0])  # nothing was taken in
 
 
 def test_the_figure_has_the_frequencies_and_the_residuals():
