@@ -366,6 +366,64 @@ def test_lines_are_found_in_the_pseudo_open_loop():
     assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * np.std(errors, axis=0) / np.sqrt(12))
 
 
+def neighbours(frequencies_hz, second=(1, 0)):
+    lines = [
+        lbt.Vibration(frequency_hz=hz, damping=0.01, rms_nm=100, direction=along)
+        for hz, along in zip(frequencies_hz, [(1, 0), second], strict=True)
+    ]
+    return lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=AIR, noise_nm=15.5, vibrations=lines)
+
+
+def sinusoids(*parts, seed, axis=0, frames=3200):
+    rng, time_s = np.random.default_rng(seed), np.arange(frames) / 800
+    series = 15.5 * rng.standard_normal((frames, 2))
+    for hz, amplitude_nm in parts:
+        phase = rng.uniform(0, 2 * np.pi)
+        series[:, axis] += amplitude_nm * np.sin(2 * np.pi * hz * time_s + phase)
+    return series
+
+
+@pytest.mark.parametrize(
+    ("frames", "parts"),
+    [
+        (3200, [(21.6, 140), (23.6, 300)]),
+        (3200, [(21.6, 300), (23.6, 140)]),
+        (3200, [(20.3, 140), (22.3, 140)]),
+        (3200, [(18.6, 140), (20.6, 300)]),
+        (3200, [(20.5, 140), (21.7, 140)]),
+        (3200, [(19, 800), (23, 100)]),
+        (1600, [(20.3, 140), (22.3, 140)]),
+    ],
+)
+def test_neighbours_are_found_each_at_its_own_peak(frames, parts):
+    for order in (1, -1):
+        follow = lbt.LineFollower(neighbours([20, 22][::order]))
+        for seed in range(2):
+            follow.reset()
+            series = sinusoids(*parts, seed=seed, frames=frames)
+            found = follow(series, np.zeros_like(series))
+            wanted = [hz for hz, _ in parts][::order]
+            assert [v.frequency_hz for v in found.vibrations] == pytest.approx(wanted, abs=0.06)
+
+
+@pytest.mark.parametrize("parts", [
+    [(21, 400)], [(21, 4000)], [(21, 40)], [(20, 140)], [(19.3, 1000)],
+    [(20.9, 300), (21.2, 300)],  # closer than the window resolves
+])  # fmt: skip
+def test_two_lines_are_not_found_on_one_peak(parts):
+    follow = lbt.LineFollower(neighbours([20, 22]))
+    for seed in range(3):
+        series = sinusoids(*parts, seed=seed)
+        assert follow(series, np.zeros_like(series)) is None
+
+
+def test_lines_along_other_directions_are_no_neighbours():
+    plant = neighbours([20, 22], second=(0, 1))
+    series = sinusoids((21.3, 400), seed=0) + sinusoids((21.2, 300), seed=1, axis=1)
+    found = lbt.LineFollower(plant)(series, np.zeros_like(series))
+    assert [v.frequency_hz for v in found.vibrations] == pytest.approx([21.3, 21.2], abs=0.02)
+
+
 def test_no_line_is_no_plant():
     plant = axis(20)
     follow = lbt.LineFollower(plant)

@@ -224,7 +224,7 @@ class SwitchedController:
         (frames,) ndarray of bool
             False where :meth:`window` has what the filter expected.
         """
-        return self._usable[self._rows(frames)]
+        return np.asarray(self._usable[self._rows(frames)], dtype=np.bool_)
 
     def spoilt_fraction(self, frames: int | None = None) -> float:
         """Fraction of the last frames whose measurement was not finite.
