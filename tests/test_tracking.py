@@ -15,6 +15,7 @@ from lbt_synth.models.plant import with_vibrations
 from lbt_synth.simulation.linear import last_state
 from lbt_synth.simulation.run import step_loop
 from lbt_synth.simulation.series import draw_disturbance, draw_noise
+from lbt_synth.tracking.glitches import glitches
 from lbt_synth.tracking.trend import extrapolated
 
 SHELL = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
@@ -673,6 +674,19 @@ def test_a_glitch_is_no_noise(size_nm, whole):
     for update, before in zip(tracker.history, clean, strict=True):
         assert update.noise_nm[0] == pytest.approx(before.noise_nm[0], rel=0.2)
         assert min(abs(hz - 19) for hz in update.frequencies_hz) < 0.1
+
+
+@pytest.mark.parametrize("frames", [16, 100, 3200])
+def test_clean_windows_have_no_outliers(frames):
+    rng = np.random.default_rng(frames)
+    swing = 500 * np.sin(0.15 * np.arange(frames))[:, None]
+    for _ in range(100):
+        series = swing + 15 * rng.standard_normal((frames, 2))
+        assert not glitches(series).any()
+        series[frames // 2, 1] += 3000
+        assert np.flatnonzero(glitches(series)).tolist() == [frames // 2]
+    assert not glitches(swing).any()
+    assert not glitches(np.zeros((frames, 1))).any()
 
 
 def test_glitches_that_come_often_keep_the_filter():
