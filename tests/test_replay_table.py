@@ -166,6 +166,40 @@ def test_a_limit_that_is_not_known_is_a_note():
     assert "no limit of performance: a limit needs modes that decouple" in table.notes[0]
 
 
+@pytest.mark.parametrize("correlation", [0.6, -0.9])
+def test_the_noise_of_the_table_has_its_correlations(correlation):
+    S, R = np.array([[1.0, 0.8], [0.3, 1.0]]), 100 * np.array([[1, correlation], [correlation, 1]])
+    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
+    plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=slow, noise_nm=R, sensor_matrix=S)
+    rng = np.random.default_rng(0)
+    total = np.column_stack([a_series(slow, 20_000, rng) for _ in range(2)])
+    z = total + rng.multivariate_normal([0, 0], R, 20_000) @ np.linalg.inv(S).T
+    table = lbt.prediction_against_data(plant, z, {"Kalman": lbt.kalman(plant)})
+    assert abs(table["Kalman"].deviations) < 4
+    assert 0.95 < table["Kalman"].ratio < 1.05
+    back = np.linalg.inv(S)
+    np.testing.assert_allclose(
+        table["Kalman"].replayed.noise_nm2, back @ R @ back.T, rtol=0, atol=1e-9
+    )
+    assert table.notes == ()
+
+
+def test_more_noise_than_the_data_has_is_a_note():
+    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
+    rng = np.random.default_rng(0)
+    z = (a_series(slow, 8000, rng) + 10 * rng.standard_normal(8000))[:, None]
+    path = {"frame_rate_hz": RATE, "turbulence": slow, "modes": 1}
+    right, wrong = (lbt.tip_tilt_plant(**path, noise_nm=s) for s in (10.0, 60.0))
+    assert lbt.prediction_against_data(right, z, {"mine": lbt.kalman(right)}).notes == ()
+    table = lbt.prediction_against_data(wrong, z, {"mine": lbt.kalman(right)}, measurements=z)
+    (note,) = table.notes
+    assert "of what ran, best integrator, mine, least-squares predictor: its variance is" in note
+    assert "standard errors below zero" in note
+    for entry in table.entries[:-1]:
+        assert entry.replayed.refuted
+        assert np.isnan(entry.replayed.upper_nm)
+
+
 # --- the model's own residual -------------------------------------------------------------------
 @pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
 def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor):

@@ -19,6 +19,7 @@ from lbt_synth.replay.stretches import Stretches
 from lbt_synth.validation import FloatArray, frozen
 
 _FEWEST = 100  # frames of which a mean square is worth a standard error
+_TOO_FAR = 4.0  # standard errors below zero that are no chance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,7 +27,8 @@ class ResidualEstimate:
     """Residual of a loop, estimated from the measured residual ``phi_res(k-1) + noise``.
 
     The variance of the noise is subtracted: an estimate may be negative within its error, and is
-    then shown as such; its rms is nan, and :attr:`upper_nm` says what it is below.
+    then shown as such; its rms is nan, and :attr:`upper_nm` says what it is below. One that is
+    negative by more than that refutes the noise that was subtracted (:attr:`refuted`).
 
     Attributes
     ----------
@@ -90,8 +92,23 @@ class ResidualEstimate:
         return self.total_error_nm2 / (2 * self.rms_nm) if self.total_nm2 > 0 else float("nan")
 
     @property
+    def errors_below_zero(self) -> float:
+        """Standard errors by which the variance, over all axes or of one, is below zero."""
+        below = -np.append(self.variance_nm2, self.total_nm2)
+        error = np.append(self.variance_error_nm2, self.total_error_nm2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.max(np.where(below > 0, below / error, 0.0)))
+
+    @property
+    def refuted(self) -> bool:
+        """Whether more noise was subtracted than there is, by more than four standard errors."""
+        return self.errors_below_zero > _TOO_FAR
+
+    @property
     def upper_nm(self) -> float:
-        """Root of the variance plus two standard errors, at least 0 [nm rms]."""
+        """Root of the variance plus two standard errors, at least 0 [nm rms]; nan if refuted."""
+        if self.refuted:
+            return float("nan")
         return float(np.sqrt(max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)))
 
     def above(self, other: ResidualEstimate) -> tuple[float, float]:
@@ -153,7 +170,7 @@ def residual_estimate(
     stretches: Stretches,
     *,
     noise_nm2: FloatArray,
-    noise_error_nm2: FloatArray,
+    noise_error_nm4: FloatArray,
 ) -> ResidualEstimate:
     """Estimate a residual from the measured residual of some stretches.
 
@@ -165,8 +182,8 @@ def residual_estimate(
         The stretches.
     noise_nm2 : (n, n) ndarray
         Covariance of its noise [nm^2].
-    noise_error_nm2 : (n,) ndarray
-        Standard errors of the noise variances [nm^2].
+    noise_error_nm4 : (n, n) ndarray
+        Covariance of the errors of the noise variances [nm^4].
 
     Returns
     -------
@@ -183,7 +200,7 @@ def residual_estimate(
             f"a residual needs at least {_FEWEST} frames after settling; got {len(measured)}. "
             "Give longer stretches, or lower settle_frames."
         )
-    error = _mean_covariance(measured, measured, stretches) + np.diag(noise_error_nm2**2)
+    error = _mean_covariance(measured, measured, stretches) + noise_error_nm4
     return ResidualEstimate(
         measured_nm=frozen(measured),
         stretches=stretches,

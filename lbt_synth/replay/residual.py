@@ -31,14 +31,14 @@ class ReplayData:
         Frames that can be used.
     noise_nm2 : (n, n) ndarray
         Covariance of the noise in z [nm^2].
-    noise_error_nm2 : (n,) ndarray
-        Standard errors of the noise variances [nm^2].
+    noise_error_nm4 : (n, n) ndarray
+        Covariance of the errors of the noise variances [nm^4].
     """
 
     open_loop: FloatArray
     stretches: Stretches
     noise_nm2: FloatArray
-    noise_error_nm2: FloatArray
+    noise_error_nm4: FloatArray
 
 
 def replayed_residual(
@@ -72,7 +72,7 @@ def replayed_residual(
     noise_nm : float or (q,) array_like
         Standard deviation of the white noise w on each measurement, per frame [nm].
     noise_error_nm : float or (q,) array_like, optional
-        Standard error of that [nm].
+        Standard error of that, the errors of different measurements independent [nm].
     sensor_gain : float, optional
         Sensor gain g of the recorded loop relative to the sensor matrix, as used to form z.
     stretches : sequence of (start, stop), optional
@@ -111,10 +111,12 @@ def replayed_residual(
     >>> bool(abs(would.rms_nm - exact.rms_nm) < 3 * would.rms_error_nm)
     True
     """
+    instance(hardware, LoopHardware)
+    deviation = _per_measurement(noise_nm, "noise_nm", hardware.n_measurements)
     data = replay_data(
         open_loop,
         hardware,
-        noise_nm=noise_nm,
+        noise_nm2=np.diag(deviation**2),
         noise_error_nm=noise_error_nm,
         sensor_gain=sensor_gain,
         stretches=stretches,
@@ -132,12 +134,16 @@ def replay_data(
     open_loop: Any,
     hardware: LoopHardware,
     *,
-    noise_nm: Any,
+    noise_nm2: FloatArray,
     noise_error_nm: Any,
     sensor_gain: float,
     stretches: Any,
 ) -> ReplayData:
     """Check a recorded series against a loop, and refer the noise to the modes.
+
+    ``noise_nm2`` is the covariance of the measurements' noise, (q, q). The errors of their
+    standard deviations are independent, and leave its correlations as they are: an error of one
+    measurement is common to all modes that it is seen in.
 
     Raises
     ------
@@ -148,17 +154,15 @@ def replay_data(
     gain = number(sensor_gain, "sensor_gain", above=0)
     series, parts = usable_series(open_loop, hardware.modes, stretches)
     back = inverse_sensor(hardware) / gain
-    variance, error = (
-        _per_measurement(value, name, hardware.n_measurements)
-        for value, name in ((noise_nm, "noise_nm"), (noise_error_nm, "noise_error_nm"))
-    )
-    # the error of a variance s^2 is 2 s times that of s
-    spread = np.sqrt(back**4 @ (2 * variance * error) ** 2)
+    error = _per_measurement(noise_error_nm, "noise_error_nm", hardware.n_measurements)
+    deviation = np.sqrt(np.diag(noise_nm2))
+    # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2
+    slope = 2 * back * (back @ noise_nm2) / np.where(deviation > 0, deviation, np.inf)
     return ReplayData(
         open_loop=series,
         stretches=parts,
-        noise_nm2=(back * variance**2) @ back.T,
-        noise_error_nm2=np.asarray(spread),
+        noise_nm2=back @ noise_nm2 @ back.T,
+        noise_error_nm4=(slope * error**2) @ slope.T,
     )
 
 
@@ -222,7 +226,7 @@ def replayed(data: ReplayData, loop: ClosedLoop, settle: int) -> ResidualEstimat
         np.concatenate(parts),
         kept,
         noise_nm2=data.noise_nm2,
-        noise_error_nm2=data.noise_error_nm2,
+        noise_error_nm4=data.noise_error_nm4,
     )
 
 

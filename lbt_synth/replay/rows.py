@@ -86,7 +86,7 @@ class PredictionTable:
     settle_frames : int
         Frames dropped before each stretch of the test.
     notes : tuple of str
-        What is left out of the table, and why.
+        What is left out of the table or cannot be, and why.
     """
 
     entries: tuple[PredictionRow, ...]

@@ -126,7 +126,7 @@ def prediction_against_data(
     data = replay_data(
         series,
         hardware,
-        noise_nm=np.sqrt(np.diag(plant.R)),
+        noise_nm2=plant.R,
         noise_error_nm=noise_error_nm,
         sensor_gain=1.0,
         stretches=tested,
@@ -167,12 +167,29 @@ def prediction_against_data(
     else:
         along = limit.directions.T * limit.variance_nm2 @ limit.directions
         entries.append(_row(LIMIT, None, along, imaging))
+    notes += _refuted(entries)
     return PredictionTable(
         entries=tuple(entries),
         fit=fitted,
         test=settled_stretches(tested, settle),
         settle_frames=settle,
         notes=notes,
+    )
+
+
+def _refuted(entries: Sequence[PredictionRow]) -> tuple[str, ...]:
+    """Say of which rows the noise cannot be right."""
+    below = {
+        entry.name: entry.replayed.errors_below_zero
+        for entry in entries
+        if entry.replayed is not None and entry.replayed.refuted
+    }
+    if not below:
+        return ()
+    return (
+        f"no residual on the data of {', '.join(below)}: its variance is {max(below.values()):.3g} "
+        "standard errors below zero, more than chance; the model has more noise than the data, or "
+        "another sensor gain. Identify the noise anew.",
     )
 
 
@@ -226,7 +243,7 @@ def _measured(
         np.concatenate([y[start:stop] @ back.T for start, stop in kept]),
         kept,
         noise_nm2=data.noise_nm2,
-        noise_error_nm2=data.noise_error_nm2,
+        noise_error_nm4=data.noise_error_nm4,
     )
 
 

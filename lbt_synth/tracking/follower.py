@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.plant import TipTiltPlant, require_no_memory, with_vibrations
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.tracking.line_fit import LineFit, Search
 from lbt_synth.validation import FloatArray, instance, number
 
 _LEAST_BINS = 8
-_EVIDENCE = 20.0  # twice the gain in log likelihood that makes a line
+_ALIGNED = 0.9  # cosine between directions along which lines may be mistaken
 
 
 class LineFollower:
@@ -21,7 +20,9 @@ class LineFollower:
     frequency is found by the Whittle likelihood (P. Whittle, Ark. Mat. 2, 423 (1953),
     doi:10.1007/BF02590998) of the pseudo-open-loop series along its direction, tapered with a
     Hann window, within ``span_hz`` of where it was last; its power is free in the fit. It may
-    be narrower than the window can tell.
+    be narrower than the window can tell. Lines along one direction (cosine above 0.9) whose
+    searches overlap are fitted together, keep their order, and must stay two bins of the window
+    apart: no two of them are found on one peak.
 
     Parameters
     ----------
@@ -84,7 +85,8 @@ class LineFollower:
         Returns
         -------
         TipTiltPlant or None
-            The plant at these frequencies; None if a line is not there.
+            The plant at these frequencies; None if a line is not there, or cannot be told from
+            a neighbour.
 
         Raises
         ------
@@ -104,23 +106,54 @@ class LineFollower:
         directions = np.array([line.direction for line in self._lines])
         series = (open_loop - open_loop.mean(axis=0)) @ directions.T
         powers = 2 / (rate * frames) * np.abs(np.fft.rfft(series * taper[:, None], axis=0)) ** 2
-        grid = np.fft.rfftfreq(frames, 1 / rate)
-        found = []
-        for i, line in enumerate(self._lines):
-            bins = (np.abs(grid - line.frequency_hz) <= self._span_hz) & (grid > 0)
-            bins &= grid < rate / 2
-            if np.count_nonzero(bins) < _LEAST_BINS:
+        grid = np.asarray(np.fft.rfftfreq(frames, 1 / rate), dtype=np.float64)
+        inside = (grid > 0) & (grid < rate / 2)
+        grid, powers = grid[inside], powers[inside]
+        shared = (directions @ directions.T) ** 2
+        found = list(self._lines)
+        for group in self._groups(shared):
+            searches = []
+            for i in group:
+                line = self._lines[i]
+                bins = np.abs(grid - line.frequency_hz) <= self._span_hz
+                if np.count_nonzero(bins) < _LEAST_BINS:
+                    return None
+                rest = self._background(group, i, grid)
+                searches.append(Search(line=line, bins=bins, power=powers[:, i], rest=rest))
+            fit = LineFit(grid, length_s=frames / rate, frame_rate_hz=rate, beside=len(group) > 1)
+            if len(group) == 1:
+                alone = fit.alone(searches[0])
+                frequencies = None if alone is None else [alone]
+            else:
+                frequencies = fit.together(searches, shared[np.ix_(group, group)])
+            if frequencies is None:
                 return None
-            rest = self._background(i, grid[bins])
-            frequency = _fitted(line, grid[bins], powers[bins, i], rest, frames / rate, rate)
-            if frequency is None:
-                return None
-            found.append(line.moved(frequency))
+            for i, frequency in zip(group, frequencies, strict=True):
+                found[i] = self._lines[i].moved(frequency)
         self._lines = found
         return with_vibrations(self._plant, found)
 
-    def _background(self, index: int, frequency_hz: FloatArray) -> FloatArray:
-        """Spectrum along the direction of a line without the line itself [nm^2/Hz]."""
+    def _groups(self, shared: FloatArray) -> list[list[int]]:
+        """Lines that could be found on one peak, by rising frequency."""
+        frequency = [line.frequency_hz for line in self._lines]
+        groups: list[list[int]] = []
+        for i in np.argsort(frequency, kind="stable").tolist():
+            near = [
+                group
+                for group in groups
+                if any(
+                    shared[i, j] > _ALIGNED**2 and frequency[i] - frequency[j] <= 2 * self._span_hz
+                    for j in group
+                )
+            ]
+            groups = [group for group in groups if group not in near]
+            groups.append(
+                sorted({i, *(j for group in near for j in group)}, key=frequency.__getitem__)
+            )
+        return groups
+
+    def _background(self, group: list[int], index: int, frequency_hz: FloatArray) -> FloatArray:
+        """Spectrum along the direction of a line without the lines of its group [nm^2/Hz]."""
         rate = self._plant.hardware.frame_rate_hz
         along = np.array(self._lines[index].direction)
         noise = along @ self._inverse
@@ -128,38 +161,7 @@ class LineFollower:
         for weight, model in zip(along**2, self._plant.turbulence, strict=True):
             out += weight * model.psd(frequency_hz)
         for j, line in enumerate(self._lines):
-            if j != index:
+            if j not in group:
                 weight = float(along @ np.array(line.direction)) ** 2
                 out += weight * line.ar_model(rate).psd(frequency_hz)
         return out
-
-
-def _fitted(
-    line: Vibration, grid: FloatArray, power: FloatArray, rest: FloatArray, length_s: float,
-    rate: float,
-) -> float | None:  # fmt: skip
-    """Frequency of the line in a part of the periodogram [Hz]; None if it is not there."""
-    # a line narrower than the window's resolution is seen as wide as that
-    width_hz = max(line.damping * line.frequency_hz, 1 / length_s)
-    low, high = max(grid[0], 1.01 * width_hz), grid[-1]
-
-    def contrast(p: FloatArray) -> float:
-        if not low <= p[0] <= high or not -10 < p[1] < 10:
-            return np.inf
-        there = Vibration(
-            frequency_hz=float(p[0]), damping=width_hz / float(p[0]),
-            rms_nm=line.rms_nm * float(np.exp(p[1])), direction=(1.0,),
-        )  # fmt: skip
-        model = rest + there.ar_model(rate).psd(grid)
-        return float(np.sum(np.log(model) + power / model))
-
-    peak = float(np.clip(grid[np.argmax(power / rest)], low, high))
-    start = np.array([[peak, 0.0], [peak + 0.25 / length_s, 0.0], [peak, 0.3]])
-    fit = minimize(
-        contrast, start[0], method="Nelder-Mead",
-        options={"initial_simplex": start, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 400},
-    )  # fmt: skip
-    without = float(np.sum(np.log(rest) + power / rest))
-    if not fit.success or not 2 * (without - fit.fun) > _EVIDENCE:
-        return None
-    return float(fit.x[0])

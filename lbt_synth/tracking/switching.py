@@ -20,7 +20,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.hardware import LoopHardware, same_mirror
 from lbt_synth.models.plant import TipTiltPlant
 from lbt_synth.simulation.linear import last_state
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,10 +131,12 @@ class SwitchedController:
 
         Raises
         ------
+        ProblemError
+            If they are no real numbers.
         DimensionError
             If there is another number of measurements.
         """
-        measured = np.asarray(y, dtype=np.float64)
+        measured = float_array(y, "y")
         if measured.shape != (len(self._S),):
             raise DimensionError(
                 f"y must have shape ({len(self._S)},) to match the sensor matrix "
@@ -209,6 +211,21 @@ class SwitchedController:
         rows = self._rows(frames)
         return self._measurements[rows], self._corrections[rows]
 
+    def usable(self, frames: int | None = None) -> BoolArray:
+        """Return of which of the last frames the measurement was finite, the oldest first.
+
+        Parameters
+        ----------
+        frames : int, optional
+            How many, as in :meth:`window`.
+
+        Returns
+        -------
+        (frames,) ndarray of bool
+            False where :meth:`window` has what the filter expected.
+        """
+        return np.asarray(self._usable[self._rows(frames)], dtype=np.bool_)
+
     def spoilt_fraction(self, frames: int | None = None) -> float:
         """Fraction of the last frames whose measurement was not finite.
 
@@ -222,7 +239,7 @@ class SwitchedController:
         float
             From 0 to 1.
         """
-        usable = self._usable[self._rows(frames)]
+        usable = self.usable(frames)
         return 1.0 - float(np.mean(usable)) if usable.size else 0.0
 
     def _rows(self, frames: int | None) -> np.ndarray[Any, np.dtype[np.int64]]:

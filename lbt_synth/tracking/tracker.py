@@ -14,12 +14,13 @@ from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.plant import TipTiltPlant, with_vibrations
 from lbt_synth.models.vibration import Vibration
+from lbt_synth.tracking.glitches import bridged, glitches, stand_alone
 from lbt_synth.tracking.loop_identifier import LoopIdentifier
 from lbt_synth.tracking.switching import SwitchedController, require_same_loop
 from lbt_synth.tracking.trend import LineTrack, matched_tracks
 from lbt_synth.validation import FloatArray, instance, number
 
-_MOST_SPOILT = 0.01  # of a window; what the filter expected stands in for the measurements
+_MOST_SPOILT = 0.01  # of a window; fillers stand in for the measurements
 _LEAST_FRAMES = 16
 _NARROW = 0.1  # damping ratio; a wide resonance is a part of the background and has no trend
 
@@ -54,6 +55,8 @@ class TrackingUpdate:
         Their rms [nm].
     noise_nm : tuple of float
         Standard deviation of the noise that it assumes, one a measurement [nm].
+    left_out : int
+        Frames of the window that were left out: not finite, or outliers.
     switched : bool
         Whether a new filter was taken.
     reason : str
@@ -68,6 +71,7 @@ class TrackingUpdate:
     frequencies_hz: tuple[float, ...]
     rms_nm: tuple[float, ...]
     noise_nm: tuple[float, ...]
+    left_out: int
     switched: bool
     reason: str
     identify_s: float
@@ -90,7 +94,9 @@ class TrackingController:
 
     No update can stop the loop: where a window holds too few good measurements, the fit fails or
     the design does not pass its certificate, the running filter stays, and :attr:`history` says
-    why. A measurement that is not finite is left out and the command held.
+    why. A measurement that is not finite is left out and the command held. A finite one that
+    cannot be right moves the mirror as the filter lets it, but the fit does not see it: single
+    outliers of the pseudo-open-loop series are interpolated, and count like missing ones.
 
     Parameters
     ----------
@@ -153,6 +159,11 @@ class TrackingController:
                 "identifier must be a callable (measurements, corrections) -> plant or None; "
                 f"got {type(identifier).__name__}."
             )
+        if not callable(design):
+            raise ProblemError(
+                "design must be a callable plant -> FilterDesign, such as kalman; got "
+                f"{type(design).__name__}."
+            )
         rate = plant.hardware.frame_rate_hz
         self._window_s = number(window_s, "window_s", at_least=_LEAST_FRAMES / rate)
         self._update_s = number(update_s, "update_s", at_least=1 / rate)
@@ -195,6 +206,7 @@ class TrackingController:
         self._running.reset()
         self._history: list[TrackingUpdate] = []
         self._tracks: list[LineTrack] = []
+        self._left_out = 0
         reset = getattr(self._identify, "reset", None)
         if callable(reset):
             reset()
@@ -214,6 +226,8 @@ class TrackingController:
 
         Raises
         ------
+        ProblemError
+            If they are no real numbers.
         DimensionError
             If there is another number of measurements.
         """
@@ -225,6 +239,7 @@ class TrackingController:
 
     def _update(self, time_s: float) -> None:
         fitted_hz: tuple[float, ...] = ()
+        self._left_out = 0
         reason, clock = "", [time.perf_counter()]
         try:
             found = self._identified()
@@ -249,6 +264,7 @@ class TrackingController:
                 frequencies_hz=tuple(line.frequency_hz for line in plant.vibrations),
                 rms_nm=tuple(line.rms_nm for line in plant.vibrations),
                 noise_nm=tuple(float(v) for v in np.sqrt(np.diag(plant.R))),
+                left_out=self._left_out,
                 switched=not reason,
                 reason=reason,
                 identify_s=float(identify_s),
@@ -259,11 +275,9 @@ class TrackingController:
 
     def _identified(self) -> TipTiltPlant:
         """Plant of the last window."""
-        spoilt = self._running.spoilt_fraction(self._window)
-        if spoilt > _MOST_SPOILT:
-            raise _KeptError(f"{100 * spoilt:.3g} % of the window's measurements are not finite")
+        window = self._clean_window()
         try:
-            found = self._identify(*self._running.window(self._window))
+            found = self._identify(*window)
         except Exception as error:  # whatever a fit trips over, the loop goes on
             raise _KeptError(f"the fit failed: {type(error).__name__}: {error}") from error
         if found is None:
@@ -272,6 +286,28 @@ class TrackingController:
             raise _KeptError(f"the fit gave a {type(found).__name__}, not a TipTiltPlant")
         require_same_loop(found, self.hardware)
         return found
+
+    def _clean_window(self) -> tuple[FloatArray, FloatArray]:
+        """Measurements and corrections of the last window, without outliers."""
+        measurements, corrections = self._running.window(self._window)
+        missing = ~self._running.usable(self._window)
+        plant = self.design.problem
+        assert isinstance(plant, TipTiltPlant)
+        seen = corrections @ plant.hardware.sensor.T  # with the sensor gain found last
+        wrong = glitches(measurements + seen)
+        self._left_out = int(np.count_nonzero(missing | wrong))
+        share = 100 * self._left_out / len(missing)
+        what = "not finite or outliers" if wrong.any() else "not finite"
+        if share > 100 * _MOST_SPOILT:
+            raise _KeptError(f"{share:.3g} % of the window's measurements are {what}")
+        if wrong.any():
+            if not stand_alone(wrong, self.hardware.delay_frames):
+                raise _KeptError(
+                    f"{np.count_nonzero(wrong)} of the window's measurements are outliers that "
+                    "do not stand alone"
+                )
+            measurements = bridged(measurements + seen, wrong) - seen
+        return measurements, corrections
 
     def _designed(self, plant: TipTiltPlant) -> FilterDesign:
         """Certified filter of a plant."""
