@@ -133,7 +133,7 @@ def _by_rate(
         note = f"times are rounded to {quantum:.6g} s"
         if complete and (step >= _ABOVE or placed is None):
             return np.arange(rows), note
-        if complete and np.array_equal(placed, np.arange(rows)):
+        if complete and placed is not None and np.array_equal(placed, np.arange(rows)):
             return np.arange(rows), note
         if complete:
             raise ProblemError(
@@ -144,8 +144,8 @@ def _by_rate(
         if not complete and (step >= _ABOVE or placed is None):
             raise ProblemError(
                 f"times_s in steps of {quantum:.6g} s leave the grid of {rate:.9g} Hz by up to "
-                f"{np.ptp(_apart(times, rate)):.3g} frames, and cannot tell which frames are missing or "
-                "repeated. Give a counter of frames, or cut the record there."
+                f"{np.ptp(_apart(times, rate)):.3g} frames, and cannot tell which frames are "
+                "missing or repeated. Give a counter of frames, or cut the record there."
             )
     if placed is not None:
         return placed, ""
