@@ -233,8 +233,12 @@ def test_nulls_of_scaled_columns_and_images(tmp_path):
     image = fits.PrimaryHDU(np.column_stack([raw, raw]))
     image.header.update({"BLANK": -999, "BUNIT": "nm", "FPS": RATE})
     image.writeto(tmp_path / "c.fits")
-    for path in (scaled, shifted, tmp_path / "c.fits"):
-        chosen = {"open_loop": (0, 1)} if path.name == "c.fits" else None
+    image = fits.PrimaryHDU(np.column_stack([unsigned, unsigned]))
+    image.header.update({"BUNIT": "nm", "FPS": RATE})
+    image.writeto(tmp_path / "d.fits")
+    fits.setval(tmp_path / "d.fits", "BLANK", value=-999)
+    for path in (scaled, shifted, tmp_path / "c.fits", tmp_path / "d.fits"):
+        chosen = {"open_loop": (0, 1)} if path.name in ("c.fits", "d.fits") else None
         seen = lbt.load_record(path, columns=chosen)
         assert np.flatnonzero(~seen.usable).tolist() == [10]
     assert lbt.load_record(scaled).measurements[11, 0] == pytest.approx(3 - 9.98)

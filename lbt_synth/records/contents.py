@@ -120,9 +120,9 @@ def _fits(content: bytes) -> Contents:
                     _table(out, unit)
                 elif unit.is_image and unit.data is not None:
                     own, blank = unit.header.get("BUNIT"), unit.header.get("BLANK")
+                    zero = float(unit.header.get("BZERO", 0.0))  # reading the data drops it
                     data = _native(unit.data)
                     if blank is not None and data.dtype.kind in "iu":
-                        zero = float(unit.header.get("BZERO", 0.0))
                         data = np.where(data == blank + zero, np.nan, data)
                     out.add(name, data, str(own) if own is not None else None)
     return out

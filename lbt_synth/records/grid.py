@@ -131,15 +131,14 @@ def _by_rate(
             found, spread = _narrowest(times)
             complete = abs(found / rate - 1) * rows < 0.5 and spread <= step + slack
         note = f"times are rounded to {quantum:.6g} s"
-        if complete and (step >= _ABOVE or placed is None):
-            return np.arange(rows), note
-        if complete and placed is not None and np.array_equal(placed, np.arange(rows)):
-            return np.arange(rows), note
         if complete:
+            alone = step >= _ABOVE or placed is None or np.array_equal(placed, np.arange(rows))
+            if alone and not _hides(_apart(times, rate), step, slack):
+                return np.arange(rows), note
             raise ProblemError(
                 f"times_s in steps of {quantum:.6g} s cannot tell rounding from missing or "
-                f"repeated frames at {rate:.9g} Hz. Give a counter of frames, or leave the times "
-                "away."
+                f"repeated frames at {rate:.9g} Hz in {rows} rows. Give a counter of frames, or "
+                "leave the times away."
             )
         if not complete and (step >= _ABOVE or placed is None):
             raise ProblemError(
@@ -155,15 +154,29 @@ def _by_rate(
 def _complete(apart: FloatArray, step: float, slack: float) -> bool:
     """Whether rounding alone explains how far the rows are from the grid."""
     spread = float(np.ptp(apart))
-    part = Fraction(step).limit_denominator(_DENOMINATOR)
-    finest = 1 / part.denominator if abs(float(part) - step) < 1e-9 else 0.0
-    if spread <= step - finest + slack:  # distances are multiples of the finest, ends are one
+    if spread <= step - _finest(step) + slack:
         return True
     # ties may be rounded up and down: then both ends are reached, and nothing moves
     if spread > step + slack or len(apart) < 4 * _BLOCKS:
         return False
     means = [float(block.mean()) for block in np.array_split(apart, _BLOCKS)]
     return max(means) - min(means) < 0.5
+
+
+def _finest(step: float) -> float:
+    """Return what the distances from the grid are multiples of; rounding reaches one end only."""
+    part = Fraction(step).limit_denominator(_DENOMINATOR)
+    return 1 / part.denominator if abs(float(part) - step) < 1e-9 else 0.0
+
+
+def _hides(apart: FloatArray, step: float, slack: float) -> bool:
+    """Whether a frame may be missing and rounding hide it, but for the ends of the record."""
+    high, low = np.maximum.accumulate, np.minimum.accumulate
+    top = np.maximum(high(apart)[:-1], high(apart[::-1])[::-1][1:] - 1)
+    bottom = np.minimum(low(apart)[:-1], low(apart[::-1])[::-1][1:] - 1)
+    end = 1 + len(apart) // _BLOCKS
+    hidden = (top - bottom)[end:-end] <= step - _finest(step) + slack
+    return bool(hidden.any())
 
 
 def _nearest(times: FloatArray, steps: FloatArray, rate: float) -> tuple[IntArray | None, float]:
