@@ -123,7 +123,7 @@ def _by_rate(
     """Lay rows on the grid of a known rate."""
     rows, slack = len(times), _slack(times, rate)
     step = quantum * rate  # frames
-    placed, gap = _nearest(times, steps, rate)
+    placed, gap, second = _nearest(times, steps, rate)
     coarse = step > _COARSE and abs(1 - step) * rows > _EXACT
     if coarse:
         complete = _complete(_apart(times, rate), step, slack)
@@ -140,7 +140,8 @@ def _by_rate(
                 f"repeated frames at {rate:.9g} Hz in {rows} rows. Give a counter of frames, or "
                 "leave the times away."
             )
-        if not complete and (step >= _ABOVE or placed is None):
+        # the frames begin in the gap that rounding leaves: another one that wide would do, too
+        if placed is None or second >= 1 - step + _finest(step) - slack:
             raise ProblemError(
                 f"times_s in steps of {quantum:.6g} s leave the grid of {rate:.9g} Hz by up to "
                 f"{np.ptp(_apart(times, rate)):.3g} frames, and cannot tell which frames are "
@@ -179,19 +180,22 @@ def _hides(apart: FloatArray, step: float, slack: float) -> bool:
     return bool(hidden.any())
 
 
-def _nearest(times: FloatArray, steps: FloatArray, rate: float) -> tuple[IntArray | None, float]:
-    """Frames, between whose rows there is the widest gap; None where that is narrow."""
+def _nearest(
+    times: FloatArray, steps: FloatArray, rate: float
+) -> tuple[IntArray | None, float, float]:
+    """Return frames parted in the widest gap (None where it is narrow), and the two widest."""
     grid = (times - times[0]) * rate
     parts = np.sort(grid - np.floor(grid))
     gaps = np.diff(np.append(parts, parts[0] + 1))
     k = int(np.argmax(gaps))
     gap = float(gaps[k])
+    second = float(np.max(np.delete(gaps, k), initial=0.0))
     if gap < _LEAST_GAP:
-        return None, gap
+        return None, gap, second
     frame = np.floor(grid - (parts[k] + gap / 2))
     if np.any(np.diff(frame)[steps > 0] <= 0):
-        return None, gap
-    return np.asarray(frame - frame[0], dtype=np.int64), gap
+        return None, gap, second
+    return np.asarray(frame - frame[0], dtype=np.int64), gap, second
 
 
 def line_rate(times: FloatArray, frame: IntArray) -> float:
