@@ -8,6 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.records.clock import clock_of
 
 RATE = 1000.0
 
@@ -40,6 +41,38 @@ def alarms() -> None:
     for name, series in cases.items():
         seen = lbt.loop_record(series, frame_rate_hz=RATE, unit="nm")
         print(f"faulty of 1e6, {name}: {frames - seen.health.usable}")
+
+
+def rounded_times() -> None:
+    """Records whose times are rounded to ms: laid out right, wrongly, or refused."""
+    rng = np.random.default_rng(1)
+    counts: dict[tuple[int, bool, str], int] = {}
+    for _ in range(6000):
+        rate = float(
+            rng.choice(
+                [
+                    1000.0,
+                    1000 + rng.uniform(-10, 10),
+                    round(1000 + rng.uniform(-10, 10), 1),
+                    rng.uniform(500, 2100),
+                ]
+            )
+        )
+        rows, count = int(rng.choice([50, 300, 2000, 10_000])), int(rng.choice([0, 0, 1, 2, 5]))
+        lost = rng.choice(np.arange(rows // 7, rows - rows // 7), count, replace=False)
+        kept = np.setdiff1d(np.arange(rows), lost)
+        ms = (kept / rate + rng.uniform(0, 1e-3)) * 1e3
+        times = 1e-3 * (np.round(ms) if rng.choice([0, 1]) else np.floor(ms))
+        times = times + rng.choice([0, 1.7e9])
+        try:
+            frame = clock_of(len(kept), frame_rate_hz=rate, times_s=times).frame_of_row
+            word = "right" if np.array_equal(frame, kept) else "wrong"
+        except lbt.ProblemError:
+            word = "refused"
+        key = (rows, count > 0, word)
+        counts[key] = counts.get(key, 0) + 1
+    for (rows, holes, word), count in sorted(counts.items()):
+        print(f"times in ms, {rows} rows, {'some' if holes else 'none'} lost: {count} {word}")
 
 
 def missed() -> None:
@@ -91,6 +124,7 @@ def times() -> None:
 
 if __name__ == "__main__":
     alarms()
+    rounded_times()
     missed()
     pseudo_open_loop()
     times()

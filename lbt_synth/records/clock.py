@@ -8,14 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.records.grid import frames_of_times, line_rate, within_bounds
 from lbt_synth.validation import FloatArray, IntArray, number, real_array
 
-_SAME_RATE = 5e-3  # by which a stated rate may differ from that of the times
-_CLEAR = 0.3  # of a frame: how far a step may be from a whole number of frames
-_LATE = 0.45  # of a frame, for times with a jitter
+_MOST_APART = 5e-3  # by which a stated rate may ever differ from that of the times
+_SAME_RATE = 1e-4  # that is allowed in a record of any length
+_SAME_FRAMES = 3.0  # the same over the record, where that is more
+_SAID_FRAMES = 0.5  # over the record, from where a difference is noted
 _MOST_UNEVEN = 0.1  # of the steps over more than a frame, where the times tell the rate
 _FEW_ROWS = 20  # of which no share is taken
-_MOST_HOLES = 9  # missing frames over those that are there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,8 +80,9 @@ def clock_of(
         frame = _counted(_rising(frame_numbers, "frame_numbers", rows))
     if times is not None and rows > 1:
         if frame_numbers is None:
-            frame = _on_grid(times, rate)
-        found = _rate_of(times, frame)
+            frame, said = frames_of_times(times, rate)
+            notes += [said] if said else []
+        found = line_rate(times, frame)
         if rate is None:
             rate = found
             notes.append(f"frame rate {rate:.9g} Hz, from the times")
@@ -91,19 +93,12 @@ def clock_of(
                     f"{rate:.6g} Hz, the rate by the median step: the times may be rounded. Give "
                     "frame_rate_hz."
                 )
-        elif abs(found / rate - 1) > _SAME_RATE:
-            raise ProblemError(
-                f"frame_rate_hz must be that of the times, {found:.9g} Hz; got {rate:.9g} Hz. "
-                "Leave it away, or leave the times away."
-            )
+        else:
+            notes += _compared(rate, found, times, frame)
     if rate is None:
         raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
     frames = int(frame[-1]) + 1
-    if frames > (1 + _MOST_HOLES) * rows:
-        raise ProblemError(
-            f"{frames - rows} of {frames} frames would be missing between the first row and the "
-            "last; cut the record where it was interrupted."
-        )
+    within_bounds(frames, rows)
     return Clock(frame_rate_hz=rate, frame_of_row=frame, frames=frames, notes=tuple(notes))
 
 
@@ -119,14 +114,35 @@ def first_per_frame(
     same : callable
         Whether the rows of these indices all hold the same values.
     """
-    again = np.flatnonzero(np.diff(clock.frame_of_row) == 0) + 1
-    keep = np.setdiff1d(np.arange(len(clock.frame_of_row)), again)
+    frame = clock.frame_of_row
+    first = np.concatenate([[True], np.diff(frame) > 0])
+    keep = np.flatnonzero(first)
+    stops = np.append(keep[1:], len(frame))
     torn = [
-        int(frame)
-        for frame in np.unique(clock.frame_of_row[again])
-        if not same(np.flatnonzero(clock.frame_of_row == frame))
+        int(frame[start])
+        for start, stop in zip(keep, stops, strict=True)
+        if stop - start > 1 and not same(np.arange(start, stop))
     ]
-    return keep, np.array(torn, dtype=np.int64), again.size
+    return keep, np.array(torn, dtype=np.int64), int(np.sum(~first))
+
+
+def _compared(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:
+    """Say how far a stated rate is from that of the times; refuse what they do not allow."""
+    span = max(int(frame[-1]), 1)
+    loose = float(np.ptp((times - times[0]) * found - frame))  # rounding, jitter
+    apart = abs(found / rate - 1) * span
+    most = min(max(_SAME_RATE * span, _SAME_FRAMES + loose), max(_MOST_APART * span, loose))
+    if apart > most:
+        raise ProblemError(
+            f"frame_rate_hz must be that of the times, {found:.9g} Hz; got {rate:.9g} Hz: "
+            f"{apart:.3g} frames apart over the record. Leave it away, or leave the times away."
+        )
+    if apart > _SAID_FRAMES + loose:
+        return [
+            f"frame rate {rate:.9g} Hz, as stated; by the times {found:.9g} Hz, {apart:.3g} "
+            "frames apart over the record"
+        ]
+    return []
 
 
 def _rising(values: FloatArray, name: str, rows: int) -> FloatArray:
@@ -155,39 +171,5 @@ def _counted(numbers: FloatArray) -> IntArray:
             "frame_numbers must mostly rise by 1 a row; got a median step of "
             f"{np.median(steps):.6g}. A record of every second frame is one of half the rate."
         )
+    within_bounds(float(numbers[-1]) - float(numbers[0]) + 1, len(numbers))
     return np.asarray(numbers - numbers[0], dtype=np.int64)
-
-
-def _on_grid(times: FloatArray, rate: float | None) -> IntArray:
-    steps = np.diff(times)
-    rising = steps[steps > 0]
-    if rising.size == 0:
-        raise ProblemError("times_s must rise; all rows have the same time.")
-    period = float(np.median(rising)) if rate is None else 1 / rate
-    if rising.size == len(steps) and np.ptp(steps) < 2 * _CLEAR * float(np.median(steps)):
-        # no frame is missing, whatever the rate is: that is compared afterwards
-        return np.arange(len(times))
-    if rate is not None:  # times may be rounded, or jitter
-        grid = (times - times[0]) * rate
-        grid = grid - np.median(grid - np.round(grid))
-        frame = np.round(grid)
-        if np.all(np.abs(grid - frame) < _LATE) and np.all(np.diff(frame)[steps > 0] > 0):
-            return np.asarray(frame - frame[0], dtype=np.int64)
-    counts = np.round(steps / period)
-    if np.all(np.abs(steps / period - counts) < _CLEAR):
-        return np.asarray(np.concatenate([[0], np.cumsum(counts)]), dtype=np.int64)
-    k = int(np.argmax(np.abs(steps / period - counts)))
-    raise ProblemError(
-        f"times_s lie on no regular grid of {1 / period:.6g} Hz; row {k + 1} comes "
-        f"{steps[k] / period:.3g} frames after the one before. Give frame_rate_hz, a counter of "
-        "frames, or leave the times away."
-    )
-
-
-def _rate_of(times: FloatArray, frame: IntArray) -> float:
-    """Rate by a straight line through times and frames, to nine digits."""
-    t, n = times - times.mean(), frame - frame.mean()
-    slope = float(n @ t)
-    if not slope > 0:
-        raise ProblemError("times_s must rise; all rows have the same time.")
-    return float(f"{float(n @ n) / slope:.9g}")

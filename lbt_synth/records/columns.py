@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from lbt_synth.errors import TelemetryError
 from lbt_synth.records.units import FREQUENCIES, TIMES, density_unit, unit_word
 from lbt_synth.validation import FloatArray
 
@@ -41,6 +44,7 @@ FACTS = {
 }  # fmt: skip
 _BASES = {name: role for role, names in ROLES.items() for name in names}
 _OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
+_CLOCK_ROWS = 8  # of noise rise with a chance of 1 in 40 000
 _AXES = {"0": 0, "1": 1, "2": 2, "tip": 0, "tilt": 1, "x": 0, "y": 1}
 _WITH_AXIS = re.compile(r"^(?P<base>.*?)_?(?P<axis>0|1|2|tip|tilt|x|y)$")
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*(?:\([^)]*\))?[^\])]*)[\])]\s*$")
@@ -76,13 +80,16 @@ def column(
 ) -> Column:
     """Read a name: its unit in brackets or behind an underscore, its axis, and what it is."""
     plain, named_unit = _split_unit(name.strip())
+    given = (unit or "").strip()
+    if given and named_unit and _known(given) != _known(named_unit):
+        raise TelemetryError(f"{name} has the unit {given!r} in the header: which is right?")
     role, named_axis = _split_axis(re.sub(r"[\s\-.]+", "_", plain.lower()).strip("_"))
     return Column(
         name=name,
         values=values,
         role=role,
         axis=named_axis if axis is None else axis,
-        unit=(unit or "").strip() or named_unit,
+        unit=given or named_unit,
     )
 
 
@@ -97,6 +104,29 @@ def indexed(name: str, values: FloatArray, *, unit: str | None = None) -> list[C
     ]
 
 
+def paired(columns: list[Column]) -> list[Column]:
+    """Take x and y that stand together for two axes; x of a clock is none."""
+    plain = [_split_unit(each.name.strip())[0].lower() for each in columns]
+    if plain.count("x") != 1 or plain.count("y") != 1:
+        return columns
+    x = columns[plain.index("x")].values
+    if rises(x):
+        return columns
+    return [
+        replace(each, role="measurements", axis=_AXES[name]) if name in ("x", "y") else each
+        for name, each in zip(plain, columns, strict=True)
+    ]
+
+
+def rises(values: FloatArray) -> bool:
+    """Whether a series rises from row to row, as clocks and frequencies do."""
+    return len(values) >= _CLOCK_ROWS and bool(np.all(np.diff(values) > 0))
+
+
+def _known(unit: str) -> object:
+    return unit_word(unit) or density_unit(unit) or unit.lower()
+
+
 def _split_unit(name: str) -> tuple[str, str | None]:
     if match := _BRACKETS.match(name):
         return match["name"], match["unit"].strip() or None
@@ -105,7 +135,7 @@ def _split_unit(name: str) -> tuple[str, str | None]:
         tail = lower[at + 1 :]
         known = unit_word(tail) or density_unit(tail) or tail in TIMES or tail in FREQUENCIES
         if known and at > 0:
-            return name[:at], tail
+            return name[:at], name[at + 1 :]
     return name, None
 
 

@@ -93,13 +93,20 @@ def saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     tolerance = _SAME_LEVEL * span
     for sign in (1.0, -1.0):
         end = float(np.max(sign * values))
-        near = np.sort(sign * values[sign * values > end - 0.25 * span])[::-1]
-        ends = np.flatnonzero(-np.diff(near) > tolerance) + 1  # where a next level begins
+        near, ends = _levels(sign * values[sign * values > end - 0.25 * span], tolerance)
+        if len(ends) <= _LEVELS:  # of coarse numbers there are few
+            near, ends = _levels(sign * values, tolerance)
         counts = np.diff(np.concatenate([[0], ends, [near.size]]))[: _LEVELS + 1]
         inside = int(np.max(counts[1:], initial=1))
         if counts[0] >= max(_LEAST_AT_LIMIT, _LIMIT_RATIO * inside):
             out |= good & (sign * series >= end - tolerance)
     return out
+
+
+def _levels(values: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:
+    """Return the values from the largest on, and where a next level begins."""
+    near = np.sort(values)[::-1]
+    return near, np.flatnonzero(-np.diff(near) > tolerance) + 1
 
 
 def outliers(series: FloatArray, good: BoolArray) -> BoolArray:

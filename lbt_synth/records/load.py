@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -19,11 +18,12 @@ from lbt_synth.records.build import loop_record
 from lbt_synth.records.columns import Column
 from lbt_synth.records.contents import ENDINGS, FITS, Contents, read_contents
 from lbt_synth.records.health import joined
+from lbt_synth.records.join import join_commands
 from lbt_synth.records.of_telemetry import record_of
 from lbt_synth.records.record import LoopRecord
-from lbt_synth.records.selection import Series, counted, select
+from lbt_synth.records.selection import Series, select
 from lbt_synth.records.spectrum import SpectrumRecord
-from lbt_synth.records.units import FREQUENCIES, TIMES, density_unit, nm_per, unit_word
+from lbt_synth.records.units import density_unit, hz_per, nm_per, seconds_per, unit_word
 from lbt_synth.telemetry import load_telemetry
 from lbt_synth.validation import FloatArray, choice, number
 
@@ -31,6 +31,7 @@ KINDS = ("closed_loop", "open_loop", "spectrum")
 _OURS = "LBTTELEM"  # card of our own telemetry
 _AOT = "AOT-VERS"
 _ARRAYS_OF_OURS = {"META", "COMMANDS", "MEASURE"}
+_RATES_HZ = (5.0, 1e5)  # of times whose unit is not told
 
 
 def load_record(
@@ -84,7 +85,8 @@ def load_record(
         What names do not tell: names or numbers (from 0) of columns under "measurements",
         "open_loop", "commands", "times", "frame_numbers", "frequency", "density" or "amplitude".
     commands : path-like, optional
-        Another file, with the commands.
+        Another file, with the commands. Rows are matched by the frame counters of both files,
+        or else by the times of both; where one has neither, as they stand.
 
     Returns
     -------
@@ -118,14 +120,18 @@ def load_record(
                 f"{source} is telemetry with measurements and commands: kind must be closed_loop, "
                 "and neither columns nor commands be given. Choose its modes by axes."
             )
+        if averages is not None:
+            raise ProblemError(f"{source} is telemetry: averages are of a spectrum.")
         return _of(source, lambda: record_of(
             load_telemetry(source), modes=None if axes is None else tuple(axes),
             frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, mirror=mirror, unit=unit,
-            command_unit=command_unit, diameter_m=diameter_m, source=str(source),
+            command_unit=command_unit, diameter_m=diameter_m, obstruction=obstruction,
+            source=str(source),
         ))  # fmt: skip
     contents = read_contents(source, content)
     if commands is not None:
-        _join_commands(contents, Path(commands))
+        other = Path(commands)
+        join_commands(contents, read_contents(other, _bytes(other)), other)
 
     def build() -> LoopRecord | SpectrumRecord:
         series = select(contents, kind=kind, axes=axes, columns=columns)
@@ -138,6 +144,8 @@ def load_record(
                 series, contents, unit=unit, source=str(source),
                 averages=_fact(contents, "averages", averages), **facts,
             )  # fmt: skip
+        if averages is not None:
+            raise ProblemError(f"averages are of a spectrum; the record is of kind {series.kind}.")
         return _loop(
             series, contents, unit=unit, command_unit=command_unit, mirror=mirror,
             source=str(source), delay_frames=_fact(contents, "delay_frames", delay_frames),
@@ -183,34 +191,6 @@ def _is_telemetry(path: Path, content: bytes) -> bool:
     return names >= _ARRAYS_OF_OURS
 
 
-def _join_commands(contents: Contents, path: Path) -> None:
-    """Add the commands of another file; those of the first one give way."""
-    other = read_contents(path, _bytes(path))
-    named = [each for each in other.columns if each.role == "commands"]
-    if not named:
-        named = [each for each in other.columns if each.role in (None, "measurements")]
-    if not named:
-        raise TelemetryError(f"{path} holds no commands.", path=path)
-    rows = {len(each.values) for each in (*contents.columns, *named)}
-    if len(rows) > 1:
-        raise TelemetryError(
-            f"{path} must have as many frames as the measurements; got "
-            f"{', '.join(map(str, sorted(rows)))}.",
-            path=path,
-        )
-    own = [each for each in contents.columns if each.role != "commands"]
-    if not any(each.role in ("measurements", "open_loop") for each in own):
-        plain = counted([each for each in own if each.role is None])
-        own = [each for each in own if each.role is not None]
-        own += [replace(each, role="measurements") for each in plain]
-    if any(each.axis is None for each in named):
-        named = counted(named)
-    contents.columns = own + [replace(each, role="commands") for each in named]
-    if "unit" in other.facts:
-        contents.facts["command unit"] = other.facts["unit"]
-    contents.notes += [f"commands are from {path}", *other.notes]
-
-
 def _fact(contents: Contents, name: str, given: Any, *, may_differ: bool = True) -> Any:
     """Return what was given, or what the file tells; it may not tell two things."""
     places = contents.facts.get(name, {})
@@ -251,15 +231,10 @@ def _loop(
         u_unit = _unit(series.commands, given, contents, fact, "commands")
     times = None
     if series.times is not None:
-        word = (series.times.unit or "").lower()
-        if word and word not in TIMES:
-            raise ProblemError(
-                f"times must be in one of {', '.join(TIMES)}; got {series.times.unit!r}."
-            )
-        if not word:
+        times = seconds_per(series.times.unit) * series.times.values
+        if not series.times.unit:
             contents.notes.append(f"{series.times.name} was taken for seconds")
-        times = TIMES[word or "s"] * series.times.values
-    return loop_record(
+    record = loop_record(
         _stacked(series.measurements),
         _stacked(series.commands) if series.commands else None,
         unit=y_unit,
@@ -269,6 +244,15 @@ def _loop(
         notes=joined(contents.notes, series.notes),
         **facts,
     )
+    if series.times is not None and not series.times.unit:
+        low, high = _RATES_HZ
+        if facts["frame_rate_hz"] is None and not low <= record.frame_rate_hz <= high:
+            raise ProblemError(
+                f"the frame rate would be {record.frame_rate_hz:.6g} Hz with "
+                f"{series.times.name or 'the times'} in seconds, and their unit is not told; name "
+                "it, as in time_ms, or give frame_rate_hz."
+            )
+    return record
 
 
 def _unit(
@@ -334,13 +318,8 @@ def _spectrum(
             f"{series.measurements[0].name} is named as an amplitude, but has the unit {text!r} of "
             "a power; choose by columns={'density': ...}."
         )
-    word = (series.frequency.unit or "").lower()
-    if word and word not in FREQUENCIES:
-        raise ProblemError(
-            f"frequencies must be in one of {', '.join(FREQUENCIES)}; got "
-            f"{series.frequency.unit!r}."
-        )
-    if not word:
+    scale_hz = hz_per(series.frequency.unit)
+    if not series.frequency.unit:
         contents.notes.append("frequencies were taken for Hz")
     table = _stacked([series.frequency, *series.measurements])
     complete = np.all(np.isfinite(table), axis=1)
@@ -354,7 +333,7 @@ def _spectrum(
         contents.notes.append("amplitude densities were squared")
         scaled = scaled**2
     return SpectrumRecord(
-        frequency_hz=FREQUENCIES[word or "hz"] * table[:, 0],
+        frequency_hz=scale_hz * table[:, 0],
         density_nm2_hz=scaled,
         diameter_m=diameter_m,
         notes=joined(contents.notes, series.notes),

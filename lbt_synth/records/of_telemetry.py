@@ -30,6 +30,7 @@ def record_of(
     unit: str | None = None,
     command_unit: str | None = None,
     diameter_m: float | None = None,
+    obstruction: float | None = None,
     source: str | None = None,
 ) -> LoopRecord:
     """Make a record of tip and tilt from telemetry.
@@ -52,8 +53,9 @@ def record_of(
     unit, command_unit : str, optional
         Units of the modal measurements and of the modal commands, where the telemetry does not
         tell them.
-    diameter_m : float, optional
-        Telescope diameter [m], where it is not known, or in place of that of the telemetry.
+    diameter_m, obstruction : float, optional
+        Telescope diameter [m], and its central obstruction as a fraction of it, where they are
+        not known, or in place of those of the telemetry.
     source : str, optional
         Where it is from; by default the name of the system.
 
@@ -93,7 +95,9 @@ def record_of(
     chosen = _chosen(modes, n)
     y, y_unit = _modal_measurements(telemetry, chosen, unit, notes)
     u, u_unit = _modal_commands(telemetry, chosen, command_unit or unit, notes)
-    for word, given in (("delay_frames", delay_frames), ("diameter_m", diameter_m)):
+    for word, given in (
+        ("delay_frames", delay_frames), ("diameter_m", diameter_m), ("obstruction", obstruction),
+    ):  # fmt: skip
         there = getattr(telemetry, word)
         if given is not None and there is not None and given != there:
             notes.append(f"{word} {given:g} was given; the telemetry has {there:g}")
@@ -113,7 +117,7 @@ def record_of(
         delay_frames=telemetry.delay_frames if delay_frames is None else delay_frames,
         mirror=telemetry.mirror if mirror is None else mirror,
         diameter_m=telemetry.diameter_m if diameter_m is None else diameter_m,
-        obstruction=telemetry.obstruction,
+        obstruction=telemetry.obstruction if obstruction is None else obstruction,
         source=(telemetry.name or "telemetry") if source is None else source,
         notes=notes,
     )

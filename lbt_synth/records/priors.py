@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, TelemetryError
+from lbt_synth.records.columns import column
 from lbt_synth.records.contents import read_contents
 from lbt_synth.records.csvfile import read_csv
+from lbt_synth.records.units import hz_per
 from lbt_synth.validation import BoolArray, FloatArray, frozen, integer, number, real_array
 
 _FEWEST_AVERAGES = 8
@@ -19,6 +22,9 @@ _AVERAGES = 32  # that a segment is chosen for
 _FINEST_HZ = 0.25
 _SHORTEST_SEGMENT = 64
 _DIP = 0.5  # of a peak: how far the power falls before the next counts as another
+_ERRORS = (
+    "error", "frequency_error", "freq_error", "f_error", "err", "sigma", "std", "uncertainty",
+)  # fmt: skip
 _ENDINGS = (".csv", ".tsv", ".txt", ".dat")
 
 
@@ -67,8 +73,8 @@ def load_lines(lines: Any) -> tuple[LinePrior, ...]:
     ----------
     lines : path-like or sequence
         A text file (.csv, .tsv, .txt, .dat) with a frequency a row [Hz], and its error in a
-        second column if there is one; or a list of frequencies, of pairs of frequency and
-        error, or of LinePrior.
+        second column if there is one (or by the headings frequency_hz and error_hz); or a list
+        of frequencies, of pairs of frequency and error, or of LinePrior.
 
     Returns
     -------
@@ -124,8 +130,12 @@ def _lines_of_file(path: Path) -> list[LinePrior]:
                 f"it must have one or two columns, frequency and error; got "
                 f"{table.values.shape[1]}."
             )
-        rows = [[value for value in row if not np.isnan(value)] for row in table.values]
-        return [_line(row, str(path)) for row in rows]
+        at, error = _columns_of_lines(table.names)
+        gaps = np.flatnonzero(np.isnan(table.values[:, at]))
+        if gaps.size:
+            raise TelemetryError(f"row {gaps[0] + 1} of the numbers has no frequency.")
+        rows = table.values[:, [at] if error is None else [at, error]]
+        return [_line([v for v in row if not np.isnan(v)], str(path)) for row in rows]
     except OSError as error:
         why = getattr(error, "strerror", None) or error
         raise TelemetryError(f"cannot read {path}: {why}.", path=path) from error
@@ -133,6 +143,26 @@ def _lines_of_file(path: Path) -> list[LinePrior]:
         raise TelemetryError(f"{path} is no text in UTF-8.", path=path) from error
     except LbtSynthError as error:
         raise TelemetryError(f"{path}: {error}", path=path) from error
+
+
+def _columns_of_lines(names: list[str]) -> tuple[int, int | None]:
+    """Return the columns of frequencies and of their errors; by place without a heading."""
+    if not any(names):
+        return 0, 1 if len(names) > 1 else None
+    found: dict[str, int] = {}
+    for i, name in enumerate(names):
+        known = column(name, np.zeros(1))
+        plain = re.sub(r"[\s\-.]*[\[(].*$|_hz$", "", name.strip().lower())
+        word = "error" if re.sub(r"[\s\-.]+", "_", plain) in _ERRORS else known.role
+        if word not in ("frequency", "error") or word in found or hz_per(known.unit) != 1:
+            raise TelemetryError(
+                "its columns must be frequency_hz, and frequency_error_hz or error_hz if there is "
+                f"one; got {', '.join(names)}."
+            )
+        found[word] = i
+    if "frequency" not in found:
+        raise TelemetryError(f"it must have a column frequency_hz; got {', '.join(names)}.")
+    return found["frequency"], found.get("error")
 
 
 def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
@@ -159,9 +189,9 @@ def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
     except OSError as error:
         raise TelemetryError(f"cannot read {source}: {error.strerror}.", path=source) from error
     found = [
-        column.values
-        for column in read_contents(source, content).columns
-        if column.role not in ("times", "frame_numbers")
+        each.values
+        for each in read_contents(source, content).columns
+        if each.role not in ("times", "frame_numbers")
     ]
     if not found or len({values.size for values in found}) > 1:
         raise TelemetryError(

@@ -219,7 +219,7 @@ class LoopRecord:
         delay_frames : float
             Total delay [frames], at least 1.
         mirror : PositionLoop, optional
-            Dynamics of the mirror.
+            Dynamics of the mirror; those of the record by default.
 
         Returns
         -------
@@ -231,6 +231,7 @@ class LoopRecord:
         ProblemError
             If the delay is out of range or the mirror does not fit.
         """
+        mirror = self.mirror if mirror is None else mirror
         path = LoopHardware(
             frame_rate_hz=self.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
         )
@@ -318,7 +319,8 @@ class LoopRecord:
             bridged=self.health.bridged + count,
             notes=joined(self.health.notes, [note]),
         )
-        measured = self.usable if self.measured is None else self.measured
+        # a measurement that was replaced is none of another delay
+        measured = (self.usable if self.measured is None else self.measured) & ~new
         return replace(
             self, measurements=measurements, usable=usable, measured=measured, health=health
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.records.columns import ROLES, Column
+from lbt_synth.records.columns import ROLES, Column, rises
 from lbt_synth.records.contents import Contents
 from lbt_synth.validation import choice, integer, sequence
 
@@ -100,7 +100,25 @@ def select(
             times=_single(roles, "times"),
             frame_numbers=_single(roles, "frame_numbers"),
         )
+        _same_axes(series)
     return _with_notes(series, contents.columns, notes)
+
+
+def _same_axes(series: Series) -> None:
+    """Refuse measurements of one axis with commands of another."""
+    mine, theirs = (
+        [each.axis for each in chosen if each.axis is not None]
+        for chosen in (series.measurements, series.commands)
+    )
+    if len(mine) != len(series.measurements) or len(theirs) != len(series.commands):
+        return
+    from_one = {tuple(mine), tuple(theirs)} == {(0, 1), (1, 2)}  # one counts from 1
+    if len(mine) == len(theirs) and mine != theirs and not from_one:
+        raise ProblemError(
+            f"measurements and commands must be of the same axes; got "
+            f"{_named(series.measurements)} with {_named(series.commands)}. Choose by "
+            "columns={'measurements': ..., 'commands': ...} if they do belong together."
+        )
 
 
 def counted(columns: Sequence[Column]) -> list[Column]:
@@ -167,6 +185,13 @@ def _nameless(
         out["frequency"], out["density"] = [columns[0]], counted(columns[1:])
         notes.append("the first column was taken for the frequencies, the others for densities")
     elif kind == "open_loop":
+        for number, each in enumerate(columns):
+            if rises(each.values):
+                raise ProblemError(
+                    f"column {number} ({_named([each])}) rises from row to row, as a clock does: "
+                    f"choose by columns={{'times': {number}, 'open_loop': ...}}, by names or "
+                    "numbers from 0."
+                )
         out["open_loop"] = counted(columns)
         notes.append("all columns were taken for the open-loop series")
     return out

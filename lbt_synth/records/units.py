@@ -24,7 +24,7 @@ _ALIASES = {
     "milliarcsec": "mas", "milliarcsecond": "mas",
 }  # fmt: skip
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": 1e-3}
+FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": None}  # mHz or MHz: capitals tell
 _SQUARED = re.compile(r"^(?P<unit>.+?)(?:\^2|\*\*2|²|2)\s*(?:/|_|\s|per)\s*hz$", re.IGNORECASE)
 _ROOT = re.compile(
     r"^(?P<unit>.+?)\s*(?:/|_|per)\s*(?:sqrt\(?hz\)?|rthz|√hz|hz\^?(?:0\.5|\(1/2\)))$",
@@ -72,6 +72,25 @@ def nm_per(unit: str, *, diameter_m: float | None = None) -> float:
             "diameter_m."
         )
     return _MAS[word] * nm_per_mas(diameter_m)
+
+
+def seconds_per(unit: str | None) -> float:
+    """Return the seconds of a unit of time; of none, 1."""
+    factor = TIMES.get((unit or "s").strip().lower())
+    if factor is None:
+        raise ProblemError(f"times must be in one of {', '.join(TIMES)}; got {unit!r}.")
+    return factor
+
+
+def hz_per(unit: str | None) -> float:
+    """Return the hertz of a unit of frequency; of none, 1."""
+    word = (unit or "Hz").strip()
+    if word in ("mHz", "MHz"):
+        return 1e-3 if word == "mHz" else 1e6
+    factor = FREQUENCIES.get(word.lower())
+    if factor is None:
+        raise ProblemError(f"frequencies must be in one of Hz, kHz, mHz, MHz; got {unit!r}.")
+    return factor
 
 
 def density_unit(text: str) -> tuple[str, int] | None:
