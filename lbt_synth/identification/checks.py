@@ -17,12 +17,13 @@ from lbt_synth.identification.periodogram import (
 )
 from lbt_synth.identification.result import IdentifiedAxis
 from lbt_synth.identification.whittle import GAIN, NOISE
+from lbt_synth.identification.window import tukey
 from lbt_synth.models.resonance import PARAMETERS
 from lbt_synth.records import LoopRecord
 from lbt_synth.validation import FloatArray
 
 _UNLIKELY = 8.0  # standard deviations of the innovations
-_EDGE = 0.01  # of a stretch, at either end, that is not looked at
+_EDGE = 0.06  # of a stretch, at either end, that is not looked at: the taper is there
 _CLUSTER = 20  # frames within which outliers are one jump
 _AROUND = 3  # frames left out on either side
 DELAYS = (-1.0, -0.5, 0.5, 1.0)  # frames by which another delay is tried
@@ -68,15 +69,13 @@ def jumps(
     list of Jump
         By rising frame.
     """
-    from scipy.signal.windows import tukey
-
     out: list[Jump] = []
     log_f, log_density = np.log(axis.frequency_hz), np.log(axis.fitted_nm2_hz)
     for start, stop in stretches:
         count = stop - start - 1
         if count < SHORTEST_SEGMENT:
             continue
-        transform = np.fft.rfft(tukey(count, 2 * _EDGE) * np.diff(series[start:stop]))
+        transform = np.fft.rfft(tukey(count) * np.diff(series[start:stop]))
         f: FloatArray = np.arange(1.0, transform.size) * (axis.frame_rate_hz / count)
         density = np.exp(np.interp(np.log(f), log_f, log_density))
         power = density * half_angle_square(f, axis.frame_rate_hz) * axis.frame_rate_hz / 2
