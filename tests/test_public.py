@@ -79,9 +79,13 @@ _PAGES = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("docs
 
 @pytest.mark.parametrize("page", _PAGES)
 def test_no_figure_is_left_to_be_filled_in(page):
-    """``{{NAME}}`` stands for what is still to be measured; LaTeX and JSON close braces, too."""
+    """``{{NAME}}``, and a line that is one word in capitals, stand for what is still to be measured.
+
+    LaTeX and JSON close braces, too.
+    """
     text = (ROOT / page).read_text(encoding="utf-8")
     assert re.findall(r".*(?:\{\{|\b[A-Z][A-Z0-9_]*\}\}).*", text) == []
+    assert re.findall(r"^[A-Z]{4,}$", text, re.MULTILINE) == []
 
 
 def test_readme_names_commands_that_exist():
