@@ -170,7 +170,7 @@ def started(tmp_path, jobs):
         stderr=subprocess.PIPE,
         text=True,
         # a shell's background job ignores interrupts, and so would what it starts
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 
