@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lbt_synth.design import Design, hinf, kalman, lqg
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification import IdentifiedModel, identify
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.models import TipTiltPlant
@@ -100,7 +100,8 @@ def design_from_record(
     ProblemError
         If the record is too short, its delay is missing, or a value is out of range.
     NumericalError, CertificateError
-        If a fit fails, or a design does not pass its checks.
+        If a fit fails; or if a design does not pass its checks, or its loop is unstable at one
+        of the sensor gains that were found.
 
     Examples
     --------
@@ -169,7 +170,7 @@ def design_from_record(
 
 
 def _doubts(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:
-    """Return warnings of sensor gains that do not agree, and of loops that would not hold."""
+    """Return warnings of sensor gains that do not agree; refuse loops that would not hold."""
     out = []
     for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
         if whole.sensor_gain_error is None or first.sensor_gain_error is None:
@@ -183,9 +184,10 @@ def _doubts(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tu
     for gain in sorted({*half.sensor_gains, *model.sensor_gains}):
         path = replace(model.hardware, sensor_matrix=gain * np.eye(len(model.axes)))
         if not close_loop(path, design.controller).is_stable:
-            out.append(
-                f"warning: with the sensor gain {gain:.3f}, which was found as well, the loop of "
-                "the design is unstable. Do not use it before the gains are understood"
+            raise CertificateError(
+                f"the loop of the design is unstable at the sensor gain {gain:.3f}, which was "
+                "found as well, in a half of the record or on the other axis. Look for jumps in "
+                "the record, and for commands that do not belong to it, or give the sensor gain."
             )
     return tuple(out)
 

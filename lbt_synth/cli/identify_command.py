@@ -33,6 +33,7 @@ from lbt_synth.replay.table import RAN
 
 _AXES = ("tip", "tilt")
 _YAML = (".yaml", ".yml")
+_FAR = 4.0  # standard errors
 
 
 def identify_command(arguments: Namespace) -> Report:
@@ -132,6 +133,7 @@ def _record(arguments: Namespace) -> LoopRecord | SpectrumRecord:
         diameter_m=arguments.diameter_m,
         obstruction=arguments.obstruction,
         axes=arguments.axes,
+        averages=arguments.averages,
         columns=_columns(arguments.columns),
         commands=arguments.commands,
     )
@@ -430,10 +432,11 @@ def _tell_test(report: Report, made: RecordedDesign, record: LoopRecord) -> None
             "residual_nm": [ran.replayed_nm, best.replayed_nm],
             "strehl": [ran.strehl, best.strehl],
         }
-    if abs(best.deviations) > 4:
+    if abs(best.deviations) > _FAR:
+        more = "more" if best.deviations > 0 else "less"
         report.notes.append(
-            f"warning: on unseen data the residual of the {made.name} is {best.deviations:+.1f} "
-            "standard errors from what the model promises: the disturbance changed, or the model "
+            f"warning: on unseen data the {made.name} leaves {more} than the model expects, by "
+            f"{abs(best.deviations):.1f} standard errors: the disturbance changed, or the model "
             "leaves something out."
         )
     report.notes += [_marked(note) for note in made.notes]

@@ -335,6 +335,9 @@ def _add_record_commands(command: Callable[..., argparse.ArgumentParser]) -> Non
         facts.add_argument("--command-unit", help="of the commands (default: --unit)")
         facts.add_argument("--diameter-m", type=float, help="telescope diameter [m], for angles")
         facts.add_argument("--obstruction", type=float, help="as a fraction of the diameter")
+        facts.add_argument(
+            "--averages", type=int, help="periodograms that a spectrum is the mean of"
+        )
         facts.add_argument("--commands", help="another file, with the commands")
         facts.add_argument(
             "--columns",

@@ -22,6 +22,7 @@ from lbt_synth.models.resonance import PARAMETERS
 from lbt_synth.records import LoopRecord
 from lbt_synth.validation import FloatArray
 
+_LARGE = 12.0  # standard deviations of the change of a correction
 _UNLIKELY = 8.0  # standard deviations of the innovations
 _EDGE = 0.06  # of a stretch, at either end, that is not looked at: the taper is there
 _CLUSTER = 20  # frames within which outliers are one jump
@@ -89,6 +90,40 @@ def jumps(
             if place.size:
                 best = int(place[np.argmax(size[place])])
                 out.append(Jump(frame=start + 1 + best, size=float(size[best] / scale)))
+    return out
+
+
+def steps(corrections: FloatArray, stretches: Sequence[tuple[int, int]]) -> list[Jump]:
+    """Find where the corrections of an axis go on elsewhere.
+
+    The sensor gain that fits a jump of the commands is one at which it does not show: it is
+    looked for before anything is fitted.
+
+    Parameters
+    ----------
+    corrections : (frames,) ndarray
+        Corrections c(k) [nm].
+    stretches : sequence of (start, stop)
+        Usable frames.
+
+    Returns
+    -------
+    list of Jump
+        By rising frame.
+    """
+    change = np.abs(np.diff(corrections))
+    inside = np.zeros(change.size, dtype=np.bool_)
+    for start, stop in stretches:
+        inside[start : stop - 1] = True
+    scale = float(np.median(change[inside])) / 0.6745 if inside.any() else 0.0
+    if scale == 0:
+        return []
+    far = np.flatnonzero(inside & (change > _LARGE * scale))
+    out = []
+    for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _CLUSTER)):
+        if place.size:
+            best = int(place[np.argmax(change[place])])
+            out.append(Jump(frame=1 + best, size=float(change[best] / scale)))
     return out
 
 

@@ -326,7 +326,10 @@ def identify_periodogram(
     grown = grow(data, rules, None if start is None else start.grown)
     if sensor_gain is not None:
         relative = given_error / sensor_gain
-        return _described(data, rules, grown, relative or None, "given", known=relative)
+        note = "given" if data.closed else "given: the series is divided by it"
+        if data.duration_s is None:
+            note = "1: of a spectrum it has no meaning"
+        return _described(data, rules, grown, relative or None, note, known=relative)
     if not data.closed:
         note = "1: of an open loop it has no meaning"
         return _described(data, rules, grown, None, note, known=0.0)
@@ -459,7 +462,7 @@ def _described(
         turbulence_fit=_turbulence_fit(theta, covariance, rate),
         parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
         noise_nm=noise,
-        noise_error_nm=noise * float(error[NOISE]) / 2,
+        noise_error_nm=min(noise * float(error[NOISE]) / 2, innovation),
         sensor_gain=gain,
         sensor_gain_error=None if gain_error is None else gain * gain_error,
         sensor_gain_note=note,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.checks import Jump, better_delay, cut, jumps
+from lbt_synth.identification.checks import Jump, better_delay, cut, jumps, steps
 from lbt_synth.identification.identify import (
     LOWEST_LINE_HZ,
     MOST_LINES,
@@ -23,6 +23,7 @@ from lbt_synth.validation import instance
 
 _DELAY = 2.0  # frames, where nothing is said
 _MOST_JUMPS = 20
+_LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # that a sensor has
 _SAME_JUMP = 50  # frames
 _UNSEEN = 0.5
 _APART = 3.0  # standard errors between gains that are not the same
@@ -166,8 +167,14 @@ def identify(
             progress(done, total)
         return found
 
-    axes = [one(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
     notes: list[str] = []
+    if corrections is not None:
+        early = _merged([jump for i in range(count) for jump in steps(corrections[:, i], pieces)])
+        if early:
+            notes.append(_told(early, "commands"))
+        if len(early) <= _MOST_JUMPS:
+            pieces[:] = cut(pieces, [jump.frame for jump in early])
+    axes = [one(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
     broken = _jumps(record, axes, pieces)
     if broken:
         notes.append(_told(broken))
@@ -254,6 +261,11 @@ def _jumps(
     for i, axis in enumerate(axes):
         gains = [axis.sensor_gain] * len(axes)
         found += jumps(record.pseudo_open_loop(gains)[:, i], axis, pieces)
+    return _merged(found)
+
+
+def _merged(found: Sequence[Jump]) -> list[Jump]:
+    """Return jumps by rising frame, each place once."""
     out: list[Jump] = []
     for jump in sorted(found, key=lambda jump: jump.frame):
         if not out or jump.frame - out[-1].frame > _SAME_JUMP:
@@ -261,12 +273,12 @@ def _jumps(
     return out
 
 
-def _told(broken: Sequence[Jump]) -> str:
+def _told(broken: Sequence[Jump], of: str = "pseudo-open loop") -> str:
     """Return what is said of jumps."""
     first = max(broken, key=lambda jump: jump.size)
     text = (
-        f"warning: {len(broken)} jump{'s' if len(broken) > 1 else ''} of the pseudo-open loop, the "
-        f"largest at frame {first.frame} with {first.size:.0f} deviations of the innovations"
+        f"warning: {len(broken)} jump{'s' if len(broken) > 1 else ''} of the {of}, the largest at "
+        f"frame {first.frame} with {first.size:.0f} standard deviations"
     )
     if len(broken) <= _MOST_JUMPS:
         return f"{text}; the record was cut there"
@@ -288,6 +300,12 @@ def _doubts(
                 f"warning: a delay of {other[0]:g} frames fits better than {record.delay_frames:g} "
                 f"(its criterion is better by {other[1]:.0f}). Check the delay"
             )
+    out += [
+        f"warning: axis {i} has a sensor gain of {axes[i].sensor_gain:.3g}: are the units, signs "
+        "and axes of the commands right?"
+        for i in told
+        if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN
+    ]
     out += [
         f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
         for i, axis in enumerate(axes)

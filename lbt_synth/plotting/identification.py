@@ -40,8 +40,8 @@ def identification_figure(
     matplotlib.figure.Figure
         Rows: density of the pseudo-open-loop measurement, with the fit, its background and the
         lines' frequencies and rms; rms accumulated from low to high frequencies, of the
-        disturbance, of the residual that ran and of what the designs would leave; cumulative
-        periodogram of the innovations less that of white noise.
+        disturbance, of the measurement that ran (its noise included) and of what the designs
+        would leave; cumulative periodogram of the innovations less that of white noise.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def _draw_cumulative(plot: Any, axis: IdentifiedAxis, residuals: dict[str, Float
         "disturbance, fit": rms(axis.fitted_nm2_hz - white),
     }
     if axis.data.closed:
-        curves["residual that ran"] = rms(axis.data.measured / axis.sensor_gain**2 - white)
+        curves["measurement that ran"] = rms(axis.data.measured / axis.sensor_gain**2)
     for name, density in residuals.items():
         curves[f"residual, {name}"] = rms(density)
     greys = {"disturbance, data": "0.45"}
