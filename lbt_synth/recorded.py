@@ -17,10 +17,10 @@ from lbt_synth.records import LinePrior, LoopRecord, require_length
 from lbt_synth.replay import PredictionTable, prediction_against_data, split_halves
 from lbt_synth.validation import choice, instance, number
 
-METHODS = ("kalman", "hinf", "lqg")
 _GAMMA_RATIO = 1.2
 _APART = 3.0  # standard errors
 _NAMES = {"kalman": "Kalman filter", "hinf": "H-infinity filter", "lqg": "LQG controller"}
+METHODS = tuple(_NAMES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lbt_synth.identification.description import WIDE_DAMPING
 from lbt_synth.identification.fitting import Rules, kept
-from lbt_synth.identification.layout import Grown
+from lbt_synth.identification.layout import Grown, Layout
 from lbt_synth.identification.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -18,9 +19,8 @@ from lbt_synth.identification.periodogram import (
 from lbt_synth.identification.result import IdentifiedAxis
 from lbt_synth.identification.whittle import GAIN, NOISE
 from lbt_synth.identification.window import tukey
-from lbt_synth.models.resonance import PARAMETERS
 from lbt_synth.records import LoopRecord
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, IntArray
 
 _LARGE = 12.0  # standard deviations of the change of a correction
 _UNLIKELY = 8.0  # standard deviations of the innovations
@@ -30,7 +30,6 @@ _AROUND = 3  # frames left out on either side
 DELAYS = (-1.0, -0.5, 0.5, 1.0)  # frames by which another delay is tried
 _HIGH = 0.6  # of the highest frequency
 _CLEARLY = 5.0  # by which the criterion of another delay is better
-_WIDE = 0.1  # damping ratio
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,10 +85,7 @@ def jumps(
         edge = int(_EDGE * count)
         scale = float(np.median(size)) / 0.6745
         far = edge + np.flatnonzero(size[edge : count - edge] > _UNLIKELY * scale)
-        for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _CLUSTER)):
-            if place.size:
-                best = int(place[np.argmax(size[place])])
-                out.append(Jump(frame=start + 1 + best, size=float(size[best] / scale)))
+        out += _peaks(size / scale, far, start)
     return out
 
 
@@ -119,11 +115,16 @@ def steps(corrections: FloatArray, stretches: Sequence[tuple[int, int]]) -> list
     if scale == 0:
         return []
     far = np.flatnonzero(inside & (change > _LARGE * scale))
+    return _peaks(change / scale, far, 0)
+
+
+def _peaks(size: FloatArray, far: IntArray, start: int) -> list[Jump]:
+    """Return the largest of each cluster of differences that are too large."""
     out = []
     for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _CLUSTER)):
         if place.size:
-            best = int(place[np.argmax(change[place])])
-            out.append(Jump(frame=1 + best, size=float(change[best] / scale)))
+            best = int(place[np.argmax(size[place])])
+            out.append(Jump(frame=start + 1 + best, size=float(size[best])))
     return out
 
 
@@ -175,7 +176,7 @@ def better_delay(
         return None
     # of the model as it is, with the gain free and without new parts
     rules = Rules(gain=None, lowest_line_hz=0.0, most_lines=0)
-    simple = axis.grown.narrow(_WIDE)
+    simple = axis.grown.narrow(WIDE_DAMPING)
     found: dict[float, float] = {}
     for shift in (0.0, *DELAYS):
         delay = record.delay_frames + shift
@@ -190,8 +191,7 @@ def better_delay(
         )
         again = kept(data, rules, _with_noise(simple, data) if shift else axis.grown)
         if again is not None:
-            need = 0.5 * PARAMETERS * float(np.log(np.sum(data.count)))
-            found[delay] = again.fitted.contrast + need * len(again.parts)
+            found[delay] = again.fitted.contrast + Layout(data).price * len(again.parts)
     here = found.pop(record.delay_frames, None)
     if here is None or not found:
         return None

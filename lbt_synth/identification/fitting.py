@@ -41,7 +41,6 @@ from lbt_synth.models.resonance import PARAMETERS
 from lbt_synth.validation import BoolArray, FloatArray
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)
-_OTHER_GAINS = (0.35, 0.6, 1.0)
 _FEW_ROUNDS = 3
 _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
@@ -120,12 +119,13 @@ def other_gain(data: LoopPeriodogram, rules: Rules, best: Grown) -> float:
     free = _Search(data, rules)
     least, gain = free.cost(best), float(best.theta[GAIN])
     away = 0.0
-    for trial in _OTHER_GAINS:
+    for trial in _STARTING_GAINS:
         if abs(float(np.log(trial)) - gain) < _SAME_GAIN:
             continue
         fixed = _Search(data, replace(rules, gain=trial))
         try:
-            made = free.fitted(*_parameters(fixed.grown(None, rounds=_FEW_ROUNDS)))
+            other = fixed.grown(None, rounds=_FEW_ROUNDS)
+            made = free.fitted(other.theta, other.parts)
         except NumericalError:
             continue
         if free.cost(made) < least + free.need:
@@ -133,16 +133,12 @@ def other_gain(data: LoopPeriodogram, rules: Rules, best: Grown) -> float:
     return away
 
 
-def _parameters(grown: Grown) -> tuple[FloatArray, tuple[Part, ...]]:
-    return grown.theta, grown.parts
-
-
 class _Search:
     def __init__(self, data: LoopPeriodogram, rules: Rules) -> None:
         self.data, self.rules = data, rules
         self.full = Likelihood(data)
         self.layout = Layout(data)
-        self.need = 0.5 * PARAMETERS * float(np.log(max(2.0, np.sum(data.count))))
+        self.need = self.layout.price
         self.free_gain = rules.gain is None and data.closed
 
     def grown(self, start: Grown | None, *, rounds: int = _MOST_ROUNDS) -> Grown:
@@ -306,9 +302,7 @@ class _Search:
         room = self._room(current)
         if room <= 0:
             return []
-        found = candidates(
-            self.data, power, self.full.model(theta), least=self.need, most=max(1, room)
-        )
+        found = candidates(self.data, power, self.full.model(theta), least=self.need, most=room)
         slow = sum(not part.line for part in current.parts)
         full = slow >= _MOST_TURBULENCES
         found = [c for c in found if not (full and c.frequency_hz < self.rules.lowest_line_hz)]

@@ -172,14 +172,13 @@ def identify(
         early = _merged([jump for i in range(count) for jump in steps(corrections[:, i], pieces)])
         if early:
             notes.append(_told(early, "commands"))
-        if len(early) <= _MOST_JUMPS:
-            pieces[:] = cut(pieces, [jump.frame for jump in early])
+            pieces = _cut(pieces, early)
     axes = [one(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
     broken = _jumps(record, axes, pieces)
     if broken:
-        notes.append(_told(broken))
+        notes.append(_told(broken, "pseudo-open loop"))
         if len(broken) <= _MOST_JUMPS:
-            pieces[:] = cut(pieces, [jump.frame for jump in broken])
+            pieces = _cut(pieces, broken)
             axes = [one(i, gains[i], axes[i]) for i in range(count)]
     told = [i for i in range(count) if axes[i].sensor_gain_error is not None]
     if count > 1 and told and all(gain is None for gain in gains):
@@ -257,11 +256,10 @@ def _jumps(
     record: LoopRecord, axes: Sequence[IdentifiedAxis], pieces: Sequence[tuple[int, int]]
 ) -> list[Jump]:
     """Return the jumps of all axes, each place once."""
-    found: list[Jump] = []
-    for i, axis in enumerate(axes):
-        gains = [axis.sensor_gain] * len(axes)
-        found += jumps(record.pseudo_open_loop(gains)[:, i], axis, pieces)
-    return _merged(found)
+    series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
+    return _merged(
+        [jump for i, axis in enumerate(axes) for jump in jumps(series[:, i], axis, pieces)]
+    )
 
 
 def _merged(found: Sequence[Jump]) -> list[Jump]:
@@ -273,7 +271,12 @@ def _merged(found: Sequence[Jump]) -> list[Jump]:
     return out
 
 
-def _told(broken: Sequence[Jump], of: str = "pseudo-open loop") -> str:
+def _cut(pieces: list[tuple[int, int]], broken: Sequence[Jump]) -> list[tuple[int, int]]:
+    """Cut the stretches at jumps, if there are few."""
+    return cut(pieces, [jump.frame for jump in broken]) if len(broken) <= _MOST_JUMPS else pieces
+
+
+def _told(broken: Sequence[Jump], of: str) -> str:
     """Return what is said of jumps."""
     first = max(broken, key=lambda jump: jump.size)
     text = (

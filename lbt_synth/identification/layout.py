@@ -128,6 +128,8 @@ class Layout:
         self.data = data
         self.angle = 2 * np.pi / data.frame_rate_hz
         self.step = float(np.median(np.diff(data.frequency_hz)))
+        # what a component must add to the logarithm of the likelihood
+        self.price = 0.5 * PARAMETERS * float(np.log(max(2.0, np.sum(data.count))))
 
     def place(self, theta: FloatArray, i: int) -> tuple[float, float]:
         """Frequency and half width of a component [Hz], the width at least a bin."""

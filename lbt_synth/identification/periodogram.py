@@ -112,6 +112,8 @@ def loop_periodogram(
     LoopPeriodogram
         From the first frequency above 0 to below the Nyquist frequency.
     """
+    from scipy.fft import next_fast_len, rfft
+
     length = _segment_length([stop - start for start, stop in stretches])
     starts: list[int] = []
     for start, stop in stretches:
@@ -121,15 +123,13 @@ def loop_periodogram(
             starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
     rows = np.array(starts)[:, None] + np.arange(length)[None, :]
     taper = tukey(length - 1)
-    size = _fast(length - 1)
+    size = int(next_fast_len(length - 1, real=True))
     frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
     scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
 
     def transform(series: FloatArray) -> FloatArray:
         tapered = taper * np.diff(series[rows], axis=1)
         return np.asarray(rfft(tapered, size, axis=1)[:, 1 : (size + 1) // 2])
-
-    from scipy.fft import rfft
 
     y = transform(measurement)
     c = None if correction is None else transform(correction)
@@ -165,9 +165,3 @@ def _segment_length(lengths: list[int]) -> int:
         u / most + 0.1 * np.log2(c / LONGEST_SEGMENT) for u, c in zip(used, candidates, strict=True)
     ]
     return candidates[int(np.argmax(worth))]
-
-
-def _fast(length: int) -> int:
-    from scipy.fft import next_fast_len
-
-    return int(next_fast_len(length, real=True))

@@ -138,9 +138,8 @@ def smooth_background(
     from scipy.special import gammaincinv
 
     low, high = frequency_hz[0], frequency_hz[-1]
-    edges = np.unique(np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80)))
-    edges = np.append(edges[np.concatenate([[True], np.diff(edges) >= 1])], frequency_hz.size)
-    edges = np.unique(edges)
+    edges = np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80))
+    edges = np.unique(np.append(edges, frequency_hz.size))
     shape = max(float(np.median(count)), 0.5)
     to_mean = shape / float(gammaincinv(shape, 0.5))
     f, d, w = [], [], []
