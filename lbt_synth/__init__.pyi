@@ -194,6 +194,11 @@ from .simulation import simulate as simulate
 from .statespace import Controller as Controller
 from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace
+from .study import ControllerStatistics as ControllerStatistics
+from .study import StudyStatistics as StudyStatistics
+from .study import first_order_index as first_order_index
+from .study import study_statistics as study_statistics
+from .study import summary_tables as summary_tables
 from .sweep import RobustnessRow as RobustnessRow
 from .sweep import frequency_robustness as frequency_robustness
 from .telemetry import Telemetry as Telemetry
