@@ -242,15 +242,15 @@ def _sampled(
             continue
         rows.append(
             (
-                name,
                 names[name],
+                name,
                 info.parameters.get(name, ""),
-                *(f"{np.percentile(column_, p):.5g}" for p in (0, 50, 100)),
+                *_rounded(np.percentile(column_, (0, 50, 100))),
             )
         )
     table = Table(
         caption="Parameters",
-        headings=("parameter", "here called", "distribution", "least", "median", "greatest"),
+        headings=("parameter", "its place", "distribution", "least", "median", "greatest"),
         rows=tuple(rows),
         words=(1, 2),
     )
@@ -264,6 +264,13 @@ def _sampled(
             *([chart] if chart is not None else []),
         ),
     )
+
+
+def _rounded(values: FloatArray) -> list[str]:
+    """Return numbers with four digits of their range, or of themselves if they are the same."""
+    span = float(np.ptp(values)) or float(np.max(np.abs(values))) or 1.0
+    digits = 3 - int(np.floor(np.log10(span)))
+    return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
 
 
 def _controllers(info: StudyInfo, statistics: StudyStatistics) -> Section:

@@ -308,7 +308,8 @@ def map_charts(
                 caption=(
                     f"Mean of the Strehl ratio of {each.controller} in each cell, all other "
                     "parameters as they come; unstable loops count as 0. These two parameters have "
-                    "its greatest indices. The scale of colours is its own."
+                    "its greatest indices; the outermost cells hold what is beyond. The scale of "
+                    "colours is its own."
                 ),
                 alt=(
                     f"Map of the mean Strehl ratio of {each.controller} over {first} and {second}: "

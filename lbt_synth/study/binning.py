@@ -12,6 +12,7 @@ from lbt_synth.validation import FloatArray, frozen
 _POINTS = 200  # of a cumulative distribution
 _BINS = 30  # of a histogram, at most
 _CELLS = 32  # along either axis of a map, at most
+_WITHIN = 1, 99  # percentiles that a map reaches to; its outermost cells hold what is beyond
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 
 
@@ -112,8 +113,9 @@ def binned_map(x: FloatArray, y: FloatArray, result: FloatArray) -> BinnedMap:
     Returns
     -------
     BinnedMap
-        Cells of equal width, so many that there are some samples in each on average; a list has
-        a row or a column for each value.
+        Cells of equal width from the 1st to the 99th percentile, so many that there are some
+        samples in each on average; the outermost hold what is beyond. A list has a row or a
+        column for each value.
 
     Examples
     --------
@@ -153,7 +155,9 @@ def _places(
     """Centres of the cells along one axis, and the cell of each sample."""
     if listed is not None:
         return listed[0], np.searchsorted(listed[0], values)
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = np.percentile(values, _WITHIN)
+    if not low < high:
+        low, high = float(np.min(values)), float(np.max(values))
     edges = np.linspace(low, high, cells + 1)
     places = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, cells - 1)
     return (edges[:-1] + edges[1:]) / 2, places

@@ -64,7 +64,10 @@ def strehl_table(statistics: StudyStatistics) -> Table:
     found = statistics.controllers
     ranks = range(len(found[0].strehl))
     rows: list[Row] = [
-        ("mean", *(with_error(c.mean, c.mean_error, scale=100, digits=2) for c in found))
+        (
+            "mean and its standard error",
+            *(with_error(c.mean, c.mean_error, scale=100, digits=2) for c in found),
+        )
     ]
     rows.extend(
         (ordinal(found[0].strehl[i].percent), *(_percentile(c.strehl[i]) for c in found))
