@@ -194,9 +194,14 @@ from .simulation import simulate as simulate
 from .statespace import Controller as Controller
 from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace
+from .study import BatchResult as BatchResult
 from .study import ControllerStatistics as ControllerStatistics
+from .study import Failure as Failure
+from .study import Study as Study
 from .study import StudyStatistics as StudyStatistics
+from .study import evaluate_samples as evaluate_samples
 from .study import first_order_index as first_order_index
+from .study import load_study as load_study
 from .study import study_statistics as study_statistics
 from .study import summary_tables as summary_tables
 from .sweep import RobustnessRow as RobustnessRow

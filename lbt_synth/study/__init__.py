@@ -1,13 +1,24 @@
-"""Robustness studies: controllers on many samples of what the loop may meet."""
+"""Robustness studies: samples of a configuration, evaluated on any number of processes."""
 
+from lbt_synth.study.load import load_study
+from lbt_synth.study.point import evaluate_samples
+from lbt_synth.study.result import BatchResult, Failure
 from lbt_synth.study.statistics import ControllerStatistics, StudyStatistics, study_statistics
+from lbt_synth.study.study import Parameter, Study, StudyController
 from lbt_synth.study.summary import summary_tables
 from lbt_synth.study.variance import first_order_index
 
 __all__ = [
+    "BatchResult",
     "ControllerStatistics",
+    "Failure",
+    "Parameter",
+    "Study",
+    "StudyController",
     "StudyStatistics",
+    "evaluate_samples",
     "first_order_index",
+    "load_study",
     "study_statistics",
     "summary_tables",
 ]
