@@ -19,7 +19,7 @@ from lbt_synth.gainfile import load_gain
 from lbt_synth.limits import least_residual
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
 from lbt_synth.models import Truth
-from lbt_synth.models.hardware import same_mirror
+from lbt_synth.models.hardware import loop_differences, same_mirror
 from lbt_synth.plotting import require_figure_name, save_figure, sigma_figure, simulation_figure
 from lbt_synth.simulation import settling_frames
 from lbt_synth.simulation import simulate as run_simulation
@@ -219,28 +219,9 @@ def _simulation_notes(
 
 def foreign_notes(config: Config, design: Design) -> list[str]:
     """Say where a design was made for another loop than the configuration's."""
-    notes = []
-    own, here = design.hardware, config.hardware
-    if own is not None and own.delay_frames != here.delay_frames:
-        notes.append(
-            f"note: designed for a delay of {own.delay_frames:g} frames, run with "
-            f"{here.delay_frames:g}."
-        )
-    if own is not None and not (
-        np.array_equal(own.sensor, here.sensor) and np.array_equal(own.influence, here.influence)
-    ):
-        notes.append("note: designed for another sensor or influence matrix than it is run with.")
-    if own is not None and not same_mirror(own, here):
-        kinds = [
-            "a mirror that settles at once" if h.mirror is None else "a mirror with dynamics"
-            for h in (own, here)
-        ]
-        notes.append(
-            f"note: designed for {kinds[0]}, run with {kinds[1]}."
-            if kinds[0] != kinds[1]
-            else "note: designed for other dynamics of the mirror than it is run with."
-        )
-    return notes
+    if design.hardware is None:
+        return []
+    return [f"note: {text}" for text in loop_differences(design.hardware, config.hardware)]
 
 
 def real_truth(config: Config, arguments: Namespace) -> Truth:

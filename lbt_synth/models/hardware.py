@@ -160,6 +160,30 @@ def same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
     return astuple(one.mirror) == astuple(other.mirror)
 
 
+def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
+    """Say in what the loop that a design was made for differs from the one it is run in."""
+    notes = []
+    if own.delay_frames != here.delay_frames:
+        notes.append(
+            f"designed for a delay of {own.delay_frames:g} frames, run with {here.delay_frames:g}."
+        )
+    if not (
+        np.array_equal(own.sensor, here.sensor) and np.array_equal(own.influence, here.influence)
+    ):
+        notes.append("designed for another sensor or influence matrix than it is run with.")
+    if not same_mirror(own, here):
+        kinds = [
+            "a mirror that settles at once" if h.mirror is None else "a mirror with dynamics"
+            for h in (own, here)
+        ]
+        notes.append(
+            f"designed for {kinds[0]}, run with {kinds[1]}."
+            if kinds[0] != kinds[1]
+            else "designed for other dynamics of the mirror than it is run with."
+        )
+    return notes
+
+
 def past_corrections(taps: FloatArray, commands: FloatArray) -> FloatArray:
     """Return ``c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...``, which measurement k sees.
 

@@ -1,0 +1,144 @@
+"""What the numbers of a report say, in sentences made of these numbers alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.report.designs import DesignReport
+from lbt_synth.report.designs_assessment import DesignAssessment
+from lbt_synth.report.words import (
+    fixed_text,
+    interval_text,
+    listing_text,
+    number_text,
+    signed_text,
+)
+
+KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GoodRange:
+    """Frequency errors around its best over which a design keeps most of its Strehl ratio.
+
+    Attributes
+    ----------
+    low_hz, high_hz : float
+        The range [Hz], on the grid of the report.
+    whole : bool
+        Whether it is the whole range that was looked at.
+    """
+
+    low_hz: float
+    high_hz: float
+    whole: bool
+
+
+def good_range(one: DesignAssessment) -> GoodRange | None:
+    """Return where a design keeps 90 % of its best Strehl ratio; None where it is unstable."""
+    if not one.stable:
+        return None
+    errors, strehls = one.curve.errors_hz, one.curve.strehl[0, 0]
+    good = strehls >= KEPT * np.max(strehls)
+    first = last = int(np.argmax(strehls))
+    while first > 0 and good[first - 1]:
+        first -= 1
+    while last < errors.size - 1 and good[last + 1]:
+        last += 1
+    return GoodRange(
+        low_hz=float(errors[first]),
+        high_hz=float(errors[last]),
+        whole=first == 0 and last == errors.size - 1,
+    )
+
+
+def verdict(report: DesignReport) -> str:
+    """Return one paragraph: who leaves least, who bears errors, what is proved."""
+    stable = report.stable
+    sentences = []
+    if stable:
+        sentences.append(_least(report))
+        if report.errors_hz.size > 1:
+            sentences += _tolerance(report)
+        sentences.append(_gains(report))
+    unstable = [one.name for one in report.assessments if not one.stable]
+    if unstable:
+        verb = "is" if len(unstable) == 1 else "are"
+        sentences.append(f"{_upper(listing_text(unstable))} {verb} UNSTABLE in this loop.")
+    sentences.append(_certificates(report))
+    return " ".join(sentences)
+
+
+def _upper(text: str) -> str:
+    """Return a text as the beginning of a sentence; names stay as they are."""
+    return text
+
+
+def _least(report: DesignReport) -> str:
+    stable = report.stable
+    best = min(stable, key=lambda one: one.residual_nm)
+    limit = report.limits.limit
+    beside = ""
+    if limit is not None and limit.rms_nm > 0:
+        ratio = best.residual_nm / limit.rms_nm
+        beside = (
+            f"; no linear controller leaves less than {fixed_text(limit.rms_nm, 1)} nm, "
+            f"1/{number_text(ratio, 3)} of that"
+            if ratio > 1.005
+            else ", the least of any linear controller"
+        )
+    among = f"Of {len(stable)} stable designs, " if len(stable) > 1 else ""
+    return (
+        f"{among}{best.name} leaves {'the least, ' if len(stable) > 1 else ''}"
+        f"{fixed_text(best.residual_nm, 1)} nm rms (Strehl ratio {fixed_text(100 * best.strehl, 1)} "
+        f"%), if the vibrations are where the configuration has them{beside}."
+        if report.config.truth.vibrations
+        else f"{among}{best.name} leaves {'the least, ' if len(stable) > 1 else ''}"
+        f"{fixed_text(best.residual_nm, 1)} nm rms (Strehl ratio {fixed_text(100 * best.strehl, 1)} "
+        f"%){beside}."
+    )
+
+
+def _tolerance(report: DesignReport) -> list[str]:
+    errors = report.errors_hz
+    over = f"{signed_text(float(errors[0]))} to {signed_text(float(errors[-1]))} Hz"
+    worst = {one.name: float(np.min(one.curve.strehl)) for one in report.stable}
+    toughest = max(worst, key=lambda name: worst[name])
+    sentences = [
+        f"Over frequency errors of {over} the worst Strehl ratio is "
+        + listing_text([f"{fixed_text(100 * v, 1)} % for {name}" for name, v in worst.items()])
+        + (f": {toughest} bears them best." if len(worst) > 1 else ".")
+    ]
+    parts = []
+    for one in report.stable:
+        found = good_range(one)
+        assert found is not None  # it is stable
+        if found.whole:
+            parts.append(f"{one.name} over all of these errors")
+        else:
+            parts.append(
+                f"{one.name} from {signed_text(found.low_hz)} to {signed_text(found.high_hz)} Hz"
+            )
+    sentences.append(f"Within 10 % of its own best Strehl ratio stays {listing_text(parts)}.")
+    return sentences
+
+
+def _gains(report: DesignReport) -> str:
+    parts = []
+    for one in report.stable:
+        low, high = next(
+            (ends for ends in one.sensor_gains if ends[0] <= report.real_gain <= ends[1]),
+            (float("nan"), float("nan")),
+        )
+        parts.append(f"{one.name} for {interval_text(low, high, 3)}")
+    return f"Around the real sensor gain the loop is stable with {listing_text(parts)}."
+
+
+def _certificates(report: DesignReport) -> str:
+    failed = [one.name for one in report.assessments if not one.certified]
+    checks = sum(len(one.checks) for one in report.assessments)
+    if not failed:
+        return f"All {checks} checks of the certificates were computed anew and passed."
+    return f"The certificate of {listing_text(failed)} does NOT hold."
