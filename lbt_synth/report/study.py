@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.pages import Cell, Listing, Notice, Page, Paragraph, Section, Table
 from lbt_synth.pages.blocks import Block
+from lbt_synth.report.making import creator, time_text
 from lbt_synth.report.study_charts import (
     conditional_chart,
     distribution_chart,
@@ -20,6 +21,7 @@ from lbt_synth.report.study_charts import (
     sensitivity_chart,
     unstable_chart,
 )
+from lbt_synth.report.study_info import StudyInfo
 from lbt_synth.study.names import short_names
 from lbt_synth.study.outcomes import Outcomes, column, outcomes
 from lbt_synth.study.statistics import ControllerStatistics, StudyStatistics
@@ -38,59 +40,6 @@ from lbt_synth.validation import FloatArray
 _FAILURES = 10  # that are listed
 _TO = "\u00a0to\u00a0"
 _LISTED = 5  # parameters of a worst sample: with the row and the Strehl ratio, a sheet is full
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StudyInfo:
-    """What a page says of a study besides its results.
-
-    Attributes
-    ----------
-    name : str
-        Name of the study, such as that of its file.
-    samples : int
-        Samples asked for.
-    sampling : str
-        How they were drawn.
-    evaluation : str
-        How each was evaluated.
-    parameters : dict of str to str
-        Distribution of each parameter, in words.
-    controllers : dict of str to str
-        Origin of each controller, in words.
-    digests : dict of str to str
-        Digest of each controller, as far as there is one.
-    digest : str
-        Digest of the whole study.
-    failures : tuple of (int, str, str)
-        Row, controller and error of those that failed.
-    study_text, config_text : str
-        The study file and the configuration as they were read.
-    versions : dict of str to str
-        Version of each program that took part.
-    elapsed_s : float or None
-        Time that it took [s].
-    replay : str
-        Command that replays a sample, with ``{row}`` for its number; empty for none.
-    creator : str
-        Program and version that made the page.
-    """
-
-    name: str
-    samples: int
-    sampling: str
-    evaluation: str
-    parameters: Mapping[str, str]
-    controllers: Mapping[str, str]
-    digests: Mapping[str, str] = field(default_factory=dict)
-    digest: str = ""
-    failures: Sequence[tuple[int, str, str]] = ()
-    study_text: str = ""
-    config_text: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    elapsed_s: float | None = None
-    replay: str = ""
-    creator: str = "lbt_synth"
 
 
 def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, Any]) -> Page:
@@ -128,7 +77,8 @@ def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[st
         title=f"Robustness study {info.name}",
         subtitle=(
             f"{statistics.samples} samples of {len(varying(values))} parameters, "
-            f"{len(found)} {'controllers' if len(found) > 1 else 'controller'}"
+            f"{len(found)} {'controllers' if len(found) > 1 else 'controller'}. "
+            f"Made {time_text(info.made)}."
         ),
         sections=tuple(
             replace(section, blocks=tuple(_unbroken(block) for block in section.blocks))
@@ -144,7 +94,7 @@ def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[st
             )
             if section.blocks
         ),
-        creator=info.creator,
+        creator=creator(),
     )
 
 
@@ -204,7 +154,9 @@ def _summary(info: StudyInfo, statistics: StudyStatistics, found: Sequence[Outco
         )
     blocks.append(Paragraph(text=_verdict(statistics.controllers)))
     blocks.append(strehl_table(statistics))
-    blocks.append(distribution_chart(found))
+    chart = distribution_chart(found)
+    if chart is not None:
+        blocks.append(chart)
     return Section(key="summary", title="Summary", blocks=tuple(blocks))
 
 
@@ -300,8 +252,8 @@ def _controllers(info: StudyInfo, statistics: StudyStatistics) -> Section:
                 + (f": the first {_FAILURES}, and {more} more" if more > 0 else ""),
                 headings=("row", "controller", "error"),
                 rows=tuple(
-                    (str(row), controller, error)
-                    for row, controller, error in info.failures[:_FAILURES]
+                    (str(each.row), each.controller, each.error)
+                    for each in info.failures[:_FAILURES]
                 ),
                 words=(1, 2),
             )
@@ -365,14 +317,14 @@ def _worst(info: StudyInfo, statistics: StudyStatistics, names: Mapping[str, str
             shown = (ranked or others)[:_LISTED]
             most = max(most, len(ranked) - len(shown))
             blocks.append(worst_table(each, shown, names=names))
-            commands.append(info.replay.format(row=each.worst[0].row))
+            commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
     if most:
         text = (
             f"Unstable loops first, then by the Strehl ratio; of the parameters, the {_LISTED} "
             "with the greatest indices of the controller."
         )
         blocks.insert(0, Paragraph(text=text))
-    if info.replay and commands:
+    if commands:
         caption = "Commands that replay the first of each table; any other row likewise"
         blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
     return Section(key="worst", title="Worst samples", blocks=tuple(blocks))
@@ -409,21 +361,31 @@ def _reading() -> Section:
 
 def _provenance(info: StudyInfo, statistics: StudyStatistics) -> Section:
     rows: list[tuple[str, str]] = [
-        ("samples with results", f"{statistics.samples} of {info.samples}")
+        ("samples with results", f"{statistics.samples} of {info.samples}"),
+        ("digest of the study", info.digest),
     ]
-    if info.digest:
-        rows.append(("digest of the study", info.digest))
     if info.elapsed_s is not None:
         rows.append(("time", _duration(info.elapsed_s)))
-    rows += [(f"version of {name}", version) for name, version in info.versions.items()]
-    blocks: list[Block] = [
-        Table(caption="Origin", headings=("what", "value"), rows=tuple(rows), words=(1,))
-    ]
-    if info.study_text:
-        blocks.append(Listing(caption="Study file", text=info.study_text))
-    if info.config_text:
-        blocks.append(Listing(caption="Configuration", text=info.config_text))
-    return Section(key="origin", title="Files and versions", blocks=tuple(blocks))
+    return Section(
+        key="origin",
+        title="Files and versions",
+        blocks=(
+            Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,)),
+            Table(
+                caption="Files that were read",
+                headings=("file", "what it is", "SHA-256"),
+                rows=tuple((file.name, file.role, file.sha256) for file in info.files),
+                words=(1, 2),
+            ),
+            Table(
+                caption="Made with",
+                headings=("program", "version"),
+                rows=info.versions,
+                words=(1,),
+            ),
+            *(Listing(caption=caption, text=text) for caption, text in info.texts.items()),
+        ),
+    )
 
 
 def _duration(seconds: float) -> str:

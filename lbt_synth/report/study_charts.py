@@ -17,7 +17,7 @@ from lbt_synth.validation import FloatArray
 _HIGH = 40.0  # Strehl ratio [%]; an axis of curves that are all above it does not start at 0
 
 
-def distribution_chart(found: Sequence[Outcomes]) -> Chart:
+def distribution_chart(found: Sequence[Outcomes]) -> Chart | None:
     """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
     curves = []
     most = 1.0
@@ -30,8 +30,10 @@ def distribution_chart(found: Sequence[Outcomes]) -> Chart:
         # from nothing just below the first value
         x, y = np.concatenate((level[:1], level)), np.concatenate(([0.0], part))
         curves.append((look, each.controller, 100 * x, 100 * y))
-    top = max((float(x[-1]) for _, _, x, _ in curves), default=1.0)
-    low = 10.0 ** np.floor(np.log10(100 * most))
+    if not curves:
+        return None
+    top = max(float(x[-1]) for _, _, x, _ in curves)
+    low = min(10.0, 10.0 ** np.floor(np.log10(100 * most)))
     plain = [
         Curve(name=name, x=x, y=y, look=look, step=True, width=1.8) for look, name, x, y in curves
     ]
@@ -39,7 +41,7 @@ def distribution_chart(found: Sequence[Outcomes]) -> Chart:
         Curve(name=name, x=x[1:], y=y[1:], look=look, step=True, width=1.8)
         for look, name, x, y in curves
     ]
-    across = Axis(label="Strehl ratio", unit="%", low=0, high=min(100.0, 1.02 * top))
+    across = Axis(label="Strehl ratio", unit="%", low=0, high=min(100.0, max(1.02 * top, 1.0)))
     part_label = "samples at or below"
     return Chart(
         key="distribution",

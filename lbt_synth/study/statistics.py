@@ -148,6 +148,8 @@ def study_statistics(
     levels = [number(level, "levels", at_least=0, at_most=1) for level in levels]
     worst = integer(worst, "worst", at_least=0)
     size = len(column(columns, f"{controllers[0]}.stable"))
+    if not size:
+        raise ProblemError("the results must have at least one sample; got none.")
     found = [outcomes(columns, name, size) for name in controllers]
     values = {name: _finite(columns, name, size) for name in parameters}
     rows = _row_numbers(columns, size)

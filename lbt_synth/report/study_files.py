@@ -1,0 +1,80 @@
+"""The page of a study as files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.files import write_together
+from lbt_synth.pages import page_html, page_pdf
+from lbt_synth.report.designs_page import require_page_names
+from lbt_synth.report.study import study_page
+from lbt_synth.report.study_info import study_info
+from lbt_synth.study import Failure, Study, StudyStatistics, study_statistics
+
+
+def write_study_page(
+    study: Study,
+    columns: Mapping[str, Any],
+    path: str | os.PathLike[str],
+    *,
+    statistics: StudyStatistics | None = None,
+    failures: Sequence[Failure] = (),
+    elapsed_s: float | None = None,
+    pdf: str | os.PathLike[str] | None = None,
+) -> tuple[Path, ...]:
+    """Write the page of a study as one HTML file that opens offline, and as a PDF if wanted.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    columns : mapping of str to (n,) array_like
+        Its results, all or those that there are so far.
+    path : path-like
+        File to write, that ends in .html, in the directory of the results.
+    statistics : StudyStatistics, optional
+        Those of the columns, if they are known already.
+    failures : sequence of Failure, optional
+        What failed.
+    elapsed_s : float, optional
+        Time that the study took [s].
+    pdf : path-like, optional
+        File to write, that ends in .pdf.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The files; all of them are written, or none.
+
+    Raises
+    ------
+    ProblemError
+        If the columns are not those of the study.
+    OutputError
+        If a name ends in something else, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> study = lbt.load_study("examples/study.yaml")
+    >>> values = study.values(0, 2)
+    >>> columns = dict(zip(study.parameter_names, values.T))
+    >>> columns |= lbt.evaluate_samples(study, values, 0).columns
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = lbt.write_study_page(study, columns, pathlib.Path(folder) / "summary.html")
+    >>> files[0].name
+    'summary.html'
+    """
+    require_page_names(path, pdf, inputs=study.inputs)
+    if statistics is None:
+        names = [each.name for each in study.controllers]
+        statistics = study_statistics(columns, study.parameter_names, names)
+    info = study_info(study, directory=Path(path).parent, failures=failures, elapsed_s=elapsed_s)
+    page = study_page(info, statistics, columns)
+    contents: dict[str | os.PathLike[str], bytes] = {path: page_html(page)}
+    if pdf is not None:
+        contents[pdf] = page_pdf(page)
+    return write_together(contents)

@@ -1,0 +1,310 @@
+"""The page of a study: what it says, and what it must not depend on."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from plants import ROOT
+
+import lbt_synth as lbt
+from lbt_synth.pages import Cell, Listing, Notice, Paragraph, Table, page_html
+from lbt_synth.pages.interactive import interactive
+from lbt_synth.report.study import study_page
+from lbt_synth.report.study_charts import distribution_chart, loss_chart
+from lbt_synth.report.study_info import StudyInfo, study_info
+from lbt_synth.study.binning import binned_map, cumulative, histogram
+from lbt_synth.study.names import short_names
+from lbt_synth.study.outcomes import outcomes
+
+PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")
+
+
+def results(n=300, seed=0):
+    """Three controllers: one steady, one that low gains make unstable, one that fails at times."""
+    rng = np.random.default_rng(seed)
+    gain, delay = 0.4 + 0.7 * rng.random(n), 0.3 * rng.random(n)
+    wind = rng.choice([10.0, 20.0, 30.0], n)
+    strehls = {
+        "steady": 0.8 - 0.1 * delay - 0.002 * wind,
+        "sharp": 0.9 * gain / 1.1 - 0.5 * delay,
+        "frail": 0.7 - 0.2 * gain,
+    }
+    stable = {name: np.ones(n) for name in strehls}
+    stable["sharp"][gain < 0.5] = 0
+    stable["frail"][::50] = np.nan
+    columns = {
+        "row": np.arange(n),
+        "truth.sensor_gain": gain,
+        "error.delay_frames": delay,
+        "atmosphere.wind_speed_m_s": wind,
+        "fixed": np.full(n, 0.9),
+    }
+    for name, strehl in strehls.items():
+        there = stable[name] == 1
+        columns[f"{name}.stable"] = stable[name]
+        columns[f"{name}.strehl"] = np.where(there, strehl, np.nan)
+        columns[f"{name}.residual_nm"] = np.where(there, 100 * (1 - strehl), np.nan)
+    return columns
+
+
+CONTROLLERS = ("steady", "sharp", "frail")
+INFO = StudyInfo(
+    name="night.yaml",
+    samples=300,
+    sampling="points of a scrambled Sobol sequence, seed 1",
+    evaluation="each evaluated exactly",
+    parameters={"truth.sensor_gain": "uniform from 0.4 to 1.1"},
+    controllers={"steady": "kalman for the configuration"},
+    digests={"steady": "0123456789abcdef" * 4},
+    digest="fedcba98" * 8,
+    failures=tuple(
+        lbt.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
+        for row in range(0, 300, 20)
+    ),
+    files=(),
+    texts={"Study night.yaml": "samples: 300 # & <script>"},
+    versions=(("numpy", "2.4"),),
+    made=datetime(2026, 11, 21, tzinfo=UTC),
+    elapsed_s=75.0,
+    replay="lbt-synth study night.yaml -o out --replay {row}",
+)
+
+
+@pytest.fixture(scope="module")
+def page():
+    return page_of(results())
+
+
+def page_of(columns, controllers=CONTROLLERS, parameters=PARAMETERS, info=INFO):
+    statistics = lbt.study_statistics(columns, parameters, controllers)
+    return study_page(info, statistics, columns)
+
+
+def blocks(page, kind):
+    return [block for section in page.sections for block in section.blocks if type(block) is kind]
+
+
+def table(page, start):
+    return next(t for t in blocks(page, Table) if t.caption.startswith(start))
+
+
+def text(cell):
+    return cell.text if isinstance(cell, Cell) else cell
+
+
+def test_what_is_wrong_is_said_first(page):
+    first = page.sections[0].blocks
+    assert [type(block) for block in first[:3]] == [Notice, Notice, Paragraph]
+    unstable = int(np.sum(results()["sharp.stable"] == 0))
+    assert f"sharp in {unstable} of 300" in first[0].text
+    assert "frail 6" in first[1].text
+    assert all(block.tone == "bad" for block in first[:2])
+
+
+def test_a_study_that_is_not_complete_says_so():
+    columns = {name: values[:100] for name, values in results().items()}
+    first = page_of(columns).sections[0].blocks[0]
+    assert isinstance(first, Notice)
+    assert first.tone == "bad"
+    assert "100 of 300 samples" in first.text
+
+
+def test_a_study_in_which_all_is_well_says_so():
+    columns = {name: values for name, values in results().items() if not name.startswith("frail")}
+    first = page_of(columns, ("steady",)).sections[0].blocks[0]
+    assert (first.tone, "stable in every sample" in first.text) == ("good", True)
+
+
+def test_the_leader_is_named_by_each_measure(page):
+    columns = results()
+    words = next(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
+    steady = columns["steady.strehl"]
+    assert f"Highest mean Strehl ratio: steady, {100 * steady.mean():.1f} %" in words
+    low = 100 * np.percentile(steady, 5)
+    assert f"Highest 5th percentile, which 19 of 20 samples exceed: steady, {low:.1f} %" in words
+
+
+def test_failures_are_listed_and_counted(page):
+    found = table(page, "Evaluations that failed")
+    assert len(found.rows) == 10
+    assert found.caption.endswith("the first 10, and 5 more")
+    html = page_html(page).decode()
+    assert "&lt;b&gt;no&lt;/b&gt; design in row 20" in html
+    assert "<b>no</b>" not in html
+    assert "<script>" not in re.sub(r"<script[ >].*?</script>", "", html, flags=re.DOTALL)
+
+
+def test_worst_rows_come_with_the_command_that_replays_them(page):
+    rows = table(page, "Worst samples of sharp").rows
+    assert all(text(row[1]) == "unstable" for row in rows)
+    commands = next(b.text for b in blocks(page, Listing) if "replay" in b.caption).splitlines()
+    assert commands[1] == f"lbt-synth study night.yaml -o out --replay {text(rows[0][0])}"
+
+
+def test_names_are_short_and_explained_once(page):
+    first = {text(row[0]): text(row[1]) for row in table(page, "Parameters").rows}
+    assert first["sensor_gain"] == "truth.sensor_gain"
+    assert {text(row[0]) for row in table(page, "Variance").rows} >= {"sensor_gain", "delay_frames"}
+
+
+def test_every_section_has_content_and_every_chart_its_words(page):
+    assert [section.key for section in page.sections] == [
+        "summary", "samples", "controllers", "comparison", "dependence", "worst", "reading", "origin",
+    ]  # fmt: skip
+    keys = [chart.key for chart in page.charts]
+    assert keys == [
+        "distribution", "parameters", "loss", "sensitivity", "curves", "unstable", "map-1", "map-2", "map-3",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("n", [1, 21])
+def test_few_samples_make_a_page_all_the_same(n):
+    columns = {name: values[:n] for name, values in results().items()}
+    html = page_html(page_of(columns))
+    assert b"nan" not in re.sub(rb"<script[ >].*?</script>", b"", html, flags=re.DOTALL)
+
+
+def test_nothing_evaluated_makes_a_page_without_figures():
+    columns = results(30)
+    for name in columns:
+        if "." in name and name.split(".")[0] in CONTROLLERS:
+            columns[name] = np.full(30, np.nan)
+    page = page_of(columns)
+    assert page.sections[0].blocks[-2].text == "No controller was evaluated on any sample."
+    assert page_html(page)
+
+
+def test_no_sample_yet_is_refused():
+    columns = {name: values[:0] for name, values in results().items()}
+    with pytest.raises(lbt.ProblemError, match="at least one sample; got none"):
+        page_of(columns)
+
+
+def test_columns_of_other_results_are_refused():
+    statistics = lbt.study_statistics(results(), PARAMETERS, CONTROLLERS)
+    with pytest.raises(lbt.ProblemError, match="300 samples of the statistics; got 200"):
+        study_page(INFO, statistics, results(200))
+
+
+def test_the_size_does_not_grow_with_the_samples():
+    small, large = (
+        len(json.dumps(interactive(page_of(results(n)).charts).embedding)) for n in (4000, 200_000)
+    )
+    assert small < large < 1.4 * small
+    assert large < 1e6
+
+
+# --------------------------------------------------------------------------
+# Binned data
+# --------------------------------------------------------------------------
+@pytest.mark.parametrize("n", [1, 5, 400, 401, 50_000])
+def test_points_of_a_distribution_lie_on_it(n):
+    values = np.round(np.random.default_rng(n).normal(size=n), 2)
+    level, part = cumulative(values)
+    assert len(level) <= 500
+    assert np.all(np.diff(level) > 0)
+    expected = [np.mean(values <= each) for each in level]
+    np.testing.assert_allclose(part, expected)
+    assert part[-1] == 1
+    assert level[0] == values.min()
+
+
+def test_a_histogram_has_every_sample():
+    values = np.random.default_rng(0).normal(size=1000)
+    edges, part = histogram(values)
+    assert part.sum() == pytest.approx(1)
+    assert len(edges) == len(part) + 1
+
+
+def test_a_map_has_the_mean_of_each_cell():
+    rng = np.random.default_rng(1)
+    x, y = rng.random(4000), rng.choice([1.0, 2.0, 5.0], 4000)
+    result = x * y
+    found = binned_map(x, y, result)
+    np.testing.assert_array_equal(found.y, [1, 2, 5])
+    assert found.samples.sum() == 4000
+    inner = slice(1, -1)  # the outermost cells hold what is beyond
+    np.testing.assert_allclose(
+        found.mean[:, inner], np.outer(found.y, found.x)[:, inner], atol=0.05
+    )
+    np.testing.assert_allclose(np.nansum(found.mean * found.samples), result.sum())
+
+
+def test_charts_show_the_numbers_of_the_columns():
+    columns = results()
+    found = [outcomes(columns, name) for name in CONTROLLERS]
+    curves = {c.name: c for c in distribution_chart(found).panels[0].marks if hasattr(c, "x")}
+    sharp = found[1].strehl
+    assert curves["sharp"].y[1] == pytest.approx(100 * np.mean(sharp == 0))
+    loss = {c.name: c for c in loss_chart(found).panels[0].marks}
+    whole = found[2].evaluated
+    best = np.max([each.strehl[whole] for each in found], axis=0)
+    at = np.searchsorted(loss["sharp"].x, 10, side="right") - 1
+    expected = 100 * np.mean(100 * (best - sharp[whole]) > loss["sharp"].x[at] + 1e-9)
+    assert loss["sharp"].y[at] == pytest.approx(expected)
+
+
+def test_short_names_are_different():
+    names = ["a.b.c", "d.b.c", "d.e", "e", "f.g"]
+    assert list(short_names(names).values()) == ["a.b.c", "d.b.c", "d.e", "e", "g"]
+
+
+# --------------------------------------------------------------------------
+# A real study
+# --------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def study():
+    return lbt.load_study(ROOT / "examples" / "study.yaml")
+
+
+def test_a_page_from_a_study_file(study, tmp_path):
+    values = study.values(0, 3)
+    columns = dict(zip(study.parameter_names, values.T, strict=True))
+    columns |= lbt.evaluate_samples(study, values, 0).columns
+    folder = tmp_path / "a folder"
+    folder.mkdir()
+    files = lbt.write_study_page(
+        study, columns, folder / "summary.html", pdf=folder / "summary.pdf"
+    )
+    assert [file.name for file in files] == ["summary.html", "summary.pdf"]
+    assert files[1].read_bytes().startswith(b"%PDF")
+    html = files[0].read_text(encoding="utf-8")
+    for words in (
+        "3 of 4096 samples",
+        "normal, 20 with deviation 0.5, from 18, to 22",
+        "hinf for the configuration",
+        study.digest,
+        "samples: 4096",
+        "diameter_m: 8.22",
+        "a folder&#39; --replay 0",
+    ):
+        assert words in html, words
+
+
+def test_a_page_must_have_the_name_of_one(study, tmp_path):
+    with pytest.raises(lbt.OutputError, match=r"must end in \.html"):
+        lbt.write_study_page(study, {}, tmp_path / "summary.txt")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_digests_are_of_the_matrices(study):
+    first = study_info(study, directory="out")
+    other = replace(study, controllers=study.controllers[::-1])
+    assert study_info(other, directory="out").digests == first.digests
+    assert len(set(first.digests.values())) == 3
+    assert first.replay.endswith("study.yaml -o out --replay {row}")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("a{b}.yaml", "'a{b}.yaml'"), ("my night.yaml", "'my night.yaml'")]
+)
+def test_names_of_files_cannot_break_the_command(page, name, words):
+    info = replace(INFO, replay=f"lbt-synth study {words} --replay {{row}}")
+    found = page_of(results(), info=info)
+    commands = next(b.text for b in blocks(found, Listing) if "replay" in b.caption)
+    assert f"lbt-synth study {words} --replay " in commands
