@@ -171,6 +171,10 @@ from .replay import least_squares_predictor as least_squares_predictor
 from .replay import prediction_against_data as prediction_against_data
 from .replay import replayed_residual as replayed_residual
 from .replay import split_halves as split_halves
+from .report import DesignAssessment as DesignAssessment
+from .report import DesignReport as DesignReport
+from .report import design_report as design_report
+from .report import write_report as write_report
 from .report import write_study_page as write_study_page
 from .riccati import Attempt as Attempt
 from .riccati import DareSolution as DareSolution

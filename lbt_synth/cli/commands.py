@@ -16,6 +16,7 @@ from lbt_synth.cli.mirror_command import mirror
 from lbt_synth.cli.modal_command import modal
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.paper_command import paper
+from lbt_synth.cli.report_command import report_command
 from lbt_synth.cli.robustness_command import robustness
 from lbt_synth.cli.telemetry_command import telemetry
 
@@ -30,6 +31,7 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "mirror": mirror,
     "modal": modal,
     "paper": paper,
+    "report": report_command,
     "robustness": robustness,
     "show": show,
     "sigma": sigma,

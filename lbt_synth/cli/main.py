@@ -250,6 +250,15 @@ def build_parser() -> argparse.ArgumentParser:
         help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
     )
 
+    report = command("report", "Write a page about designs in the loop of a configuration")
+    report.add_argument("config", help=config_help)
+    report.add_argument("gains", nargs="+", metavar="gain", help=gain_help)
+    report.add_argument("--title", help="heading of the page (default: names the configuration)")
+    report.add_argument("--pdf", metavar="FILE", help="write the same as a PDF, too (.pdf)")
+    report.add_argument(
+        "-o", "--output", required=True, help="page to write, one file that opens offline (.html)"
+    )
+
     end_to_end = command("e2e", "Close the loop end to end: pyramid, mirror and moving air")
     table = command("e2e-table", "Tables II and III of Agapito et al. 2008 end to end")
     for sub in (end_to_end, table):

@@ -15,7 +15,7 @@ import numpy as np
 
 from lbt_synth.pages.charts import Area, Axis, Bars, Chart, Curve, Map, Mark, Panel, Rule, Span
 from lbt_synth.pages.looks import GREY, PALE, colour, dashes, marker_name
-from lbt_synth.pages.scales import ends_of, log_tick_text, log_ticks, shortened
+from lbt_synth.pages.scales import ends_of, log_tick_texts, log_ticks, shortened
 from lbt_synth.pages.static import bar_places, blank_cells, level_colour, levels_within
 from lbt_synth.plotting.cells import cell_edges
 from lbt_synth.validation import FloatArray
@@ -40,8 +40,7 @@ class Interactive:
     Attributes
     ----------
     embedding : dict
-        ``documents``, ``items`` for ``Bokeh.embed.embed_items``, and ``zooms``, the tools that
-        are switched on where there is a mouse.
+        ``documents`` and ``items`` for ``Bokeh.embed.embed_items``.
     places : dict of str to tuple of str
         For each chart, the identifiers of the elements that its panels are drawn in.
     lines : dict of str to dict of str to tuple of str
@@ -82,17 +81,15 @@ def interactive(charts: Sequence[Chart]) -> Interactive:
     roots: dict[str, str] = {}
     places: dict[str, tuple[str, ...]] = {}
     lines: dict[str, dict[str, tuple[str, ...]]] = {}
-    zooms: list[str] = []
     for chart in charts:
         named: dict[str, list[str]] = {}
         shared: dict[Any, Any] = {}
         elements = []
         for i, panel in enumerate(chart.panels):
-            figure, zoom = _figure(panel, shared, named)
+            figure = _figure(panel, shared, named)
             document.add_root(figure)
             elements.append(f"{chart.key}_panel-{i + 1}")
             roots[figure.id] = elements[-1]
-            zooms.append(zoom.id)
         places[chart.key] = tuple(elements)
         lines[chart.key] = {name: tuple(ids) for name, ids in named.items()}
     data = document.to_json(deferred=False)
@@ -108,7 +105,6 @@ def interactive(charts: Sequence[Chart]) -> Interactive:
                     "root_ids": [numbers[i] for i in roots],
                 }
             ],
-            "zooms": [numbers[i] for i in zooms],
         },
         places=places,
         lines={
@@ -133,8 +129,8 @@ def _renumbered(value: Any, numbers: dict[str, str]) -> Any:
     return value
 
 
-def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -> tuple[Any, Any]:
-    """Figure of a panel and its tool for zooming, and note whom each name stands for."""
+def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -> Any:
+    """Figure of a panel, and note whom each name stands for."""
     from bokeh.models import BoxZoomTool, InlineStyleSheet, PanTool, ResetTool, WheelZoomTool
     from bokeh.plotting import figure as new_figure
 
@@ -155,7 +151,7 @@ def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -
         match_aspect=panel.equal,
     )
     figure.toolbar.logo = None
-    figure.toolbar.active_drag = None
+    figure.toolbar.active_drag = zoom
     figure.toolbar.active_scroll = None
     figure.grid.grid_line_color = "#e0e0e0"
     figure.outline_line_color = None
@@ -175,7 +171,7 @@ def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -
         figure.yaxis.axis_label = None
         figure.ygrid.grid_line_color = None
     _hover_curves(figure, panel)
-    return figure, zoom
+    return figure
 
 
 def _range(ends: tuple[float, float], panel: Panel) -> Any:
@@ -214,8 +210,9 @@ def _style_axis(axis: Any, own: Axis, ends: tuple[float, float]) -> None:
 
         # those of the whole scale, and finer ones for who zooms in
         fine = [t for t in _fine_ticks(ends) if t not in log_ticks(*ends)]
-        axis.ticker = FixedTicker(ticks=log_ticks(*ends), minor_ticks=fine)
-        axis.major_label_overrides = {t: log_tick_text(t) for t in log_ticks(*ends)}
+        ticks = log_ticks(*ends)
+        axis.ticker = FixedTicker(ticks=ticks, minor_ticks=fine)
+        axis.major_label_overrides = dict(zip(ticks, log_tick_texts(ticks), strict=True))
 
 
 def _fine_ticks(ends: tuple[float, float]) -> list[float]:

@@ -4,12 +4,15 @@
   const root = document.documentElement;
   try {
     const charts = JSON.parse(document.getElementById("_charts").textContent);
+    if (!window.matchMedia("(pointer: fine)").matches) {
+      // a finger scrolls the page: it zooms only after a tap on that tool
+      for (const plot of charts.documents.page.roots) {
+        plot.attributes.toolbar.attributes.active_drag = null;
+      }
+    }
     root.classList.add("live"); // places must have a size before they are drawn in
     await Bokeh.embed.embed_items(charts.documents, charts.items);
     const page = Bokeh.documents[0];
-    if (window.matchMedia("(pointer: fine)").matches) {
-      for (const id of charts.zooms) page.get_model_by_id(id).active = true;
-    }
     for (const button of document.querySelectorAll(".legend button")) {
       button.addEventListener("click", () => {
         const shown = button.getAttribute("aria-pressed") !== "true";

@@ -16,6 +16,7 @@ WIDTH, HEIGHT = 8.27, 11.69  # A4 [inch]
 _SIDE, _TOP, _BOTTOM = 0.635, 0.6, 0.65
 INSIDE = WIDTH - 2 * _SIDE
 _COLUMNS = 6  # of a table, after the first one
+_TOGETHER = 12  # lines of a paragraph or rows of a table that are not torn apart
 _PAD = 0.05  # around the text of a cell
 _INKS = {"bad": "#a40e26", "good": "#116329", "note": "#6a4b00", "plain": "#1b1f24"}
 _TINTS = {"bad": "#fdecee", "good": "#e9f5ec", "note": "#fff6dc"}
@@ -86,7 +87,11 @@ class _Sheets:
     def section(self, section: Section, *, first: bool) -> None:
         """Set a section; its heading is not left alone at the foot of a sheet."""
         head = Style(size=14, weight="bold")
-        opening = height_of_block(section.blocks[0]) if section.blocks else 0.0
+        opening = 0.0
+        for block in section.blocks:  # up to the first thing that is no text
+            opening += height_of_block(block)
+            if not isinstance(block, Paragraph | Notice):
+                break
         room = 0.45 + min(opening, HEIGHT - _TOP - _BOTTOM - 0.5)
         if not first and self.y - room < _BOTTOM:
             self.y = 0.0
@@ -109,8 +114,11 @@ class _Sheets:
             self.chart(block)
 
     def words(self, text: str, style: Style, *, after: float) -> None:
-        """Lines of a text."""
-        for line in wrapped(text, style, INSIDE):
+        """Lines of a text; a short one is kept together."""
+        lines = wrapped(text, style, INSIDE)
+        if len(lines) <= _TOGETHER and self.y - len(lines) * style.leading < _BOTTOM:
+            self.y = 0.0
+        for line in lines:
             top = self.take(style.leading)
             self.draw(partial(_line, top=top, left=_SIDE, text=line, style=style))
         self.y -= after
@@ -161,7 +169,8 @@ class _Sheets:
         widths = column_widths([head, *rows])
         top_row = _Row(head, widths, table.words, heading=True)
         body = [_Row(cells, widths, table.words) for cells in rows]
-        start = top_row.height + (body[0].height if body else 0.0)
+        kept = body if len(body) <= _TOGETHER else body[:1]
+        start = top_row.height + sum(row.height for row in kept)
         if self.y - start - BOLD.leading - 0.1 < _BOTTOM:
             self.y = 0.0
         self.words(table.caption, BOLD, after=0.03)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -77,10 +77,14 @@ def log_ticks(low: float, high: float) -> list[float]:
     return [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
 
 
-def log_tick_text(value: float) -> str:
-    """Return a tick of a logarithmic scale as a text: 0.01, 5, 200, 10⁻⁶."""
-    if 1e-3 * 0.999 <= value <= 1e4 * 1.001:
-        return f"{value:g}"
+def log_tick_texts(ticks: Sequence[float]) -> list[str]:
+    """Return ticks of a logarithmic scale as texts: 0.01, 5, 200; or all as powers: 10⁻⁶, 2·10⁵."""
+    if all(1e-3 * 0.999 <= tick <= 1e4 * 1.001 for tick in ticks):
+        return [f"{tick:g}" for tick in ticks]
+    return [_power_text(tick) for tick in ticks]
+
+
+def _power_text(value: float) -> str:
     power = math.floor(math.log10(value) + 1e-9)
     factor = round(value / 10.0**power)
     raised = "10" + str(power).translate(_RAISED)

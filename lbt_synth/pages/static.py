@@ -17,7 +17,7 @@ import numpy as np
 
 from lbt_synth.pages.charts import Area, Bars, Chart, Curve, Map, Mark, Panel, Rule, Span, legend_of
 from lbt_synth.pages.looks import GREY, PALE, colour, dashes, marker_name
-from lbt_synth.pages.scales import ends_of, log_tick_text, log_ticks, shortened
+from lbt_synth.pages.scales import ends_of, log_tick_texts, log_ticks, shortened
 from lbt_synth.plotting.cells import bands, cell_edges
 from lbt_synth.plotting.style import house_style
 from lbt_synth.validation import FloatArray
@@ -267,7 +267,7 @@ def _scales(axes: Any, panel: Panel) -> None:
         if own.log:
             getattr(axes, f"set_{end}scale")("log")
             ticks = log_ticks(low, high)
-            scale.set_ticks(ticks, [log_tick_text(tick) for tick in ticks])
+            scale.set_ticks(ticks, log_tick_texts(ticks))
             scale.set_ticks([], minor=True)
         getattr(axes, f"set_{end}lim")(low, high)
         getattr(axes, f"set_{end}label")(own.text)

@@ -128,9 +128,7 @@ def design_report(
     """
     instance(config, Config)
     if not 1 <= len(designs) <= _MOST_DESIGNS:
-        raise ProblemError(
-            f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}."
-        )
+        raise ProblemError(f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}.")
     for name, design in designs.items():
         instance(design, Design)
         require_fitting(name, design, config.hardware)
@@ -196,7 +194,7 @@ def design_report(
 
 
 def steps_of(designs: int) -> int:
-    """Steps that a report of so many designs counts, at most."""
+    """Return how many steps a report of so many designs counts, at most."""
     return 2 * designs + 1
 
 

@@ -183,7 +183,6 @@ def assessed(
         strehl_map(carrier, truth, imaging, errors_hz=errors_hz, sensor_gains=gains)
         for gains in ([truth.sensor_gain], np.asarray(sensor_gains) / assumed_gain)
     )
-    estimates = isinstance(design, EstimatorDesign)
     return DesignAssessment(
         name=name,
         design=design,
@@ -205,7 +204,7 @@ def assessed(
         certificate_error=complaint,
         cost=frame_cost(design),
         error_norms=largest_singular_values(design.error_system(), frequency_hz)
-        if estimates
+        if isinstance(design, EstimatorDesign)
         else None,
         rejection=_norms(loop, frequency_hz, noise=False),
         noise_transfer=_norms(loop, frequency_hz, noise=True),
@@ -271,7 +270,7 @@ def stable_intervals(
 
 
 def _recertified(design: Design) -> tuple[tuple[Check, ...], str]:
-    """Checks of the certificate computed anew, or why that failed."""
+    """Return the checks of the certificate computed anew, or why that failed."""
     try:
         return design.recertified().checks, ""
     except (LbtSynthError, ArithmeticError) as error:

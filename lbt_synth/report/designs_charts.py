@@ -112,6 +112,7 @@ def _over_error(report: DesignReport) -> Chart:
         f"{signed_text(float(one.curve.errors_hz[int(np.argmin(one.curve.strehl[0, 0]))]))} Hz"
         for one in report.stable
     ]
+    worst = 100 * min([float(np.min(one.curve.strehl)) for one in report.stable], default=0.0)
     return Chart(
         key="robustness",
         title="Strehl ratio over the frequency error",
@@ -122,7 +123,7 @@ def _over_error(report: DesignReport) -> Chart:
         panels=(
             Panel(
                 x=_ERROR,
-                y=Axis(label=_STREHL, unit="%", low=0.0),
+                y=Axis(label=_STREHL, unit="%", low=max(0.0, 10 * np.floor((worst - 5) / 10))),
                 marks=tuple(
                     _curve(
                         report,
@@ -153,10 +154,10 @@ def _residuals(report: DesignReport) -> Chart:
     for one, curve in zip(report.assessments, study.residual_nm, strict=True):
         values = curve[::-1] if one.stable else None
         marks.append(_curve(report, one, -study.shift_hz[::-1] + 0.0, values))
-    limits = [f"{rule.name} {fixed_text(rule.at, 1)} nm" for rule in marks if isinstance(rule, Rule)]
-    worst = [
-        f"{row.design} {fixed_text(row.worst_nm, 1)} nm" for row in study.rows if row.stable
+    limits = [
+        f"{rule.name} {fixed_text(rule.at, 1)} nm" for rule in marks if isinstance(rule, Rule)
     ]
+    worst = [f"{row.design} {fixed_text(row.worst_nm, 1)} nm" for row in study.rows if row.stable]
     return Chart(
         key="limits",
         title="Residual over the frequency error, beside the limits",
@@ -210,7 +211,7 @@ def _maps(report: DesignReport) -> list[Chart]:
                 "unstable there.",
                 alt=f"One map a design. {' '.join(words)}",
                 panels=tuple(panels),
-                columns=2 if len(panels) > 1 else 1,
+                columns=_columns(len(panels)),
             )
         )
     )
@@ -259,11 +260,13 @@ def dynamics_charts(report: DesignReport) -> list[Chart]:
     circle = Curve(
         name="unit circle", x=np.cos(turn), y=np.sin(turn), look=None, width=1.0, hover=False
     )
+    poles = [np.append(one.loop_poles, one.controller_poles) for one in report.assessments]
+    reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for values in poles))
     panels = [
         Panel(
             title=one.name if one.stable else f"{one.name}: unstable",
-            x=Axis(label="real part", unit="-"),
-            y=Axis(label="imaginary part", unit="-"),
+            x=Axis(label="real part", unit="-", low=-reach, high=reach),
+            y=Axis(label="imaginary part", unit="-", low=-reach, high=reach),
             equal=True,
             marks=(
                 circle,
@@ -292,7 +295,7 @@ def dynamics_charts(report: DesignReport) -> list[Chart]:
                 alt="One complex plane a design, with the unit circle. Largest modulus of the "
                 f"closed loop's poles: {listing_text(radii)}.",
                 panels=tuple(panels),
-                columns=2 if len(panels) > 1 else 1,
+                columns=_columns(len(panels)),
             )
         )
     )
@@ -338,25 +341,31 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
     if not rows:
         return []
     duration = fixed_text(float(rows[0][1].time_s[-1]), 2)
+    largest = 1.05 * max(float(np.max(np.abs(run.series_nm[:, 0]))) for _, run in rows)
     series = Chart(
         key="series",
         title="Simulated residual",
         caption=f"First {duration} s of the first run, first axis; the same turbulence, vibrations "
         "and noise for all designs.",
-        alt="One curve a design over time. Residuals over all runs: "
+        alt="One panel a design, all of the same scale, over time. Residuals over all runs: "
         + listing_text([f"{one.name} {fixed_text(run.residual_nm, 1)} nm rms" for one, run in rows])
         + ".",
-        panels=(
+        panels=tuple(
             Panel(
+                title=one.name,
                 x=Axis(label="time", unit="s"),
-                y=Axis(label="residual", unit="nm"),
-                marks=tuple(
-                    _curve(report, one, run.time_s, run.series_nm[:, 0], width=1.1)
-                    for one, run in rows
+                y=Axis(label="residual", unit="nm", low=-largest, high=largest),
+                marks=(
+                    Curve(
+                        name="", x=run.time_s, y=run.series_nm[:, 0], look=_look(report, one),
+                        width=0.9, dashed=False,
+                    ),
                 ),
-            ),
+                height_in=0.95,
+            )
+            for one, run in rows
         ),
-    )
+    )  # fmt: skip
     panels = tuple(
         Panel(
             title=one.name,
@@ -382,9 +391,14 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
         alt="One panel a design: the spectrum before the correction, and that of the residual "
         "twice, simulated and exact, which lie on each other.",
         panels=panels,
-        columns=2 if len(panels) > 1 else 1,
+        columns=_columns(len(panels)),
     )
-    return [series, *_in_sheets(spectra)]
+    return [*_in_sheets(series), *_in_sheets(spectra)]
+
+
+def _columns(panels: int) -> int:
+    """Panels side by side: three, but two and two of four."""
+    return 2 if panels == 4 else min(panels, 3)
 
 
 def _in_sheets(chart: Chart) -> Iterator[Chart]:
@@ -415,13 +429,16 @@ def _curve(
     y: FloatArray | None,
     *,
     step: bool = False,
-    width: float = 1.6,
 ) -> Curve:
     """Curve of a design in its own look; without values it is in the legend as unstable."""
-    look = [other.name for other in report.assessments].index(one.name)
+    look = _look(report, one)
     if y is None:
         return Curve(name=f"{one.name}: unstable", x=np.zeros(0), y=np.zeros(0), look=look)
-    return Curve(name=one.name, x=x, y=y, look=look, step=step, width=width)
+    return Curve(name=one.name, x=x, y=y, look=look, step=step)
+
+
+def _look(report: DesignReport, one: DesignAssessment) -> int:
+    return [other.name for other in report.assessments].index(one.name)
 
 
 def _largest(report: DesignReport, name: str, words: str) -> str:

@@ -92,13 +92,13 @@ def require_page_names(
     OutputError
         Before any work is done.
     """
-    given = [(path, (".html", ".htm"))]
+    given: list[tuple[str | os.PathLike[str], str]] = [(path, ".html")]
     if pdf is not None:
-        given.append((pdf, (".pdf",)))
-    for name, endings in given:
+        given.append((pdf, ".pdf"))
+    for name, ending in given:
         target = Path(name)
-        if target.suffix.lower() not in endings:
-            raise OutputError(f"a page must end in {endings[0]}; got {target.name!r}.", path=target)
+        if target.suffix.lower() != ending:
+            raise OutputError(f"a page must end in {ending}; got {target.name!r}.", path=target)
     require_writable(*(name for name, _ in given), inputs=inputs)
 
 

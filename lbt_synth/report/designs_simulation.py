@@ -18,7 +18,7 @@ from lbt_synth.validation import FloatArray, frozen
 STEP_NM = 100.0
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
 _EXCERPT = 400  # frames that are drawn
-_STEP_FRAMES = (80, 400)
+_STEP_FRAMES = 120
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,18 +131,12 @@ def common_settling(designs: list[Design], hardware: LoopHardware, truth: Truth,
 
 
 def step_response(loop: ClosedLoop) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times [s], residual and first command after a step on the first axis [nm].
-
-    The time is that in which the slowest pole decays to 2 %, within 80 and 400 frames.
-    """
-    least, most = _STEP_FRAMES
-    decay = np.log(0.02) / np.log(max(loop.spectral_radius, 1e-6))
-    frames = int(np.clip(np.ceil(decay), least, most))
+    """Return times [s], residual and first command after a step on the first axis [nm]."""
     n = loop.hardware.modes
-    inputs = np.zeros((frames, n + loop.hardware.n_measurements))
+    inputs = np.zeros((_STEP_FRAMES, n + loop.hardware.n_measurements))
     inputs[:, 0] = STEP_NM
     outputs = filter_series(loop.system, inputs)
-    time_s = np.arange(frames) / loop.hardware.frame_rate_hz
+    time_s = np.arange(_STEP_FRAMES) / loop.hardware.frame_rate_hz
     return frozen(time_s), frozen(outputs[:, 0]), frozen(outputs[:, n])
 
 

@@ -10,10 +10,9 @@ from lbt_synth.distance import LimitRow
 from lbt_synth.pages import Cell, Table
 from lbt_synth.report.designs import DesignReport
 from lbt_synth.report.designs_assessment import DesignAssessment
-from lbt_synth.report.words import fixed_text, interval_text, number_text
+from lbt_synth.report.words import DASH, MINUS, fixed_text, interval_text, number_text
 
 Value = Callable[[DesignAssessment, LimitRow], str | Cell]
-_NONE = "–"
 
 
 def summary_table(report: DesignReport) -> Table:
@@ -79,16 +78,18 @@ def summary_table(report: DesignReport) -> Table:
 
 
 def certificate_table(one: DesignAssessment) -> Table:
-    """Checks of one design."""
+    """Return the checks of one design."""
     return Table(
         caption=f"Certificate of {one.name}",
         headings=("check", "value", "must stay below", "result", "how it was measured"),
         rows=tuple(
             (
                 check.name,
-                number_text(check.value, 6),
-                number_text(check.limit, 6) if not 0.999 < check.limit < 1 else "1 − 1e−9",
-                Cell(text="passed", tone="good") if check.passed else Cell(text="FAILED", tone="bad"),
+                _measured(check.value),
+                _measured(check.limit) if not 0.999 < check.limit < 1 else f"1 {MINUS} 1e{MINUS}9",
+                Cell(text="passed", tone="good")
+                if check.passed
+                else Cell(text="FAILED", tone="bad"),
                 check.method,
             )
             for check in one.checks
@@ -117,6 +118,11 @@ def versions_table(report: DesignReport) -> Table:
     )
 
 
+def _measured(value: float) -> str:
+    """Return six digits of a number, three of one that is all but 0."""
+    return number_text(value, 6 if abs(value) >= 1e-4 else 3)
+
+
 def _certificate(one: DesignAssessment) -> Cell:
     if one.certified:
         return Cell(text=f"passed, {len(one.checks)} checks", tone="good")
@@ -130,13 +136,13 @@ def _stable(one: DesignAssessment) -> Cell:
 
 
 def _part(one: DesignAssessment, name: str) -> str:
-    return _NONE if one.budget is None else fixed_text(getattr(one.budget, name), 1)
+    return DASH if one.budget is None else fixed_text(getattr(one.budget, name), 1)
 
 
 def _simulated(report: DesignReport, one: DesignAssessment) -> str:
     run = report.simulations.get(one.name)
     if run is None:
-        return _NONE
+        return DASH
     scatter = "" if np.isnan(run.scatter) else f" ± {fixed_text(100 * run.scatter, 2)}"
     return f"{fixed_text(100 * run.strehl, 2)}{scatter}"
 
@@ -146,12 +152,12 @@ def _worst(one: DesignAssessment) -> float:
 
 
 def _margin(one: DesignAssessment, name: str, digits: int) -> str:
-    return _NONE if one.margins is None else number_text(getattr(one.margins, name), digits)
+    return DASH if one.margins is None else number_text(getattr(one.margins, name), digits)
 
 
 def _gain_margin(one: DesignAssessment) -> str:
     if one.margins is None:
-        return _NONE
+        return DASH
     return interval_text(one.margins.gain_low, one.margins.gain_high, 3)
 
 

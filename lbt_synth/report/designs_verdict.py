@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,10 @@ import numpy as np
 from lbt_synth.report.designs import DesignReport
 from lbt_synth.report.designs_assessment import DesignAssessment
 from lbt_synth.report.words import (
+    NO_BREAK,
     fixed_text,
     interval_text,
     listing_text,
-    number_text,
     signed_text,
 )
 
@@ -66,39 +67,26 @@ def verdict(report: DesignReport) -> str:
     unstable = [one.name for one in report.assessments if not one.stable]
     if unstable:
         verb = "is" if len(unstable) == 1 else "are"
-        sentences.append(f"{_upper(listing_text(unstable))} {verb} UNSTABLE in this loop.")
+        sentences.append(f"{listing_text(unstable)} {verb} UNSTABLE in this loop.")
     sentences.append(_certificates(report))
-    return " ".join(sentences)
-
-
-def _upper(text: str) -> str:
-    """Return a text as the beginning of a sentence; names stay as they are."""
-    return text
+    # a number stays in one line with its unit
+    return re.sub(r"(?<=\d) (?=%|nm|Hz)", NO_BREAK, " ".join(sentences))
 
 
 def _least(report: DesignReport) -> str:
     stable = report.stable
     best = min(stable, key=lambda one: one.residual_nm)
-    limit = report.limits.limit
-    beside = ""
-    if limit is not None and limit.rms_nm > 0:
-        ratio = best.residual_nm / limit.rms_nm
-        beside = (
-            f"; no linear controller leaves less than {fixed_text(limit.rms_nm, 1)} nm, "
-            f"1/{number_text(ratio, 3)} of that"
-            if ratio > 1.005
-            else ", the least of any linear controller"
-        )
-    among = f"Of {len(stable)} stable designs, " if len(stable) > 1 else ""
-    return (
-        f"{among}{best.name} leaves {'the least, ' if len(stable) > 1 else ''}"
-        f"{fixed_text(best.residual_nm, 1)} nm rms (Strehl ratio {fixed_text(100 * best.strehl, 1)} "
-        f"%), if the vibrations are where the configuration has them{beside}."
-        if report.config.truth.vibrations
-        else f"{among}{best.name} leaves {'the least, ' if len(stable) > 1 else ''}"
-        f"{fixed_text(best.residual_nm, 1)} nm rms (Strehl ratio {fixed_text(100 * best.strehl, 1)} "
-        f"%){beside}."
+    several = len(stable) > 1
+    where = " if the vibrations are where the configuration has them"
+    sentence = (
+        f"{f'Of {len(stable)} stable designs, ' if several else ''}{best.name} leaves "
+        f"{'the least, ' if several else ''}{fixed_text(best.residual_nm, 1)} nm rms (Strehl ratio "
+        f"{fixed_text(100 * best.strehl, 1)} %){where if report.config.truth.vibrations else ''}"
     )
+    limit = report.limits.limit
+    if limit is None or limit.rms_nm <= 0:
+        return f"{sentence}."
+    return f"{sentence}; no linear controller leaves less than {fixed_text(limit.rms_nm, 1)} nm."
 
 
 def _tolerance(report: DesignReport) -> list[str]:

@@ -5,29 +5,35 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+MINUS = "\u2212"  # as long as a plus
+DASH = "\u2013"  # where there is no number
+NO_BREAK = "\u00a0"
+
 
 def number_text(value: float, digits: int = 4) -> str:
     """Return a number with so many significant digits: 27.7, 0.4512, ∞, –."""
     if math.isnan(value):
-        return "–"
+        return DASH
     if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
+        return "∞" if value > 0 else f"{MINUS}∞"
     if value != 0 and not 1e-4 <= abs(value) < 1e7:
-        mantissa, power = f"{value:.{max(digits - 2, 0)}e}".split("e")
-        return f"{mantissa}e{int(power)}".replace("-", "−")
+        mantissa, power = f"{value:.{max(digits - 1, 0)}e}".split("e")
+        if "." in mantissa:
+            mantissa = mantissa.rstrip("0").rstrip(".")
+        return f"{mantissa}e{int(power)}".replace("-", MINUS)
     text = f"{value:.{digits}g}"
     if "e" in text:
         text = f"{value:.0f}"
-    return text.replace("-", "−")
+    return text.replace("-", MINUS)
 
 
 def fixed_text(value: float, decimals: int) -> str:
     """Return a number with so many decimals, a dash where there is none."""
     if math.isnan(value):
-        return "–"
+        return DASH
     if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
-    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−")
+        return "∞" if value > 0 else f"{MINUS}∞"
+    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", MINUS)
 
 
 def signed_text(value: float, digits: int = 4) -> str:
