@@ -196,9 +196,13 @@ from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace
 from .study import BatchResult as BatchResult
 from .study import Failure as Failure
+from .study import Replay as Replay
 from .study import Study as Study
+from .study import StudyRun as StudyRun
 from .study import evaluate_samples as evaluate_samples
 from .study import load_study as load_study
+from .study import replay_row as replay_row
+from .study import run_study as run_study
 from .sweep import RobustnessRow as RobustnessRow
 from .sweep import frequency_robustness as frequency_robustness
 from .telemetry import Telemetry as Telemetry

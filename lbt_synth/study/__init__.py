@@ -2,15 +2,21 @@
 
 from lbt_synth.study.load import load_study
 from lbt_synth.study.point import evaluate_samples
+from lbt_synth.study.replay import Replay, replay_row
 from lbt_synth.study.result import BatchResult, Failure
+from lbt_synth.study.run import StudyRun, run_study
 from lbt_synth.study.study import Parameter, Study, StudyController
 
 __all__ = [
     "BatchResult",
     "Failure",
     "Parameter",
+    "Replay",
     "Study",
     "StudyController",
+    "StudyRun",
     "evaluate_samples",
     "load_study",
+    "replay_row",
+    "run_study",
 ]
