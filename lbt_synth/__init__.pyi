@@ -196,11 +196,13 @@ from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace
 from .study import BatchResult as BatchResult
 from .study import ControllerStatistics as ControllerStatistics
+from .study import Estimate as Estimate
 from .study import Failure as Failure
 from .study import Replay as Replay
 from .study import Study as Study
 from .study import StudyRun as StudyRun
 from .study import StudyStatistics as StudyStatistics
+from .study import estimate_study as estimate_study
 from .study import evaluate_samples as evaluate_samples
 from .study import first_order_index as first_order_index
 from .study import load_study as load_study

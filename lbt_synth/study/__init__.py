@@ -1,5 +1,6 @@
 """Robustness studies: samples of a configuration, on any number of processes, and what they say."""
 
+from lbt_synth.study.estimate import Estimate, estimate_study
 from lbt_synth.study.load import load_study
 from lbt_synth.study.point import evaluate_samples
 from lbt_synth.study.replay import Replay, replay_row
@@ -13,6 +14,7 @@ from lbt_synth.study.variance import first_order_index
 __all__ = [
     "BatchResult",
     "ControllerStatistics",
+    "Estimate",
     "Failure",
     "Parameter",
     "Replay",
@@ -20,6 +22,7 @@ __all__ = [
     "StudyController",
     "StudyRun",
     "StudyStatistics",
+    "estimate_study",
     "evaluate_samples",
     "first_order_index",
     "load_study",

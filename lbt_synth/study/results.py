@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -64,6 +65,12 @@ def write_failures(folder: Path, failures: Sequence[Failure]) -> Path:
         for failure in sorted(failures, key=lambda failure: failure.row)
     ]
     return write_atomically(folder / FAILED, csv_bytes(("row", "controller", "error"), rows))
+
+
+def read_failures(folder: Path) -> list[tuple[int, str, str]]:
+    """Return row, controller and error of what failed, from the table of failures."""
+    with (folder / FAILED).open(encoding="utf-8", newline="") as stream:
+        return [(int(row), name, error) for row, name, error in list(csv.reader(stream))[1:]]
 
 
 def failures_in(study: Study, parts: Sequence[Part]) -> list[Failure]:

@@ -18,7 +18,13 @@ from lbt_synth.processes import alone_in
 from lbt_synth.study.engine import Evaluate, run_batches
 from lbt_synth.study.parquet import require_parquet
 from lbt_synth.study.point import evaluate_samples
-from lbt_synth.study.results import failures_in, results_path, write_failures, write_results
+from lbt_synth.study.results import (
+    failures_in,
+    read_results,
+    results_path,
+    write_failures,
+    write_results,
+)
 from lbt_synth.study.store import (
     FAILED,
     MANIFEST,
@@ -36,7 +42,7 @@ from lbt_synth.study.store import (
     write_part,
 )
 from lbt_synth.study.study import Study
-from lbt_synth.validation import instance, integer
+from lbt_synth.validation import FloatArray, instance, integer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +84,7 @@ def run_study(
     workers: int | None = None,
     evaluate: Evaluate = evaluate_samples,
     progress: Callable[[int], None] | None = None,
+    whole: Callable[[dict[str, FloatArray]], None] | None = None,
 ) -> StudyRun:
     """Run what is missing of a study, and write its results.
 
@@ -104,6 +111,9 @@ def run_study(
         ``study.values``; importable by name where other processes run it.
     progress : callable, optional
         Called with the number of rows that were found or finished since its last call.
+    whole : callable, optional
+        Called with all columns, each under its name, when all rows are there: before the manifest
+        says so, so that what it does is done again if it fails.
 
     Returns
     -------
@@ -155,7 +165,7 @@ def run_study(
                 study, folder, parts, executor=executor, jobs=jobs, workers=workers,
                 evaluate=evaluate, progress=progress,
             )  # fmt: skip
-            manifest = _written(folder, study, manifest, computed, time.perf_counter() - began)
+            manifest = _written(folder, study, manifest, computed, began, whole)
         elif progress is not None:
             progress(study.samples)
     return StudyRun(
@@ -251,13 +261,20 @@ def _complete(
 
 
 def _written(
-    folder: Path, study: Study, manifest: dict[str, Any], computed: int, seconds: float
+    folder: Path,
+    study: Study,
+    manifest: dict[str, Any],
+    computed: int,
+    began: float,
+    whole: Callable[[dict[str, FloatArray]], None] | None,
 ) -> dict[str, Any]:
     """Write the results of all parts, then the manifest, then remove the parts."""
     parts = part_list(folder)
     failures = failures_in(study, parts)
     write_results(folder, study, parts)
     write_failures(folder, failures)
+    if whole is not None:
+        whole(read_results(folder, study, parts))
     retry = sum(failure.retry for failure in failures)
     spent = sum(read_part(part, study)[2] for part in parts)
     manifest = manifest | {
@@ -265,7 +282,7 @@ def _written(
         "failures": len(failures),
         "retry": retry,
         "computed_last": computed,
-        "seconds": manifest["seconds"] + seconds,
+        "seconds": manifest["seconds"] + time.perf_counter() - began,
         "computing_seconds": spent,
     }
     write_manifest(folder, manifest)
