@@ -18,6 +18,7 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.paper_command import paper
 from lbt_synth.cli.report_command import report_command
 from lbt_synth.cli.robustness_command import robustness
+from lbt_synth.cli.study_command import study
 from lbt_synth.cli.telemetry_command import telemetry
 
 COMMANDS: dict[str, Callable[[Namespace], Report]] = {
@@ -36,6 +37,7 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "show": show,
     "sigma": sigma,
     "simulate": simulate,
+    "study": study,
     "telemetry": telemetry,
     "tradeoff": tradeoff_command,
     "verify": verify,
