@@ -71,7 +71,7 @@ INFO = StudyInfo(
     versions=(("numpy", "2.4"),),
     made=datetime(2026, 11, 21, tzinfo=UTC),
     elapsed_s=75.0,
-    replay="lbt-synth study night.yaml -o out --replay {row}",
+    replay="lbt-synth study night.yaml -o out --row {row}",
 )
 
 
@@ -143,7 +143,7 @@ def test_worst_rows_come_with_the_command_that_replays_them(page):
     rows = table(page, "Worst samples of sharp").rows
     assert all(text(row[1]) == "unstable" for row in rows)
     commands = next(b.text for b in blocks(page, Listing) if "replay" in b.caption).splitlines()
-    assert commands[1] == f"lbt-synth study night.yaml -o out --replay {text(rows[0][0])}"
+    assert commands[1] == f"lbt-synth study night.yaml -o out --row {text(rows[0][0])}"
 
 
 def test_names_are_short_and_explained_once(page):
@@ -281,7 +281,7 @@ def test_a_page_from_a_study_file(study, tmp_path):
         study.digest,
         "samples: 4096",
         "diameter_m: 8.22",
-        "a folder&#39; --replay 0",
+        "a folder&#39; --row 0",
     ):
         assert words in html, words
 
@@ -297,14 +297,14 @@ def test_digests_are_of_the_matrices(study):
     other = replace(study, controllers=study.controllers[::-1])
     assert study_info(other, directory="out").digests == first.digests
     assert len(set(first.digests.values())) == 3
-    assert first.replay.endswith("study.yaml -o out --replay {row}")
+    assert first.replay.endswith("study.yaml -o out --row {row}")
 
 
 @pytest.mark.parametrize(
     ("name", "words"), [("a{b}.yaml", "'a{b}.yaml'"), ("my night.yaml", "'my night.yaml'")]
 )
 def test_names_of_files_cannot_break_the_command(page, name, words):
-    info = replace(INFO, replay=f"lbt-synth study {words} --replay {{row}}")
+    info = replace(INFO, replay=f"lbt-synth study {words} --row {{row}}")
     found = page_of(results(), info=info)
     commands = next(b.text for b in blocks(found, Listing) if "replay" in b.caption)
-    assert f"lbt-synth study {words} --replay " in commands
+    assert f"lbt-synth study {words} --row " in commands

@@ -10,16 +10,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-import lbt_synth
 from lbt_synth.cli.output import Report, TableText, counting, working
 from lbt_synth.cli.writing import made_directory
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import refuse_replacing, write_atomically
-from lbt_synth.pages import Cell, Table, page_html
-from lbt_synth.report.study import StudyInfo, study_page
+from lbt_synth.files import refuse_replacing
+from lbt_synth.pages import Cell, Table
+from lbt_synth.report import write_study_page
 from lbt_synth.study import (
+    Failure,
     Study,
     StudyStatistics,
     load_study,
@@ -32,7 +30,6 @@ from lbt_synth.study.cluster import connected
 from lbt_synth.study.estimate import estimate_study
 from lbt_synth.study.results import read_failures
 from lbt_synth.study.run import written_files
-from lbt_synth.study.store import read_manifest
 from lbt_synth.study.summary import worst_table
 from lbt_synth.validation import FloatArray
 
@@ -125,24 +122,10 @@ def _summarised(loaded: Study, folder: Path, columns: Mapping[str, FloatArray]) 
     statistics = study_statistics(
         columns, loaded.parameter_names, [controller.name for controller in loaded.controllers]
     )
-    manifest = read_manifest(folder) or {}
-    info = StudyInfo(
-        name=loaded.source.stem,
-        samples=loaded.samples,
-        sampling=loaded.settings.sampling.replace("_", " "),
-        evaluation=loaded.settings.evaluation,
-        parameters={p.name: p.distribution.text for p in loaded.parameters},
-        controllers={c.name: c.origin for c in loaded.controllers},
-        digests=manifest.get("designs", {}),
-        digest=loaded.digest,
-        failures=read_failures(folder),
-        study_text=loaded.source.read_text(encoding="utf-8"),
-        config_text=loaded.config.source.read_text(encoding="utf-8"),
-        versions={"lbt_synth": lbt_synth.__version__, "numpy": np.__version__},
-        replay=f"lbt-synth study {loaded.source} -o {folder} --row {{row}}",
-        creator=f"lbt_synth {lbt_synth.__version__}",
-    )
-    write_atomically(folder / _PAGE, page_html(study_page(info, statistics, columns)))
+    failures = [
+        Failure(row=row, controller=name, error=error) for row, name, error in read_failures(folder)
+    ]
+    write_study_page(loaded, columns, folder / _PAGE, statistics=statistics, failures=failures)
     return statistics
 
 

@@ -134,5 +134,5 @@ def study_info(
         made=time_of_making(),
         elapsed_s=elapsed_s,
         replay=shlex.join(["lbt-synth", "study", os.fspath(study.source)])
-        + f" -o {shlex.quote(os.fspath(directory))} --replay {{row}}",
+        + f" -o {shlex.quote(os.fspath(directory))} --row {{row}}",
     )

@@ -188,7 +188,10 @@ def sensitivity_table(
         rows += [
             ("all of them",),
             ("sum", *(with_error(s.sum, s.sum_error, scale=100, digits=1) for s in found)),
-            ("only together (interactions)", *(percent(s.interactions) for s in found)),
+            (
+                "only together (interactions)",
+                *(with_error(s.interactions, s.sum_error, scale=100, digits=1) for s in found),
+            ),
         ]
     return Table(
         caption="Variance of the Strehl ratio that one parameter explains by itself [%]",
