@@ -12,7 +12,12 @@ from scipy.stats import qmc
 import lbt_synth as lbt
 from lbt_synth.study.conditional import conditional_curve
 from lbt_synth.study.percentiles import percentiles, share
-from lbt_synth.study.summary import varying_parameters, worst_table
+from lbt_synth.study.summary import (
+    comparison_table,
+    sensitivity_table,
+    varying_parameters,
+    worst_table,
+)
 
 NAN = float("nan")
 
@@ -354,31 +359,55 @@ def test_a_controller_that_always_failed_has_dashes_and_no_numbers():
     assert found.controllers[1].failed == 50
     assert found.controllers[1].worst == ()
     first = lbt.summary_tables(found)[0]
-    assert set(first.rows[1][1:9]) == {"-"}
-    assert first.rows[1][-2] == "50"
+    column = {row[0]: text(row[2]) for row in first.rows if len(row) > 1}
+    assert (column.pop("evaluated"), column.pop("failed")) == ("0", "50")
+    assert set(column.values()) == {"-"}
+
+
+def text(cell):
+    return cell if isinstance(cell, str) else cell.text
 
 
 def test_tables(small):
     found = lbt.study_statistics(small, ["gain"], ["a", "b"])
-    tables = {table.title.split(":")[0]: table for table in lbt.summary_tables(found)}
-    assert all(len(row) == len(t.headings) for t in tables.values() for row in t.rows)
-    strehl = tables["Strehl ratio [%]"].rows[0]
-    assert strehl[0] == "a"
-    assert strehl[4] == "50.0"
-    assert strehl[-3:] == ("25.00", "1", "100.0")
-    assert tables["Residual [nm rms]"].rows[0][7] == "unstable"
+    tables = {table.caption.split(" over")[0]: table for table in lbt.summary_tables(found)}
+    assert len(tables) == 3  # too few samples for indices
+    strehl = {text(row[0]): text(row[1]) for row in tables["Strehl ratio"].rows if len(row) > 1}
+    assert strehl["mean ± standard error"] == "45.00 ± 17.08"
+    assert strehl["50th percentile"] == "50.0"
+    assert strehl["above 50 %"].startswith("50.0 (6.8 to 93.2")
+    assert strehl["unstable, counted as 0"].startswith("25.00 (0.63 to 80.59")
+    assert (strehl["evaluated"], strehl["failed"]) == ("4", "1")
+    residual = {row[0]: row[1] for row in tables["Residual of tip and tilt"].rows if len(row) > 1}
+    assert residual["99th percentile"] == "unstable"
+    assert residual["of noise"] == "20.0"
     worst = worst_table(found.controllers[0], ["gain"])
-    assert worst.rows[0] == ("11", "unstable", "-", "0.6")
-    assert worst.rows[1] == ("12", "40.0", "90.0", "0.7")
+    assert [text(cell) for cell in worst.rows[0]] == ["11", "unstable", "0.6"]
+    assert [text(cell) for cell in worst.rows[1]] == ["12", "40.0", "0.7"]
+
+
+def test_a_table_compares_every_pair(small):
+    small |= {name.replace("b.", "c."): small[name] for name in list(small) if name[:2] == "b."}
+    found = lbt.study_statistics(small, ["gain"], ["a", "b", "c"])
+    rows = comparison_table(found).rows
+    assert [row[0] for row in rows] == ["a less b", "a less c", "b less c"]
+    assert rows[0][1:4] == ("50.0", "50.0", "12.50 ± 9.46")
+    assert rows[2][1:4] == ("0.0", "100.0", "0.00 ± 0.00")
+    assert rows[2][4:] == ("+0.0", "+0.0", "+0.0")
 
 
 def test_tables_of_one_controller_have_no_comparison():
     columns = study({"p": np.linspace(0, 1, 50)}, {"a": np.linspace(0, 1, 50)})
     found = lbt.study_statistics(columns, ["p"], ["a"])
-    titles = [table.title for table in lbt.summary_tables(found)]
-    assert not any(title.startswith("Difference") for title in titles)
-    sensitivity = next(t for t in lbt.summary_tables(found) if t.title.startswith("Variance"))
-    assert [row[0] for row in sensitivity.rows] == ["p", "sum", "only together"]
+    captions = [table.caption for table in lbt.summary_tables(found)]
+    assert not any("same samples" in caption for caption in captions)
+    index = next(t for t in lbt.summary_tables(found) if t.caption.startswith("Variance"))
+    assert [row[0] for row in index.rows] == [
+        "p", "all of them", "sum", "only together (interactions)",
+    ]  # fmt: skip
+    assert index.rows[0][1] == "100.0 ± 0.0"
+    named = sensitivity_table(found, names={"p": "short"})
+    assert named.rows[0][0] == "short"
 
 
 @pytest.mark.parametrize(

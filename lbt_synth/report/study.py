@@ -294,8 +294,8 @@ def _dependence(
     blocks = (
         sensitivity_chart(statistics, names),
         sensitivity_table(statistics, names=names),
-        conditional_chart(statistics, names),
         swing_table(statistics, names=names),
+        conditional_chart(statistics, names),
         unstable_chart(statistics, names),
         *map_charts(statistics, found, values, names),
     )

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lbt_synth.pages import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
+from lbt_synth.report.words import listing_text
 from lbt_synth.study.binning import binned_map, cumulative, histogram, values_of
 from lbt_synth.study.conditional import ConditionalCurve
 from lbt_synth.study.outcomes import Outcomes
@@ -14,6 +15,7 @@ from lbt_synth.study.statistics import StudyStatistics
 from lbt_synth.study.summary import varying_parameters
 from lbt_synth.validation import FloatArray
 
+_UNSTABLE_PANELS = 4
 _HIGH = 40.0  # Strehl ratio [%]; an axis of curves that are all above it does not start at 0
 
 
@@ -218,7 +220,7 @@ def conditional_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> 
             "(with markers), and the 10th percentile (thin, without): one night in ten is below it."
         ),
         alt="Mean and 10th percentile of the Strehl ratio over "
-        + ", ".join(panel.x.label for panel in panels)
+        + listing_text([panel.x.label for panel in panels])
         + ".",
         panels=tuple(panels),
         columns=min(len(panels), 2),
@@ -248,43 +250,39 @@ def _curve_marks(name: str, curve: ConditionalCurve, look: int) -> list[Curve]:
 
 
 def unstable_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Chart | None:
-    """Part of the loops that are unstable over each parameter, where there are any."""
+    """Part of the loops that are unstable, over the parameters that it changes most with."""
     panels = []
     for name in varying_parameters(statistics):
-        marks = []
+        marks, span = [], 0.0
         for look, one in enumerate(statistics.sensitivities):
             curve = next(each.curve for each in one.parameters if each.parameter == name)
             if curve is not None and curve.unstable.any():
-                marks.append(
-                    Curve(
-                        name=one.controller,
-                        x=curve.parameter,
-                        y=100 * curve.unstable,
-                        look=look,
-                        marker="own",
-                        width=1.8,
-                    )
-                )
-        if marks:
-            panels.append(
-                Panel(
-                    x=Axis(label=names[name]),
-                    y=Axis(label="unstable", unit="%", low=0),
-                    marks=tuple(marks),
-                )
-            )
-    if not panels:
+                marks.append(_unstable_curve(one.controller, curve, look))
+                span = max(span, float(np.ptp(curve.unstable)))
+        axis = Axis(label="unstable", unit="%", low=0)
+        panels.append((span, Panel(x=Axis(label=names[name]), y=axis, marks=tuple(marks))))
+    most = sorted((pair for pair in panels if pair[1].marks), key=lambda pair: -pair[0])
+    shown = tuple(panel for _, panel in most[:_UNSTABLE_PANELS])
+    if not shown:
         return None
+    listed = listing_text([panel.x.label for panel in shown])
     return Chart(
         key="unstable",
-        title="Unstable loops over each parameter",
+        title="Where loops are unstable",
         caption=(
             "Part of the loops that are unstable in each group of a parameter, all others as they "
-            "come. Controllers that are stable in every sample are not drawn."
+            f"come, over the parameters that it changes most with: {listed}. Controllers that are "
+            "stable in every sample are not drawn."
         ),
-        alt="Part of the loops that are unstable over each parameter.",
-        panels=tuple(panels),
-        columns=min(len(panels), 2),
+        alt=f"Part of the loops that are unstable over {listed}.",
+        panels=shown,
+        columns=min(len(shown), 2),
+    )
+
+
+def _unstable_curve(name: str, curve: ConditionalCurve, look: int) -> Curve:
+    return Curve(
+        name=name, x=curve.parameter, y=100 * curve.unstable, look=look, marker="own", width=1.8
     )
 
 

@@ -65,7 +65,7 @@ def strehl_table(statistics: StudyStatistics) -> Table:
     ranks = range(len(found[0].strehl))
     rows: list[Row] = [
         (
-            "mean and its standard error",
+            "mean ± standard error",
             *(with_error(c.mean, c.mean_error, scale=100, digits=2) for c in found),
         )
     ]

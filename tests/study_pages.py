@@ -1,0 +1,69 @@
+"""A study with all that can go wrong in one, and its page."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+
+import lbt_synth as lbt
+from lbt_synth.report.study import study_page
+from lbt_synth.report.study_info import StudyInfo
+
+PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")
+
+
+def results(n=300, seed=0):
+    """Three controllers: one steady, one that low gains make unstable, one that fails at times."""
+    rng = np.random.default_rng(seed)
+    gain, delay = 0.4 + 0.7 * rng.random(n), 0.3 * rng.random(n)
+    wind = rng.choice([10.0, 20.0, 30.0], n)
+    strehls = {
+        "steady": 0.8 - 0.1 * delay - 0.002 * wind,
+        "sharp": 0.9 * gain / 1.1 - 0.5 * delay,
+        "frail": 0.7 - 0.2 * gain,
+    }
+    stable = {name: np.ones(n) for name in strehls}
+    stable["sharp"][gain < 0.5] = 0
+    stable["frail"][::50] = np.nan
+    columns = {
+        "row": np.arange(n),
+        "truth.sensor_gain": gain,
+        "error.delay_frames": delay,
+        "atmosphere.wind_speed_m_s": wind,
+        "fixed": np.full(n, 0.9),
+    }
+    for name, strehl in strehls.items():
+        there = stable[name] == 1
+        columns[f"{name}.stable"] = stable[name]
+        columns[f"{name}.strehl"] = np.where(there, strehl, np.nan)
+        columns[f"{name}.residual_nm"] = np.where(there, 100 * (1 - strehl), np.nan)
+    return columns
+
+
+CONTROLLERS = ("steady", "sharp", "frail")
+INFO = StudyInfo(
+    name="night.yaml",
+    samples=300,
+    sampling="points of a scrambled Sobol sequence, seed 1",
+    evaluation="each evaluated exactly",
+    parameters={"truth.sensor_gain": "uniform from 0.4 to 1.1"},
+    controllers={"steady": "kalman for the configuration"},
+    digests={"steady": "0123456789abcdef" * 4},
+    digest="fedcba98" * 8,
+    failures=tuple(
+        lbt.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
+        for row in range(0, 300, 20)
+    ),
+    files=(),
+    texts={"Study night.yaml": "samples: 300 # & <script>"},
+    versions=(("numpy", "2.4"),),
+    made=datetime(2026, 11, 21, tzinfo=UTC),
+    elapsed_s=75.0,
+    replay="lbt-synth study night.yaml -o out --row {row}",
+)
+
+
+def page_of(columns, controllers=CONTROLLERS, parameters=PARAMETERS, info=INFO):
+    statistics = lbt.study_statistics(columns, parameters, controllers)
+    return study_page(info, statistics, columns)
