@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
@@ -120,16 +121,8 @@ class Atmosphere:
         frequency = real_array(frequency_hz, "frequency_hz")
         if np.any(frequency < 0):
             raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency)}.")
-        log_f, log_psd, low = _tilt_psd_table(self)
         with np.errstate(divide="ignore"):
-            x = np.log(frequency)
-        values = np.exp(np.interp(x, log_f, log_psd))
-        # beyond the table: the power law f^(-17/3) of tilt
-        tail = x > log_f[-1]
-        values = np.where(
-            tail, np.exp(log_psd[-1] - 17 / 3 * (np.where(tail, x, log_f[-1]) - log_f[-1])), values
-        )
-        return np.asarray(np.where(x < log_f[0], low, values))
+            return np.exp(tilt_spline(self)(np.log(frequency)))
 
 
 def kolmogorov_constant_nm2(air: Atmosphere) -> float:
@@ -178,9 +171,25 @@ def _tilt_variance(air: Atmosphere) -> float:
     return float(np.sum(2 * np.pi * f * w * _filtered_spectrum(air, f)))
 
 
-@lru_cache(maxsize=32)
-def _tilt_psd_table(air: Atmosphere) -> tuple[FloatArray, FloatArray, float]:
-    """Logarithms of frequency and spectrum on a grid, and the value at zero frequency.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LogSpline:
+    """Logarithm of a tilt spectrum over the logarithm of frequency, a cubic spline.
+
+    Constant below its first knot; beyond the last the power law f^(-17/3) of tilt.
+    """
+
+    spline: Any  # a PPoly of scipy
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the logarithms of the spectrum at logarithms of frequencies."""
+        first, last = self.spline.x[[0, -1]]
+        values = self.spline(np.clip(x, first, last))
+        return np.asarray(values - 17 / 3 * np.maximum(x - last, 0))
+
+
+@lru_cache(maxsize=128)
+def tilt_spline(air: Atmosphere) -> LogSpline:
+    """Spectrum of one axis, from a table whose frequencies go with the wind.
 
     ``S(f) = (4 / V) int_0^inf Phi(f/V, f_y) df_y`` (one-sided).
     """
@@ -194,4 +203,4 @@ def _tilt_psd_table(air: Atmosphere) -> tuple[FloatArray, FloatArray, float]:
     for i, f in enumerate(frequency):
         radius = np.hypot(f / air.wind_speed_m_s, fy)
         psd[i] = 4 / air.wind_speed_m_s * np.sum(wy * _filtered_spectrum(air, radius))
-    return np.log(frequency), np.log(psd), float(psd[0])
+    return LogSpline(spline=CubicSpline(np.log(frequency), np.log(psd)))
