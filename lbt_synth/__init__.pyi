@@ -199,6 +199,11 @@ from .simulation import simulate as simulate
 from .statespace import Controller as Controller
 from .statespace import RunningController as RunningController
 from .statespace import StateSpace as StateSpace
+from .study import BatchResult as BatchResult
+from .study import Failure as Failure
+from .study import Study as Study
+from .study import evaluate_samples as evaluate_samples
+from .study import load_study as load_study
 from .sweep import RobustnessRow as RobustnessRow
 from .sweep import frequency_robustness as frequency_robustness
 from .telemetry import Telemetry as Telemetry

@@ -11,7 +11,14 @@ import numpy as np
 from lbt_synth.certify import Certificate
 from lbt_synth.cli.export_command import cost_data, cost_facts
 from lbt_synth.cli.output import Report, TableText, working
-from lbt_synth.config import Config, load_config, robust_design
+from lbt_synth.config import Config, load_config
+from lbt_synth.config.designing import (
+    OWNERS,
+    ROUTES,
+    WITHOUT_HORIZON,
+    DesignRequest,
+    designed,
+)
 from lbt_synth.design import (
     Design,
     EstimatorDesign,
@@ -20,13 +27,6 @@ from lbt_synth.design import (
     LqgDesign,
     PolytopicDesign,
     ShapedDesign,
-    hinf,
-    integrator,
-    kalman,
-    lqg,
-    mixed,
-    optimal_integrator,
-    polytopic,
 )
 from lbt_synth.distance import model_distance, shaped_distance
 from lbt_synth.errors import ProblemError
@@ -38,25 +38,6 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
 _SMALL_MODULUS = 0.3
-_ROUTES = {
-    "kalman": ("riccati", "sdp"),
-    "hinf": ("lmi", "riccati"),
-    "mixed": (),
-    "lqg": (),
-    "polytopic": (),
-    "integrator": (),
-    "robust": (),
-}
-_OWNERS = {
-    "gamma": ("hinf", "mixed"),
-    "gamma_ratio": ("hinf", "mixed"),
-    "rms": ("mixed",),
-    "taps": ("mixed",),
-    "norm": ("polytopic",),
-    "half_width_hz": ("polytopic",),
-    "gain": ("integrator",),
-    "command_weight": ("lqg",),
-}
 
 
 def design(arguments: Namespace) -> Report:
@@ -80,11 +61,11 @@ def design(arguments: Namespace) -> Report:
 def _refuse_foreign_options(arguments: Namespace) -> None:
     """Refuse an option that the chosen method would silently ignore."""
     method = arguments.method
-    routes = _ROUTES[method]
+    routes = ROUTES[method]
     if arguments.route is not None and arguments.route not in routes:
         expected = " or ".join(routes) if routes else "no --route"
         raise ProblemError(f"--method {method} takes {expected}; got --route {arguments.route}.")
-    for option, owners in _OWNERS.items():
+    for option, owners in OWNERS.items():
         if getattr(arguments, option) is not None and method not in owners:
             raise ProblemError(
                 f"--{option.replace('_', '-')} goes with --method {' or '.join(owners)}; "
@@ -95,7 +76,7 @@ def _refuse_foreign_options(arguments: Namespace) -> None:
             "--method polytopic needs the half width of the interval of frequencies; try "
             "--half-width-hz 1."
         )
-    if method in ("integrator", "robust", "lqg") and arguments.horizon != 1:
+    if method in WITHOUT_HORIZON and arguments.horizon != 1:
         raise ProblemError(
             f"--method {method} takes no horizon; set loop.delay_frames in the configuration "
             f"instead. Got --horizon {arguments.horizon}."
@@ -103,45 +84,9 @@ def _refuse_foreign_options(arguments: Namespace) -> None:
 
 
 def _synthesise(config: Config, arguments: Namespace) -> Design:
-    if arguments.method == "kalman":
-        return kalman(config.plant, horizon=arguments.horizon, method=arguments.route or "riccati")
-    if arguments.method == "integrator":
-        if arguments.gain is not None:
-            return integrator(config.hardware, gain=arguments.gain)
-        return optimal_integrator(config.hardware, config.truth)
-    if arguments.method == "robust":
-        return robust_design(config)
-    if arguments.method == "lqg":
-        weight = arguments.command_weight
-        if weight is None:
-            weight = config.settings.design.command_weight
-        return lqg(config.plant, command_weight=weight)
-    if arguments.method == "polytopic":
-        return polytopic(
-            config.plant,
-            half_width_hz=arguments.half_width_hz,
-            norm=arguments.norm or "hinf",
-            horizon=arguments.horizon,
-        )
-    ratio = arguments.gamma_ratio
-    if arguments.gamma is None and ratio is None and arguments.rms is None:
-        ratio = config.settings.design.gamma_ratio
-    if arguments.method == "mixed":
-        return mixed(
-            config.plant,
-            gamma=arguments.gamma,
-            gamma_ratio=ratio,
-            rms=arguments.rms,
-            taps=16 if arguments.taps is None else arguments.taps,
-            horizon=arguments.horizon,
-        )
-    return hinf(
-        config.plant,
-        gamma=arguments.gamma,
-        gamma_ratio=ratio,
-        horizon=arguments.horizon,
-        method=arguments.route,
-    )
+    given = {name: getattr(arguments, name) for name in ("route", "horizon", *OWNERS)}
+    options = {name: value for name, value in given.items() if value is not None}
+    return designed(config, DesignRequest(method=arguments.method, options=options))
 
 
 def show(arguments: Namespace) -> Report:

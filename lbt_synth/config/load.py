@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -21,6 +22,8 @@ from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.loop import Imaging
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.validation import FloatArray
+
+Checked = TypeVar("Checked", bound=BaseModel)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,16 +110,32 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     (800.0, (8, 8))
     """
     source = Path(path)
-    raw = _read_yaml(source)
+    return config_of(validated(FileSection, read_mapping(source), source), source)
+
+
+def validated(schema: type[Checked], raw: Mapping[str, Any], source: Path) -> Checked:
+    """Return the sections of a file, checked.
+
+    Raises
+    ------
+    ConfigError
+        If a key is unknown, missing or has an impossible value, with its path.
+    """
     try:
-        settings = FileSection.model_validate(raw)
+        return schema.model_validate(raw)
     except ValidationError as error:
-        message, key = described(error)
+        message, key = described(error, schema)
         raise ConfigError(f"{source}: {message}", path=key) from error
-    return _build(settings, source)
 
 
-def _read_yaml(source: Path) -> dict[str, Any]:
+def read_mapping(source: Path) -> dict[str, Any]:
+    """Read a YAML file that holds a mapping.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be read, is no YAML or holds something else.
+    """
     try:
         text = source.read_text(encoding="utf-8")
     except OSError as error:
@@ -135,7 +154,14 @@ def _read_yaml(source: Path) -> dict[str, Any]:
     return raw
 
 
-def _build(settings: FileSection, source: Path) -> Config:
+def config_of(settings: FileSection, source: Path) -> Config:
+    """Build what the settings of a file describe.
+
+    Raises
+    ------
+    ConfigError
+        If they do not fit together.
+    """
     try:
         atmosphere = atmosphere_of(settings)
         noise_nm = noise_of(settings)

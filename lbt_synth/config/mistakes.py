@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from typing import Any
+from typing import Any, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from lbt_synth.config.schema import EACH, ONE, FileSection
 
 
-def described(error: ValidationError) -> tuple[str, str]:
+def described(error: ValidationError, schema: type[BaseModel] = FileSection) -> tuple[str, str]:
     """Return one sentence on the first mistake, and the path of its key."""
     details = error.errors()
     # an unknown key tells more than the missing one that it was meant to be
@@ -19,7 +19,7 @@ def described(error: ValidationError) -> tuple[str, str]:
     key = _key_path(location)
     more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
-        known = _fields_at(FileSection, location[:-1])
+        known = _fields_at(schema, location[:-1])
         close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
         hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
         return f"unknown key {key}; {hint}{more}", key
@@ -46,16 +46,22 @@ def _key_path(location: tuple[int | str, ...]) -> str:
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """Names of the keys known at a place of the schema."""
     here: list[type[BaseModel]] = [model]
+    chosen_name = False  # the next part is a name that the file chooses, a key of a mapping
     for part in location:
-        if isinstance(part, int):
+        if isinstance(part, int) or chosen_name:
+            chosen_name = False
             continue
-        found: list[type[BaseModel]] = []
-        for section in here:
-            field = section.model_fields.get(str(part))
-            if field is not None:
-                found += _models_in(field.annotation)
-        here = found
-    return sorted({name for section in here for name in section.model_fields})
+        fields = [
+            field
+            for section in here
+            for name, field in section.model_fields.items()
+            if part == (field.alias or name)
+        ]
+        chosen_name = any(get_origin(field.annotation) is dict for field in fields)
+        here = [found for field in fields for found in _models_in(field.annotation)]
+    return sorted(
+        {field.alias or name for section in here for name, field in section.model_fields.items()}
+    )
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

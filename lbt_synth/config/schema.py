@@ -22,18 +22,20 @@ PositiveOrEach = Annotated[
 ]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """What all sections share: strict types, no unknown keys, read-only."""
+
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
-class TelescopeSection(_Section):
+class TelescopeSection(Section):
     """The pupil."""
 
     diameter_m: Positive
     obstruction: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
 
-class AtmosphereSection(_Section):
+class AtmosphereSection(Section):
     """The turbulence; ``outer_scale_m: null`` is Kolmogorov."""
 
     seeing_arcsec: Positive
@@ -42,7 +44,7 @@ class AtmosphereSection(_Section):
     seeing_wavelength_um: Positive = 0.5
 
 
-class PyramidSection(_Section):
+class PyramidSection(Section):
     """Pyramid sensor, from which the noise is computed."""
 
     wavelength_um: Positive
@@ -52,7 +54,7 @@ class PyramidSection(_Section):
     read_noise_electrons: Annotated[float, Field(ge=0)]
 
 
-class SensorSection(_Section):
+class SensorSection(Section):
     """Measurement noise: given, or from a pyramid."""
 
     noise_nm: PositiveOrEach | None = None
@@ -68,7 +70,7 @@ class SensorSection(_Section):
         return self
 
 
-class LocalLoopSection(_Section):
+class LocalLoopSection(Section):
     """The mirror's local position loop: its gains, or the frequency and damping they make."""
 
     natural_frequency_hz: Positive
@@ -95,7 +97,7 @@ class LocalLoopSection(_Section):
         return self
 
 
-class MirrorSection(_Section):
+class MirrorSection(Section):
     """Deformable mirror; ``modes`` counts those that are controlled: by hundreds, or end to end."""
 
     modes: Annotated[int, Field(ge=1)] | None = None
@@ -103,7 +105,7 @@ class MirrorSection(_Section):
     local_loop: LocalLoopSection | None = None
 
 
-class LoopSection(_Section):
+class LoopSection(Section):
     """Timing, and how many axes there are."""
 
     axes: Annotated[int, Field(ge=1, le=2)] | None = None
@@ -111,7 +113,7 @@ class LoopSection(_Section):
     delay_frames: Annotated[float, Field(ge=1)] = 2.0
 
 
-class _Line(_Section):
+class _Line(Section):
     # which of axis and direction_deg is needed depends on the number of axes
     axis: Literal["tip", "tilt", "both"] | None = None
     direction_deg: float | None = None
@@ -162,19 +164,19 @@ class TrueVibrationSection(_Line):
         return self
 
 
-class Ar1Section(_Section):
+class Ar1Section(Section):
     """AR1 turbulence, from the atmosphere."""
 
     kind: Literal["ar1"]
 
 
-class Ar2Section(_Section):
+class Ar2Section(Section):
     """AR2 turbulence, fitted to the atmosphere's spectrum above the noise."""
 
     kind: Literal["ar2"]
 
 
-class ArSection(_Section):
+class ArSection(Section):
     """Auto-regressive turbulence by its coefficients."""
 
     kind: Literal["ar"]
@@ -185,7 +187,7 @@ class ArSection(_Section):
 TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discriminator="kind")]
 
 
-class ModelSection(_Section):
+class ModelSection(Section):
     """What the design believes; leave ``vibrations`` out for a plant without any."""
 
     turbulence: Annotated[
@@ -197,7 +199,7 @@ class ModelSection(_Section):
     sensor_gain: PositiveOrEach = 1.0
 
 
-class TruthSection(_Section):
+class TruthSection(Section):
     """What the loop really meets; ``vibrations: model`` are those of the model."""
 
     turbulence: Literal["frozen_flow", "model", "none"] | None = None
@@ -208,14 +210,14 @@ class TruthSection(_Section):
     sensor_gain: PositiveOrEach = 1.0
 
 
-class ImagingSection(_Section):
+class ImagingSection(Section):
     """The camera."""
 
     wavelength_um: Positive = 2.2
     other_modes_strehl: Fraction = 1.0
 
 
-class BandSection(_Section):
+class BandSection(Section):
     """A band in which a vibration may be anywhere."""
 
     low_hz: Annotated[float, Field(ge=0)]
@@ -230,7 +232,7 @@ class BandSection(_Section):
         return self
 
 
-class AttenuationSection(_Section):
+class AttenuationSection(Section):
     """One step of a mask on the rejection."""
 
     low_hz: Annotated[float, Field(ge=0)]
@@ -239,7 +241,7 @@ class AttenuationSection(_Section):
     sensor_gain: Positive | None = None
 
 
-class MirrorUncertaintySection(_Section):
+class MirrorUncertaintySection(Section):
     """Relative size of what is not known of the mirror, in a band."""
 
     relative: Positive
@@ -247,7 +249,7 @@ class MirrorUncertaintySection(_Section):
     high_hz: Positive
 
 
-class RobustSection(_Section):
+class RobustSection(Section):
     """The robust design: bands of vibrations, sensor gains, demands."""
 
     bands: Annotated[list[BandSection], Field(min_length=1)]
@@ -267,7 +269,7 @@ class RobustSection(_Section):
     loss: Annotated[float, Field(ge=0)] = 0.1
 
 
-class DesignSection(_Section):
+class DesignSection(Section):
     """Defaults of the synthesis."""
 
     gamma_ratio: Annotated[float, Field(ge=1)] = 1.2
@@ -275,7 +277,7 @@ class DesignSection(_Section):
     robust: RobustSection | None = None
 
 
-class SimulationSection(_Section):
+class SimulationSection(Section):
     """Time-domain runs."""
 
     frames: Annotated[int, Field(ge=2)] = 8000
@@ -284,7 +286,7 @@ class SimulationSection(_Section):
     settle_frames: Annotated[int, Field(ge=0)] = 2000
 
 
-class RobustnessSection(_Section):
+class RobustnessSection(Section):
     """The studies over a frequency error, a sensor gain and a delay error."""
 
     errors_hz: Annotated[list[float], Field(min_length=1)] = [x / 2 for x in range(-7, 8)]
@@ -293,7 +295,7 @@ class RobustnessSection(_Section):
     delay_errors_frames: Annotated[list[float], Field(min_length=1)] = [0.0]
 
 
-class EndToEndSection(_Section):
+class EndToEndSection(Section):
     """The end-to-end simulation; the other sections say what it is of."""
 
     pixels: Annotated[int, Field(ge=8)] = 60
@@ -307,7 +309,7 @@ class EndToEndSection(_Section):
     calibration_nm: Positive = 20.0
 
 
-class FileSection(_Section):
+class FileSection(Section):
     """A whole configuration file; an identified system knows no telescope and no atmosphere."""
 
     version: Annotated[int, Field(ge=1, le=1)]

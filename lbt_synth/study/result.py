@@ -1,0 +1,50 @@
+"""What comes of a batch of samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lbt_synth.validation import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """A controller of a sample that has no result.
+
+    Attributes
+    ----------
+    row : int
+        The sample, from 0.
+    controller : str
+        Name of the controller.
+    error : str
+        What went wrong.
+    retry : bool
+        Whether it is tried again when the study is started again: its process ended without
+        a word, which need not be the sample's doing.
+    """
+
+    row: int
+    controller: str
+    error: str
+    retry: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BatchResult:
+    """Results of samples that follow each other.
+
+    Attributes
+    ----------
+    start : int
+        Row of the first.
+    columns : mapping of str to (b,) ndarray
+        Results by the names of their columns, ``Study.result_columns``; nan where there is none.
+    failures : tuple of Failure
+        Those that failed, in the order of their rows.
+    """
+
+    start: int
+    columns: Mapping[str, FloatArray]
+    failures: tuple[Failure, ...] = ()
