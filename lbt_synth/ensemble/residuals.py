@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -111,7 +112,12 @@ def _textbook(controller: Any, hardware: LoopHardware, count: int) -> tuple[Floa
             f"give one controller, or one a loop ({count}) with as many states each; got "
             f"{len(each)} with {sorted({one.n_states for one in each})} states."
         )
-    systems = [one.to_statespace() for one in each]
+    return textbook_matrices(each)
+
+
+def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:
+    """Return controllers of as many states each as ``A, B, C, D`` in textbook form."""
+    systems = [controller.to_statespace() for controller in controllers]
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
 
 

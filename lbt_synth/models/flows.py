@@ -94,6 +94,16 @@ class FrozenFlows:
             outer_scale_m=outer,
         )
 
+    @property
+    def tilt_rms_nm(self) -> FloatArray:
+        """Standard deviation of tip, and of tilt, of each loop [nm rms wavefront], (p,)."""
+        strength = (self.seeing_arcsec / self.atmosphere.seeing_arcsec) ** (5 / 6)
+        if self.outer_scale_m is None:
+            return np.asarray(strength * self._template(None).tilt_rms_nm)
+        scales, which = np.unique(self.outer_scale_m, return_inverse=True)
+        each = np.array([self._template(float(scale)).tilt_rms_nm for scale in scales])
+        return np.asarray(strength * each[which])
+
     def psd(self, frequency_hz: Any) -> FloatArray:
         """One-sided temporal power spectra of one axis [nm^2/Hz].
 
