@@ -1,13 +1,13 @@
 """Frozen flows of many seeings, wind speeds and outer scales, over one telescope.
 
-The spectrum scales with ``seeing^(5/3)``, and with the wind as ``S(f; V) = S(f V0 / V; V0) V0 /
-V``: only the outer scale needs tables of its own. Over an octave of it the logarithm of the
-spectrum is interpolated by a polynomial.
+The spectrum scales with ``seeing^(5/3)``, and is a function of ``f D / V``: only the outer scale
+needs tables of its own. Over an octave of it the logarithm of the spectrum is interpolated by a
+polynomial.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -16,7 +16,13 @@ from numpy.polynomial import chebyshev
 from scipy.interpolate import PPoly
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.atmosphere import Atmosphere, LogSpline, tilt_spline
+from lbt_synth.models.atmosphere import (
+    Atmosphere,
+    LogSpline,
+    tilt_spline,
+    tilt_strength_nm2,
+    tilt_variance,
+)
 from lbt_synth.validation import FloatArray, IntArray, instance, real_array
 
 _TERMS = 12  # of the polynomial over an octave of the outer scale
@@ -88,7 +94,7 @@ class FrozenFlows:
         """Return the flows of some loops."""
         outer = None if self.outer_scale_m is None else self.outer_scale_m[rows]
         return FrozenFlows(
-            atmosphere=self.atmosphere if outer is not None else self._template(None),
+            atmosphere=self.atmosphere,
             seeing_arcsec=self.seeing_arcsec[rows],
             wind_speed_m_s=self.wind_speed_m_s[rows],
             outer_scale_m=outer,
@@ -97,12 +103,10 @@ class FrozenFlows:
     @property
     def tilt_rms_nm(self) -> FloatArray:
         """Standard deviation of tip, and of tilt, of each loop [nm rms wavefront], (p,)."""
-        strength = (self.seeing_arcsec / self.atmosphere.seeing_arcsec) ** (5 / 6)
-        if self.outer_scale_m is None:
-            return np.asarray(strength * self._template(None).tilt_rms_nm)
-        scales, which = np.unique(self.outer_scale_m, return_inverse=True)
-        each = np.array([self._template(float(scale)).tilt_rms_nm for scale in scales])
-        return np.asarray(strength * each[which])
+        ratios, which = np.unique(self._scale_ratio, return_inverse=True)
+        obstruction = self.atmosphere.obstruction
+        variances = np.array([tilt_variance(float(ratio), obstruction) for ratio in ratios])
+        return np.asarray(np.sqrt(self._strength * variances[which.reshape(-1)]))
 
     def psd(self, frequency_hz: Any) -> FloatArray:
         """One-sided temporal power spectra of one axis [nm^2/Hz].
@@ -126,49 +130,57 @@ class FrozenFlows:
         if frequency.ndim != 1 or np.any(frequency <= 0):
             raise ProblemError("frequency_hz must be a list of frequencies above 0 Hz.")
         air = self.atmosphere
-        strength = (self.seeing_arcsec / air.seeing_arcsec) ** (5 / 3)
+        crossing_s = air.diameter_m / self.wind_speed_m_s
         # spectra that differ by their strength only are computed once
-        shapes = [self.wind_speed_m_s]
-        shapes += [] if self.outer_scale_m is None else [self.outer_scale_m]
-        unique, which = np.unique(np.stack(shapes, axis=1), axis=0, return_inverse=True)
-        slower = air.wind_speed_m_s / unique[:, 0]
-        x = np.log(frequency) + np.log(slower)[:, None]
-        scales = [None] if self.outer_scale_m is None else list(np.unique(unique[:, 1]))
+        shapes = np.stack([crossing_s, self._scale_ratio], axis=1)
+        unique, which = np.unique(shapes, axis=0, return_inverse=True)
+        x = np.log(frequency) + np.log(unique[:, :1])
         values = np.empty(x.shape)
-        if len(scales) <= _FEW_SCALES:
-            for scale in scales:
-                rows = slice(None) if scale is None else unique[:, 1] == scale
-                spline = tilt_spline(self._template(None if scale is None else float(scale)))
-                values[rows] = spline(x[rows])
+        ratios = np.unique(unique[:, 1])
+        if len(ratios) <= _FEW_SCALES:
+            for ratio in ratios:
+                rows = unique[:, 1] == ratio
+                values[rows] = tilt_spline(float(ratio), air.obstruction)(x[rows])
         else:
-            self._interpolate_over_scales(x, unique[:, 1], values)
-        return np.asarray((np.exp(values) * slower[:, None])[which.ravel()] * strength[:, None])
+            _interpolate_over_scales(x, unique[:, 1], air.obstruction, values)
+        return np.asarray(
+            np.exp(values)[which.reshape(-1)] * (self._strength * crossing_s)[:, None]
+        )
 
-    def _template(self, outer_scale_m: float | None) -> Atmosphere:
-        return replace(self.atmosphere, outer_scale_m=outer_scale_m)
+    @property
+    def _strength(self) -> FloatArray:
+        seeing = self.seeing_arcsec / self.atmosphere.seeing_arcsec
+        return np.asarray(tilt_strength_nm2(self.atmosphere) * seeing ** (5 / 3))
 
-    def _interpolate_over_scales(
-        self, x: FloatArray, outer_scale_m: FloatArray, values: FloatArray
-    ) -> None:
-        """Fill in the logarithms of spectra that each have their own outer scale."""
-        octave = np.floor(np.log2(outer_scale_m))
-        for each in np.unique(octave):
-            knots, coefficients = _octave_splines(self._template(None), int(each))
-            rows = np.flatnonzero(octave == each)
-            place = 2 * (np.log2(outer_scale_m[rows]) - each) - 1
-            for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
-                spline = PPoly.construct_fast(coefficients @ terms, knots)
-                values[row] = LogSpline(spline=spline)(x[row])
+    @property
+    def _scale_ratio(self) -> FloatArray:
+        if self.outer_scale_m is None:
+            return np.zeros(len(self))
+        return np.asarray(self.atmosphere.diameter_m / self.outer_scale_m)
+
+
+def _interpolate_over_scales(
+    x: FloatArray, scale_ratio: FloatArray, obstruction: float, values: FloatArray
+) -> None:
+    """Fill in the logarithms of spectra that each have their own outer scale."""
+    octave = np.floor(np.log2(scale_ratio))
+    for each in np.unique(octave):
+        knots, coefficients = _octave_splines(int(each), obstruction)
+        rows = np.flatnonzero(octave == each)
+        place = 2 * (np.log2(scale_ratio[rows]) - each) - 1
+        for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
+            spline = PPoly.construct_fast(coefficients @ terms, knots)
+            values[row] = LogSpline(spline=spline)(x[row])
 
 
 @lru_cache(maxsize=16)
-def _octave_splines(air: Atmosphere, octave: int) -> tuple[FloatArray, FloatArray]:
+def _octave_splines(octave: int, obstruction: float) -> tuple[FloatArray, FloatArray]:
     """Knots, and coefficients of the splines as polynomials in the logarithm of the outer scale.
 
-    They are (4, intervals, terms), over one octave of the outer scale.
+    They are (4, intervals, terms), over one octave of the diameter over the outer scale.
     """
     nodes = chebyshev.chebpts1(_TERMS)
-    scales = 2.0 ** (octave + (nodes + 1) / 2)
-    splines = [tilt_spline(replace(air, outer_scale_m=float(scale))).spline for scale in scales]
+    ratios = 2.0 ** (octave + (nodes + 1) / 2)
+    splines = [tilt_spline(float(ratio), obstruction).spline for ratio in ratios]
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, _TERMS - 1))
     return splines[0].x, np.stack([spline.c for spline in splines], axis=-1) @ inverse.T
