@@ -308,6 +308,18 @@ def test_pieces_of_a_loop(kalman, coupled):
     assert not parts[0].equals(parts[1])
 
 
+def test_states_in_odd_units_stay_coupled(coupled):
+    """The same controller in states of 1e9 times other units is the same controller."""
+    k = coupled.controller
+    units = 10.0 ** np.linspace(-9, 9, k.n_states)
+    odd = lbt.Controller(
+        A=k.A * units / units[:, None], B=k.B / units[:, None], C=k.C * units, D=k.D, dt_s=k.dt_s
+    )
+    ensemble = lbt.LoopEnsemble(sensor_gain=[0.5, 1.0], noise_nm=15.5, turbulence=AIR)
+    one, other = (lbt.ensemble_residuals(c, coupled.hardware, ensemble) for c in (k, odd))
+    assert other.rms_nm == pytest.approx(one.rms_nm, rel=1e-8)
+
+
 def test_a_state_that_no_mode_sees_counts_for_stability():
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     for pole, stable in ((0.5, True), (1.1, False)):

@@ -1,5 +1,7 @@
 """Many samples at once, against each on its own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from studies import BASE, LBT_TEXT, study_file
@@ -69,7 +71,7 @@ def test_filters_told_their_samples(tmp_path, monkeypatch):
     single = point.evaluate_samples(study, study.values(0, 6), 0)
     rows = counted(monkeypatch)
     found = lbt.evaluate_samples(study, study.values(0, 6), 0)
-    assert rows == []  # all of them at once
+    assert rows == [3]  # all of them at once, and one by itself
     for name, expected in single.columns.items():
         assert found.columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
     strehl = found.columns["told.strehl"]
@@ -139,7 +141,8 @@ def test_groups_of_what_makes_another_configuration(tmp_path, monkeypatch):
       truth.sensor_gain: {uniform: [0.4, 1]}
     }"""
     agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, samples="16", count=16)
-    assert rows == list(range(16))  # of the point evaluation that it is held against
+    # one of each group and controller, then those of the evaluation that it is held against
+    assert len(rows) == 2 + 16
 
 
 def test_samples_that_the_configuration_refuses(tmp_path):
@@ -199,3 +202,23 @@ def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
     assert not any(changes_numbers_only(study, keys) for keys in others)
     assert changes_beliefs_only(study, ("model", "vibrations", 0, "rms_mas"))
     assert not changes_beliefs_only(study, ("model", "sensor_gain"))
+
+
+def test_two_answers_stop_a_study(tmp_path, monkeypatch):
+    study = lbt.load_study(
+        study_file(
+            tmp_path,
+            base=BASE,
+            controllers=FIXED,
+            parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}",
+        )
+    )
+    real = batch.residuals_of_matrices
+
+    def wrong(matrices, hardware, ensemble):
+        found = real(matrices, hardware, ensemble)
+        return replace(found, noise_nm2=1.001 * found.noise_nm2)
+
+    monkeypatch.setattr(batch, "residuals_of_matrices", wrong)
+    with pytest.raises(lbt.CertificateError, match="row 14 has slow.*by itself"):
+        lbt.evaluate_samples(study, study.values(10, 16)[:8], 11)

@@ -116,8 +116,12 @@ def _textbook(controller: Any, hardware: LoopHardware, count: int) -> tuple[Floa
 
 
 def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:
-    """Return controllers of as many states each as ``A, B, C, D`` in textbook form."""
+    """Return controllers of as many states each as ``A, B, C, D`` in textbook form, balanced.
+
+    In states of comparable units an entry that is tiny beside the others does nothing.
+    """
     systems = [controller.to_statespace() for controller in controllers]
+    systems = [system.balanced() if system.n_states else system for system in systems]
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
 
 

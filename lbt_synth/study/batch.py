@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from lbt_synth.ensemble import EnsembleResiduals
 from lbt_synth.ensemble.residuals import residuals_of_matrices, textbook_matrices
+from lbt_synth.errors import CertificateError
 from lbt_synth.loop import Imaging
 from lbt_synth.study import point
 from lbt_synth.study.meeting import (
@@ -27,6 +28,7 @@ from lbt_synth.study.told import (
 )
 from lbt_synth.validation import FloatArray, IntArray
 
+_AGREEMENT = 1e-5  # of a sample evaluated both ways; a residual of less than 1 nm counts as 1 nm
 _FEWEST = 4  # samples of a group that are worth an ensemble
 _DELAY = ("loop", "delay_frames")
 
@@ -37,7 +39,8 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     Samples whose configurations differ by numbers only are evaluated together by
     :func:`ensemble_residuals`; Kalman filters for samples are designed together by
     :func:`modal_filters`. Other designs, simulations, and samples that a configuration refuses
-    are evaluated one after the other.
+    are evaluated one after the other. So is one sample of those that were evaluated together, and
+    the two answers have to agree.
 
     Parameters
     ----------
@@ -54,6 +57,11 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
         A value of each of ``study.result_columns`` for each sample. A controller that has no
         result is among the failures, and has nan; an unstable loop has ``stable`` 0 and nan
         otherwise.
+
+    Raises
+    ------
+    CertificateError
+        If the sample that is evaluated both ways has two answers.
 
     Examples
     --------
@@ -82,6 +90,12 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
                 columns[f"{controller.name}.{name}"][rows] = result
         for i in np.flatnonzero(~done).tolist():
             left.setdefault(i, []).append(controller)
+        if done.any():
+            together = np.flatnonzero(done)
+            _require_agreement(
+                replace(study, controllers=(controller,)), values, start,
+                int(together[together.size // 2]), columns,
+            )  # fmt: skip
     for i, controllers in sorted(left.items()):
         some = replace(study, controllers=tuple(controllers))
         results_of_row, failed = point.evaluate_row(some, values[i], start + i)
@@ -128,6 +142,27 @@ def _evaluated_together(
         except point.EXPECTED_ERRORS:
             continue  # one of them fails; which one is found point by point
         yield group, found, sample.config.imaging
+
+
+def _require_agreement(
+    study: Study, values: FloatArray, start: int, i: int, columns: Mapping[str, FloatArray]
+) -> None:
+    """Hold one sample against its evaluation by itself."""
+    alone, failed = point.evaluate_row(study, values[i], start + i)
+    if failed:
+        raise CertificateError(
+            f"row {start + i} has a result among others, and fails by itself: {failed[0].error} "
+            "This is a fault of the program; please report it with the study file."
+        )
+    for name, expected in alone.items():
+        found = float(columns[name][i])
+        apart = abs(found - expected)
+        if not apart <= _AGREEMENT * max(abs(expected), 1.0):
+            raise CertificateError(
+                f"row {start + i} has {name} {found:.9g} among others, and {expected:.9g} by "
+                "itself: one of the two is wrong. This is a fault of the program; please report "
+                "it with the study file."
+            )
 
 
 def _groups(
