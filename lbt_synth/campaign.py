@@ -10,19 +10,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import multiprocessing
 import os
 import re
-import signal
-import threading
-import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
     Executor,
     Future,
-    ProcessPoolExecutor,
     wait,
 )
 from pathlib import Path
@@ -30,12 +25,11 @@ from typing import Any
 
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.files import write_atomically
+from lbt_synth.processes import WorkerPool, alone_in, one_thread_each
 from lbt_synth.validation import integer
 
 Case = Mapping[str, Any]
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*\Z")
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-_ORPHAN_SECONDS = 1.0
 
 
 def run_cases(
@@ -95,7 +89,7 @@ def run_cases(
     folder = Path(directory)
     jobs = integer(jobs, "jobs", at_least=1)
     digests = {name: _digest(name, case) for name, case in cases.items()}
-    with _alone_in(folder):
+    with alone_in(folder, "campaign"):
         results = {}
         for name, expected in digests.items():
             found = _read(folder / f"{name}.json", expected)
@@ -153,44 +147,24 @@ def _results(
 
 @contextlib.contextmanager
 def _pool(workers: int) -> Iterator[Executor]:
-    """Fresh processes with one thread of linear algebra each, gone when their parent is."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    for name in _THREADS:
-        os.environ.setdefault(name, "1")
-    try:
-        with ProcessPoolExecutor(
-            workers,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_watch_parent,
-            initargs=(os.getpid(),),
-        ) as pool:
-            others = set(multiprocessing.active_children())
-            try:
-                yield pool
-            except BrokenExecutor as error:
-                raise NumericalError(
-                    "a process of the campaign ended without a word, for want of memory perhaps. "
-                    "What is finished is kept: start again, with fewer jobs."
-                ) from error
-            except (KeyboardInterrupt, SystemExit, GeneratorExit):
-                for worker in set(multiprocessing.active_children()) - others:
-                    worker.terminate()  # what they run is not waited for
-                raise
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-
-
-def _watch_parent(parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and ends them
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_ORPHAN_SECONDS)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    """Give processes that are waited for, unless this one is interrupted."""
+    with one_thread_each():
+        pool = WorkerPool(workers)
+        try:
+            yield pool.executor
+        except BrokenExecutor as error:
+            pool.close()
+            raise NumericalError(
+                "a process of the campaign ended without a word, for want of memory perhaps. "
+                "What is finished is kept: start again, with fewer jobs."
+            ) from error
+        except (KeyboardInterrupt, SystemExit, GeneratorExit):
+            pool.kill()
+            raise
+        except BaseException:
+            pool.close()
+            raise
+        pool.close()
 
 
 def _digest(name: str, case: Case) -> str:
@@ -241,26 +215,3 @@ def _write(
         raise ProblemError(f"the result of {name} must fit into JSON: {error}.") from error
     write_atomically(folder / f"{name}.json", text.encode())
     return dict(json.loads(text)["result"])
-
-
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold a lock that the system lets go of when this process ends, however it ends."""
-    try:
-        import fcntl
-    except ImportError:  # Windows: two campaigns in one directory are not noticed
-        yield
-        return
-    try:
-        stream = (folder / ".lock").open("w")
-    except OSError as error:
-        raise OutputError(f"cannot write into {folder}: {error.strerror}.", path=folder) from error
-    with stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise OutputError(
-                f"another campaign is running in {folder}. Wait for it, or name another directory.",
-                path=folder,
-            ) from error
-        yield

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 from lbt_synth.errors import OutputError
 
@@ -184,28 +185,79 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
                     done.unlink()
                 else:
                     _stage(done, content_before).replace(done)
-        reason = getattr(error, "strerror", None) or error
-        raise OutputError(
-            f"cannot write {target}: {reason}. Check the directory and its free space.",
-            path=target,
-        ) from error
+        raise _unwritten(target, error) from error
     return tuple(targets)
 
 
 def _stage(target: Path, content: bytes) -> Path:
     """Write a whole file under a temporary name beside its target; none is left if that fails."""
+    with _staged(target) as (stream, temporary):
+        stream.write(content)
+    return temporary
+
+
+@contextlib.contextmanager
+def _staged(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
+    """Give a stream to a temporary file beside a target, and its name; gone if the block fails."""
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+            yield stream, temporary
             stream.flush()
             os.fsync(stream.fileno())
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
-    except OSError:
+    except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
-    return temporary
+
+
+@contextlib.contextmanager
+def writing_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Give a stream whose content becomes a file when the block ends well, and not before.
+
+    Parameters
+    ----------
+    path : path-like
+        Where to write.
+
+    Yields
+    ------
+    binary stream
+        The file, for content that need not be in memory as a whole.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; nothing is left behind, and an older file of that name stays as
+        it was.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> from lbt_synth.files import writing_atomically
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with writing_atomically(pathlib.Path(folder) / "a.txt") as stream:
+    ...         _ = stream.write(b"part by part")
+    ...     (pathlib.Path(folder) / "a.txt").read_bytes()
+    b'part by part'
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+    try:
+        with _staged(target) as (stream, temporary):
+            yield stream
+        temporary.replace(target)
+    except OSError as error:
+        raise _unwritten(target, error) from error
+
+
+def _unwritten(target: Path, error: Exception) -> OutputError:
+    reason = getattr(error, "strerror", None) or error
+    return OutputError(
+        f"cannot write {target}: {reason}. Check the directory and its free space.", path=target
+    )

@@ -17,6 +17,7 @@ from lbt_synth.cli.modal_command import modal
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.paper_command import paper
 from lbt_synth.cli.robustness_command import robustness
+from lbt_synth.cli.study_command import study
 from lbt_synth.cli.telemetry_command import telemetry
 
 COMMANDS: dict[str, Callable[[Namespace], Report]] = {
@@ -34,6 +35,7 @@ COMMANDS: dict[str, Callable[[Namespace], Report]] = {
     "show": show,
     "sigma": sigma,
     "simulate": simulate,
+    "study": study,
     "telemetry": telemetry,
     "tradeoff": tradeoff_command,
     "verify": verify,

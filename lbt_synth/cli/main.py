@@ -308,9 +308,35 @@ def build_parser() -> argparse.ArgumentParser:
         help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
     )
 
+    _add_study_command(command)
+
     paper = command("paper", "Tables and figures of Agapito et al. 2008, ours beside theirs")
     paper.add_argument("-o", "--output", required=True, help="directory to write into")
     return parser
+
+
+def _add_study_command(command: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the robustness study."""
+    study = command(
+        "study",
+        "Try controllers on many samples of what the loop may meet; resumes if started again",
+    )
+    study.add_argument("study", metavar="file", help="study file (YAML)")
+    study.add_argument("-o", "--output", required=True, help="directory of the study")
+    engine = study.add_mutually_exclusive_group()
+    engine.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
+    engine.add_argument(
+        "--dask", metavar="ADDRESS", help="Dask scheduler that runs it instead, as tcp://host:8786"
+    )
+    instead = study.add_mutually_exclusive_group()
+    instead.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say how many samples and how long, and write nothing",
+    )
+    instead.add_argument(
+        "--row", type=int, help="compute one row anew, and write it as a configuration"
+    )
 
 
 def _add_record_commands(command: Callable[..., argparse.ArgumentParser]) -> None:

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -128,10 +136,12 @@ def progress(items: Iterable[Any], *, total: int, what: str, quiet: bool) -> Ite
 
 
 @contextmanager
-def counting(*, total: int, what: str, quiet: bool) -> Iterator[Callable[[int], None]]:
+def counting(
+    *, total: int, what: str, quiet: bool, rate: bool = False
+) -> Iterator[Callable[[int], None]]:
     """Give a function that counts what is done, for a bar that shows after two seconds."""
     start = time.monotonic()
-    with _bar(quiet=quiet) as bar:
+    with _bar(quiet=quiet, rate=rate) as bar:
         task = bar.add_task(what, total=total, visible=False)
 
         def count(done: int) -> None:
@@ -140,12 +150,21 @@ def counting(*, total: int, what: str, quiet: bool) -> Iterator[Callable[[int], 
         yield count
 
 
-def _bar(*, quiet: bool) -> Progress:
+class _Rate(ProgressColumn):
+    """How many a second."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.4g}/s")
+
+
+def _bar(*, quiet: bool, rate: bool = False) -> Progress:
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        *([_Rate()] if rate else []),
         TimeRemainingColumn(),
         console=console,
         disable=quiet or not console.is_terminal,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.plotting.cells import bands, cell_edges
 from lbt_synth.plotting.style import house_style, new_figure
 from lbt_synth.robustness_map import StrehlMap
-from lbt_synth.validation import BoolArray, FloatArray
 
 _LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
 
@@ -87,7 +87,7 @@ def _panel(panel: Any, found: StrehlMap, row: int, low: float, high: float) -> A
     errors, gains = found.errors_hz[across], found.sensor_gains[up]
     percent = 100 * found.strehl[row][np.ix_(up, across)]
     panel.grid(False)
-    x, y = _cell_edges(errors), _cell_edges(gains)
+    x, y = cell_edges(errors), cell_edges(gains)
     mesh = panel.pcolormesh(
         x, y, np.ma.masked_invalid(percent), cmap="viridis", vmin=low, vmax=high, rasterized=True
     )
@@ -100,7 +100,7 @@ def _panel(panel: Any, found: StrehlMap, row: int, low: float, high: float) -> A
         )  # fmt: skip
         panel.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
     height = y[-1] - y[0]
-    for bottom, top in _bands(~found.stable[row][up], y):
+    for bottom, top in bands(~found.stable[row][up], y):
         panel.axhspan(bottom, top, facecolor="0.85", edgecolor="0.55", hatch="////", linewidth=0)
         if top - bottom < 0.08 * height:  # no room for a word
             continue
@@ -113,19 +113,3 @@ def _panel(panel: Any, found: StrehlMap, row: int, low: float, high: float) -> A
     panel.set_xlim(x[0], x[-1])
     panel.set_ylim(y[0], y[-1])
     return mesh
-
-
-def _cell_edges(centres: FloatArray) -> FloatArray:
-    """Return the ends of the cells of increasing values, halfway between them."""
-    if centres.size == 1:
-        return np.array([centres[0] - 0.05, centres[0] + 0.05])
-    middle = (centres[1:] + centres[:-1]) / 2
-    first, last = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
-    return np.concatenate([[first], middle, [last]])
-
-
-def _bands(marked: BoolArray, edges: FloatArray) -> list[tuple[float, float]]:
-    """Intervals that consecutive marked cells cover."""
-    steps = np.diff(np.concatenate([[False], marked, [False]]).astype(np.int64))
-    starts, ends = np.nonzero(steps > 0)[0], np.nonzero(steps < 0)[0]
-    return [(float(edges[i]), float(edges[j])) for i, j in zip(starts, ends, strict=True)]

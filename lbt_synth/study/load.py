@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +16,7 @@ from lbt_synth.config import Config, load_config
 from lbt_synth.config.designing import DesignRequest, designed
 from lbt_synth.config.load import read_mapping, validated
 from lbt_synth.design import Design
-from lbt_synth.errors import ConfigError, FileError, LbtSynthError
-from lbt_synth.gainfile import load_gain
+from lbt_synth.errors import ConfigError, LbtSynthError
 from lbt_synth.gainfile.store import load_with_digest
 from lbt_synth.study.distributions import (
     Distribution,
@@ -32,13 +31,15 @@ from lbt_synth.study.paths import Keys, keys_of, require_number
 from lbt_synth.study.point import closed_loop
 from lbt_synth.study.sample import Sample, sample_of
 from lbt_synth.study.schema import ParameterSection, StudySection
+from lbt_synth.study.store import read_manifest, require_same, stored_design
 from lbt_synth.study.study import ERRORS, Parameter, Study, StudyController
 
 _MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
-Maker = Callable[[str, DesignRequest], Design]
 
 
-def load_study(path: str | os.PathLike[str], *, made: Maker | None = None) -> Study:
+def load_study(
+    path: str | os.PathLike[str], *, directory: str | os.PathLike[str] | None = None
+) -> Study:
     """Read a study file, check it and make the designs that are for the whole study.
 
     Checked are the file, the configuration, the gain files, that every parameter is a number of
@@ -49,9 +50,8 @@ def load_study(path: str | os.PathLike[str], *, made: Maker | None = None) -> St
     ----------
     path : path-like
         The file (YAML).
-    made : callable, optional
-        Returns the design of a controller's name and request, instead of a new one: that of an
-        earlier run, for example.
+    directory : path-like, optional
+        Directory of the study. If it was begun there, its designs are read instead of made anew.
 
     Returns
     -------
@@ -66,6 +66,8 @@ def load_study(path: str | os.PathLike[str], *, made: Maker | None = None) -> St
         If a gain file cannot be read.
     SynthesisError
         If a design cannot be made.
+    OutputError
+        If the directory is of another study, or a design in it was changed.
 
     Examples
     --------
@@ -102,6 +104,7 @@ def load_study(path: str | os.PathLike[str], *, made: Maker | None = None) -> St
         inputs=(source, config_file, *files.values()),
     )
     samples = [(where, _checked(study, where, values)) for where, values in _corners(study)]
+    stored = _stored(study, directory)
     controllers = []
     for name, section in settings.controllers.items():
         if section.file is not None:
@@ -112,7 +115,7 @@ def load_study(path: str | os.PathLike[str], *, made: Maker | None = None) -> St
             assert section.design is not None  # the schema wants one of the two
             request = DesignRequest(method=section.design, options=section.options)
             own = section.for_ == "sample"
-            design = None if own else _made(name, request, config, made, source)
+            design = None if own else stored.get(name) or _made(name, request, config, source)
             words = "for each sample" if own else "for the configuration"
             entry = StudyController(
                 name=name, request=request, design=design, origin=f"{section.design} {words}"
@@ -133,22 +136,19 @@ def load_study(path: str | os.PathLike[str], *, made: Maker | None = None) -> St
     return study
 
 
-def made_in(directory: str | os.PathLike[str]) -> Maker:
-    """Return a maker that reads ``NAME.fits`` of a directory, and fails if it is not there."""
+def _stored(study: Study, directory: str | os.PathLike[str] | None) -> dict[str, Design]:
+    """Return the designs that a directory has of a study."""
+    manifest = None if directory is None else read_manifest(Path(directory))
+    if directory is None or manifest is None:
+        return {}
+    require_same(manifest, study.digest, Path(directory))
+    found = {name: stored_design(Path(directory), name, manifest) for name in manifest["designs"]}
+    return {name: design for name, design in found.items() if design is not None}
 
-    def read(name: str, request: DesignRequest) -> Design:
-        return load_gain(Path(directory) / f"{name}.fits")
 
-    return read
-
-
-def _made(
-    name: str, request: DesignRequest, config: Config, made: Maker | None, source: Path
-) -> Design:
+def _made(name: str, request: DesignRequest, config: Config, source: Path) -> Design:
     try:
-        return designed(config, request) if made is None else made(name, request)
-    except FileError:
-        raise
+        return designed(config, request)
     except LbtSynthError as error:
         error.args = (f"{source}: controllers.{name}: {error}",)
         raise

@@ -1,0 +1,264 @@
+"""Command ``study``: run, dry run, replay of a row."""
+
+from __future__ import annotations
+
+import contextlib
+from argparse import Namespace
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lbt_synth
+from lbt_synth.cli.output import Report, TableText, counting, working
+from lbt_synth.cli.writing import made_directory
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import refuse_replacing, write_atomically
+from lbt_synth.pages import Cell, Table, page_html
+from lbt_synth.report.study import StudyInfo, study_page
+from lbt_synth.study import (
+    Study,
+    StudyStatistics,
+    load_study,
+    replay_row,
+    run_study,
+    study_statistics,
+    summary_tables,
+)
+from lbt_synth.study.cluster import connected
+from lbt_synth.study.estimate import estimate_study
+from lbt_synth.study.results import read_failures
+from lbt_synth.study.run import written_files
+from lbt_synth.study.store import read_manifest
+from lbt_synth.study.summary import worst_table
+from lbt_synth.validation import FloatArray
+
+_PAGE = "summary.html"
+_WORST = 3  # rows of each controller that are printed; the page has more
+
+
+def study(arguments: Namespace) -> Report:
+    """Run a study, say what it will cost, or replay one of its rows."""
+    if arguments.jobs < 1:
+        raise ProblemError(f"--jobs must be at least 1; got {arguments.jobs}.")
+    folder = Path(arguments.output)
+    with working("reading the study, designing", quiet=arguments.json):
+        loaded = load_study(arguments.study, directory=folder)
+    refuse_replacing([folder / _PAGE, *written_files(folder, loaded)], loaded.inputs)
+    if arguments.dry_run:
+        return _dry_run(loaded, arguments)
+    if arguments.row is not None:
+        return _replay(loaded, folder, arguments)
+    return _run(loaded, folder, arguments)
+
+
+# ---------------------------------------------------------------- run
+def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
+    found: list[StudyStatistics] = []
+    with _engine(arguments) as (executor, workers):
+        made_directory(folder)
+        with counting(
+            total=loaded.samples, what="samples", quiet=arguments.json, rate=True
+        ) as count:
+            run = run_study(
+                loaded,
+                folder,
+                executor=executor,
+                jobs=arguments.jobs,
+                workers=workers,
+                progress=count,
+                whole=lambda columns: found.append(_summarised(loaded, folder, columns)),
+            )
+    report = Report(
+        data={
+            "samples": run.samples,
+            "computed": run.computed,
+            "failures": run.failures,
+            "retry": run.retry,
+            "seconds": run.seconds,
+            "files": [str(run.results), str(run.failed), str(folder / _PAGE)],
+        }
+    )
+    if not found:
+        report.notes.append(
+            f"{folder} is finished: {run.samples} samples in {run.results.name}; nothing to do."
+        )
+        return report
+    statistics = found[0]
+    varying = [p.name for p in loaded.parameters if p.distribution.varies]
+    report.data["statistics"] = asdict(statistics)
+    report.tables = [_text_of(table) for table in summary_tables(statistics)]
+    report.tables += [
+        _text_of(worst_table(each, varying), rows=_WORST) for each in statistics.controllers
+    ]
+    speed = run.computed / run.seconds if run.seconds > 0 else float("inf")
+    report.notes.append(
+        f"{run.computed} of {run.samples} samples computed in {_duration(run.seconds)} "
+        f"({speed:.3g} a second)."
+    )
+    if run.failures:
+        report.notes.append(
+            f"note: {run.failures} results failed, see {run.failed}."
+            + (" Those that ended their process are tried again if it is started again."
+               if run.retry else "")
+        )  # fmt: skip
+    report.notes += [f"written: {path}" for path in report.data["files"]]
+    return report
+
+
+@contextlib.contextmanager
+def _engine(arguments: Namespace) -> Iterator[tuple[Executor | None, int | None]]:
+    """Give the executor of ``--dask`` and its workers, or none for ``--jobs``."""
+    if arguments.dask is None:
+        yield None, None
+        return
+    with connected(arguments.dask) as cluster:
+        yield cluster.executor, cluster.workers
+
+
+def _summarised(loaded: Study, folder: Path, columns: Mapping[str, FloatArray]) -> StudyStatistics:
+    """Compute the statistics of a whole study, and write its page."""
+    statistics = study_statistics(
+        columns, loaded.parameter_names, [controller.name for controller in loaded.controllers]
+    )
+    manifest = read_manifest(folder) or {}
+    info = StudyInfo(
+        name=loaded.source.stem,
+        samples=loaded.samples,
+        sampling=loaded.settings.sampling.replace("_", " "),
+        evaluation=loaded.settings.evaluation,
+        parameters={p.name: p.distribution.text for p in loaded.parameters},
+        controllers={c.name: c.origin for c in loaded.controllers},
+        digests=manifest.get("designs", {}),
+        digest=loaded.digest,
+        failures=read_failures(folder),
+        study_text=loaded.source.read_text(encoding="utf-8"),
+        config_text=loaded.config.source.read_text(encoding="utf-8"),
+        versions={"lbt_synth": lbt_synth.__version__, "numpy": np.__version__},
+        replay=f"lbt-synth study {loaded.source} -o {folder} --row {{row}}",
+        creator=f"lbt_synth {lbt_synth.__version__}",
+    )
+    write_atomically(folder / _PAGE, page_html(study_page(info, statistics, columns)))
+    return statistics
+
+
+def _text_of(table: Table, rows: int | None = None) -> TableText:
+    cells = [
+        [cell.text if isinstance(cell, Cell) else cell for cell in row] for row in table.rows[:rows]
+    ]
+    width = len(table.headings)
+    return TableText(
+        title=table.caption,
+        headings=table.headings,
+        rows=[row + [""] * (width - len(row)) for row in cells],
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.3g} s"
+    if seconds < 6000:
+        return f"{seconds / 60:.3g} min"
+    hours = seconds / 3600
+    return f"{hours:.3g} h" if hours < 100 else f"{hours / 24:.3g} days"
+
+
+# ---------------------------------------------------------------- dry run
+def _dry_run(loaded: Study, arguments: Namespace) -> Report:
+    with _engine(arguments) as (_, workers):
+        count = workers or arguments.jobs
+    with working("measuring a batch", quiet=arguments.json):
+        cost = estimate_study(loaded, workers=count, local=workers is None)
+    where = f"{count} {'process' if count == 1 else 'processes'}"
+    if workers is not None:
+        where = f"{count} threads of {arguments.dask}, as quick as this one"
+    settings = loaded.settings
+    notes = []
+    if settings.sampling == "sobol" and loaded.samples & (loaded.samples - 1):
+        notes.append(
+            "note: Sobol's points are balanced best when their number is a power of two; "
+            f"{loaded.samples} is none."
+        )
+    return Report(
+        data={
+            "samples": loaded.samples,
+            "sampling": settings.sampling,
+            "evaluation": settings.evaluation,
+            "parameters": {p.name: p.distribution.text for p in loaded.parameters},
+            "controllers": {c.name: c.origin for c in loaded.controllers},
+            "workers": count,
+            **asdict(cost),
+        },
+        tables=[
+            TableText(
+                title=f"Study {loaded.source}",
+                headings=("quantity", "value", "unit"),
+                rows=[
+                    ("samples", str(loaded.samples), ""),
+                    (
+                        "sampling",
+                        f"{settings.sampling.replace('_', ' ')}, seed {settings.seed}",
+                        "",
+                    ),
+                    ("evaluation", settings.evaluation, ""),
+                    (
+                        f"time of {cost.measured_rows} samples, measured in one process",
+                        f"{cost.measured_s:.3g}",
+                        "s",
+                    ),
+                    (f"time of the whole, on {where}", f"about {_duration(cost.seconds)}", ""),
+                    ("space on the disk", f"about {cost.disk_bytes / 1e6:.3g}", "MB"),
+                ],
+            ),
+            TableText(
+                title="Parameters",
+                headings=("parameter", "distribution"),
+                rows=[(p.name, p.distribution.text) for p in loaded.parameters],
+            ),
+            TableText(
+                title="Controllers",
+                headings=("controller", "what"),
+                rows=[(c.name, c.origin) for c in loaded.controllers],
+            ),
+        ],
+        notes=[*notes, "nothing was written."],
+    )
+
+
+# ---------------------------------------------------------------- replay
+def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
+    made_directory(folder)
+    with working("replaying", quiet=arguments.json):
+        again = replay_row(loaded, folder, arguments.row)
+    names = loaded.result_columns
+    data: dict[str, Any] = {
+        "row": again.row,
+        "parameters": again.parameters,
+        "stored": again.stored,
+        "fresh": again.fresh,
+        "failures": [asdict(failure) for failure in again.failures],
+        "files": [str(path) for path in again.files],
+    }
+    return Report(
+        data=data,
+        tables=[
+            TableText(
+                title=f"Row {again.row}",
+                headings=("parameter", "value"),
+                rows=list(again.parameters.items()),
+            ),
+            TableText(
+                title="Results",
+                headings=("result", "stored", "now"),
+                rows=[(name, again.stored.get(name), again.fresh.get(name)) for name in names],
+            ),
+        ],
+        notes=[
+            *([] if again.stored else ["note: the study has no result of this row yet."]),
+            *(f"failed: {failure.controller}: {failure.error}" for failure in again.failures),
+            *(f"written: {path}" for path in again.files),
+        ],
+    )

@@ -1,0 +1,27 @@
+"use strict";
+// The drawings in the page are replaced by charts with hover and zoom, if these can be made.
+(async function () {
+  const root = document.documentElement;
+  try {
+    const charts = JSON.parse(document.getElementById("_charts").textContent);
+    root.classList.add("live"); // places must have a size before they are drawn in
+    await Bokeh.embed.embed_items(charts.documents, charts.items);
+    const page = Bokeh.documents[0];
+    if (window.matchMedia("(pointer: fine)").matches) {
+      for (const id of charts.zooms) page.get_model_by_id(id).active = true;
+    }
+    for (const button of document.querySelectorAll(".legend button")) {
+      button.addEventListener("click", () => {
+        const shown = button.getAttribute("aria-pressed") !== "true";
+        button.setAttribute("aria-pressed", String(shown));
+        for (const id of button.dataset.lines.split(" ")) {
+          page.get_model_by_id(id).visible = shown;
+        }
+      });
+    }
+    root.dataset.drawn = "yes";
+  } catch (error) {
+    root.classList.remove("live");
+    console.error("the charts stay drawings:", error);
+  }
+})();
