@@ -335,9 +335,9 @@ def test_unstable_loops_and_samples_that_fail(tmp_path):
     study = loaded(
         tmp_path,
         samples="8",
-        controllers="{wild: {design: integrator, gain: 0.9}, tight: {design: mixed, rms: 140, for: "
-        "sample}}",
-        parameters="{truth.sensor_gain: {list: [0.3, 1.4]}, sensor.noise_nm: {list: [1, 60]}}",
+        controllers="{wild: {design: integrator, gain: 0.9}, tight: {design: integrator, gain: "
+        "0.7, for: sample}}",
+        parameters="{truth.sensor_gain: {list: [0.3, 1.4]}, loop.delay_frames: {list: [2, 4]}}",
     )
     values = study.values()
     batch = lbt.evaluate_samples(study, values, 0)
@@ -346,12 +346,12 @@ def test_unstable_loops_and_samples_that_fail(tmp_path):
     assert np.all(stable[unstable] == 0)
     assert np.all(stable[~unstable] == 1)
     np.testing.assert_array_equal(np.isnan(strehl), unstable)
-    noisy = values[:, 1] == 60
-    assert [failure.row for failure in batch.failures] == np.flatnonzero(noisy).tolist()
+    slow = values[:, 1] == 4
+    assert [failure.row for failure in batch.failures] == np.flatnonzero(slow).tolist()
     assert {failure.controller for failure in batch.failures} == {"tight"}
-    assert "rms" in batch.failures[0].error
-    np.testing.assert_array_equal(np.isnan(batch.columns["tight.stable"]), noisy)
-    lost = noisy | (batch.columns["tight.stable"] == 0)
+    assert "failed its certificate" in batch.failures[0].error
+    np.testing.assert_array_equal(np.isnan(batch.columns["tight.stable"]), slow)
+    lost = slow | (batch.columns["tight.stable"] == 0)
     np.testing.assert_array_equal(np.isnan(batch.columns["tight.strehl"]), lost)
 
 

@@ -89,8 +89,7 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     report.data["statistics"] = asdict(statistics)
     report.tables = [_text_of(table) for table in summary_tables(statistics)]
     report.tables += [
-        _text_of(worst_table(each, varying), rows=_WORST)
-        for each in statistics.controllers
+        _text_of(worst_table(each, varying), rows=_WORST) for each in statistics.controllers
     ]
     speed = run.computed / run.seconds if run.seconds > 0 else float("inf")
     report.notes.append(

@@ -11,6 +11,7 @@ _FIRST_ROWS = 16
 _MOST_ROWS = 65_536
 _GROWTH = 4  # at most so much larger than one that was measured
 _SECONDS = 1.5  # long beside the milliseconds that a task costs, short beside the patience
+_CRUMB_SECONDS = 0.1  # towards the end, no batch is shorter
 _MOST_PARTS = 4000  # a long study has longer batches rather than more files than that
 
 
@@ -56,6 +57,5 @@ class Batches:
             return max(1, min(_FIRST_ROWS, share))
         total_s = self.left / (self._rate * self._workers)
         target_s = max(_SECONDS, total_s * self._workers / _MOST_PARTS)
-        wanted = int(self._rate * target_s)
-        least = min(wanted, max(1, int(0.1 * self._rate)))  # no crumbs shorter than 0.1 s
-        return max(1, least, min(wanted, _GROWTH * self._largest, _MOST_ROWS, share))
+        most = min(int(self._rate * target_s), _GROWTH * self._largest, _MOST_ROWS)
+        return max(1, min(most, max(share, int(self._rate * _CRUMB_SECONDS))))
