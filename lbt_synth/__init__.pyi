@@ -39,6 +39,10 @@ from .endtoend import EndToEndSetup as EndToEndSetup
 from .endtoend import EndToEndSystem as EndToEndSystem
 from .endtoend import calibrate as calibrate
 from .endtoend import run_end_to_end as run_end_to_end
+from .ensemble import EnsembleResiduals as EnsembleResiduals
+from .ensemble import EnsembleVibration as EnsembleVibration
+from .ensemble import LoopEnsemble as LoopEnsemble
+from .ensemble import ensemble_residuals as ensemble_residuals
 from .errors import CertificateError as CertificateError
 from .errors import ConfigError as ConfigError
 from .errors import DefinitenessError as DefinitenessError
@@ -109,6 +113,7 @@ from .models import ARModel as ARModel
 from .models import Atmosphere as Atmosphere
 from .models import DriftingVibration as DriftingVibration
 from .models import EstimationProblem as EstimationProblem
+from .models import FrozenFlows as FrozenFlows
 from .models import FullStatePlant as FullStatePlant
 from .models import LoopHardware as LoopHardware
 from .models import ModalTurbulence as ModalTurbulence

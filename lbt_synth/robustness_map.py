@@ -9,18 +9,13 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design
+from lbt_synth.ensemble import EnsembleVibration, LoopEnsemble, ensemble_residuals
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop import Imaging
-from lbt_synth.loop.budget import ar_covariance, noise_covariance
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, close_loops, loop_poles
-from lbt_synth.loop.sensor_gains import rejections, spectrum_covariances
-from lbt_synth.loop.strehl import jitter_spread_nm, jitter_strehls, widest_jitter_nm
-from lbt_synth.models import ARModel, LoopHardware, Truth, Vibration
+from lbt_synth.models import LoopHardware, Truth, Vibration
 from lbt_synth.models.truth import fitted_direction, stationary_vibrations
-from lbt_synth.statespace import Controller
 from lbt_synth.validation import (
     BoolArray,
-    ComplexArray,
     FloatArray,
     frozen,
     instance,
@@ -140,24 +135,30 @@ def strehl_map(
         hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
         "lie between 1 and 100.",
     )
-    truths = [_moved(truth, error, hardware) for error in errors]
+    lines = _moved_lines(truth, errors, hardware)
     shape = (delays.size, gains.size, errors.size)
     strehls, residuals = np.full(shape, np.nan), np.full(shape, np.nan)
     stable = np.zeros(shape[:2], dtype=np.bool_)
     for i, delay in enumerate(delays):
-        real = replace(hardware, delay_frames=hardware.delay_frames + delay)
         for start in range(0, gains.size, _GAINS_AT_ONCE):
             rows = slice(start, start + _GAINS_AT_ONCE)
-            poles = loop_poles(real, design.controller, gains[rows])
-            inside = np.max(np.abs(poles), axis=1) < 1 - STABILITY_MARGIN
-            stable[i, rows] = inside
-            found = np.nonzero(inside)[0]
-            if found.size:
-                strehls[i, start + found], residuals[i, start + found] = _evaluated(
-                    real, design.controller, gains[rows][found], poles[found], truths, imaging
-                )
+            part = gains[rows]
+            ensemble = LoopEnsemble(
+                sensor_gain=np.repeat(part, errors.size),
+                delay_frames=hardware.delay_frames + delay,
+                noise_nm=truth.noise_of(hardware.n_measurements)[None],
+                turbulence=truth.turbulence,
+                vibrations=tuple(
+                    replace(line, frequency_hz=np.tile(line.frequency_hz, part.size))
+                    for line in lines
+                ),
+            )
+            found = ensemble_residuals(design.controller, hardware, ensemble)
+            stable[i, rows] = found.stable.reshape(part.size, -1)[:, 0]
+            strehls[i, rows] = found.strehl(imaging).reshape(part.size, -1)
+            residuals[i, rows] = found.rms_nm.reshape(part.size, -1)
             if advance is not None:
-                advance(len(inside) * errors.size)
+                advance(part.size * errors.size)
     stable.setflags(write=False)
     return StrehlMap(
         errors_hz=errors,
@@ -181,9 +182,11 @@ def _axis(values: Any, name: str, **bounds: Any) -> FloatArray:
     return axis
 
 
-def _moved(truth: Truth, error_hz: float, hardware: LoopHardware) -> Truth:
-    """Truth whose vibrations lie below what the design believes by an error."""
-    if not truth.vibrations and error_hz != 0:
+def _moved_lines(
+    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
+) -> list[EnsembleVibration]:
+    """Vibrations that lie below what the design believes, one frequency an error."""
+    if not truth.vibrations and np.any(errors_hz != 0):
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
@@ -191,57 +194,20 @@ def _moved(truth: Truth, error_hz: float, hardware: LoopHardware) -> Truth:
     moved = []
     for vibration in stationary_vibrations(truth.vibrations):
         fitted_direction(vibration, hardware)
-        frequency = vibration.frequency_hz - float(error_hz)
-        if not 0 < frequency < nyquist:
+        frequencies = vibration.frequency_hz - errors_hz
+        wrong = ~((frequencies > 0) & (frequencies < nyquist))
+        if np.any(wrong):
             raise ProblemError(
                 f"errors_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
-                f"of {error_hz:.6g} Hz, which moves the one at {vibration.frequency_hz:.6g} Hz to "
-                f"{frequency:.6g} Hz."
+                f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
+                f"{vibration.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
             )
-        moved.append(replace(vibration, frequency_hz=frequency))
-    return replace(truth, vibrations=tuple(moved))
-
-
-def _evaluated(
-    hardware: LoopHardware,
-    controller: Controller,
-    gains: FloatArray,
-    poles: ComplexArray,
-    truths: list[Truth],
-    imaging: Imaging,
-) -> tuple[FloatArray, FloatArray]:
-    """Strehl ratio and residual [nm rms] at stable gains and all truths, (g, e) each."""
-    n, shape = hardware.modes, (len(gains), len(truths))
-    loops = close_loops(hardware, controller, gains)
-    # the others are computed from the loop that is furthest from instability
-    reference = loops[int(np.argmin(np.max(np.abs(poles), axis=1)))]
-    truth = truths[0]  # turbulence and noise are the same in all of them
-    common = np.array([noise_covariance(loop, truth) for loop in loops])
-    for spectrum, modes in truth.turbulence_groups(n):
-        if isinstance(spectrum, ARModel):
-            common += [ar_covariance(loop, spectrum, np.eye(n)[list(modes)]) for loop in loops]
-        else:
-            common += spectrum_covariances(reference, gains, poles, spectrum, modes)
-
-    gaussian = np.repeat(common[:, None], len(truths), axis=1)
-    lines = []
-    moved = (stationary_vibrations(truth.vibrations) for truth in truths)
-    for same in zip(*moved, strict=True):  # one vibration, moved
-        direction = fitted_direction(same[0], hardware)
-        if isinstance(same[0], Vibration):
-            models = [line.ar_model(hardware.frame_rate_hz) for line in same]
-            gaussian += [[ar_covariance(lo, m, direction[None]) for m in models] for lo in loops]
-        else:
-            frequencies = np.array([line.frequency_hz for line in same])
-            response = rejections(reference, gains, frequencies) @ direction
-            lines.append(same[0].amplitude_nm * np.swapaxes(response, 0, 1))
-    amplitudes = np.stack(lines, axis=2) if lines else np.zeros((*shape, 0, n), np.complex128)
-
-    power = np.trace(gaussian, axis1=2, axis2=3) + np.sum(np.abs(amplitudes) ** 2, axis=(2, 3)) / 2
-    covariances, amplitudes = gaussian.reshape(-1, n, n), amplitudes.reshape(power.size, -1, n)
-    seen = jitter_spread_nm(covariances, amplitudes) <= widest_jitter_nm(imaging)
-    strehls = np.zeros(power.size)
-    strehls[seen] = jitter_strehls(
-        covariances[seen], imaging=imaging, line_amplitudes_nm=amplitudes[seen]
-    )
-    return strehls.reshape(shape), np.sqrt(power)
+        moved.append(
+            EnsembleVibration(
+                frequency_hz=frequencies,
+                rms_nm=vibration.rms_nm,
+                direction=vibration.direction,
+                damping=vibration.damping if isinstance(vibration, Vibration) else None,
+            )
+        )
+    return moved

@@ -205,7 +205,7 @@ def test_kalman_of_the_example(config):
 def test_limit_of_the_example_and_a_filter_that_comes_close(config):
     """A Kalman filter with a long AR model of the true spectrum, against 10.84 nm."""
     limit = lbt.least_residual(config.hardware, config.truth).rms_nm
-    assert limit == pytest.approx(10.8412, abs=1e-4)
+    assert limit == pytest.approx(10.8414, abs=1e-4)
     still = replace(config.truth, vibrations=())
     f = (np.arange(1 << 17) + 0.5) / (1 << 17) * RATE / 2
     lags = np.arange(17)
@@ -536,7 +536,7 @@ def test_limits_command(tmp_path, capsys, config):
     status, out, _ = run(capsys, "limits", CONFIG, gain, "-o", table, "-o", figure, "--json")
     assert status == 0
     data = json.loads(out)
-    assert data["limit_nm"] == pytest.approx(10.8412, abs=1e-4)
+    assert data["limit_nm"] == pytest.approx(10.8414, abs=1e-4)
     assert data["band_limit_nm"] == pytest.approx(15.1086, abs=1e-4)
     assert data["band_hz"] == [16.5, 23.5]
     rows = {row["design"]: row for row in data["rows"]}
@@ -600,7 +600,7 @@ def test_show_and_simulate_tell_the_distance(tmp_path, capsys, config):
     assert abs(data["above_limit_percent"]) < 1e-4
     simulate = ("simulate", CONFIG, gain, "--frames", 200, "--cases", 1)
     data = json.loads(run(capsys, *simulate, "--json")[1])
-    assert data["limit_nm"] == pytest.approx(10.8412, abs=1e-4)
+    assert data["limit_nm"] == pytest.approx(10.8414, abs=1e-4)
     assert data["above_limit_percent"] == pytest.approx(231.556, abs=1e-2)
     assert "least residual of any linear controller" in run(capsys, *simulate)[1]
 

@@ -10,8 +10,8 @@ from plants import LBT_YAML
 from scipy.special import j0
 
 import lbt_synth as lbt
+from lbt_synth.ensemble.panels import graded_edges
 from lbt_synth.loop.budget import residual_budget
-from lbt_synth.loop.sensor_gains import graded_edges, rejections
 from lbt_synth.loop.strehl import annular_otf, jitter_strehls
 from lbt_synth.quadrature import adaptive_integral, gauss_panels
 
@@ -240,16 +240,6 @@ def test_many_jitters_of_wrong_sizes():
     indefinite = np.stack([np.eye(2), np.diag([1, -1])])
     with pytest.raises(lbt.DefinitenessError, match="least eigenvalue of -1"):
         jitter_strehls(indefinite, imaging=CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2)))
-
-
-def test_rejections_of_other_gains(robust):
-    one = lbt.close_loop(robust.hardware, robust.controller, sensor_gain=0.8)
-    frequency = np.geomspace(0.01, 399, 60)
-    found = rejections(one, np.array([0.6, 0.8, 1.4]), frequency)
-    for i, gain in enumerate((0.6, 0.8, 1.4)):
-        other = lbt.close_loop(robust.hardware, robust.controller, sensor_gain=gain)
-        expected = other.sensitivity(frequency)
-        assert np.max(np.abs(found[:, i] - expected)) < 1e-11 * np.max(np.abs(expected))
 
 
 def test_panels_are_short_where_a_pole_is_near():

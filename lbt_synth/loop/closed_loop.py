@@ -185,18 +185,8 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
 
     State: controller, mirror (its past commands, if it settles), last residual phi_res(k-1).
     """
+    require_fitting(hardware, controller)
     k = controller.to_statespace()
-    m, q = hardware.n_commands, hardware.n_measurements
-    if (k.C.shape[0], k.B.shape[1]) != (m, q):
-        raise DimensionError(
-            f"the controller must map {q} measurements to {m} commands; got "
-            f"{k.B.shape[1]} to {k.C.shape[0]}."
-        )
-    if not np.isclose(k.dt_s, hardware.dt_s, rtol=1e-9):
-        raise ProblemError(
-            f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
-            f"designed for {1 / k.dt_s:.6g} Hz. Design it for this frame rate."
-        )
     return loop_matrices(
         k.A,
         k.B,
@@ -206,6 +196,21 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
         sensor=hardware.sensor,
         influence=hardware.influence,
     )
+
+
+def require_fitting(hardware: LoopHardware, controller: Controller) -> None:
+    """Raise if a controller has other sizes or another sampling period than a loop."""
+    m, q = hardware.n_commands, hardware.n_measurements
+    if (controller.C.shape[0], controller.B.shape[1]) != (m, q):
+        raise DimensionError(
+            f"the controller must map {q} measurements to {m} commands; got "
+            f"{controller.B.shape[1]} to {controller.C.shape[0]}."
+        )
+    if not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
+        raise ProblemError(
+            f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
+            f"designed for {1 / controller.dt_s:.6g} Hz. Design it for this frame rate."
+        )
 
 
 def loop_matrices(

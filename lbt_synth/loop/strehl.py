@@ -9,7 +9,7 @@ sinusoids of complex amplitude a::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -210,22 +210,32 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
         return np.empty(0)
     rules = _rules(covariance, lines, spread, imaging.cycles_per_nm)
     # |f.a|^2 and f'Sf are quadratic forms of f
-    forms = np.real(np.einsum("psi,psj->psij", lines, lines.conj()))
+    turns = _form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
+    widths = _form(covariance)
+    # jitter along the axes is the same in all four quadrants
+    aligned = ~np.any(turns[..., 1], axis=1) & (widths[:, 1] == 0)
     out = np.empty(count)
-    for members in _alike(rules, covariance):
-        fineness, directions = rules[members[0]].tolist()
-        squares, weight = _weighted_otf(imaging.obstruction, fineness, directions)
+    for members, rule in _alike(np.column_stack([rules, aligned])):
+        squares, weight = _weighted_otf(imaging.obstruction, *rule)
         squares = squares * imaging.cycles_per_nm**2
-        common = weight * np.exp(-2 * np.pi**2 * (_form(covariance[members[0]]) @ squares))
         step = max(1, _POINT_CHUNK // weight.size)
         for start in range(0, len(members), step):
             part = members[start : start + step]
-            factor = np.ones((1, weight.size))
+            factor = _blurred(widths[part], squares)
             for line in range(lines.shape[1]):
-                turns_squared = np.maximum(_form(forms[part, line]) @ squares, 0)
-                factor = factor * j0(2 * np.pi * np.sqrt(turns_squared))
-            out[part] = imaging.other_modes * (factor @ common)
+                if np.any(turns[part, line]):
+                    turns_squared = np.maximum(turns[part, line] @ squares, 0)
+                    factor = factor * j0(2 * np.pi * np.sqrt(turns_squared))
+            out[part] = imaging.other_modes * (factor @ weight)
     return out
+
+
+def _blurred(forms: FloatArray, squares: FloatArray) -> FloatArray:
+    """Transfer of Gaussian jitters (p, nodes); those that share one are computed once."""
+    if len(forms) > 1 and np.array_equal(forms[0], forms[-1]):
+        unique, which = np.unique(forms, axis=0, return_inverse=True)
+        return np.exp(-2 * np.pi**2 * (unique @ squares))[which.ravel()]
+    return np.exp(-2 * np.pi**2 * (forms @ squares))
 
 
 def jitter_spread_nm(covariance_nm2: FloatArray, line_amplitudes_nm: ComplexArray) -> FloatArray:
@@ -246,15 +256,11 @@ def _form(matrices: FloatArray) -> FloatArray:
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
 
 
-def _alike(rules: IntArray, covariance: FloatArray) -> list[IntArray]:
-    """Return the indices of the points that share a rule and a covariance, group by group."""
-    count = len(rules)
-    if count == 1:
-        return [np.zeros(1, dtype=np.int64)]
-    keys = np.column_stack([rules, covariance.reshape(count, -1)])
-    _, own, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(own.reshape(-1), kind="stable")
-    return np.split(order, np.cumsum(counts)[:-1])
+def _alike(rules: IntArray) -> Iterator[tuple[IntArray, list[int]]]:
+    """Yield the indices of the points that share a rule, with the rule."""
+    unique, own = np.unique(rules, axis=0, return_inverse=True)
+    for i, rule in enumerate(unique.tolist()):
+        yield np.flatnonzero(own.reshape(-1) == i), rule
 
 
 def _rules(
@@ -333,9 +339,12 @@ def _require_axes(size: int) -> None:
 
 @lru_cache(maxsize=32)
 def _weighted_otf(
-    obstruction: float, fineness: int, directions: int
+    obstruction: float, fineness: int, directions: int, quadrant: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Nodes over half the plane, as (fx^2, 2 fx fy, fy^2) [(D/lambda)^2]; OTF weights of sum 1."""
+    """Nodes as (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1.
+
+    They fill half the plane; with ``quadrant``, a quarter of it.
+    """
     eps = obstruction
     kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
     edges = np.array(sorted(kinks))
@@ -343,9 +352,9 @@ def _weighted_otf(
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    angle = np.pi * np.arange(directions) / directions
+    angle = np.pi * (np.arange(directions // 2 if quadrant else directions) + 0.5) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
-    weights = np.repeat(weight / (weight.sum() * directions), directions)
+    weights = np.repeat(weight / (weight.sum() * angle.size), angle.size)
     return np.stack([fx**2, 2 * fx * fy, fy**2]), weights
 
 

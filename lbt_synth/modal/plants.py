@@ -12,7 +12,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.lifting import Response
 from lbt_synth.models.modal_turbulence import ModalTurbulence
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.vibration import Vibration, sampled_lines
 from lbt_synth.stacks import transposed
 from lbt_synth.validation import FloatArray, frozen, integer, real_array
 
@@ -101,11 +101,14 @@ def disturbances(turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray) -
         np.zeros((count, size)),
     )
     now, before, tur = np.arange(p), np.arange(p, 2 * p), 2 * p
-    for i, mode in enumerate(modes):
-        for j, line in enumerate(lines[mode]):
-            model = line.ar_model(turbulence.frame_rate_hz)
-            A[i, j, [j, p + j]] = model.coefficients
-            B[i, j, j] = model.driving_rms_nm
+    each = [(i, j, line) for i, mode in enumerate(modes) for j, line in enumerate(lines[mode])]
+    if each:
+        i, j = np.array([place[:2] for place in each]).T
+        numbers = np.array([[line.frequency_hz, line.damping, line.rms_nm] for *_, line in each])
+        frequency, damping, rms = numbers.T
+        coefficients, driving = sampled_lines(frequency, damping, rms, turbulence.frame_rate_hz)
+        A[i, j, j], A[i, j, p + j] = coefficients.T
+        B[i, j, j] = driving
     A[:, before, now] = 1
     A[:, tur:, tur:] = turbulence.companions[modes]
     B[:, tur, p] = turbulence.driving_rms_nm[modes]

@@ -3,6 +3,7 @@
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
 from lbt_synth.models.drift import DriftingVibration
+from lbt_synth.models.flows import FrozenFlows
 from lbt_synth.models.full_plant import FullStatePlant
 from lbt_synth.models.hardware import LoopHardware
 from lbt_synth.models.local_loop import PositionLoop, StepResponse
@@ -32,6 +33,7 @@ __all__ = [
     "Atmosphere",
     "DriftingVibration",
     "EstimationProblem",
+    "FrozenFlows",
     "FullStatePlant",
     "LoopHardware",
     "ModalTurbulence",

@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
@@ -84,7 +85,13 @@ class Atmosphere:
     @property
     def tilt_rms_nm(self) -> float:
         """Standard deviation of tip, and of tilt [nm rms wavefront]."""
-        return float(np.sqrt(_tilt_variance(self)))
+        variance = tilt_variance(self.scale_ratio, self.obstruction)
+        return float(np.sqrt(tilt_strength_nm2(self) * variance))
+
+    @property
+    def scale_ratio(self) -> float:
+        """Telescope diameter over the outer scale; 0 for Kolmogorov turbulence."""
+        return 0.0 if self.outer_scale_m is None else self.diameter_m / self.outer_scale_m
 
     def psd(self, frequency_hz: Any) -> FloatArray:
         """One-sided temporal power spectrum of one axis [nm^2/Hz].
@@ -120,16 +127,12 @@ class Atmosphere:
         frequency = real_array(frequency_hz, "frequency_hz")
         if np.any(frequency < 0):
             raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency)}.")
-        log_f, log_psd, low = _tilt_psd_table(self)
+        crossing_s = self.diameter_m / self.wind_speed_m_s
         with np.errstate(divide="ignore"):
-            x = np.log(frequency)
-        values = np.exp(np.interp(x, log_f, log_psd))
-        # beyond the table: the power law f^(-17/3) of tilt
-        tail = x > log_f[-1]
-        values = np.where(
-            tail, np.exp(log_psd[-1] - 17 / 3 * (np.where(tail, x, log_f[-1]) - log_f[-1])), values
-        )
-        return np.asarray(np.where(x < log_f[0], low, values))
+            density = tilt_spline(self.scale_ratio, self.obstruction)(
+                np.log(frequency * crossing_s)
+            )
+        return np.asarray(tilt_strength_nm2(self) * crossing_s * np.exp(density))
 
 
 def kolmogorov_constant_nm2(air: Atmosphere) -> float:
@@ -138,22 +141,24 @@ def kolmogorov_constant_nm2(air: Atmosphere) -> float:
     return float(_VON_KARMAN * air.fried_parameter_m ** (-5 / 3) * nm_per_radian**2)
 
 
-def _filtered_spectrum(air: Atmosphere, f: FloatArray) -> FloatArray:
-    """Spatial phase spectrum times the tilt filter, mean over directions [nm^2 m^2].
+def tilt_strength_nm2(air: Atmosphere) -> float:
+    """Factor of tilt spectra in units of the telescope's diameter [nm^2]."""
+    return float(kolmogorov_constant_nm2(air) * air.diameter_m ** (5 / 3))
 
-    The filter is Noll's for a disc, and for an annulus the transform of the
-    annular tilt of unit rms.
+
+def _filtered_spectrum(scale_ratio: float, eps: float, f: FloatArray) -> FloatArray:
+    """Spatial phase spectrum times the tilt filter, mean over directions.
+
+    Of unit Kolmogorov constant, with f in cycles a diameter. The filter is Noll's for a disc,
+    and for an annulus the transform of the annular tilt of unit rms.
     """
-    inner = 0.0 if air.outer_scale_m is None else air.outer_scale_m**-2
-    eps = air.obstruction
-    argument = np.pi * air.diameter_m * f
+    argument = np.pi * f
     edge = _bessel_j2(argument)
     if eps > 0:
         edge = edge - eps**3 * _bessel_j2(eps * argument)
     amplitude = 2 * edge / argument
     tilt_filter = 2 * amplitude**2 / ((1 - eps**2) ** 2 * (1 + eps**2))
-    phase = kolmogorov_constant_nm2(air) * (f**2 + inner) ** (-11 / 6)
-    return np.asarray(phase * tilt_filter)
+    return np.asarray((f**2 + scale_ratio**2) ** (-11 / 6) * tilt_filter)
 
 
 def _bessel_j2(x: FloatArray) -> FloatArray:
@@ -165,33 +170,49 @@ def _bessel_j2(x: FloatArray) -> FloatArray:
     return out
 
 
-def _spatial_panels(diameter_m: float) -> tuple[FloatArray, FloatArray]:
-    """Nodes over spatial frequency [1/m]: octaves below 1/D, steps of 1/(2D) above."""
+@lru_cache(maxsize=1)
+def _spatial_panels() -> tuple[FloatArray, FloatArray]:
+    """Nodes over spatial frequency [1/D]: octaves below 1/4, steps of 1/2 above."""
     low = np.geomspace(1e-9, 0.25, 90)
-    high = np.arange(0.5, 40.5, 0.5)
-    return gauss_panels(np.concatenate([low, high]) / diameter_m, 8)
+    return gauss_panels(np.concatenate([low, np.arange(0.5, 40.5, 0.5)]), 8)
 
 
-@lru_cache(maxsize=32)
-def _tilt_variance(air: Atmosphere) -> float:
-    f, w = _spatial_panels(air.diameter_m)
-    return float(np.sum(2 * np.pi * f * w * _filtered_spectrum(air, f)))
+@lru_cache(maxsize=128)
+def tilt_variance(scale_ratio: float, obstruction: float) -> float:
+    """Variance of one axis, of unit strength."""
+    f, w = _spatial_panels()
+    return float(np.sum(2 * np.pi * f * w * _filtered_spectrum(scale_ratio, obstruction, f)))
 
 
-@lru_cache(maxsize=32)
-def _tilt_psd_table(air: Atmosphere) -> tuple[FloatArray, FloatArray, float]:
-    """Logarithms of frequency and spectrum on a grid, and the value at zero frequency.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LogSpline:
+    """Logarithm of a tilt spectrum over the logarithm of frequency, a cubic spline.
+
+    Constant below its first knot; beyond the last the power law f^(-17/3) of tilt.
+    """
+
+    spline: Any  # a PPoly of scipy
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the logarithms of the spectrum at logarithms of frequencies."""
+        first, last = self.spline.x[[0, -1]]
+        values = self.spline(np.clip(x, first, last))
+        return np.asarray(values - 17 / 3 * np.maximum(x - last, 0))
+
+
+@lru_cache(maxsize=128)
+def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
+    """Temporal spectrum of one axis, of unit strength, over frequency in units of V / D.
 
     ``S(f) = (4 / V) int_0^inf Phi(f/V, f_y) df_y`` (one-sided).
     """
-    scale = air.wind_speed_m_s / air.diameter_m
     frequency = np.concatenate(
         [np.geomspace(1e-4, 0.3, 120, endpoint=False), np.linspace(0.3, 12, 480, endpoint=False),
          np.linspace(12, 120, 400)]
-    ) * scale  # fmt: skip
-    fy, wy = _spatial_panels(air.diameter_m)
-    psd = np.empty(frequency.size)
-    for i, f in enumerate(frequency):
-        radius = np.hypot(f / air.wind_speed_m_s, fy)
-        psd[i] = 4 / air.wind_speed_m_s * np.sum(wy * _filtered_spectrum(air, radius))
-    return np.log(frequency), np.log(psd), float(psd[0])
+    )  # fmt: skip
+    fy, wy = _spatial_panels()
+    density = [
+        4 * np.sum(wy * _filtered_spectrum(scale_ratio, obstruction, np.hypot(f, fy)))
+        for f in frequency
+    ]
+    return LogSpline(spline=CubicSpline(np.log(frequency), np.log(density)))

@@ -108,7 +108,7 @@ def settled_mirror(delay_frames: float) -> MirrorSystem:
     if fraction > 0:
         taps[lead + 1] = fraction
     return MirrorSystem(
-        whole=_of_taps(taps), core=_of_taps(taps[lead:]), lead=lead, taps=frozen(taps)
+        whole=tapped_mirror(taps), core=tapped_mirror(taps[lead:]), lead=lead, taps=frozen(taps)
     )
 
 
@@ -271,8 +271,8 @@ def _delayed(core: Response, lead: int) -> Response:
     return Response(A=A, B=B, C=C, D=0.0)
 
 
-def _of_taps(taps: FloatArray) -> Response:
-    """Past inputs as states."""
+def tapped_mirror(taps: FloatArray) -> Response:
+    """Return a mirror by its impulse response; its states are the past commands."""
     n = len(taps) - 1
     B = np.zeros(n)
     B[:1] = 1.0

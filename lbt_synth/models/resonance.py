@@ -74,6 +74,21 @@ def coefficients(frequency: float, damping: float) -> tuple[float, float, float]
     return float(2 * decay * np.cos(turn)), -float(decay**2), drive
 
 
+def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
+    """Coefficients a1 and a2 of many sampled resonances, (p, 2).
+
+    Parameters
+    ----------
+    frequency : (p,) ndarray
+        Natural frequencies, as angles a frame.
+    damping : (p,) ndarray
+        Damping ratios, between 0 and 1.
+    """
+    decay = np.exp(-damping * frequency)
+    turn = frequency * np.sqrt((1 - damping) * (1 + damping))
+    return np.stack([2 * decay * np.cos(turn), -(decay**2)], axis=-1)
+
+
 def log_density(
     frequency: float, damping: float, s: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:

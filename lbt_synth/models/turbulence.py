@@ -8,14 +8,17 @@ series, turbulence plus white noise: what lies below the noise does not count.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.optimize import minimize
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.models.flows import FrozenFlows
 from lbt_synth.models.resonance import coefficients, log_density
-from lbt_synth.validation import frozen, integer, number
+from lbt_synth.validation import FloatArray, frozen, integer, number
 
 
 def le_roux_pole(
@@ -54,7 +57,11 @@ def le_roux_pole(
     speed = number(wind_speed_m_s, "wind_speed_m_s", above=0)
     diameter = number(diameter_m, "diameter_m", above=0)
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    return float(np.exp(-2 * np.pi * 0.3 * (order + 1) * speed / diameter / rate))
+    return float(_pole(speed, diameter, rate, order))
+
+
+def _pole(speed: Any, diameter: float, rate: float, order: int = 1) -> Any:
+    return np.exp(-2 * np.pi * 0.3 * (order + 1) * speed / diameter / rate)
 
 
 def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
@@ -95,6 +102,38 @@ def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
     return ARModel(
         coefficients=frozen([pole]), driving_rms_nm=float(driving), frame_rate_hz=frame_rate_hz
     )
+
+
+def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, FloatArray]:
+    """AR1 models of many frozen flows, as :func:`ar1_turbulence` makes them one by one.
+
+    Parameters
+    ----------
+    flows : FrozenFlows
+        The flows, p of them.
+    frame_rate_hz : float
+        Sampling frequency [Hz].
+
+    Returns
+    -------
+    coefficients : (p, 1) ndarray
+        Poles.
+    driving_rms_nm : (p,) ndarray
+        Standard deviations of their driving noises [nm].
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.models.turbulence import ar1_flows
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
+    ...                      diameter_m=8.22)
+    >>> poles, driving = ar1_flows(lbt.FrozenFlows(atmosphere=air), frame_rate_hz=800)
+    >>> poles.round(4).tolist(), driving.round(2).tolist()
+    ([[0.9886]], [89.04])
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    poles = _pole(flows.wind_speed_m_s, flows.atmosphere.diameter_m, rate)
+    return poles[:, None], flows.tilt_rms_nm * np.sqrt(1 - poles**2)
 
 
 def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: float) -> ARModel:

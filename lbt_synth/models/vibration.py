@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.ar import ARModel, variance_ratio
-from lbt_synth.models.resonance import coefficients
-from lbt_synth.validation import choice, frozen, number, real_array
+from lbt_synth.models.ar import ARModel, variance_ratios
+from lbt_synth.models.resonance import coefficient_rows
+from lbt_synth.validation import FloatArray, choice, number, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,17 +83,10 @@ class Vibration:
         100.0
         """
         rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-        if not self.frequency_hz < rate / 2:
-            raise ProblemError(
-                f"a vibration must lie below the Nyquist frequency {rate / 2:.6g} Hz; "
-                f"got {self.frequency_hz:.6g} Hz. Give the frequency it is aliased to."
-            )
-        a1, a2, _ = coefficients(2 * np.pi * self.frequency_hz / rate, self.damping)
-        # of the coefficients as they are rounded: the process has this rms exactly
-        driving = self.rms_nm / np.sqrt(variance_ratio(frozen([a1, a2])))
-        return ARModel(
-            coefficients=frozen([a1, a2]), driving_rms_nm=float(driving), frame_rate_hz=rate
+        a, driving = sampled_lines(
+            np.array(self.frequency_hz), np.array(self.damping), self.rms_nm, rate
         )
+        return ARModel(coefficients=a, driving_rms_nm=float(driving), frame_rate_hz=rate)
 
     def retuned(self, frequency_hz: float, *, frame_rate_hz: float, hold: str = "rms") -> Vibration:
         """Return this vibration at another frequency.
@@ -168,3 +161,31 @@ class Vibration:
                 f"frequency above that; got {frequency:.6g} Hz. Try a narrower range."
             )
         return replace(self, frequency_hz=frequency, damping=rate / frequency)
+
+
+def sampled_lines(
+    frequency_hz: FloatArray, damping: FloatArray, rms_nm: FloatArray | float, frame_rate_hz: float
+) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (p, 2) and driving noise (p,) [nm] of many vibrations at a frame rate.
+
+    Parameters
+    ----------
+    frequency_hz, damping, rms_nm : (p,) ndarray
+        Frequencies below Nyquist [Hz], damping ratios in (0, 1), standard deviations [nm].
+    frame_rate_hz : float
+        Sampling frequency [Hz].
+
+    Raises
+    ------
+    ProblemError
+        If a line is not below the Nyquist frequency.
+    """
+    highest = float(np.max(frequency_hz, initial=0.0))
+    if not highest < frame_rate_hz / 2:
+        raise ProblemError(
+            f"a vibration must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "
+            f"got {highest:.6g} Hz. Give the frequency it is aliased to."
+        )
+    a = coefficient_rows(2 * np.pi * frequency_hz / frame_rate_hz, damping)
+    # of the coefficients as they are rounded: the process has this rms exactly
+    return a, np.asarray(rms_nm / np.sqrt(variance_ratios(a)))

@@ -1,8 +1,8 @@
 """Robustness studies: samples of a configuration, on any number of processes, and what they say."""
 
+from lbt_synth.study.batch import evaluate_samples
 from lbt_synth.study.estimate import Estimate, estimate_study
 from lbt_synth.study.load import load_study
-from lbt_synth.study.point import evaluate_samples
 from lbt_synth.study.replay import Replay, replay_row
 from lbt_synth.study.result import BatchResult, Failure
 from lbt_synth.study.run import StudyRun, run_study

@@ -6,8 +6,8 @@ import os
 import time
 from dataclasses import dataclass
 
+from lbt_synth.study.batch import evaluate_samples
 from lbt_synth.study.engine import Evaluate
-from lbt_synth.study.point import evaluate_samples
 from lbt_synth.study.study import Study
 from lbt_synth.validation import integer
 

@@ -42,8 +42,9 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     Examples
     --------
     >>> import lbt_synth as lbt
+    >>> from lbt_synth.study.point import evaluate_samples
     >>> study = lbt.load_study("examples/study.yaml")
-    >>> batch = lbt.evaluate_samples(study, study.values(0, 2), 0)
+    >>> batch = evaluate_samples(study, study.values(0, 2), 0)
     >>> batch.columns["kalman.strehl"].round(3).tolist(), batch.columns["kalman.stable"].tolist()
     ([0.837, 0.821], [1.0, 1.0])
     """

@@ -15,9 +15,9 @@ import lbt_synth
 from lbt_synth.errors import OutputError
 from lbt_synth.files import refuse_replacing
 from lbt_synth.processes import alone_in
+from lbt_synth.study.batch import evaluate_samples
 from lbt_synth.study.engine import Evaluate, run_batches
 from lbt_synth.study.parquet import require_parquet
-from lbt_synth.study.point import evaluate_samples
 from lbt_synth.study.results import (
     failures_in,
     read_results,

@@ -1,0 +1,91 @@
+"""Cases of many loops at once: fixed gain files, and filters designed for each sample."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from harness import Row, paired, with_growth
+
+import lbt_synth as lbt
+from lbt_synth.study import point
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+FEW = 16  # loops that the peer does; its time is scaled up
+TOLD = """
+version: 1
+config: {config}
+samples: 4096
+seed: 1
+controllers:
+  told: {{design: kalman, for: sample}}
+parameters:
+  atmosphere.seeing_arcsec: {{uniform: [0.5, 1.2]}}
+  atmosphere.wind_speed_m_s: {{uniform: [10, 30]}}
+  model.vibrations[0].frequency_hz: {{uniform: [19, 21]}}
+  truth.vibrations[0].rms_mas: {{uniform: [40, 100], also: ["model.vibrations[0].rms_mas"]}}
+  truth.sensor_gain: {{uniform: [0.4, 1.1]}}
+"""
+
+
+def fixed_design() -> dict[int, Row]:
+    """Frequency x sensor gain x delay of one Kalman filter, no two alike."""
+    config = lbt.load_config(EXAMPLES / "lbt.yaml")
+    hardware, (line,) = config.hardware, config.truth.vibrations
+    controller = lbt.kalman(config.plant).controller
+    rng = np.random.default_rng(0)
+    rows = {}
+    for count in (64, 512, 4096):
+        frequency = rng.uniform(18, 22, count)
+        gain, delay = rng.uniform(0.4, 1.1, count), rng.uniform(2, 2.3, count)
+        ensemble = lbt.LoopEnsemble(
+            sensor_gain=gain,
+            delay_frames=delay,
+            noise_nm=config.noise_nm,
+            turbulence=config.atmosphere,
+            vibrations=(lbt.EnsembleVibration(frequency_hz=frequency, rms_nm=line.rms_nm),),
+        )
+
+        def ours(met: lbt.LoopEnsemble = ensemble) -> object:
+            return lbt.ensemble_residuals(controller, hardware, met).strehl(config.imaging)
+
+        def peer(f: np.ndarray = frequency, g: np.ndarray = gain, d: np.ndarray = delay) -> object:
+            found = []
+            for i in range(FEW):
+                loop = lbt.close_loop(
+                    replace(hardware, delay_frames=d[i]), controller, sensor_gain=g[i]
+                )
+                truth = replace(
+                    config.truth,
+                    sensor_gain=g[i],
+                    vibrations=(replace(line, frequency_hz=f[i]),),
+                )
+                found.append(lbt.strehl(lbt.residual_budget(loop, truth), config.imaging))
+            return found
+
+        rows[count] = _scaled(paired(ours, peer, 3), count)
+    return with_growth(rows)
+
+
+def told_designs(folder: Path) -> dict[int, Row]:
+    """Kalman filters of samples, designed and evaluated."""
+    file = folder / "told.yaml"
+    file.write_text(TOLD.format(config=EXAMPLES / "lbt.yaml"))
+    study = lbt.load_study(file)
+    rows = {}
+    for count in (64, 512, 4096):
+        values = study.values(0, count)
+        row = paired(
+            lambda v=values: lbt.evaluate_samples(study, v, 0),
+            lambda v=values: point.evaluate_samples(study, v[:FEW], 0),
+            3,
+        )
+        rows[count] = _scaled(row, count)
+    return with_growth(rows)
+
+
+def _scaled(row: Row, count: int) -> Row:
+    """Scale the peer's time, of some loops, to all of them."""
+    factor = count / FEW
+    return row | {"peer_s": row["peer_s"] * factor, "ratio": row["ratio"] * factor}

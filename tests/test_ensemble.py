@@ -1,0 +1,435 @@
+"""Many loops at once, against each loop on its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lbt_synth as lbt
+from lbt_synth.ensemble.panels import graded_edges
+from lbt_synth.ensemble.parts import independent_parts
+from lbt_synth.ensemble.responses import stacked_response
+from lbt_synth.models.flows import _octave_splines
+from lbt_synth.statespace import pointwise_response
+
+RATE = 800
+SLOW = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
+AIR = lbt.Atmosphere(
+    seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22, obstruction=0.11
+)
+LINE = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=563.6)
+CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
+
+
+def plant(**changes):
+    lines = changes.pop("vibrations", [LINE, replace(LINE, direction=(0, 1))])
+    given = {"frame_rate_hz": RATE, "turbulence": SLOW, "noise_nm": 15.5, "vibrations": lines}
+    return lbt.tip_tilt_plant(**(given | changes))
+
+
+@pytest.fixture(scope="module")
+def kalman():
+    return lbt.kalman(plant())
+
+
+@pytest.fixture(scope="module")
+def coupled():
+    """A sensor turned by 30 degrees, and another diagonal vibration: no axis is independent."""
+    turn = np.deg2rad(30)
+    sensor = 0.9 * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    lines = [replace(LINE, direction=(1, 2)), replace(LINE, frequency_hz=31, direction=(1, 0))]
+    return lbt.kalman(plant(sensor_matrix=sensor, vibrations=lines))
+
+
+def weather(count, seed=0):
+    rng = np.random.default_rng(seed)
+    return {
+        "gains": rng.uniform(0.3, 1.2, count),
+        "delays": rng.choice([1.0, 1.7, 2.0, 2.2, 3.0], count),
+        "noise": rng.uniform(5, 30, count),
+        "seeing": rng.uniform(0.5, 1.5, count),
+        "wind": rng.uniform(8, 30, count),
+        "scale": rng.uniform(12, 60, count),
+        "frequency": rng.uniform(18, 22, count),
+        "rms": rng.uniform(300, 900, count),
+        "damping": rng.uniform(0.002, 0.02, count),
+    }
+
+
+def ensemble_of(w, *, turbulence, direction=(1, 0.5)):
+    return lbt.LoopEnsemble(
+        sensor_gain=w["gains"],
+        delay_frames=w["delays"],
+        noise_nm=w["noise"],
+        turbulence=turbulence,
+        vibrations=[
+            lbt.EnsembleVibration(
+                frequency_hz=w["frequency"], rms_nm=w["rms"], direction=direction
+            ),
+            lbt.EnsembleVibration(
+                frequency_hz=w["frequency"] + 10,
+                rms_nm=w["rms"],
+                damping=w["damping"],
+                direction=direction,
+            ),
+        ],
+    )
+
+
+def truth_of(w, i, turbulence, direction=(1, 0.5)):
+    f, rms = float(w["frequency"][i]), float(w["rms"][i])
+    return lbt.Truth(
+        turbulence=turbulence,
+        noise_nm=float(w["noise"][i]),
+        sensor_gain=float(w["gains"][i]),
+        vibrations=(
+            lbt.SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=direction),
+            lbt.Vibration(
+                frequency_hz=f + 10, rms_nm=rms, damping=float(w["damping"][i]), direction=direction
+            ),
+        ),
+    )
+
+
+def agree(found, design, w, turbulence_of, *, rel=5e-7):
+    """Hold each row against residual_budget of its own loop."""
+    strehls = found.strehl(CAMERA)
+    unstable = 0
+    for i in range(len(found.stable)):
+        hardware = replace(design.hardware, delay_frames=float(w["delays"][i]))
+        truth = truth_of(w, i, turbulence_of(i))
+        loop = lbt.close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        assert found.stable[i] == loop.is_stable
+        if not loop.is_stable:
+            unstable += 1
+            assert np.isnan([found.rms_nm[i], strehls[i], found.noise_nm[i]]).all()
+            continue
+        budget = lbt.residual_budget(loop, truth)
+        for mine, theirs in (
+            (found.turbulence_nm2[i], budget.turbulence_nm2),
+            (found.noise_nm2[i], budget.noise_nm2),
+            (found.random_vibration_nm2[i], budget.random_vibration_nm2),
+        ):
+            assert np.max(np.abs(mine - theirs)) < rel * np.trace(theirs)
+        left = np.abs(found.line_amplitudes_nm[i] - budget.line_amplitudes_nm)
+        assert np.max(left) < 1e-9 * np.max(np.abs(budget.line_amplitudes_nm))
+        assert found.rms_nm[i] == pytest.approx(budget.rms_nm, rel=rel)
+        assert found.vibration_nm[i] == pytest.approx(budget.vibration_nm, rel=1e-9)
+        assert strehls[i] == pytest.approx(lbt.strehl(budget, CAMERA), abs=1e-6)
+    return unstable
+
+
+@pytest.mark.parametrize("which", ["kalman", "coupled"])
+def test_each_loop_on_its_own_under_frozen_flow(which, request):
+    design, w = request.getfixturevalue(which), weather(14)
+    flows = lbt.FrozenFlows(atmosphere=AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"])
+
+    def air(i):
+        return replace(AIR, seeing_arcsec=w["seeing"][i], wind_speed_m_s=w["wind"][i])
+
+    found = lbt.ensemble_residuals(
+        design.controller, design.hardware, ensemble_of(w, turbulence=flows)
+    )
+    agree(found, design, w, air)
+
+
+@pytest.mark.parametrize("which", ["kalman", "coupled"])
+def test_each_loop_on_its_own_under_processes(which, request):
+    """One process for all loops, one a loop, and different ones of the two axes."""
+    design, w = request.getfixturevalue(which), weather(10, seed=1)
+    rng = np.random.default_rng(2)
+    poles, drive = rng.uniform(0.97, 0.995, 10), rng.uniform(20, 90, 10)
+    each = lbt.ModalTurbulence(
+        coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE
+    )
+
+    def own(i):
+        return lbt.ARModel(coefficients=[poles[i]], driving_rms_nm=drive[i], frame_rate_hz=RATE)
+
+    for turbulence, single in (
+        (SLOW, lambda i: SLOW),
+        (each, own),
+        ((SLOW, None), lambda i: (SLOW, None)),
+        ((AIR, each), lambda i: (AIR, own(i))),
+    ):
+        ensemble = ensemble_of(w, turbulence=turbulence)
+        found = lbt.ensemble_residuals(design.controller, design.hardware, ensemble)
+        agree(found, design, w, single)
+
+
+def test_unstable_loops_are_told(kalman):
+    w = weather(20, seed=3)
+    w["gains"] = np.linspace(0.2, 4, 20)
+    found = lbt.ensemble_residuals(
+        kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR)
+    )
+    assert agree(found, kalman, w, lambda i: AIR) > 3
+
+
+def test_a_mirror_with_dynamics(kalman):
+    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
+    design = lbt.kalman(plant(mirror=shell))
+    w = weather(6, seed=4)
+    w["gains"] = np.linspace(0.5, 1, 6)
+    found = lbt.ensemble_residuals(
+        design.controller, design.hardware, ensemble_of(w, turbulence=AIR)
+    )
+    agree(found, design, w, lambda i: AIR)
+
+
+def test_a_controller_for_each_loop():
+    """Filters of other frequencies, each in its own loop."""
+    w = weather(6, seed=5)
+    designs = [
+        lbt.kalman(plant(vibrations=[replace(LINE, frequency_hz=f)]))
+        for f in (18, 19, 20, 21, 22, 23)
+    ]
+    found = lbt.ensemble_residuals(
+        [design.controller for design in designs],
+        designs[0].hardware,
+        ensemble_of(w, turbulence=AIR),
+    )
+    for i, design in enumerate(designs):
+        own = {name: values[i : i + 1] for name, values in w.items()}
+        alone = lbt.ensemble_residuals(
+            design.controller, design.hardware, ensemble_of(own, turbulence=AIR)
+        )
+        assert alone.stable[0] == found.stable[i]
+        assert alone.rms_nm[0] == pytest.approx(found.rms_nm[i], rel=1e-7, nan_ok=True)
+        agree(alone, design, own, lambda _: AIR)
+
+
+def test_loops_that_differ_by_their_lines_only_are_the_same_as_apart(kalman):
+    """Rows that share a loop are closed once; each has its own answer all the same."""
+    f = np.repeat([18.0, 20.0, 22.0], 5)
+    lines = [lbt.EnsembleVibration(frequency_hz=f, rms_nm=500, damping=0.01)]
+    given = {"noise_nm": 15.5, "turbulence": AIR, "vibrations": lines}
+    gains = np.tile(np.linspace(0.5, 1, 5), 3)
+    together = lbt.ensemble_residuals(
+        kalman.controller, kalman.hardware, lbt.LoopEnsemble(sensor_gain=gains, **given)
+    )
+    jitter = gains * (1 + 1e-13 * np.arange(15))  # no two rows alike
+    apart = lbt.ensemble_residuals(
+        kalman.controller, kalman.hardware, lbt.LoopEnsemble(sensor_gain=jitter, **given)
+    )
+    assert together.rms_nm == pytest.approx(apart.rms_nm, rel=1e-9)
+    assert len(np.unique(together.rms_nm)) == 15
+
+
+@settings(max_examples=15, deadline=None)
+@given(order=st.permutations(range(12)), scale=st.floats(0.1, 10))
+def test_order_and_scale_do_not_matter(kalman, order, scale):
+    """Rows in another order give rows in that order; disturbances twice as large, residuals too."""
+    w = weather(12, seed=6)
+    other = {name: values[list(order)] for name, values in w.items()}
+    other["rms"], other["noise"] = scale * other["rms"], scale * other["noise"]
+    strength = scale ** (6 / 5)  # seeing^(5/3) is a variance
+    found = lbt.ensemble_residuals(
+        kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR)
+    )
+    again = lbt.ensemble_residuals(
+        kalman.controller,
+        kalman.hardware,
+        ensemble_of(
+            other,
+            turbulence=lbt.FrozenFlows(atmosphere=AIR, seeing_arcsec=np.full(12, 0.8 * strength)),
+        ),
+    )
+    assert again.rms_nm == pytest.approx(scale * found.rms_nm[list(order)], rel=1e-7, nan_ok=True)
+
+
+def test_flows_are_those_of_single_atmospheres():
+    w = weather(8, seed=7)
+    f = np.geomspace(1e-5, 399, 300)
+    flows = lbt.FrozenFlows(
+        atmosphere=AIR,
+        seeing_arcsec=w["seeing"],
+        wind_speed_m_s=w["wind"],
+        outer_scale_m=[22.0, 30.0] * 4,
+    )
+    for i, psd in enumerate(flows.psd(f)):
+        single = replace(
+            AIR,
+            seeing_arcsec=w["seeing"][i],
+            wind_speed_m_s=w["wind"][i],
+            outer_scale_m=[22.0, 30.0][i % 2],
+        )
+        assert psd == pytest.approx(single.psd(f), rel=1e-11)
+    assert flows.taken(np.array([3])).psd(f)[0] == pytest.approx(flows.psd(f)[3], rel=1e-12)
+
+
+def test_flows_of_many_outer_scales():
+    """More scales than have tables of their own: a polynomial over each octave."""
+    scales = np.geomspace(16.5, 31.5, 20)
+    f = np.geomspace(1e-4, 399, 100)
+    found = lbt.FrozenFlows(atmosphere=AIR, outer_scale_m=scales).psd(f)
+    for i in (0, 7, 19):
+        single = replace(AIR, outer_scale_m=float(scales[i])).psd(f)
+        assert found[i] == pytest.approx(single, rel=1e-9)
+    assert _octave_splines.cache_info().currsize >= 1
+
+
+def test_kolmogorov_flows():
+    air = replace(AIR, outer_scale_m=None)
+    flows = lbt.FrozenFlows(atmosphere=air, wind_speed_m_s=[10.0, 20.0])
+    assert flows.psd([3.0])[1, 0] == pytest.approx(air.psd(3.0), rel=1e-12)
+    assert flows.taken(np.array([0])).psd([3.0])[0, 0] == pytest.approx(
+        replace(air, wind_speed_m_s=10).psd(3.0), rel=1e-12
+    )
+
+
+def test_partial_fractions_and_what_has_none():
+    rng = np.random.default_rng(8)
+    A = rng.standard_normal((3, 4, 4)) / 3
+    A[1] = np.eye(4, k=-1)  # a chain of delays: defective
+    B, C, D = rng.standard_normal((3, 4, 2)), rng.standard_normal((3, 1, 4)), np.ones((3, 1, 2))
+    z = np.exp(1j * np.linspace(0.01, 3, 50))
+    found = stacked_response(A, B, C, D, z)
+    for k in range(3):
+        system = lbt.StateSpace(A=A[k], B=B[k], C=C[k], D=D[k])
+        assert found[k] == pytest.approx(pointwise_response(system, z), rel=1e-9, abs=1e-9)
+
+
+def test_pieces_of_a_loop(kalman, coupled):
+    def pieces(design):
+        system = design.controller.to_statespace()
+        matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
+        return independent_parts(matrices, design.hardware)
+
+    parts, rest = pieces(kalman)
+    assert [part.modes.tolist() for part in parts] == [[0], [1]]
+    assert parts[0].equals(parts[1])
+    assert rest == []
+    assert [part.modes.tolist() for part in pieces(coupled)[0]] == [[0, 1]]
+    # an axis without a vibration is another piece than one with
+    parts, _ = pieces(lbt.kalman(plant(vibrations=[LINE])))
+    assert not parts[0].equals(parts[1])
+
+
+def test_states_in_odd_units_stay_coupled(coupled):
+    """The same controller in states of 1e9 times other units is the same controller."""
+    k = coupled.controller
+    units = 10.0 ** np.linspace(-9, 9, k.n_states)
+    odd = lbt.Controller(
+        A=k.A * units / units[:, None], B=k.B / units[:, None], C=k.C * units, D=k.D, dt_s=k.dt_s
+    )
+    ensemble = lbt.LoopEnsemble(sensor_gain=[0.5, 1.0], noise_nm=15.5, turbulence=AIR)
+    one, other = (lbt.ensemble_residuals(c, coupled.hardware, ensemble) for c in (k, odd))
+    assert other.rms_nm == pytest.approx(one.rms_nm, rel=1e-8)
+
+
+def test_a_state_that_no_mode_sees_counts_for_stability():
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    for pole, stable in ((0.5, True), (1.1, False)):
+        hidden = lbt.Controller(
+            A=np.diag([1.0, pole]), B=[[0.3], [0.0]], C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE
+        )
+        found = lbt.ensemble_residuals(hidden, path, lbt.LoopEnsemble(noise_nm=[1.0, 2.0]))
+        assert found.stable.tolist() == [stable] * 2
+
+
+def test_noise_through_an_integrator():
+    """Closed form: g / (2 - g) of the variance at a delay of one frame."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=1, modes=1)
+    lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / RATE)
+    g = np.array([0.2, 0.5, 1.0, 1.9])
+    found = lbt.ensemble_residuals(lazy, path, lbt.LoopEnsemble(sensor_gain=g / 0.5, noise_nm=3.0))
+    # the noise enters as (0.5 / g) of what the closed form has
+    assert found.noise_nm**2 == pytest.approx(9 * (0.5 / g) ** 2 * g / (2 - g), rel=1e-9)
+
+
+def test_panels_reach_the_narrowest_poles():
+    pole = (1 - 1e-8) * np.exp(0.3j)
+    edges = graded_edges(np.array([pole, pole.conj()]))
+    inside = np.searchsorted(edges, 0.3 / np.pi)
+    assert edges[inside] - edges[inside - 1] <= 2.1e-8 / np.pi
+
+
+def test_nothing_to_meet(kalman):
+    found = lbt.ensemble_residuals(kalman.controller, kalman.hardware, lbt.LoopEnsemble(loops=3))
+    assert found.rms_nm.tolist() == [0.0] * 3
+    assert found.strehl(CAMERA) == pytest.approx([1.0] * 3)
+
+
+WRONG = [
+    ({"sensor_gain": 0.0}, lbt.ProblemError, "sensor_gain must be above 0"),
+    ({"sensor_gain": [np.nan, 1]}, lbt.ProblemError, "finite"),
+    ({"noise_nm": -1.0}, lbt.ProblemError, "noise_nm must be at least 0"),
+    ({"delay_frames": [0.5, 2]}, lbt.ProblemError, "delay_frames must be at least 1"),
+    ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, lbt.DimensionError, "one entry a loop"),
+    ({"turbulence": "von Karman"}, lbt.ProblemError, "turbulence must be"),
+    ({"vibrations": [LINE]}, lbt.ProblemError, "EnsembleVibration"),
+    ({"turbulence": (AIR, AIR, AIR)}, lbt.DimensionError, "one entry a mode"),
+    ({"noise_nm": np.ones((2, 3))}, lbt.DimensionError, "one column a measurement"),
+    (
+        {"turbulence": lbt.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
+        lbt.ProblemError,
+        "sampled at the loop's 800 Hz; got 500 Hz",
+    ),
+    (
+        {"vibrations": [lbt.EnsembleVibration(frequency_hz=[20, 400], rms_nm=1)]},
+        lbt.ProblemError,
+        "Nyquist frequency 400 Hz; got 400 Hz",
+    ),
+    (
+        {"vibrations": [lbt.EnsembleVibration(frequency_hz=20, rms_nm=1, direction=[1, 0, 0])]},
+        lbt.DimensionError,
+        "must have 2 components",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "kind", "message"), WRONG)
+def test_what_loops_cannot_meet(kalman, given, kind, message):
+    with pytest.raises(kind, match=message):
+        lbt.ensemble_residuals(kalman.controller, kalman.hardware, lbt.LoopEnsemble(**given))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"frequency_hz": 0.0}, "frequency_hz must be above 0"),
+        ({"rms_nm": [1.0, -1.0]}, "rms_nm must be above 0"),
+        ({"damping": 1.0}, "damping must be between 0 and 1"),
+        ({"direction": [0.0, 0.0]}, "direction must be a vector"),
+    ],
+)
+def test_what_is_no_vibration(given, message):
+    with pytest.raises(lbt.ProblemError, match=message):
+        lbt.EnsembleVibration(**({"frequency_hz": 20.0, "rms_nm": 1.0} | given))
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "message"),
+    [
+        ({"seeing_arcsec": [0.5, 0.0]}, lbt.ProblemError, "seeing_arcsec must be above 0"),
+        (
+            {"seeing_arcsec": [0.5, 0.6], "wind_speed_m_s": [1, 2, 3]},
+            lbt.DimensionError,
+            "same length",
+        ),
+        ({"wind_speed_m_s": [[1.0]]}, lbt.DimensionError, "lists, one number a loop"),
+    ],
+)
+def test_what_is_no_flow(given, kind, message):
+    with pytest.raises(kind, match=message):
+        lbt.FrozenFlows(atmosphere=AIR, **given)
+
+
+def test_frequencies_of_flows():
+    with pytest.raises(lbt.ProblemError, match="above 0 Hz"):
+        lbt.FrozenFlows(atmosphere=AIR).psd([0.0])
+
+
+def test_controllers_that_do_not_fit(kalman):
+    ensemble = lbt.LoopEnsemble(loops=3)
+    with pytest.raises(lbt.DimensionError, match=r"one a loop \(3\)"):
+        lbt.ensemble_residuals([kalman.controller] * 2, kalman.hardware, ensemble)
+    small = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    with pytest.raises(lbt.DimensionError, match="map 1 measurements"):
+        lbt.ensemble_residuals(kalman.controller, small, ensemble)
+    slow = lbt.LoopHardware(frame_rate_hz=500)
+    with pytest.raises(lbt.ProblemError, match="must run at the loop's 500 Hz"):
+        lbt.ensemble_residuals(kalman.controller, slow, ensemble)

@@ -1,0 +1,224 @@
+"""Many samples at once, against each on its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from studies import BASE, LBT_TEXT, study_file
+
+import lbt_synth as lbt
+from lbt_synth.study import batch, point
+from lbt_synth.study.meeting import changes_beliefs_only, changes_numbers_only
+
+COUNT = 8
+LBT = LBT_TEXT.replace("kind: ar1", "kind: {kind}")
+FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
+TOLD = "{told: {design: kalman, for: sample}}"
+BOTH = "{kalman: {design: kalman}, told: {design: kalman, for: sample}}"
+
+
+def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
+    """Hold each column against the evaluation point by point; return the results."""
+    study = lbt.load_study(
+        study_file(tmp_path, base=base, controllers=controllers, parameters=parameters, **more)
+    )
+    values = study.values(0, count)
+    found = lbt.evaluate_samples(study, values, 0)
+    single = point.evaluate_samples(study, values, 0)
+    assert found.columns.keys() == single.columns.keys()
+    for name, expected in single.columns.items():
+        assert found.columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
+    assert found.failures == single.failures
+    return study, found
+
+
+def counted(monkeypatch):
+    """Count the samples that are evaluated point by point."""
+    rows = []
+    real = point.evaluate_row
+
+    def spy(study, values, row):
+        rows.append(row)
+        return real(study, values, row)
+
+    monkeypatch.setattr(batch.point, "evaluate_row", spy)
+    return rows
+
+
+WEATHER = """{
+  atmosphere.seeing_arcsec: {uniform: [0.5, 1.2]},
+  atmosphere.wind_speed_m_s: {list: [10, 20]},
+  atmosphere.outer_scale_m: {list: [15, 25]},
+  'truth.vibrations[0].frequency_hz': {normal: {mean: 20, deviation: 0.5}},
+  'truth.vibrations[0].rms_mas': {uniform: [40, 100], also: ['model.vibrations[0].rms_mas']},
+  'model.vibrations[0].damping': {uniform: [0.002, 0.02]},
+  sensor.pyramid.photons: {uniform: [20, 100]},
+  truth.sensor_gain: {uniform: [0.3, 1.3]},
+  error.delay_frames: {uniform: [-0.5, 1.5]},
+  error.noise_factor: {uniform: [0.5, 2]}
+}"""
+
+
+@pytest.mark.parametrize("kind", ["ar1", "ar2"])
+def test_the_telescope_of_the_paper(tmp_path, kind):
+    agree(tmp_path, base=LBT.replace("{kind}", kind), controllers=FIXED, parameters=WEATHER)
+
+
+def test_filters_told_their_samples(tmp_path, monkeypatch):
+    study = lbt.load_study(
+        study_file(tmp_path, base=LBT_TEXT, controllers=TOLD, parameters=WEATHER)
+    )
+    single = point.evaluate_samples(study, study.values(0, 6), 0)
+    rows = counted(monkeypatch)
+    found = lbt.evaluate_samples(study, study.values(0, 6), 0)
+    assert rows == [3]  # all of them at once, and one by itself
+    for name, expected in single.columns.items():
+        assert found.columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
+    strehl = found.columns["told.strehl"]
+    assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
+
+
+def test_one_axis_and_the_turbulence_of_the_model(tmp_path):
+    parameters = """{
+      'truth.vibrations[0].rms_nm': {uniform: [100, 900]},
+      'model.vibrations[0].frequency_hz': {uniform: [18, 22]},
+      sensor.noise_nm: {uniform: [5, 30]},
+      truth.sensor_gain: {uniform: [0.4, 1.1]}
+    }"""
+    agree(tmp_path, base=BASE, controllers=BOTH, parameters=parameters)
+
+
+def test_resonances_and_vibrations_of_the_model(tmp_path):
+    """The truth's vibrations are the model's: both move."""
+    base = LBT_TEXT.replace(
+        """  vibrations:
+    - {kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}
+""",
+        "  vibrations: model\n",
+    )
+    assert "vibrations: model" in base
+    parameters = """{
+      'model.vibrations[0].frequency_hz': {uniform: [18, 22]},
+      'model.vibrations[0].rms_mas': {uniform: [40, 100]},
+      'model.vibrations[0].damping': {uniform: [0.002, 0.02]},
+      error.delay_frames: {list: [0, 0.25]}
+    }"""
+    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
+
+
+def test_a_mirror_with_dynamics(tmp_path):
+    base = LBT_TEXT.replace(
+        "mirror:\n",
+        "mirror:\n  local_loop: {natural_frequency_hz: 50, damping: 0.5, bandwidth_hz: 400}\n",
+    )
+    parameters = """{
+      truth.sensor_gain: {uniform: [0.4, 1.1]},
+      error.delay_frames: {list: [0, 0.25]}
+    }"""
+    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
+
+
+def test_a_diagonal_vibration(tmp_path):
+    """No filter an axis at a time: designed point by point, evaluated all the same."""
+    base = LBT_TEXT.replace("axis: tip,", "direction_deg: 30,").replace(
+        "axis: both,", "direction_deg: 30,"
+    )
+    parameters = "{'truth.vibrations[0].frequency_hz': {uniform: [19, 21]}}"
+    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=4)
+
+
+def test_the_delay_that_designs_are_told(tmp_path):
+    parameters = "{loop.delay_frames: {list: [1, 2, 2.5]}, truth.sensor_gain: {uniform: [0.4, 1]}}"
+    agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=12)
+
+
+def test_groups_of_what_makes_another_configuration(tmp_path, monkeypatch):
+    """Telescopes of two diameters: two groups, each at once; the camera goes with them."""
+    rows = counted(monkeypatch)
+    parameters = """{
+      telescope.diameter_m: {list: [6, 8.22]},
+      imaging.wavelength_um: {list: [1.65]},
+      truth.sensor_gain: {uniform: [0.4, 1]}
+    }"""
+    agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, samples="16", count=16)
+    # one of each group and controller, then those of the evaluation that it is held against
+    assert len(rows) == 2 + 16
+
+
+def test_samples_that_the_configuration_refuses(tmp_path):
+    """A tail of the normal distribution below 0: those fail as they do on their own."""
+    parameters = """{
+      'truth.vibrations[0].rms_nm': {normal: {mean: 300, deviation: 100, high: 900}},
+      truth.sensor_gain: {normal: {mean: 0.8, deviation: 0.1, low: 0.5}}
+    }"""
+    study, _ = agree(tmp_path, base=BASE, controllers=FIXED, parameters=parameters)
+    values = study.values(0, COUNT)
+    values[2, 0] = -5.0
+    values[4, 1] = 0.0
+    found = lbt.evaluate_samples(study, values, 100)
+    single = point.evaluate_samples(study, values, 100)
+    assert [(f.row, f.controller) for f in found.failures] == [
+        (102, "slow"), (102, "kalman"), (104, "slow"), (104, "kalman"),
+    ]  # fmt: skip
+    assert found.failures == single.failures
+    assert np.isnan(found.columns["slow.stable"]).sum() == 2
+
+
+def test_a_filter_that_cannot_be_designed(tmp_path):
+    """The others of its batch are designed all the same."""
+    parameters = """{
+      'model.vibrations[0].damping': {uniform: [0.002, 0.02]},
+      sensor.noise_nm: {uniform: [5, 30]}
+    }"""
+    study, _ = agree(tmp_path, base=BASE, controllers=TOLD, parameters=parameters)
+    values = study.values(0, COUNT)
+    values[3, 1] = 1e-160  # its variance underflows
+    found = lbt.evaluate_samples(study, values, 0)
+    assert {f.row for f in found.failures} == {3}
+    assert np.isfinite(found.columns["told.strehl"]).sum() == COUNT - 1
+
+
+def test_simulations_are_done_one_by_one(tmp_path):
+    parameters = "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}}"
+    agree(
+        tmp_path, base=BASE, controllers=FIXED, parameters=parameters, count=2,
+        evaluation="simulation",
+    )  # fmt: skip
+
+
+def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
+    study = lbt.load_study(study_file(tmp_path, base=LBT_TEXT, controllers=FIXED,
+                                      parameters="{truth.sensor_gain: 1.0}"))  # fmt: skip
+    numbers = [
+        ("truth", "sensor_gain"),
+        ("atmosphere", "seeing_arcsec"),
+        ("truth", "vibrations", 0, "rms_mas"),
+        ("sensor", "pyramid", "photons"),
+    ]
+    assert all(changes_numbers_only(study, keys) for keys in numbers)
+    others = [("telescope", "diameter_m"), ("model", "sensor_gain"), ("loop", "frame_rate_hz"),
+              ("model", "vibrations", 0, "rms_mas"), ("imaging", "wavelength_um"),
+              ("atmosphere", "seeing_wavelength_um")]  # fmt: skip
+    assert not any(changes_numbers_only(study, keys) for keys in others)
+    assert changes_beliefs_only(study, ("model", "vibrations", 0, "rms_mas"))
+    assert not changes_beliefs_only(study, ("model", "sensor_gain"))
+
+
+def test_two_answers_stop_a_study(tmp_path, monkeypatch):
+    study = lbt.load_study(
+        study_file(
+            tmp_path,
+            base=BASE,
+            controllers=FIXED,
+            parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}",
+        )
+    )
+    real = batch.residuals_of_matrices
+
+    def wrong(matrices, hardware, ensemble):
+        found = real(matrices, hardware, ensemble)
+        return replace(found, noise_nm2=1.001 * found.noise_nm2)
+
+    monkeypatch.setattr(batch, "residuals_of_matrices", wrong)
+    with pytest.raises(lbt.CertificateError, match="row 14 has slow.*by itself"):
+        lbt.evaluate_samples(study, study.values(10, 16)[:8], 11)
