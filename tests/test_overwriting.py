@@ -49,6 +49,10 @@ CASES = {
     "modal": ("config.yaml", ("config.yaml", "-o", "OUT.csv")),
     "e2e": ("gain.fits", ("config.yaml", "gain.fits", "-o", "."), "telemetry.fits"),
     "e2e config": ("config.yaml", ("config.yaml", "gain.fits", "-o", "."), "summary.json"),
+    "study": ("config.yaml", ("study.yaml", "-o", "."), "a.fits"),
+    "study configuration": ("config.yaml", ("study.yaml", "-o", "."), "results.csv"),
+    "study file": ("study.yaml", ("study.yaml", "-o", "."), "summary.html"),
+    "study row": ("config.yaml", ("study.yaml", "-o", ".", "--row", "3"), "row_3.yaml"),
     "e2e-table": ("gain.fits", ("config.yaml", "gain.fits", "-o", "."), "table_ii.csv"),
     "e2e-table config": ("config.yaml", ("config.yaml", "-o", "."), "table_iii.pdf"),
 }
@@ -58,6 +62,10 @@ CASES = {
 def originals(tmp_path_factory):
     folder = tmp_path_factory.mktemp("originals")
     shutil.copy(LBT_YAML, folder / "config.yaml")
+    (folder / "study.yaml").write_text(
+        "version: 1\nconfig: config.yaml\nsamples: 4\nparameters: {loop.delay_frames: 2.5}\n"
+        "controllers: {a: {design: integrator, gain: 0.4}, b: {file: gain.fits}}\n"
+    )
     design = lbt.integrator(lbt.load_config(LBT_YAML).hardware, gain=0.4)
     lbt.save_gain(folder / "gain.fits", design)
     series = lbt.Telemetry(frame_rate_hz=800, commands=[[0.0, 1.0]], measurements=[[3.0, 2.0]])

@@ -1,0 +1,283 @@
+"""``lbt-synth study`` as it is used: run, killed, interrupted, replayed, on Dask."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from studies import study_file
+from test_campaign import alive, wait_for
+from test_cli import run
+from test_study_run import TWO, assert_whole, quick, table
+
+import lbt_synth as lbt
+from lbt_synth.study.store import part_list
+
+PARAMETERS = (
+    "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, truth.sensor_gain: {uniform: [0.5, 1]}, "
+    "error.noise_factor: 1.5}"
+)
+
+
+def started(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", "lbt_synth.cli.main", "study", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a shell's background job ignores interrupts, and so would what it starts
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
+def children(pid):
+    with contextlib.suppress(OSError):
+        return [
+            int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        ]
+    return []
+
+
+# ---------------------------------------------------------------- run and replay
+def test_the_command(tmp_path, capsys):
+    path = study_file(tmp_path, samples="200", controllers=TWO, parameters=PARAMETERS)
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--dry-run")
+    assert status == 0
+    assert "200" in out
+    assert "uniform from 100 to 900" in out
+    assert "nothing was written" in out
+    assert not (tmp_path / "out").exists()
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out")
+    assert status == 0
+    for text in ("50th percentile", "unstable", "failed", "Worst samples of b", "sensor_gain"):
+        assert text in out
+    assert "200 of 200 samples computed in" in out
+    study = lbt.load_study(path)
+    assert_whole(tmp_path / "out", study, lbt.evaluate_samples)
+    assert b"<svg" in (tmp_path / "out" / "summary.html").read_bytes()
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out")
+    assert (status, out.count("\n")) == (0, 1)
+    assert "is finished: 200 samples in results.csv; nothing to do" in out
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "7")
+    assert status == 0
+    assert "Row 7" in out
+    assert (tmp_path / "out" / "row_7.yaml").exists()
+    status, out, error = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "200")
+    assert (status, out) == (2, "")
+    assert "rows 0 to 199; got row 200" in error
+
+
+def test_json(tmp_path, capsys):
+    path = study_file(tmp_path, samples="20", parameters=PARAMETERS)
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--dry-run", "--json")
+    cost = json.loads(out)
+    assert (status, cost["samples"], cost["workers"]) == (0, 20, 1)
+    assert cost["seconds"] > 0
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--json")
+    data = json.loads(out)
+    assert (status, data["computed"], data["failures"]) == (0, 20, 0)
+    only = data["statistics"]["controllers"][0]
+    mean = np.mean(table(tmp_path / "out" / "results.csv")["slow.strehl"])
+    assert only["mean"] == pytest.approx(mean, rel=1e-7)
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "3", "--json")
+    again = json.loads(out)
+    assert again["fresh"]["slow.strehl"] == pytest.approx(again["stored"]["slow.strehl"], rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--jobs", "0"), "--jobs must be at least 1; got 0"),
+        (("--row", "-1"), "row must be at least 0"),
+    ],
+)
+def test_wrong_arguments(tmp_path, capsys, arguments, message):
+    path = study_file(tmp_path, samples="4")
+    status, out, error = run(capsys, "study", path, "-o", tmp_path / "out", *arguments)
+    assert (status, out) == (2, "")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_dask_without_its_package(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    path = study_file(tmp_path, samples="4")
+    status, _, error = run(
+        capsys, "study", path, "-o", tmp_path / "out", "--dask", "tcp://localhost:8786"
+    )
+    assert status == 2
+    assert 'pip install "lbt-synth[dask]"' in error
+    assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------- killed and interrupted
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_killed_it_goes_on_where_it_was(tmp_path, capsys, jobs):
+    path = study_file(tmp_path, samples="600", parameters=PARAMETERS)
+    folder = tmp_path / "out"
+    first = started(path, "-o", folder, "--jobs", jobs)
+    wait_for(lambda: len(part_list(folder)) >= 2)
+    workers = children(first.pid)
+    first.send_signal(signal.SIGKILL)
+    first.communicate()
+    kept = {(part.start, part.stop): part.path.stat().st_mtime_ns for part in part_list(folder)}
+    assert sum(stop - start for start, stop in kept) < 600
+    wait_for(lambda: not any(alive(pid) for pid in workers))  # none is left behind
+    status, out, error = run(capsys, "study", path, "-o", folder)
+    assert status == 0, error
+    missing = 600 - sum(stop - start for start, stop in kept)
+    assert f"{missing} of 600 samples computed" in out
+    status, _, _ = run(capsys, "study", path, "-o", tmp_path / "undisturbed")
+    assert status == 0
+    for name in ("results.csv", "failed.csv"):
+        undisturbed = (tmp_path / "undisturbed" / name).read_bytes()
+        assert (folder / name).read_bytes() == undisturbed
+
+
+def test_an_interrupt_ends_it_at_once(tmp_path):
+    path = study_file(tmp_path, samples="300000", parameters=PARAMETERS)
+    folder = tmp_path / "out"
+    first = started(path, "-o", folder, "--jobs", "2")
+    wait_for(lambda: len(part_list(folder)) >= 2)
+    workers = children(first.pid)
+    before = time.monotonic()
+    first.send_signal(signal.SIGINT)
+    out, error = first.communicate(timeout=20)
+    assert time.monotonic() - before < 10
+    assert (first.returncode, out, error) == (130, "", "lbt-synth: interrupted\n")
+    wait_for(lambda: not any(alive(pid) for pid in workers))
+    assert len(part_list(folder)) >= 2
+    assert not list(folder.rglob(".*.npz*"))
+
+
+def test_two_in_one_directory(tmp_path, capsys):
+    path = study_file(tmp_path, samples="300000", parameters=PARAMETERS)
+    folder = tmp_path / "out"
+    first = started(path, "-o", folder)
+    try:
+        wait_for(lambda: len(part_list(folder)) >= 1)
+        status, _, error = run(capsys, "study", path, "-o", folder)
+        assert status == 2
+        assert "another study is running in" in error
+    finally:
+        first.kill()
+        first.communicate()
+
+
+# ---------------------------------------------------------------- Dask
+@pytest.fixture(scope="module")
+def cluster():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+    ) as made:
+        yield made
+
+
+def waits(study, values, start):
+    time.sleep(0.02 * len(values))
+    return quick(study, values, start)
+
+
+@pytest.mark.e2e
+def test_a_worker_killed_on_dask(tmp_path, cluster):
+    from distributed import Client
+
+    study = lbt.load_study(study_file(tmp_path, samples="60", parameters=PARAMETERS))
+    folder = tmp_path / "out"
+    folder.mkdir()
+    killed = []
+
+    def kill(done):
+        if not killed:
+            victim = next(iter(client.run(os.getpid).values()))
+            os.kill(victim, signal.SIGKILL)
+            killed.append(victim)
+
+    with Client(cluster, set_as_default=False) as client:
+        result = lbt.run_study(
+            study, folder, executor=client.get_executor(pure=False), workers=2, evaluate=waits,
+            progress=kill,
+        )  # fmt: skip
+    assert killed
+    assert (result.computed, result.failures) == (60, 0)
+    assert_whole(folder, study)
+
+
+def poison(study, values, start):
+    if start <= 4 < start + len(values):
+        os._exit(5)
+    return quick(study, values, start)
+
+
+@pytest.mark.e2e
+def test_a_row_that_kills_its_workers_on_dask(tmp_path, cluster, monkeypatch):
+    from distributed import Client
+
+    study = lbt.load_study(study_file(tmp_path, samples="6", parameters=PARAMETERS))
+    folder = tmp_path / "out"
+    folder.mkdir()
+    monkeypatch.setattr(cluster.scheduler, "allowed_failures", 0)  # one death is enough
+    with Client(cluster, set_as_default=False) as client:
+        result = lbt.run_study(
+            study, folder, executor=client.get_executor(pure=False), workers=2, evaluate=poison
+        )
+    assert (result.failures, result.retry) == (1, 1)
+    found = table(folder / "results.csv")
+    assert np.flatnonzero(np.isnan(found["slow.strehl"])).tolist() == [4]
+    again = lbt.run_study(study, folder, evaluate=quick)
+    assert (again.computed, again.retry) == (1, 0)
+    assert_whole(folder, study)
+
+
+@pytest.mark.e2e
+def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
+    path = study_file(tmp_path, samples="40", parameters=PARAMETERS)
+    address = cluster.scheduler_address
+    arguments = ("study", path, "-o", tmp_path / "out", "--dask", address)
+    status, out, _ = run(capsys, *arguments, "--dry-run")
+    assert status == 0
+    assert f" of {address}, as quick as this one" in out
+    with monkeypatch.context() as patch:
+        patch.setattr(lbt, "__version__", "9.9.9")
+        status, _, error = run(capsys, *arguments)
+        assert status == 2
+        assert "must have lbt_synth 9.9.9, as here" in error
+    assert not (tmp_path / "out").exists()
+    status, _, error = run(capsys, *arguments)
+    assert status == 0, error
+    assert_whole(tmp_path / "out", lbt.load_study(path), lbt.evaluate_samples)
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport"])
+def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
+    monkeypatch.setattr("lbt_synth.study.cluster._TIMEOUT_S", 1)
+    path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
+    before = time.monotonic()
+    status, _, error = run(capsys, "study", path, "-o", tmp_path / "out", "--dask", address)
+    assert status == 2
+    assert time.monotonic() - before < 10
+    assert "no Dask scheduler answers at" in error
+
+
+@pytest.mark.e2e
+def test_a_scheduler_without_workers(tmp_path, capsys, monkeypatch):
+    from distributed import LocalCluster
+
+    monkeypatch.setattr("lbt_synth.study.cluster._TIMEOUT_S", 1)
+    path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
+    with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
+        status, _, error = run(
+            capsys, "study", path, "-o", tmp_path / "out", "--dask", empty.scheduler_address
+        )
+    assert status == 2
+    assert "has no workers; start some with" in error
