@@ -86,13 +86,17 @@ def chart_svg(chart: Chart) -> str:
     for name in ("width", "height"):
         root.attrib.pop(name, None)
     root.attrib |= {"role": "img", "aria-label": chart.alt}
+    seen: set[str] = set()
     for element in root.iter():
+        if element.attrib.get("id") in seen:  # the same thing, defined again
+            del element.attrib["id"]
         for name, value in element.attrib.items():
             if name == "id":
+                seen.add(value)
                 element.attrib[name] = f"{chart.key}_{value}"
             elif name == f"{{{_LINK}}}href" and value.startswith("#"):
                 element.attrib[name] = f"#{chart.key}_{value[1:]}"
-            elif "url(#" in value and name not in ("aria-label",):
+            elif "url(#" in value and name != "aria-label":
                 element.attrib[name] = value.replace("url(#", f"url(#{chart.key}_")
     ElementTree.register_namespace("", _SVG)
     ElementTree.register_namespace("xlink", _LINK)

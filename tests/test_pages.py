@@ -1,0 +1,306 @@
+"""Pages: charts, tables and words, as HTML and as PDF."""
+
+from __future__ import annotations
+
+import json
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from pages import HOSTILE, Reader, every_mark, whole_page
+
+import lbt_synth as lbt
+from lbt_synth.pages import (
+    Axis,
+    Bars,
+    Cell,
+    Chart,
+    Curve,
+    Listing,
+    Map,
+    Page,
+    Panel,
+    Paragraph,
+    Section,
+    Table,
+    page_html,
+    page_pdf,
+)
+from lbt_synth.pages.charts import legend_of
+from lbt_synth.pages.interactive import interactive
+from lbt_synth.pages.looks import colour, dashes, marker_name
+from lbt_synth.pages.pdf import HEIGHT
+from lbt_synth.pages.scales import ends_of, log_tick_texts, log_ticks, shortened
+from lbt_synth.pages.static import chart_svg
+from lbt_synth.pages.typeset import BODY, MONO, mono_lines, width_of, wrapped
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return page_html(whole_page()).decode()
+
+
+@pytest.fixture(scope="module")
+def hostile():
+    return page_html(whole_page(HOSTILE)).decode()
+
+
+def data_of(text):
+    (found,) = re.findall(r'<script type="application/json" id="_charts">(.*?)</script>', text)
+    return json.loads(found)
+
+
+def test_a_page_is_well_formed_and_whole(plain):
+    reader = Reader(plain)
+    assert plain.startswith("<!DOCTYPE html>")
+    assert reader.named("html") == [{"lang": "en"}]
+    assert len(reader.named("h1")) == len(reader.named("title")) == len(reader.named("main")) == 1
+    levels = [int(tag[1]) for tag, _ in reader.elements if re.fullmatch("h[1-6]", tag)]
+    assert levels[0] == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+    ids = [a["id"] for _, a in reader.elements if "id" in a]
+    assert len(ids) == len(set(ids)) > 50
+    for _, attributes in reader.elements:  # every reference has its element
+        for name in ("aria-labelledby", "aria-describedby"):
+            assert attributes.get(name, ids[0]) in ids
+        target = attributes.get("href") or attributes.get("xlink:href") or f"#{ids[0]}"
+        assert target[1:] in ids or target.startswith("data:image/png;base64,")
+        for place in re.findall(r"url\(#(.*?)\)", attributes.get("clip-path") or ""):
+            assert place in ids
+    assert reader.named("a")[0]["href"] == "#_content"
+
+
+def test_tables_have_captions_and_scopes(plain):
+    reader = Reader(plain)
+    tables = reader.named("table")
+    assert len(tables) == len(reader.named("caption")) == 3  # the wide one is two
+    assert {a.get("scope") for a in reader.named("th")} == {"col", "row", "rowgroup"}
+    assert "Wide (continued)" in plain
+
+
+def test_figures_have_words(plain):
+    reader = Reader(plain)
+    charts = every_mark()
+    assert len(reader.named("figure")) == len(reader.named("figcaption")) == len(charts)
+    drawings = [a for a in reader.named("svg") if a.get("role") == "img"]
+    assert [a["aria-label"] for a in drawings] == [chart.alt for chart in charts]
+    for chart in charts:
+        assert plain.count(chart.caption) >= 1
+
+
+def test_nothing_is_fetched(plain):
+    reader = Reader(plain)
+    assert not reader.named("link")
+    assert not reader.named("img")
+    assert not reader.named("iframe")
+    assert all("src" not in a for a in reader.named("script"))
+    (policy,) = [a for a in reader.named("meta") if "http-equiv" in a]
+    assert "default-src 'none'" in policy["content"]
+    assert "http" not in policy["content"]
+    assert "@import" not in plain
+    for image in reader.named("image"):
+        assert image["xlink:href"].startswith("data:image/png;base64,")
+
+
+def test_hostile_names_stay_names(hostile, plain):
+    reader, usual = Reader(hostile), Reader(plain)
+    assert len(reader.elements) == len(usual.elements)
+    assert [tag for tag, _ in reader.elements] == [tag for tag, _ in usual.elements]
+    assert len(reader.named("script")) == 3
+    outside = re.sub(r"<script>.*?</script>", "", hostile, flags=re.DOTALL)
+    assert "alert(1)</script>" not in outside
+    assert reader.texts["title"][0] == f"Page of {HOSTILE}"
+    names = json.dumps(data_of(hostile))
+    assert "alert(1)" in names  # a name that the pointer shows
+    raw = re.search(r'id="_charts">(.*?)</script>', hostile, flags=re.DOTALL)
+    assert raw is not None
+    assert not set("<>&") & set(raw[1])
+
+
+def test_the_same_page_is_the_same_file(plain):
+    assert page_html(whole_page()).decode() == plain
+    assert page_pdf(whole_page()) == page_pdf(whole_page())
+
+
+def test_a_page_without_charts_has_no_script():
+    page = Page(
+        title="t",
+        subtitle="s",
+        creator="c",
+        sections=(Section(key="a", title="A", blocks=(Paragraph(text="words"),)),),
+    )
+    text = page_html(page).decode()
+    assert len(text) < 20_000
+    assert "<script" not in text
+    Reader(text)
+
+
+def test_the_data_of_charts_are_those_given(plain):
+    chart = every_mark()[0]
+    drawn = interactive([chart])
+    numbers = json.dumps(drawn.embedding)
+    assert set(drawn.lines["lines"]) == set(legend_of(chart.panels)) - {"only named"}
+    for identifiers in drawn.lines["lines"].values():
+        for identifier in identifiers:
+            assert numbers.count(f'"{identifier}"') >= 1
+    assert len(drawn.lines["lines"]["first"]) == 2  # once a panel
+    assert drawn.places == {"lines": ("lines_panel-1", "lines_panel-2")}
+    assert '"x": "p' not in numbers
+
+
+def texts_of(svg):
+    return re.findall(r"<text[^>]*>(.*?)</text>", svg)
+
+
+def test_drawings_keep_their_text():
+    svg = chart_svg(every_mark()[0])
+    words = texts_of(svg)
+    for word in ("frequency [Hz]", "size [-]", "steps [nm]", "first", "second", "only named"):
+        assert word in words
+    assert svg == chart_svg(every_mark()[0])
+    assert 'viewBox="0 0' in svg
+    assert " width=" not in svg.split(">")[0]
+    strange = chart_svg(every_mark("$\\frac{$ 文字")[0])  # no mathematics, and no such glyph
+    assert "$\\frac{$ 文字" in texts_of(strange)
+
+
+def test_unequal_looks_are_told_apart():
+    looks = [(colour(i), dashes(i)) for i in range(36)]
+    assert len(set(looks)) == 36
+    marks = {(colour(i), marker_name("own", i)) for i in range(36)}
+    assert len(marks) == 36
+    assert colour(None) not in [look[0] for look in looks]
+    assert marker_name("cross", 3) == "cross"
+
+
+@pytest.mark.parametrize(
+    ("axis", "values", "ends"),
+    [
+        (Axis(label="x"), [1.0, 3.0], (1.0, 3.0)),
+        (Axis(label="x", low=0.0), [1.0, 3.0], (0.0, 3.0)),
+        (Axis(label="x", log=True), [-1.0, 0.0, 0.1, 10.0, np.nan], (0.1, 10.0)),
+        (Axis(label="x"), [5.0], (4.5, 5.5)),
+        (Axis(label="x"), [], (0.9, 1.1)),
+        (Axis(label="x", log=True), [], (np.exp(-0.5), np.exp(0.5))),
+        (Axis(label="x"), [0.0], (-0.5, 0.5)),
+    ],
+)
+def test_ends_of_scales(axis, values, ends):
+    curve = Curve(name="a", x=values, y=np.ones(len(values)))
+    found, _ = ends_of(Panel(x=axis, y=Axis(label="y"), marks=(curve,)))
+    assert found == pytest.approx(ends)
+
+
+def test_ticks():
+    assert log_ticks(0.1, 400) == pytest.approx([0.1, 1, 10, 100])
+    assert log_ticks(20, 300) == pytest.approx([20, 50, 100, 200])
+    assert len(log_ticks(1e-9, 1e9)) < 10
+    assert log_tick_texts([0.001, 0.1, 2, 10_000]) == ["0.001", "0.1", "2", "10000"]
+    assert log_tick_texts([1e-6, 1.0, 2e5]) == ["10⁻⁶", "10⁰", "2·10⁵"]
+    assert shortened("abcdefghij", 5) == "ab…ij"
+    assert shortened("abc", 5) == "abc"
+
+
+def test_lines_fit_their_width():
+    words = "some words and an_extremely_long_name_" + 80 * "x" + " and the end"
+    lines = wrapped(words, BODY, 2.0)
+    assert all(width_of(line, BODY) <= 2.0 for line in lines)
+    assert "".join(lines).replace(" ", "") == words.replace(" ", "")
+    assert all(width_of(line, MONO) <= 3.0 for line in mono_lines(200 * "m", 3.0))
+    assert mono_lines("a\n\nb", 3.0) == ["a", "", "b"]
+
+
+def pages_of(pdf):
+    return len(re.findall(rb"/Type /Page\b", pdf))
+
+
+def test_a_pdf_has_its_pages_and_no_date():
+    pdf = page_pdf(whole_page())
+    assert pdf.startswith(b"%PDF")
+    assert pages_of(pdf) == 4
+    assert b"CreationDate" not in pdf
+    assert b"/Title (Page of first)" in pdf
+    assert b"/MediaBox [ 0 0 595.44 841.68 ]" in pdf
+    assert b"/Type3" not in pdf
+    assert page_pdf(whole_page(HOSTILE)).startswith(b"%PDF")
+
+
+def test_long_listings_and_tables_go_on_on_the_next_sheet():
+    def sheets(block):
+        section = Section(key="a", title="A", blocks=(block,))
+        page = Page(title="t", subtitle="s", creator="c", sections=(section,))
+        return pages_of(page_pdf(page))
+
+    inside = HEIGHT - 0.6 - 0.65
+    assert sheets(Listing(caption="l", text="line\n" * 10)) == 1
+    used = 0.25 + 0.15 + 0.2 + 0.55 + 1000 * MONO.leading  # headings
+    assert sheets(Listing(caption="l", text="line\n" * 1000)) == pytest.approx(
+        np.ceil(used / inside), abs=1
+    )
+    rows = tuple((f"row {i}", "value") for i in range(200))
+    assert 3 <= sheets(Table(caption="t", headings=("a", "b"), rows=rows)) <= 5
+
+
+def luminance(shade):
+    parts = np.array([int(shade[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def contrast(one, other):
+    """Contrast ratio of WCAG 2.2."""
+    dark, light = sorted([luminance(one), luminance(other)])
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_contrast_of_texts(plain):
+    assert contrast("#000000", "#ffffff") == pytest.approx(21)
+    named = dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6});", plain))
+    for ink, paper in (
+        ("ink", "paper"), ("soft", "paper"), ("link", "paper"), ("ink", "tint"),
+        ("bad", "bad-tint"), ("good", "paper"), ("note", "paper"), ("ink", "note-tint"),
+        ("ink", "good-tint"), ("bad", "paper"),
+    ):  # fmt: skip
+        assert contrast(named[ink], named[paper]) >= 4.5, (ink, paper)
+
+
+X, Y = Axis(label="x"), Axis(label="y")
+DOT = Curve(name="a", x=[1.0], y=[1.0])
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Curve(name="a", x=[1, 2], y=[1]), "same length"),
+        (lambda: Curve(name="a", x=[1], y=[1], line=False), "a line or a marker"),
+        (lambda: Curve(name="a", x=[1], y=[1], marker="star"), "marker must be one of"),
+        (lambda: Map(x=[1, 2], y=[1], values=[[1]], label="v"), "a column for each of 2 x"),
+        (lambda: Map(x=[2, 1], y=[1], values=[[1, 2]], label="v"), "x of a map must increase"),
+        (lambda: Map(x=[1], y=[1], values=[[1]], label="v", low=1), "low must be below high"),
+        (
+            lambda: Panel(x=X, y=Y, marks=(Bars(name="a", values=[1]),)),
+            "a value for each of 0 categories",
+        ),
+        (
+            lambda: Chart(key="A b", title="t", caption="c", alt="a", panels=()),
+            "a key must be of small letters",
+        ),
+        (lambda: Chart(key="a", title="t", caption="c", alt=" ", panels=()), "words for its alt"),
+        (lambda: Chart(key="a", title="t", caption="c", alt="a", panels=()), "one panel"),
+        (lambda: Table(caption="t", headings=("a", "b", "c"), rows=(("1", "2"),)), "1 or 3 cells"),
+        (lambda: Cell(text="a", tone="loud"), "tone must be one of"),
+        (
+            lambda: Page(
+                title="t",
+                subtitle="s",
+                creator="c",
+                sections=tuple(Section(key="a", title="a", blocks=()) for _ in range(2)),
+            ),
+            "keys of a page must be unique; got a twice",
+        ),
+    ],
+)
+def test_mistakes_are_refused(make, text):
+    with pytest.raises(lbt.ProblemError, match=re.escape(text)):
+        make()
