@@ -9,6 +9,7 @@ import time
 import pytest
 from pages import HOSTILE, every_mark, whole_page
 from plants import LBT_YAML
+from study_pages import page_of, results
 
 import lbt_synth as lbt
 from lbt_synth.pages import page_html
@@ -35,7 +36,7 @@ function* walk(node) {
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Addresses of a real report, and of a page with every kind of mark and hostile names."""
+    """Addresses of a real report, a study, and a page with every kind of mark and hostile names."""
     folder = tmp_path_factory.mktemp("browser")
     config = lbt.load_config(LBT_YAML)
     designs = {
@@ -43,6 +44,7 @@ def pages(tmp_path_factory):
         "integrator with a rather long name of its file": lbt.integrator(config.hardware, gain=0.4),
     }
     lbt.write_report(lbt.design_report(config, designs), folder / "report.html")
+    (folder / "study.html").write_bytes(page_html(page_of(results())))
     (folder / "marks.html").write_bytes(page_html(whole_page()))
     (folder / "hostile.html").write_bytes(page_html(whole_page(HOSTILE)))
     return {path.stem: path.as_uri() for path in folder.glob("*.html")}
@@ -83,7 +85,7 @@ def opened(browser, address, screen=DESK, *, script=True):
     time.sleep(0.5)
 
 
-@pytest.mark.parametrize("name", ["report", "marks", "hostile"])
+@pytest.mark.parametrize("name", ["report", "study", "marks", "hostile"])
 def test_it_opens_offline_without_a_word(browser, pages, name):
     opened(browser, pages[name])
     said = [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"]
@@ -121,7 +123,7 @@ def drawn_plots(browser):
 
 
 @pytest.mark.parametrize("screen", [DESK, PHONE], ids=["desk", "phone"])
-@pytest.mark.parametrize("name", ["report", "marks"])
+@pytest.mark.parametrize("name", ["report", "study", "marks"])
 def test_every_figure_is_drawn(browser, pages, name, screen):
     opened(browser, pages[name], screen)
     plots = drawn_plots(browser)
@@ -135,7 +137,7 @@ def test_every_figure_is_drawn(browser, pages, name, screen):
     assert browser.execute_script(hidden)
 
 
-@pytest.mark.parametrize("name", ["report", "marks", "hostile"])
+@pytest.mark.parametrize("name", ["report", "study", "marks", "hostile"])
 def test_it_fits_a_phone(browser, pages, name):
     opened(browser, pages[name], PHONE)
     widths = browser.execute_script(
@@ -164,7 +166,7 @@ def test_it_fits_a_phone(browser, pages, name):
     assert small == 0
 
 
-@pytest.mark.parametrize("name", ["report", "marks", "hostile"])
+@pytest.mark.parametrize("name", ["report", "study", "marks", "hostile"])
 def test_it_fits_a_sheet_of_paper(browser, pages, name):
     opened(browser, pages[name])
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})

@@ -150,7 +150,7 @@ def parameter_chart(parameters: Mapping[str, FloatArray], names: Mapping[str, st
 
 def _histogram_panel(name: str, *marks: Area | Curve) -> Panel:
     return Panel(
-        x=Axis(label=name), y=Axis(label="samples", unit="%", low=0), marks=marks, height_in=1.3
+        x=Axis(label=name), y=Axis(label="samples", unit="%", low=0), marks=marks, height_in=1.7
     )
 
 
