@@ -8,7 +8,7 @@ OUT    ?= out
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-all e2e study bench docs lint clean
+.PHONY: demo test test-all e2e browser study bench docs lint clean
 
 $(VENV)/.ready: pyproject.toml
 ifdef UV
@@ -30,6 +30,14 @@ else
 endif
 	@touch $@
 
+$(VENV)/.ready-browser: $(VENV)/.ready
+ifdef UV
+	$(UV) pip install --quiet --python $(BIN)/python --group browser
+else
+	$(BIN)/python -m pip install --quiet --group browser
+endif
+	@touch $@
+
 demo: $(VENV)/.ready     ## design both filters for the LBT, close the loop, write out/
 	@mkdir -p $(OUT)
 	$(BIN)/lbt-synth design examples/lbt.yaml --method kalman -o $(OUT)/kalman.fits
@@ -38,6 +46,7 @@ demo: $(VENV)/.ready     ## design both filters for the LBT, close the loop, wri
 	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/kalman.fits -o $(OUT)/kalman_loop.png
 	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/hinf.fits -o $(OUT)/hinf_loop.png
 	$(BIN)/lbt-synth robustness examples/lbt.yaml -o $(OUT)/robustness.csv -o $(OUT)/robustness.png
+	$(BIN)/lbt-synth report examples/lbt.yaml $(OUT)/kalman.fits $(OUT)/hinf.fits -o $(OUT)/report.html
 	$(BIN)/lbt-synth paper -o $(OUT)/paper
 
 lint: $(VENV)/.ready     ## style, types, import layers
@@ -47,13 +56,16 @@ lint: $(VENV)/.ready     ## style, types, import layers
 	$(BIN)/lint-imports
 
 test: lint               ## the whole default check
-	$(BIN)/pytest -n 2 -m "not study and not e2e" --doctest-modules lbt_synth tests
+	$(BIN)/pytest -n 2 -m "not study and not e2e and not browser" --doctest-modules lbt_synth tests
 
 test-all:                ## the check on each supported Python that is found
 	PYTHON=$(PYTHON) .ci/each-python $(MAKE) test
 
 e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT, Dask, Parquet; a test that is skipped, or none at all, fails
 	$(BIN)/pytest -n 2 -m e2e --no-skips tests
+
+browser: $(VENV)/.ready-browser ## pages in headless Chromium (Debian: chromium, chromium-driver); no test may be skipped
+	$(BIN)/pytest -m browser --no-skips tests
 
 study: $(VENV)/.ready    ## the long numerical studies
 	$(BIN)/pytest -m study tests

@@ -29,8 +29,6 @@ _GLYPHS = {
 }  # fmt: skip
 _FONT = "system-ui, sans-serif"
 _IDENTIFIER = re.compile(r"p\d+")
-# a finger that moves up or down scrolls the page, not the plot
-_TOUCH = ".bk-events { touch-action: pan-y !important; }"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,7 +129,7 @@ def _renumbered(value: Any, numbers: dict[str, str]) -> Any:
 
 def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -> Any:
     """Figure of a panel, and note whom each name stands for."""
-    from bokeh.models import BoxZoomTool, InlineStyleSheet, PanTool, ResetTool, WheelZoomTool
+    from bokeh.models import BoxZoomTool, PanTool, ResetTool, WheelZoomTool
     from bokeh.plotting import figure as new_figure
 
     zoom = BoxZoomTool(match_aspect=panel.equal)
@@ -147,7 +145,6 @@ def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -
         toolbar_location="above",
         min_border_left=64,  # panels above each other are in line
         min_border_right=12,
-        stylesheets=[InlineStyleSheet(css=_TOUCH)],
         match_aspect=panel.equal,
     )
     figure.toolbar.logo = None

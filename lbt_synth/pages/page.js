@@ -4,7 +4,7 @@
   const root = document.documentElement;
   try {
     const charts = JSON.parse(document.getElementById("_charts").textContent);
-    if (!window.matchMedia("(pointer: fine)").matches) {
+    if (window.matchMedia("(pointer: coarse)").matches) {
       // a finger scrolls the page: it zooms only after a tap on that tool
       for (const plot of charts.documents.page.roots) {
         plot.attributes.toolbar.attributes.active_drag = null;
