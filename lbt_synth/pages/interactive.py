@@ -79,17 +79,21 @@ def interactive(charts: Sequence[Chart]) -> Interactive:
     roots: dict[str, str] = {}
     places: dict[str, tuple[str, ...]] = {}
     lines: dict[str, dict[str, tuple[str, ...]]] = {}
+    figures = []
     for chart in charts:
         named: dict[str, list[str]] = {}
         shared: dict[Any, Any] = {}
         elements = []
         for i, panel in enumerate(chart.panels):
             figure = _figure(panel, shared, named)
-            document.add_root(figure)
+            figures.append(figure)
             elements.append(f"{chart.key}_panel-{i + 1}")
             roots[figure.id] = elements[-1]
         places[chart.key] = tuple(elements)
         lines[chart.key] = {name: tuple(ids) for name, ids in named.items()}
+    with document.models.freeze():  # what belongs to it is looked up once
+        for figure in figures:
+            document.add_root(figure)
     data = document.to_json(deferred=False)
     numbers: dict[str, str] = {}
     data = _renumbered(data, numbers)
@@ -431,11 +435,14 @@ def _draw_levels(figure: Any, found: Map) -> None:
     if not levels:
         return
     generator = contour_generator(found.x, found.y, np.ma.masked_invalid(found.values))
+    paths, shades = [], []
     for level in levels:
-        paths = generator.lines(level)
-        figure.multi_line(
-            [path[:, 0] for path in paths],
-            [path[:, 1] for path in paths],
-            line_color=level_colour(found, level),
-            line_width=1.0,
-        )
+        for path in generator.lines(level):
+            paths.append(path)
+            shades.append(level_colour(found, level))
+    figure.multi_line(
+        [path[:, 0] for path in paths],
+        [path[:, 1] for path in paths],
+        line_color=shades,
+        line_width=1.0,
+    )
