@@ -9,6 +9,7 @@ import numpy as np
 from lbt_synth.pages import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
 from lbt_synth.report.words import listing_text
 from lbt_synth.study.binning import binned_map, cumulative, histogram, values_of
+from lbt_synth.study.comparison import losses_of
 from lbt_synth.study.conditional import ConditionalCurve
 from lbt_synth.study.outcomes import Outcomes
 from lbt_synth.study.statistics import StudyStatistics
@@ -77,13 +78,12 @@ def distribution_chart(found: Sequence[Outcomes]) -> Chart | None:
 
 def loss_chart(found: Sequence[Outcomes]) -> Chart | None:
     """How much each controller loses against the best of each sample, and how often."""
-    whole = np.logical_and.reduce([each.evaluated for each in found])
-    if len(found) < 2 or not whole.any():
+    losses = losses_of(found)
+    if len(found) < 2 or not losses[0].size:
         return None
-    best = np.max([each.strehl[whole] for each in found], axis=0)
     curves = []
-    for look, each in enumerate(found):
-        level, part = cumulative(best - each.strehl[whole])
+    for look, (each, loss) in enumerate(zip(found, losses, strict=True)):
+        level, part = cumulative(loss)
         x, y = np.concatenate(([0.0], level)), np.concatenate(([1.0], 1 - part))
         curves.append(
             Curve(name=each.controller, x=100 * x, y=100 * y, look=look, step=True, width=1.8)

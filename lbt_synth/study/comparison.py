@@ -91,6 +91,24 @@ def compare(first: Outcomes, second: Outcomes) -> Comparison:
     )
 
 
+def losses_of(controllers: Sequence[Outcomes]) -> tuple[FloatArray, ...]:
+    """Return the best Strehl ratio of each sample less that of each controller.
+
+    Parameters
+    ----------
+    controllers : sequence of Outcomes
+        The controllers, on the same samples.
+
+    Returns
+    -------
+    tuple of (m,) ndarray
+        One a controller, of the samples on which none failed.
+    """
+    whole = np.logical_and.reduce([each.evaluated for each in controllers])
+    best = np.max([each.strehl[whole] for each in controllers], axis=0)
+    return tuple(best - each.strehl[whole] for each in controllers)
+
+
 def losses(controllers: Sequence[Outcomes]) -> tuple[Loss, ...]:
     """Loss of each controller against the best one of each sample.
 
@@ -104,15 +122,10 @@ def losses(controllers: Sequence[Outcomes]) -> tuple[Loss, ...]:
     tuple of Loss
         One a controller, of the samples on which none failed.
     """
-    whole = np.logical_and.reduce([each.evaluated for each in controllers])
-    best = np.max([each.strehl[whole] for each in controllers], axis=0)
-    out = []
-    for each in controllers:
-        loss = best - each.strehl[whole]
-        out.append(
-            Loss(
-                best=share(int(np.count_nonzero(loss == 0)), len(loss)),
-                loss=percentiles(loss, (50.0, 95.0, 99.0)),
-            )
+    return tuple(
+        Loss(
+            best=share(int(np.count_nonzero(loss == 0)), len(loss)),
+            loss=percentiles(loss, (50.0, 95.0, 99.0)),
         )
-    return tuple(out)
+        for loss in losses_of(controllers)
+    )
