@@ -75,6 +75,7 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             "computed": run.computed,
             "failures": run.failures,
             "retry": run.retry,
+            "computing_seconds": run.computing_s,
             "seconds": run.seconds,
             "files": [str(run.results), str(run.failed), str(folder / _PAGE)],
         }
@@ -91,10 +92,9 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     report.tables += [
         _text_of(worst_table(each, varying), rows=_WORST) for each in statistics.controllers
     ]
-    speed = run.computed / run.seconds if run.seconds > 0 else float("inf")
     report.notes.append(
-        f"{run.computed} of {run.samples} samples computed in {_duration(run.seconds)} "
-        f"({speed:.3g} a second)."
+        f"{run.computed} of {run.samples} samples computed in {_duration(run.computing_s)}; with "
+        f"tables and page {_duration(run.seconds)}."
     )
     if run.failures:
         report.notes.append(

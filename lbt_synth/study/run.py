@@ -61,8 +61,8 @@ class StudyRun:
         Controllers of samples that have no result.
     retry : int
         How many of these are tried again when the study is started again.
-    seconds : float
-        Time of this run [s].
+    computing_s, seconds : float
+        Time of this run until the last row was there, and as a whole [s].
     """
 
     directory: Path
@@ -72,6 +72,7 @@ class StudyRun:
     computed: int
     failures: int
     retry: int
+    computing_s: float
     seconds: float
 
 
@@ -159,12 +160,13 @@ def run_study(
         if finished and not manifest["retry"]:
             remove_parts(folder)  # killed while it removed them
             parts = []
-        computed = 0
+        computed, computing_s = 0, 0.0
         if not finished or manifest["retry"]:
             computed = _complete(
                 study, folder, parts, executor=executor, jobs=jobs, workers=workers,
                 evaluate=evaluate, progress=progress,
             )  # fmt: skip
+            computing_s = time.perf_counter() - began
             manifest = _written(folder, study, manifest, computed, began, whole)
         elif progress is not None:
             progress(study.samples)
@@ -176,6 +178,7 @@ def run_study(
         computed=computed,
         failures=manifest["failures"],
         retry=manifest["retry"],
+        computing_s=computing_s,
         seconds=time.perf_counter() - began,
     )
 
