@@ -57,6 +57,7 @@ def test_public_fields_say_which_gain_they_are(name):
         "README.md",
         "docs/tutorial.md",
         "docs/robustness.md",
+        "docs/report.md",
         "docs/mirror.md",
         "docs/modal.md",
         "docs/replay.md",
