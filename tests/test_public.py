@@ -59,6 +59,7 @@ def test_public_fields_say_which_gain_they_are(name):
         "docs/robustness.md",
         "docs/ensemble.md",
         "docs/study_statistics.md",
+        "docs/report.md",
         "docs/mirror.md",
         "docs/modal.md",
         "docs/replay.md",

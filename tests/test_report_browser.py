@@ -308,6 +308,21 @@ def test_a_drag_zooms(browser, pages):
     assert browser.execute_script(end) < whole
 
 
+@pytest.mark.parametrize("screen", [DESK, PHONE], ids=["desk", "phone"])
+def test_circles_are_round(browser, pages, screen):
+    opened(browser, pages["report"], screen)
+    scales = browser.execute_script(
+        """
+        const index = [...document.querySelectorAll(".plot")].findIndex(e => e.id === "poles_panel-1");
+        const plot = Bokeh.documents[0].roots()[index];
+        return [plot.inner_width / (plot.x_range.end - plot.x_range.start),
+                plot.inner_height / (plot.y_range.end - plot.y_range.start)];
+        """
+    )
+    assert scales[0] > 50
+    assert scales[0] / scales[1] == pytest.approx(1, abs=0.03)
+
+
 def test_a_finger_scrolls_the_page(browser, pages):
     opened(browser, pages["marks"], PHONE)
     active = "return Bokeh.documents[0].roots().map(plot => plot.toolbar.active_drag)"

@@ -21,7 +21,8 @@ from lbt_synth.plotting.cells import cell_edges
 from lbt_synth.validation import FloatArray
 
 _HEIGHT = 300  # of a panel [px]
-_SQUARE = 380  # of one with equal scales, or with a scale of colours [px]
+_MAP = 380  # of one with a scale of colours [px]
+_SQUARE = 460  # width of one with equal scales, at most [px]
 _BAR = 22  # of one bar [px]
 _GLYPHS = {
     "circle": "circle", "square": "square", "triangle": "triangle", "diamond": "diamond",
@@ -138,18 +139,22 @@ def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -
 
     zoom = BoxZoomTool(match_aspect=panel.equal)
     across, up = ends_of(panel)
+    square: dict[str, Any] = {}
+    if panel.equal:  # the borders are as wide as the toolbar and the labels are high
+        (x0, x1), (y0, y1) = across, up
+        square = {"aspect_ratio": abs((x1 - x0) / (y1 - y0)), "max_width": _SQUARE}
     figure = new_figure(
         x_axis_type="log" if panel.x.log else "linear",
         y_axis_type="log" if panel.y.log else "linear",
-        x_range=shared.setdefault((panel.x.text, across), _range(across, panel)),
-        y_range=_range(up, panel),
-        height=_height(panel),
+        x_range=shared.setdefault((panel.x.text, across), _range(across)),
+        y_range=_range(up),
+        height=None if panel.equal else _height(panel),
         sizing_mode="stretch_width",
         tools=[zoom, PanTool(), WheelZoomTool(), ResetTool()],
         toolbar_location="above",
         min_border_left=64,  # panels above each other are in line
         min_border_right=12,
-        match_aspect=panel.equal,
+        **square,
     )
     figure.toolbar.logo = None
     figure.toolbar.active_drag = zoom
@@ -175,19 +180,17 @@ def _figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -
     return figure
 
 
-def _range(ends: tuple[float, float], panel: Panel) -> Any:
-    from bokeh.models import DataRange1d, Range1d
+def _range(ends: tuple[float, float]) -> Any:
+    from bokeh.models import Range1d
 
-    if panel.equal:  # the library finds the ends that make both scales the same
-        return DataRange1d(range_padding=0.04)
     return Range1d(start=ends[0], end=ends[1])
 
 
 def _height(panel: Panel) -> int:
     if panel.categories:
         return 90 + _BAR * len(panel.categories) * max(1, len(panel.of(Bars)))
-    if panel.equal or panel.of(Map):
-        return _SQUARE
+    if panel.of(Map):
+        return _MAP
     if panel.height_in is not None:
         return int(60 + 115 * panel.height_in)
     return _HEIGHT
