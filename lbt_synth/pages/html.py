@@ -35,7 +35,6 @@ def page_html(page: Page) -> bytes:
         The file; the same page is the same file.
     """
     from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
 
     here = files("lbt_synth.pages")
     environment = Environment(
@@ -47,19 +46,19 @@ def page_html(page: Page) -> bytes:
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
     text = template.render(
         page=page,
-        style=Markup((here / "page.css").read_text(encoding="utf-8")),
-        script=Markup((here / "page.js").read_text(encoding="utf-8")),
-        library=Markup(bokeh_script()) if page.charts else "",
-        data=Markup(_as_script(drawn.embedding)),
+        style=(here / "page.css").read_text(encoding="utf-8"),
+        script=(here / "page.js").read_text(encoding="utf-8"),
+        library=bokeh_script() if page.charts else "",
+        data=_as_script(drawn.embedding),
         places=drawn.places,
         legends={
             chart.key: [
-                (name, Markup(swatch(mark)), " ".join(drawn.lines[chart.key].get(name, ())))
+                (name, swatch(mark), " ".join(drawn.lines[chart.key].get(name, ())))
                 for name, mark in legend_of(chart.panels).items()
             ]
             for chart in page.charts
         },
-        drawings={chart.key: Markup(chart_svg(chart)) for chart in page.charts},
+        drawings={chart.key: chart_svg(chart) for chart in page.charts},
     )
     return text.encode()
 

@@ -40,9 +40,9 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
                 key="sigma",
                 title="Estimation error of the design models",
                 caption="Largest singular value from the disturbances that each design assumes "
-                "(of unit size) to the error of its estimate. The peak is the H-infinity norm, "
-                "the area under the square the variance. Designs that estimate nothing, such as "
-                "integrators and shaped controllers, have none.",
+                "(of unit size) to the error of its estimate; of an LQG, to its residual. The "
+                "peak is the H-infinity norm, the area under the square the variance. Designs "
+                "that estimate nothing, such as integrators and shaped controllers, have none.",
                 alt="Curves over frequency, one a design that estimates. Peaks on this grid: "
                 f"{listing_text(peaks)}.",
                 panels=(
