@@ -30,6 +30,27 @@ def test_tilt_variance_against_adaptive_quadrature(air):
     assert air.tilt_rms_nm == pytest.approx(np.sqrt(variance_rad2) * 500 / (2 * np.pi), rel=1e-5)
 
 
+def test_tilt_spectrum_between_the_points_of_its_table(air):
+    """By adaptive quadrature over the other spatial frequency."""
+    r0, D, V = air.fried_parameter_m, air.diameter_m, air.wind_speed_m_s
+    scale = 0.0228956 * r0 ** (-5 / 3) * (500 / (2 * np.pi)) ** 2
+
+    def spatial(fy, fx):
+        f = np.hypot(fx, fy)
+        tilt = 2 * (4 * jv(2, np.pi * D * f) / (2 * np.pi * D * f)) ** 2
+        return scale * (f**2 + 22.0**-2) ** (-11 / 6) * tilt
+
+    # those between two points of the table, in units of V / D
+    for x in (0.011, 0.27, 0.8137, 1.9371, 4.4417, 9.97):
+        f = x * V / D
+        edges = np.concatenate([[0], np.geomspace(1e-3, 40, 60)]) / D
+        total = sum(
+            quad(spatial, low, high, args=(f / V,), limit=200)[0]
+            for low, high in zip(edges[:-1], edges[1:], strict=True)
+        )
+        assert air.psd(f) == pytest.approx(4 / V * total, rel=2e-5)
+
+
 def test_kolmogorov_tilt_has_nolls_coefficient():
     air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=None, wind_speed_m_s=1, diameter_m=8.0)
     # Noll 1976, Table IV: each tilt has the variance 0.449 (D/r0)^(5/3) rad^2

@@ -64,7 +64,7 @@ def ensemble_residuals(
     ...     vibrations=[lbt.EnsembleVibration(frequency_hz=[19.0, 20.0, 20.0], rms_nm=797)])
     >>> found = lbt.ensemble_residuals(lbt.kalman(plant).controller, plant.hardware, ensemble)
     >>> found.rms_nm.round(1).tolist()
-    [306.9, 188.6, nan]
+    [195.4, 181.9, nan]
     """
     instance(hardware, LoopHardware)
     instance(ensemble, LoopEnsemble)

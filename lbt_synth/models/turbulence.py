@@ -129,7 +129,7 @@ def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, 
     ...                      diameter_m=8.22)
     >>> poles, driving = ar1_flows(lbt.FrozenFlows(atmosphere=air), frame_rate_hz=800)
     >>> poles.round(4).tolist(), driving.round(2).tolist()
-    ([[0.9886]], [89.04])
+    ([[0.9886]], [89.08])
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     poles = _pole(flows.wind_speed_m_s, flows.atmosphere.diameter_m, rate)
