@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,11 +69,12 @@ def fixed_design() -> dict[int, Row]:
     return with_growth(rows)
 
 
-def told_designs(folder: Path) -> dict[int, Row]:
+def told_designs() -> dict[int, Row]:
     """Kalman filters of samples, designed and evaluated."""
-    file = folder / "told.yaml"
-    file.write_text(TOLD.format(config=EXAMPLES / "lbt.yaml"))
-    study = lbt.load_study(file)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "told.yaml"
+        file.write_text(TOLD.format(config=EXAMPLES / "lbt.yaml"))
+        study = lbt.load_study(file)
     rows = {}
     for count in (64, 512, 4096):
         values = study.values(0, count)
@@ -89,3 +91,9 @@ def _scaled(row: Row, count: int) -> Row:
     """Scale the peer's time, of some loops, to all of them."""
     factor = count / FEW
     return row | {"peer_s": row["peer_s"] * factor, "ratio": row["ratio"] * factor}
+
+
+ENSEMBLE = (
+    ("many loops of a gain file at once (loop by loop)", "loops", fixed_design),
+    ("Kalman filters for samples, designed and evaluated (one by one)", "samples", told_designs),
+)

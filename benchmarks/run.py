@@ -20,6 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import control
 import numpy as np
 from engine import SIZED
+from ensemble import ENSEMBLE
 from harness import Row, machine, paired, seconds
 from modal import MODAL
 from realtime import REALTIME
@@ -179,7 +180,7 @@ def main() -> None:
     pages = []
     everyday = {**imports(), **time_domain(), **synthesis(), **maps()}
     tables = [("everyday operations", "operation", everyday)]
-    for title, first, case in (*SIZED, *MODAL, *REALTIME):
+    for title, first, case in (*SIZED, *MODAL, *ENSEMBLE, *REALTIME):
         print(f"... {title}", file=sys.stderr)
         tables.append((title, first, {str(size): row for size, row in case().items()}))
     for title, first, rows in tables:

@@ -359,6 +359,7 @@ WRONG = [
     ({"noise_nm": -1.0}, lbt.ProblemError, "noise_nm must be at least 0"),
     ({"delay_frames": [0.5, 2]}, lbt.ProblemError, "delay_frames must be at least 1"),
     ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, lbt.DimensionError, "one entry a loop"),
+    ({"sensor_gain": []}, lbt.DimensionError, "at least one loop"),
     ({"turbulence": "von Karman"}, lbt.ProblemError, "turbulence must be"),
     ({"vibrations": [LINE]}, lbt.ProblemError, "EnsembleVibration"),
     ({"turbulence": (AIR, AIR, AIR)}, lbt.DimensionError, "one entry a mode"),

@@ -167,12 +167,12 @@ def test_samples_that_the_configuration_refuses(tmp_path):
 def test_a_filter_that_cannot_be_designed(tmp_path):
     """The others of its batch are designed all the same."""
     parameters = """{
-      'model.vibrations[0].damping': {uniform: [0.002, 0.02]},
-      sensor.noise_nm: {uniform: [5, 30]}
+      sensor.noise_nm: {uniform: [5, 30]},
+      'model.vibrations[0].rms_nm': {uniform: [100, 900]}
     }"""
     study, _ = agree(tmp_path, base=BASE, controllers=TOLD, parameters=parameters)
     values = study.values(0, COUNT)
-    values[3, 1] = 1e-160  # its variance underflows
+    values[3, 1] = 1e170  # its variance overflows
     found = lbt.evaluate_samples(study, values, 0)
     assert {f.row for f in found.failures} == {3}
     assert np.isfinite(found.columns["told.strehl"]).sum() == COUNT - 1

@@ -134,6 +134,8 @@ class LoopEnsemble:
         if len(set(lengths.values()) - {1}) > 1:
             text = ", ".join(f"{name.removesuffix(' of all')} {n}" for name, n in lengths.items())
             raise DimensionError(f"all must have one entry a loop; got {text}.")
+        if 0 in lengths.values():
+            raise DimensionError("an ensemble needs at least one loop; got none.")
         set_(self, "loops", max(lengths.values(), default=1))
 
     def _arrays(self) -> dict[str, Any]:

@@ -98,7 +98,8 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
             )  # fmt: skip
     for i, controllers in sorted(left.items()):
         some = replace(study, controllers=tuple(controllers))
-        results_of_row, failed = point.evaluate_row(some, values[i], start + i)
+        with np.errstate(all="ignore"):  # what overflows fails its checks
+            results_of_row, failed = point.evaluate_row(some, values[i], start + i)
         failures += failed
         for name, value in results_of_row.items():
             columns[name][i] = value
@@ -137,8 +138,9 @@ def _evaluated_together(
             rows, group = rows.taken(np.flatnonzero(good)), group[good]
             if not group.size:
                 continue
-            own = designed_for_samples(rows) if matrices is None else matrices
-            found = residuals_of_matrices(own, sample.hardware, rows.ensemble())
+            with np.errstate(over="raise", divide="raise", invalid="raise"):
+                own = designed_for_samples(rows) if matrices is None else matrices
+                found = residuals_of_matrices(own, sample.hardware, rows.ensemble())
         except point.EXPECTED_ERRORS:
             continue  # one of them fails; which one is found point by point
         yield group, found, sample.config.imaging

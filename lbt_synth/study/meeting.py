@@ -198,8 +198,11 @@ def changes_numbers_only(study: Study, keys: Keys) -> bool:
 def changes_beliefs_only(study: Study, keys: Keys) -> bool:
     """Whether a parameter at a place changes what designs believe, and nothing else."""
     settings = study.config.settings
-    shared = settings.true_turbulence == "model" or not isinstance(settings.truth.vibrations, list)
-    return keys[0] == "model" and keys[1] != "sensor_gain" and not shared
+    return (
+        is_line(keys, "model")
+        and isinstance(settings.truth.vibrations, list)
+        and all(section.spread_hz is None for section in settings.model.vibrations or ())
+    )
 
 
 def is_line(keys: Keys, owner: str) -> bool:
