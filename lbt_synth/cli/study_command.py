@@ -96,6 +96,7 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         f"{run.computed} of {run.samples} samples computed in {_duration(run.computing_s)}; with "
         f"tables and page {_duration(run.seconds)}."
     )
+    report.notes += _sampling_notes(loaded)
     if run.failures:
         report.notes.append(
             f"note: {run.failures} results failed, see {run.failed}."
@@ -149,6 +150,15 @@ def _duration(seconds: float) -> str:
     return f"{hours:.3g} h" if hours < 100 else f"{hours / 24:.3g} days"
 
 
+def _sampling_notes(loaded: Study) -> list[str]:
+    if loaded.settings.sampling != "sobol" or loaded.samples & (loaded.samples - 1) == 0:
+        return []
+    return [
+        "note: Sobol's points are balanced best when their number is a power of two; "
+        f"{loaded.samples} is none."
+    ]
+
+
 # ---------------------------------------------------------------- dry run
 def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     with _engine(arguments) as (_, workers):
@@ -159,12 +169,6 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     if workers is not None:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
     settings = loaded.settings
-    notes = []
-    if settings.sampling == "sobol" and loaded.samples & (loaded.samples - 1):
-        notes.append(
-            "note: Sobol's points are balanced best when their number is a power of two; "
-            f"{loaded.samples} is none."
-        )
     return Report(
         data={
             "samples": loaded.samples,
@@ -207,7 +211,7 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
                 rows=[(c.name, c.origin) for c in loaded.controllers],
             ),
         ],
-        notes=[*notes, "nothing was written."],
+        notes=[*_sampling_notes(loaded), "nothing was written."],
     )
 
 

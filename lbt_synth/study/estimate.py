@@ -66,7 +66,7 @@ def estimate_study(
     >>> study = lbt.load_study("examples/study.yaml")
     >>> cost = lbt.estimate_study(study, workers=2)
     >>> cost.seconds > 0, cost.disk_bytes
-    (True, 1499136)
+    (True, 1974272)
     """
     workers = integer(workers, "workers", at_least=1)
     start, size, rows, seconds = 0, _FIRST_ROWS, 1, 0.0
