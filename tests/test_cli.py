@@ -241,7 +241,10 @@ def loaded_after(code):
 )
 def test_imports_are_quick(code):
     """Nothing heavier than the standard library before a name is used."""
-    heavy = {"cvxpy", "control", "matplotlib", "astropy", "scipy", "pydantic", "rich", "numpy"}
+    heavy = {
+        "cvxpy", "control", "matplotlib", "astropy", "scipy", "pydantic", "rich", "numpy", "bokeh",
+        "jinja2",
+    }  # fmt: skip
     assert not heavy & loaded_after(code)
 
 

@@ -46,6 +46,11 @@ def hostile():
     return page_html(whole_page(HOSTILE)).decode()
 
 
+@pytest.fixture(scope="module")
+def sheets():
+    return page_pdf(whole_page())
+
+
 def data_of(text):
     (found,) = re.findall(r'<script type="application/json" id="_charts">(.*?)</script>', text)
     return json.loads(found)
@@ -118,9 +123,9 @@ def test_hostile_names_stay_names(hostile, plain):
     assert not set("<>&") & set(raw[1])
 
 
-def test_the_same_page_is_the_same_file(plain):
+def test_the_same_page_is_the_same_file(plain, sheets):
     assert page_html(whole_page()).decode() == plain
-    assert page_pdf(whole_page()) == page_pdf(whole_page())
+    assert page_pdf(whole_page()) == sheets
 
 
 def test_a_page_without_charts_has_no_script():
@@ -215,8 +220,8 @@ def pages_of(pdf):
     return len(re.findall(rb"/Type /Page\b", pdf))
 
 
-def test_a_pdf_has_its_pages_and_no_date():
-    pdf = page_pdf(whole_page())
+def test_a_pdf_has_its_pages_and_no_date(sheets):
+    pdf = sheets
     assert pdf.startswith(b"%PDF")
     assert pages_of(pdf) == 4
     assert b"CreationDate" not in pdf
@@ -227,19 +232,19 @@ def test_a_pdf_has_its_pages_and_no_date():
 
 
 def test_long_listings_and_tables_go_on_on_the_next_sheet():
-    def sheets(block):
+    def count(block):
         section = Section(key="a", title="A", blocks=(block,))
         page = Page(title="t", subtitle="s", creator="c", sections=(section,))
         return pages_of(page_pdf(page))
 
     inside = HEIGHT - 0.6 - 0.65
-    assert sheets(Listing(caption="l", text="line\n" * 10)) == 1
+    assert count(Listing(caption="l", text="line\n" * 10)) == 1
     used = 0.25 + 0.15 + 0.2 + 0.55 + 1000 * MONO.leading  # headings
-    assert sheets(Listing(caption="l", text="line\n" * 1000)) == pytest.approx(
+    assert count(Listing(caption="l", text="line\n" * 1000)) == pytest.approx(
         np.ceil(used / inside), abs=1
     )
     rows = tuple((f"row {i}", "value") for i in range(200))
-    assert 3 <= sheets(Table(caption="t", headings=("a", "b"), rows=rows)) <= 5
+    assert 3 <= count(Table(caption="t", headings=("a", "b"), rows=rows)) <= 5
 
 
 def luminance(shade):
