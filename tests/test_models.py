@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -46,7 +48,7 @@ def test_tilt_spectrum_between_the_points_of_its_table(air):
         edges = np.concatenate([[0], np.geomspace(1e-3, 40, 60)]) / D
         total = sum(
             quad(spatial, low, high, args=(f / V,), limit=200)[0]
-            for low, high in zip(edges[:-1], edges[1:], strict=True)
+            for low, high in itertools.pairwise(edges)
         )
         assert air.psd(f) == pytest.approx(4 / V * total, rel=2e-5)
 
