@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
@@ -206,6 +205,8 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
 
     ``S(f) = (4 / V) int_0^inf Phi(f/V, f_y) df_y`` (one-sided).
     """
+    from scipy.interpolate import CubicSpline  # slow to import
+
     frequency = np.concatenate(
         [np.geomspace(1e-4, 0.3, 120, endpoint=False), np.linspace(0.3, 12, 480, endpoint=False),
          np.linspace(12, 120, 400)]

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar import variance_ratios
@@ -160,6 +159,8 @@ class DriftingVibration:
             If this is a sinusoid, or the frequency falls faster than the decay lets the
             variance follow.
         """
+        from scipy.signal import lfilter  # slow to import
+
         if self.damping is None:
             raise ProblemError("a sinusoid has no AR2 process; got one that drifts.")
         decay = 2 * np.pi * self.damping * self.start_hz / frame_rate_hz  # a frame

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from scipy.interpolate import PPoly
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.atmosphere import (
@@ -163,6 +162,8 @@ def _interpolate_over_scales(
     x: FloatArray, scale_ratio: FloatArray, obstruction: float, values: FloatArray
 ) -> None:
     """Fill in the logarithms of spectra that each have their own outer scale."""
+    from scipy.interpolate import PPoly  # slow to import
+
     octave = np.floor(np.log2(scale_ratio))
     for each in np.unique(octave):
         knots, coefficients = _octave_splines(int(each), obstruction)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len
-from scipy.signal import lfilter
 
 from lbt_synth.lyapunov import stationary_covariance
 from lbt_synth.models.ar import ARModel
@@ -123,6 +122,8 @@ def _draw_drift(
 
 
 def _draw_ar(model: ARModel, frames: int, cases: int, rng: np.random.Generator) -> FloatArray:
+    from scipy.signal import lfilter  # slow to import
+
     a, order = model.coefficients, model.order
     drive = np.zeros((order, order))
     drive[0, 0] = model.driving_rms_nm**2
