@@ -17,7 +17,14 @@ from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.files import require_writable
 from lbt_synth.gainfile import load_gain
 from lbt_synth.limits import least_residual
-from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget, strehl
+from lbt_synth.loop import (
+    ClosedLoop,
+    close_loop,
+    loop_margins,
+    residual_budget,
+    stable_sensor_gains,
+    strehl,
+)
 from lbt_synth.models import Truth
 from lbt_synth.models.hardware import loop_differences, same_mirror
 from lbt_synth.plotting import require_figure_name, save_figure, sigma_figure, simulation_figure
@@ -92,8 +99,7 @@ def simulate(arguments: Namespace) -> Report:
         return int(getattr(settings, name) if given is None else given)
 
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
-    _require_fitting_loop(loop, design)
-    loop.require_stable()
+    _require_stable(loop, design, config.sensor_gain)
     # the same settling for all controllers, so that one seed is one weather
     settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
     with working("closing the loop", quiet=arguments.json):
@@ -178,24 +184,34 @@ def _percent(value: float | None) -> float | None:
     return None if value is None else 100 * value
 
 
-def _require_fitting_loop(loop: ClosedLoop, design: Design) -> None:
-    """Refuse an unstable loop of another delay or mirror than the file's, saying so."""
+def _require_stable(loop: ClosedLoop, design: Design, reference_gain: float) -> None:
+    """Refuse an unstable loop, and say what makes it so: mirror, sensor gain or delay."""
+    if loop.is_stable:
+        return
     own, here = design.hardware, loop.hardware
-    if loop.is_stable or own is None:
-        return
-    if not same_mirror(own, here):
-        raise UnstableLoopError(
-            "the closed loop is unstable: the file was designed for another mirror than that of "
-            "the configuration. Design for mirror.local_loop of the configuration, best with "
-            "--method lqg.",
-            spectral_radius=loop.spectral_radius,
+    low, high = stable_sensor_gains(here, design.controller)
+    if own is not None and not same_mirror(own, here):
+        reason = (
+            "The file was designed for another mirror than that of the configuration. Design for "
+            "mirror.local_loop of the configuration, best with --method lqg."
         )
-    if own.delay_frames == here.delay_frames:
-        return
+    elif not np.isnan(low):
+        reason = (
+            f"With this delay the design is stable at sensor gains from {low * reference_gain:.4g} "
+            f"to {high * reference_gain:.4g}; design for this gain, or for a range of them with "
+            "--method robust."
+        )
+    elif own is not None and own.delay_frames != here.delay_frames:
+        reason = (
+            f"The file was designed for a delay of {own.delay_frames:g} frames. Set "
+            f"loop.delay_frames to {own.delay_frames:g}, or design for {here.delay_frames:g}."
+        )
+    else:
+        reason = "Design for this configuration."
     raise UnstableLoopError(
-        f"the closed loop is unstable: the file was designed for a delay of {own.delay_frames:g} "
-        f"frames, the configuration has {here.delay_frames:g}. Set loop.delay_frames to "
-        f"{own.delay_frames:g}, or design for {here.delay_frames:g}.",
+        f"the closed loop must be stable; got an unstable one (spectral radius "
+        f"{loop.spectral_radius:.6g}) at a sensor gain of {loop.sensor_gain * reference_gain:.6g} "
+        f"and a delay of {here.delay_frames:g} frames. {reason}",
         spectral_radius=loop.spectral_radius,
     )
 
