@@ -8,10 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
 from lbt_synth.pages import (
+    Area,
     Axis,
     Bars,
     Cell,
@@ -32,7 +34,7 @@ from lbt_synth.pages.interactive import interactive
 from lbt_synth.pages.looks import colour, dashes, marker_name
 from lbt_synth.pages.pdf import HEIGHT
 from lbt_synth.pages.scales import ends_of, log_tick_texts, log_ticks, shortened
-from lbt_synth.pages.static import chart_svg
+from lbt_synth.pages.static import chart_svg, draw_chart, height_of
 from lbt_synth.pages.typeset import BODY, MONO, mono_lines, width_of, wrapped
 
 
@@ -195,6 +197,41 @@ def test_ends_of_scales(axis, values, ends):
     curve = Curve(name="a", x=values, y=np.ones(len(values)))
     found, _ = ends_of(Panel(x=axis, y=Axis(label="y"), marks=(curve,)))
     assert found == pytest.approx(ends)
+
+
+@pytest.mark.parametrize(
+    ("axis", "marker", "values", "ends"),
+    [
+        # room is of what is shown, not of what the values span
+        (Axis(label="y", unit="%", low=0.0), "own", [98.0, 100.0], (0.0, 104.0)),
+        # markers on an end that is given, and lines along it, are not cut
+        (Axis(label="y", unit="%", low=0.0), "own", [0.0, 100.0], (-4.0, 104.0)),
+        (Axis(label="y", low=0.0, high=100.0), None, [100.0, 100.0, 50.0], (0.0, 104.0)),
+        (Axis(label="y", low=0.0, high=100.0), None, [0.0, 100.0, 50.0], (0.0, 100.0)),
+        (Axis(label="y", log=True, low=1.0), "own", [1.0, 100.0], (100**-0.04, 100**1.04)),
+        (Axis(label="y", low=5.0), None, [1.0, 2.0], (5.0, 6.0 + 0.04)),
+    ],
+)
+def test_curves_are_not_cut_by_the_ends_of_their_scale(axis, marker, values, ends):
+    curve = Curve(name="a", x=np.arange(len(values)), y=values, marker=marker)
+    panel = Panel(x=Axis(label="x"), y=axis, marks=(curve,))
+    _, found = ends_of(panel)
+    assert found == pytest.approx(ends)
+    shaded = Area(name="b", x=curve.x, low=curve.y, high=curve.y)
+    standing = ends_of(Panel(x=Axis(label="x"), y=axis, marks=(curve, shaded)))[1]
+    assert standing[0] == pytest.approx(axis.low)
+
+
+def test_both_renderers_leave_the_same_room():
+    curve = Curve(name="a", x=[0.0, 1.0, 2.0], y=[0.0, 99.0, 100.0], marker="own")
+    panel = Panel(x=Axis(label="x"), y=Axis(label="y", low=0.0), marks=(curve,))
+    chart = Chart(key="room", title="t", caption="c", alt="a", panels=(panel,))
+    data = interactive([chart]).embedding["documents"]["page"]["roots"][0]["attributes"]
+    ends = data["y_range"]["attributes"]
+    assert (ends["start"], ends["end"]) == pytest.approx((-4.0, 104.0))
+    figure = Figure(figsize=(7, height_of(chart)))
+    draw_chart(figure, chart, left=0, top=height_of(chart))
+    assert figure.axes[0].get_ylim() == pytest.approx((-4.0, 104.0))
 
 
 def test_ticks():

@@ -25,7 +25,7 @@ from lbt_synth.report.designs_tables import (
     versions_table,
 )
 from lbt_synth.report.designs_verdict import verdict
-from lbt_synth.report.making import creator, time_text
+from lbt_synth.report.making import creator, require_letters, time_text
 from lbt_synth.report.words import listing_text, number_text
 
 
@@ -59,7 +59,7 @@ def write_report(
     OutputError
         If a name ends in something else, or a file cannot be written.
     ProblemError
-        If the title is empty.
+        If the title is empty, or cannot be shown.
 
     Examples
     --------
@@ -120,12 +120,13 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     Raises
     ------
     ProblemError
-        If the title is empty.
+        If the title is empty, or cannot be shown.
     """
     source = report.config.source.name
     heading = f"Controllers for {source}" if title is None else title.strip()
     if not heading:
         raise ProblemError("title must hold at least one letter; got an empty text.")
+    require_letters(heading, "title")
     count = len(report.assessments)
     names = listing_text([one.name for one in report.assessments])
     sections = [
