@@ -32,9 +32,9 @@ from lbt_synth.pages import (
 from lbt_synth.pages.charts import legend_of
 from lbt_synth.pages.interactive import interactive
 from lbt_synth.pages.looks import colour, dashes, marker_name
-from lbt_synth.pages.pdf import HEIGHT
+from lbt_synth.pages.pdf import HEIGHT, by_sheets, height_of_block
 from lbt_synth.pages.scales import ends_of, log_tick_texts, log_ticks, shortened
-from lbt_synth.pages.static import chart_svg, draw_chart, height_of
+from lbt_synth.pages.static import chart_svg, draw_chart, drawing, height_of
 from lbt_synth.pages.typeset import BODY, MONO, mono_lines, width_of, wrapped
 
 
@@ -266,6 +266,55 @@ def test_a_pdf_has_its_pages_and_no_date(sheets):
     assert b"/MediaBox [ 0 0 595.44 841.68 ]" in pdf
     assert b"/Type3" not in pdf
     assert page_pdf(whole_page(HOSTILE)).startswith(b"%PDF")
+
+
+def many_panels(count, title="p", columns=2):
+    x = np.linspace(0, 1, 5)
+    panel = Panel(
+        title=title, x=Axis(label="x"), y=Axis(label="y"), marks=(Curve(name="a", x=x, y=x),)
+    )
+    return Chart(
+        key="many", title="Many", caption="c", alt="a", panels=count * (panel,), columns=columns
+    )
+
+
+@pytest.mark.parametrize("count", [1, 6, 7, 40])
+def test_charts_that_are_too_high_go_on_on_the_next_sheet(count):
+    chart = many_panels(count)
+    parts = list(by_sheets(chart))
+    assert sum(len(part.panels) for part in parts) == count
+    assert all(height_of_block(part) <= HEIGHT - 1.25 - 0.5 for part in parts)
+    assert [part.title for part in parts[:2]] == ["Many", "Many (continued)"][: len(parts)]
+    page = Page(
+        title="t", subtitle="s", creator="c",
+        sections=(
+            Section(key="a", title="A", blocks=(Paragraph(text="a"),)),
+            Section(key="b", title="B", blocks=(chart,)),
+        ),
+    )  # fmt: skip
+    assert pages_of(page_pdf(page)) == len(parts) + (count >= 6)
+
+
+def test_bars_fit_a_sheet():
+    names = tuple(f"parameter {i}" for i in range(60))
+    bars = tuple(Bars(name=f"c{i}", values=np.ones(60), look=i) for i in range(3))
+    panel = Panel(x=Axis(label="x", low=0), y=Axis(label="y"), marks=bars, categories=names)
+    chart = Chart(key="bars", title="t", caption="c", alt="a", panels=(panel,))
+    assert height_of_block(chart) <= HEIGHT - 1.25 - 0.5
+
+
+def test_titles_of_panels_stay_in_their_drawing():
+    title = "a very long name " * 10
+    for columns in (1, 2, 3):
+        figure = Figure(figsize=(7, 12))
+        with drawing():
+            draw_chart(figure, many_panels(columns, title, columns), left=0, top=12)
+            figure.canvas.draw()
+            for axes in figure.axes:
+                told = axes.get_title(loc="left")
+                assert "…" in told
+                ends = axes._left_title.get_window_extent()
+                assert ends.x1 <= axes.get_window_extent().x1 + 1
 
 
 def test_long_listings_and_tables_go_on_on_the_next_sheet():

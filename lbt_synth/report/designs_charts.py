@@ -295,7 +295,7 @@ def dynamics_charts(report: DesignReport) -> list[Chart]:
                 alt="One complex plane a design, with the unit circle. Largest modulus of the "
                 f"closed loop's poles: {listing_text(radii)}.",
                 panels=tuple(panels),
-                columns=min(len(panels), 2),
+                columns=_columns(len(panels)),
             )
         )
     )
