@@ -238,6 +238,13 @@ def test_ticks():
     assert log_ticks(0.1, 400) == pytest.approx([0.1, 1, 10, 100])
     assert log_ticks(20, 300) == pytest.approx([20, 50, 100, 200])
     assert len(log_ticks(1e-9, 1e9)) < 10
+    assert log_ticks(64.0, 171.0) == pytest.approx([80, 100, 120, 140, 160])  # not 100 alone
+    for ratio in (1.001, 1.1, 1.9, 3.0, 5.0, 9.9):
+        for low in np.geomspace(1, 10, 23):
+            ticks = log_ticks(low, ratio * low)
+            assert 3 <= len(ticks) <= 9
+            assert low * (1 - 1e-9) <= ticks[0] < ticks[-1] <= ratio * low * (1 + 1e-9)
+    assert log_tick_texts([1.2e5, 1.25e5]) == ["1.2·10⁵", "1.25·10⁵"]
     assert log_tick_texts([0.001, 0.1, 2, 10_000]) == ["0.001", "0.1", "2", "10000"]
     assert log_tick_texts([1e-6, 1.0, 2e5]) == ["10⁻⁶", "10⁰", "2·10⁵"]
     assert shortened("abcdefghij", 5) == "ab…ij"

@@ -99,12 +99,21 @@ def _is_cut(values: FloatArray, end: float, *, marked: bool) -> bool:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return ticks of a logarithmic scale: decades, and 2 and 5 between where these are few."""
+    """Return ticks of a logarithmic scale: decades, and 2 and 5 between where these are few.
+
+    Within a decade that has fewer than three of them, round values at equal steps.
+    """
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     factors = (1, 2, 5) if math.log10(high / low) < 2.2 else (1,)
     stride = max(1, math.ceil((last - first) / 8))
     ticks = [f * 10.0**n for n in range(first, last + 1, stride) for f in factors]
-    return [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
+    inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
+    if len(inside) > 2 or high >= 10 * low:
+        return inside
+    raw = (high - low) / 5
+    unit = 10.0 ** math.floor(math.log10(raw))
+    step = min((unit, 2 * unit, 5 * unit, 10 * unit), key=lambda step: abs(math.log(step / raw)))
+    return [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def log_tick_texts(ticks: Sequence[float]) -> list[str]:
@@ -116,9 +125,9 @@ def log_tick_texts(ticks: Sequence[float]) -> list[str]:
 
 def _power_text(value: float) -> str:
     power = math.floor(math.log10(value) + 1e-9)
-    factor = round(value / 10.0**power)
+    factor = f"{value / 10.0**power:.6g}"
     raised = "10" + str(power).translate(_RAISED)
-    return raised if factor == 1 else f"{factor}·{raised}"
+    return raised if factor == "1" else f"{factor}·{raised}"
 
 
 def shortened(text: str, most: int) -> str:

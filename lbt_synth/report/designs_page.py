@@ -134,7 +134,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
         Section(
             key="transfer",
             title="Transfer functions",
-            blocks=tuple(transfer_charts(report)),
+            blocks=tuple(_transfer(report)),
         ),
         Section(key="errors", title="Robustness", blocks=tuple(robustness_charts(report))),
         Section(key="dynamics", title="Dynamics", blocks=tuple(dynamics_charts(report))),
@@ -207,6 +207,17 @@ def _situation(report: DesignReport) -> str:
         "Residuals and Strehl ratios are exact, by Lyapunov equations and integrals over transfer "
         "functions, unless they are called simulated."
     )
+
+
+def _transfer(report: DesignReport) -> list[Block]:
+    """Return the transfer functions; those of a loop need a stable one."""
+    charts: list[Block] = [*transfer_charts(report)]
+    if report.stable:
+        return charts
+    return [
+        Paragraph(text="No loop is stable, so none has a rejection or a noise transfer."),
+        *charts,
+    ]
 
 
 def _distinct(report: DesignReport) -> list[float]:
