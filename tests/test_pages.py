@@ -8,10 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
 from lbt_synth.pages import (
+    Area,
     Axis,
     Bars,
     Cell,
@@ -30,9 +32,9 @@ from lbt_synth.pages import (
 from lbt_synth.pages.charts import legend_of
 from lbt_synth.pages.interactive import interactive
 from lbt_synth.pages.looks import colour, dashes, marker_name
-from lbt_synth.pages.pdf import HEIGHT
+from lbt_synth.pages.pdf import HEIGHT, by_sheets, height_of_block
 from lbt_synth.pages.scales import ends_of, log_tick_texts, log_ticks, shortened
-from lbt_synth.pages.static import chart_svg
+from lbt_synth.pages.static import chart_svg, draw_chart, drawing, height_of
 from lbt_synth.pages.typeset import BODY, MONO, mono_lines, width_of, wrapped
 
 
@@ -197,10 +199,52 @@ def test_ends_of_scales(axis, values, ends):
     assert found == pytest.approx(ends)
 
 
+@pytest.mark.parametrize(
+    ("axis", "marker", "values", "ends"),
+    [
+        # room is of what is shown, not of what the values span
+        (Axis(label="y", unit="%", low=0.0), "own", [98.0, 100.0], (0.0, 104.0)),
+        # markers on an end that is given, and lines along it, are not cut
+        (Axis(label="y", unit="%", low=0.0), "own", [0.0, 100.0], (-4.0, 104.0)),
+        (Axis(label="y", low=0.0, high=100.0), None, [100.0, 100.0, 50.0], (0.0, 104.0)),
+        (Axis(label="y", low=0.0, high=100.0), None, [0.0, 100.0, 50.0], (0.0, 100.0)),
+        (Axis(label="y", log=True, low=1.0), "own", [1.0, 100.0], (100**-0.04, 100**1.04)),
+        (Axis(label="y", low=5.0), None, [1.0, 2.0], (5.0, 6.0 + 0.04)),
+    ],
+)
+def test_curves_are_not_cut_by_the_ends_of_their_scale(axis, marker, values, ends):
+    curve = Curve(name="a", x=np.arange(len(values)), y=values, marker=marker)
+    panel = Panel(x=Axis(label="x"), y=axis, marks=(curve,))
+    _, found = ends_of(panel)
+    assert found == pytest.approx(ends)
+    shaded = Area(name="b", x=curve.x, low=curve.y, high=curve.y)
+    standing = ends_of(Panel(x=Axis(label="x"), y=axis, marks=(curve, shaded)))[1]
+    assert standing[0] == pytest.approx(axis.low)
+
+
+def test_both_renderers_leave_the_same_room():
+    curve = Curve(name="a", x=[0.0, 1.0, 2.0], y=[0.0, 99.0, 100.0], marker="own")
+    panel = Panel(x=Axis(label="x"), y=Axis(label="y", low=0.0), marks=(curve,))
+    chart = Chart(key="room", title="t", caption="c", alt="a", panels=(panel,))
+    data = interactive([chart]).embedding["documents"]["page"]["roots"][0]["attributes"]
+    ends = data["y_range"]["attributes"]
+    assert (ends["start"], ends["end"]) == pytest.approx((-4.0, 104.0))
+    figure = Figure(figsize=(7, height_of(chart)))
+    draw_chart(figure, chart, left=0, top=height_of(chart))
+    assert figure.axes[0].get_ylim() == pytest.approx((-4.0, 104.0))
+
+
 def test_ticks():
     assert log_ticks(0.1, 400) == pytest.approx([0.1, 1, 10, 100])
     assert log_ticks(20, 300) == pytest.approx([20, 50, 100, 200])
     assert len(log_ticks(1e-9, 1e9)) < 10
+    assert log_ticks(64.0, 171.0) == pytest.approx([80, 100, 120, 140, 160])  # not 100 alone
+    for ratio in (1.001, 1.1, 1.9, 3.0, 5.0, 9.9):
+        for low in np.geomspace(1, 10, 23):
+            ticks = log_ticks(low, ratio * low)
+            assert 3 <= len(ticks) <= 9
+            assert low * (1 - 1e-9) <= ticks[0] < ticks[-1] <= ratio * low * (1 + 1e-9)
+    assert log_tick_texts([1.2e5, 1.25e5]) == ["1.2·10⁵", "1.25·10⁵"]
     assert log_tick_texts([0.001, 0.1, 2, 10_000]) == ["0.001", "0.1", "2", "10000"]
     assert log_tick_texts([1e-6, 1.0, 2e5]) == ["10⁻⁶", "10⁰", "2·10⁵"]
     assert shortened("abcdefghij", 5) == "ab…ij"
@@ -229,6 +273,55 @@ def test_a_pdf_has_its_pages_and_no_date(sheets):
     assert b"/MediaBox [ 0 0 595.44 841.68 ]" in pdf
     assert b"/Type3" not in pdf
     assert page_pdf(whole_page(HOSTILE)).startswith(b"%PDF")
+
+
+def many_panels(count, title="p", columns=2):
+    x = np.linspace(0, 1, 5)
+    panel = Panel(
+        title=title, x=Axis(label="x"), y=Axis(label="y"), marks=(Curve(name="a", x=x, y=x),)
+    )
+    return Chart(
+        key="many", title="Many", caption="c", alt="a", panels=count * (panel,), columns=columns
+    )
+
+
+@pytest.mark.parametrize("count", [1, 6, 7, 40])
+def test_charts_that_are_too_high_go_on_on_the_next_sheet(count):
+    chart = many_panels(count)
+    parts = list(by_sheets(chart))
+    assert sum(len(part.panels) for part in parts) == count
+    assert all(height_of_block(part) <= HEIGHT - 1.25 - 0.5 for part in parts)
+    assert [part.title for part in parts[:2]] == ["Many", "Many (continued)"][: len(parts)]
+    page = Page(
+        title="t", subtitle="s", creator="c",
+        sections=(
+            Section(key="a", title="A", blocks=(Paragraph(text="a"),)),
+            Section(key="b", title="B", blocks=(chart,)),
+        ),
+    )  # fmt: skip
+    assert pages_of(page_pdf(page)) == len(parts) + (count >= 6)
+
+
+def test_bars_fit_a_sheet():
+    names = tuple(f"parameter {i}" for i in range(60))
+    bars = tuple(Bars(name=f"c{i}", values=np.ones(60), look=i) for i in range(3))
+    panel = Panel(x=Axis(label="x", low=0), y=Axis(label="y"), marks=bars, categories=names)
+    chart = Chart(key="bars", title="t", caption="c", alt="a", panels=(panel,))
+    assert height_of_block(chart) <= HEIGHT - 1.25 - 0.5
+
+
+def test_titles_of_panels_stay_in_their_drawing():
+    title = "a very long name " * 10
+    for columns in (1, 2, 3):
+        figure = Figure(figsize=(7, 12))
+        with drawing():
+            draw_chart(figure, many_panels(columns, title, columns), left=0, top=12)
+            figure.canvas.draw()
+            for axes in figure.axes:
+                told = axes.get_title(loc="left")
+                assert "…" in told
+                ends = axes._left_title.get_window_extent()
+                assert ends.x1 <= axes.get_window_extent().x1 + 1
 
 
 def test_long_listings_and_tables_go_on_on_the_next_sheet():

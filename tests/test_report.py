@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -175,6 +178,25 @@ def test_the_verdict_is_made_of_the_numbers(report):
     assert "The certificate of wild does NOT hold." in words
 
 
+def test_equals_are_told_as_equals(config, designs):
+    kalman = designs["kalman"]
+    pair = {"one": kalman, "two": kalman}
+    words = verdict(lbt.design_report(config, pair)).replace("\u00a0", " ")
+    assert "Of 2 stable designs, one and two leave the least, " in words
+    assert ": they bear them alike." in words
+    three = verdict(lbt.design_report(config, {"slow": designs["slow"], **pair}))
+    assert "Of 3 stable designs, one and two leave the least, " in three
+    assert ": one and two bear them best." in three or ": slow bears them best." in three
+
+
+def test_a_limit_of_nothing_is_no_limit(config, designs):
+    still = lbt.Truth(turbulence=None, noise_nm=config.truth.noise_nm)
+    report = lbt.design_report(replace(config, truth=still), {"slow": designs["slow"]})
+    assert report.limits.limit.rms_nm == 0
+    assert "above the limit" not in words_of(report)
+    assert "passed, 1 check " in words_of(report) + " "
+
+
 def test_the_page_has_all_that_it_should(text, report, config):
     reader = Reader(text)
     titles = " ".join(reader.texts["h2"] + reader.texts["h3"])
@@ -245,8 +267,16 @@ def test_many_designs_fill_several_sheets(config):
 
 
 def test_nothing_stable_is_needed(config, designs):
-    text = words_of(lbt.design_report(config, {"wild": designs["wild"]}))
+    report = lbt.design_report(config, {"wild": designs["wild"]})
+    text = words_of(report)
+    charts = design_page(report).charts
+    assert [chart.key for chart in charts] == ["map", "poles"]  # none of them is empty
+    honest = replace(report.assessments[0], checks=())
+    assert "passed; they are about the loops that the designs were made for" in verdict(
+        replace(report, assessments=(honest,))
+    )
     assert "No loop is stable, so none was simulated." in text
+    assert "No loop is stable, so none has a rejection" in text
     assert "Of 0" not in text
 
 
@@ -369,6 +399,50 @@ def test_hostile_files_are_quoted(folder, designs, tmp_path, capsys):
     assert reader.texts["title"] == ["<i>T</i>"]
     assert reader.texts["code"][0].startswith("# </code></pre><script>alert(2)</script>")
     assert "<script>alert('x')<_k" in reader.texts["th"]
+
+
+def test_pages_name_no_directories(folder, designs, tmp_path, capsys):
+    for place in ("a", "b"):
+        (tmp_path / place).mkdir()
+        lbt.save_gain(tmp_path / place / "k.fits", designs["slow"])
+    files = [str(tmp_path / place / "k.fits") for place in ("a", "b")]
+    status, out, _ = run(
+        capsys, "report", str(folder / "small.yaml"), *files, "-o", str(tmp_path / "r.html")
+    )
+    assert status == 0
+    assert "a/k.fits and b/k.fits leave the least" in out
+    text = (tmp_path / "r.html").read_text()
+    assert "a/k.fits" in text
+    assert str(tmp_path) not in text
+
+
+@pytest.mark.parametrize("name", ["red\x1b[31m", "two\nlines", "bad\udcff", "turned\u202e"])
+def test_names_that_no_page_can_show_are_refused(folder, designs, report, tmp_path, capsys, name):
+    with pytest.raises(lbt.ProblemError, match="name of a design must be of letters"):
+        lbt.design_report(report.config, {name: designs["slow"]})
+    with pytest.raises(lbt.ProblemError, match="title must be of letters"):
+        lbt.write_report(report, tmp_path / "r.html", title=name)
+    lbt.save_gain(tmp_path / "k.fits", designs["slow"])
+    odd = (tmp_path / "k.fits").rename(tmp_path / f"{name}.fits")
+    status, out, error = run(
+        capsys, "report", str(folder / "small.yaml"), str(odd), "-o", str(tmp_path / "r.html")
+    )
+    assert (status, out) == (2, "")
+    assert "must be of letters that a page can show" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "r.html").exists()
+
+
+@pytest.mark.parametrize("wrong", ["tomorrow", "", str(10**30)])
+def test_a_wrong_time_is_refused_before_libraries_read_it(wrong):
+    # numpy and scipy read it when they are loaded: only a new process shows that
+    done = subprocess.run(
+        [sys.executable, "-m", "lbt_synth.cli.main", "report", "a.yaml", "k.fits", "-o", "x.html"],
+        env=os.environ | {"SOURCE_DATE_EPOCH": wrong}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "SOURCE_DATE_EPOCH must be a number of seconds" in done.stderr
 
 
 @pytest.fixture(scope="module")

@@ -253,9 +253,19 @@ def _require_figure(output: str, *, inputs: list[str]) -> None:
 
 
 def named_designs(paths: list[str]) -> dict[str, Design]:
-    """Designs by the stems of their files, by the paths where stems repeat."""
+    """Designs by the stems of their files, by tails of the paths where stems repeat."""
     if len({Path(path).resolve() for path in paths}) != len(paths):
         raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
     stems = [Path(path).stem for path in paths]
-    names = stems if len(set(stems)) == len(stems) else paths
+    names = stems if len(set(stems)) == len(stems) else _tails(paths)
     return {name: load_gain(path) for name, path in zip(names, paths, strict=True)}
+
+
+def _tails(paths: list[str]) -> list[str]:
+    """Return the last parts of different paths, as few as tell all of them apart."""
+    whole = [Path(path).resolve().parts for path in paths]
+    for count in range(1, max(map(len, whole))):
+        names = ["/".join(parts[-count:]) for parts in whole]
+        if len(set(names)) == len(names):
+            return names
+    return paths

@@ -11,11 +11,12 @@ import importlib
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import lbt_synth
-from lbt_synth.errors import LbtSynthError, SynthesisError
+from lbt_synth.errors import LbtSynthError, ProblemError, SynthesisError
 
 DONE, FAILED, WRONG = 0, 1, 2
 
@@ -449,6 +450,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 1 a design or a verification failed, 2 wrong usage or bad input.
     """
     arguments = build_parser().parse_args(argv)
+    given = os.environ.get("SOURCE_DATE_EPOCH")
+    if given is not None:  # libraries read it, too, when they are loaded
+        try:
+            time.gmtime(int(given))
+        except (ValueError, OverflowError, OSError):
+            return _refuse(
+                ProblemError(
+                    f"SOURCE_DATE_EPOCH must be a number of seconds since 1970; got {given!r}."
+                ),
+                WRONG,
+                as_json=arguments.json,
+            )
     commands = importlib.import_module("lbt_synth.cli.commands")
     try:
         report = commands.COMMANDS[arguments.command](arguments)

@@ -15,7 +15,7 @@ from lbt_synth.report.designs import DesignReport, design_report, steps_of
 from lbt_synth.report.designs_assessment import DesignAssessment
 from lbt_synth.report.designs_page import require_page_names, write_report
 from lbt_synth.report.designs_verdict import good_range, verdict
-from lbt_synth.report.making import time_text
+from lbt_synth.report.making import require_letters, time_text
 
 
 def report_command(arguments: Namespace) -> Report:
@@ -24,6 +24,7 @@ def report_command(arguments: Namespace) -> Report:
     require_page_names(arguments.output, arguments.pdf, inputs=inputs)
     if arguments.title is not None and not arguments.title.strip():
         raise ProblemError("--title must hold at least one letter; got an empty text.")
+    require_letters(arguments.title or "", "--title")
     config = load_config(arguments.config)
     designs = named_designs(arguments.gains)
     files = dict(zip(designs, arguments.gains, strict=True))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from lbt_synth.pages.blocks import Block, Cell, Listing, Notice, Page, Paragraph, Section, Table
-from lbt_synth.pages.charts import Chart
+from lbt_synth.pages.charts import Chart, Panel
 from lbt_synth.pages.static import draw_chart, drawing, height_of
 from lbt_synth.pages.typeset import BODY, BOLD, LINE, MONO, Style, mono_lines, width_of, wrapped
 
@@ -16,6 +17,7 @@ WIDTH, HEIGHT = 8.27, 11.69  # A4 [inch]
 _SIDE, _TOP, _BOTTOM = 0.635, 0.6, 0.65
 INSIDE = WIDTH - 2 * _SIDE
 _COLUMNS = 6  # of a table, after the first one
+_ROOM = HEIGHT - _TOP - _BOTTOM - 0.5  # of a sheet below the heading of a section [inch]
 _TOGETHER = 12  # lines of a paragraph or rows of a table that are not torn apart
 _PAD = 0.05  # around the text of a cell
 _INKS = {"bad": "#a40e26", "good": "#116329", "note": "#6a4b00", "plain": "#1b1f24"}
@@ -89,10 +91,11 @@ class _Sheets:
         head = Style(size=14, weight="bold")
         opening = 0.0
         for block in section.blocks:  # up to the first thing that is no text
-            opening += height_of_block(block)
+            first_part = next(by_sheets(block)) if isinstance(block, Chart) else block
+            opening += height_of_block(first_part)
             if not isinstance(block, Paragraph | Notice):
                 break
-        room = 0.45 + min(opening, HEIGHT - _TOP - _BOTTOM - 0.5)
+        room = 0.45 + min(opening, _ROOM)
         if not first and self.y - room < _BOTTOM:
             self.y = 0.0
         self.words(section.title, head, after=0.1)
@@ -111,7 +114,8 @@ class _Sheets:
             for part in block.by_columns(_COLUMNS):
                 self.table(part)
         else:
-            self.chart(block)
+            for chart in by_sheets(block):
+                self.chart(chart)
 
     def words(self, text: str, style: Style, *, after: float) -> None:
         """Lines of a text; a short one is kept together."""
@@ -233,6 +237,22 @@ class _Row:
         thickness = 0.012 if self.heading else 0.005
         _box(figure, left=_SIDE, top=bottom + thickness, width=left - _SIDE, height=thickness,
              shade="#1b1f24" if self.heading else "#c9d1d9")  # fmt: skip
+
+
+def by_sheets(chart: Chart) -> Iterator[Chart]:
+    """Yield charts that each fit a sheet below the heading of a section, in whole rows."""
+    panels = chart.panels
+    parts: list[tuple[Panel, ...]] = [()]
+    for start in range(0, len(panels), chart.columns):
+        row = panels[start : start + chart.columns]
+        longer = replace(chart, panels=parts[-1] + row)
+        if parts[-1] and height_of_block(longer) > _ROOM:
+            parts.append(row)
+        else:
+            parts[-1] += row
+    for number, part in enumerate(parts):
+        more = f"{chart.title} (continued)" if number else chart.title
+        yield replace(chart, title=more, panels=part)
 
 
 def height_of_block(block: Block) -> float:

@@ -37,10 +37,14 @@ def ends_of(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
             tight = True
         elif isinstance(mark, Rule) and mark.axis == "y":
             up.append(np.array([mark.at]))
-    x = _ends(panel.x, across, 0.0 if tight or _is_line(panel) else _ROOM)
+    # a shaded area stands on its end of the scale; equal scales stay equal
+    drawn = [] if tight or panel.equal or panel.of(Area) or panel.of(Bars) else panel.of(Curve)
+    x = _ends(panel.x, across, 0.0 if tight or _is_line(panel) else _ROOM,
+              [(curve.x, curve.marker is not None) for curve in drawn])  # fmt: skip
     if panel.categories:
         return x, (len(panel.categories) - 0.4, -0.6)
-    return x, _ends(panel.y, up, 0.0 if tight else _ROOM)
+    return x, _ends(panel.y, up, 0.0 if tight else _ROOM,
+                    [(curve.y, curve.marker is not None) for curve in drawn])  # fmt: skip
 
 
 def _is_line(panel: Panel) -> bool:
@@ -50,7 +54,16 @@ def _is_line(panel: Panel) -> bool:
     )
 
 
-def _ends(axis: Axis, values: Iterable[FloatArray], room: float) -> tuple[float, float]:
+def _ends(
+    axis: Axis,
+    values: Iterable[FloatArray],
+    room: float,
+    curves: Sequence[tuple[FloatArray, bool]],
+) -> tuple[float, float]:
+    """Return the ends of a scale: those given, else of the values with room of what is shown.
+
+    A given end is moved out where curves, told with whether they have markers, would be cut by it.
+    """
     found = np.concatenate([np.zeros(0), *values])
     found = found[np.isfinite(found) & ((found > 0) | (not axis.log))]
     low, high = (float(found.min()), float(found.max())) if found.size else (1.0, 1.0)
@@ -59,22 +72,48 @@ def _ends(axis: Axis, values: Iterable[FloatArray], room: float) -> tuple[float,
     if high - low <= 1e-12 * max(abs(low), abs(high)):
         half = 0.5 if axis.log or low == 0 else abs(low) / 10
         low, high = low - half, high + half
-    low, high = low - room * (high - low), high + room * (high - low)
-    if axis.log:
-        low, high = math.exp(low), math.exp(high)
-    return (
-        low if axis.low is None else axis.low,
-        high if axis.high is None else axis.high,
+    given = [end if end is None or not axis.log else math.log(end) for end in (axis.low, axis.high)]
+    low, high = (
+        end if end is not None else own for end, own in zip(given, (low, high), strict=True)
     )
+    if high <= low:  # all values are beyond the end that is given
+        low, high = (low, low + 1.0) if given[1] is None else (high - 1.0, high)
+    extent = high - low
+    ends = []
+    for end, own, sign in zip(given, (low, high), (-1, 1), strict=True):
+        away = room
+        if end is not None:
+            exact = math.exp(end) if axis.log else end
+            cut = any(_is_cut(v, exact, marked=m) for v, m in curves)
+            away = _ROOM if cut else 0.0
+        ends.append(own + sign * away * extent)
+    if axis.log:
+        return math.exp(ends[0]), math.exp(ends[1])
+    return ends[0], ends[1]
+
+
+def _is_cut(values: FloatArray, end: float, *, marked: bool) -> bool:
+    """Whether an end of a scale cuts a marker, or a line that runs along it."""
+    there = np.isclose(values, end, rtol=1e-9, atol=1e-12)
+    return bool(np.any(there) if marked else np.any(there[1:] & there[:-1]))
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return ticks of a logarithmic scale: decades, and 2 and 5 between where these are few."""
+    """Return ticks of a logarithmic scale: decades, and 2 and 5 between where these are few.
+
+    Within a decade that has fewer than three of them, round values at equal steps.
+    """
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     factors = (1, 2, 5) if math.log10(high / low) < 2.2 else (1,)
     stride = max(1, math.ceil((last - first) / 8))
     ticks = [f * 10.0**n for n in range(first, last + 1, stride) for f in factors]
-    return [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
+    inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
+    if len(inside) > 2 or high >= 10 * low:
+        return inside
+    raw = (high - low) / 5
+    unit = 10.0 ** math.floor(math.log10(raw))
+    step = min((unit, 2 * unit, 5 * unit, 10 * unit), key=lambda step: abs(math.log(step / raw)))
+    return [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def log_tick_texts(ticks: Sequence[float]) -> list[str]:
@@ -86,9 +125,9 @@ def log_tick_texts(ticks: Sequence[float]) -> list[str]:
 
 def _power_text(value: float) -> str:
     power = math.floor(math.log10(value) + 1e-9)
-    factor = round(value / 10.0**power)
+    factor = f"{value / 10.0**power:.6g}"
     raised = "10" + str(power).translate(_RAISED)
-    return raised if factor == 1 else f"{factor}·{raised}"
+    return raised if factor == "1" else f"{factor}·{raised}"
 
 
 def shortened(text: str, most: int) -> str:

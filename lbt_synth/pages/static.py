@@ -27,7 +27,9 @@ _PANEL_IN, _BAR_IN = 2.1, 0.24  # height of a panel, and of one bar
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.62, 0.12, 0.42, 0.08
 _TITLE, _LEGEND_ROW, _SCALE = 0.22, 0.2, 0.62
 _LETTER = 0.068  # width of a letter at 8 points [inch], generously
+_BOLD_LETTER = 0.08  # of a bold one
 _LONGEST = 60
+_HIGHEST = 7.5  # of a panel with bars [inch], so that it fits a sheet
 _MARKERS = {
     "circle": "o", "square": "s", "triangle": "^", "diamond": "D", "cross": "x", "plus": "+",
 }  # fmt: skip
@@ -134,7 +136,8 @@ def draw_chart(
                 cell - margin - _RIGHT,
                 height - _BOTTOM - _TOP - titled * _TITLE,
             )
-            image = _draw_panel(axes, panel) or image
+            room = int((cell - margin - _RIGHT) / _BOLD_LETTER)
+            image = _draw_panel(axes, panel, room) or image
     if image is not None:
         where = axes_at(left + width * 0.25, y - _SCALE + 0.44, width * 0.5, 0.11)
         bar = figure.colorbar(image, cax=where, orientation="horizontal")
@@ -157,7 +160,8 @@ def _row_heights(chart: Chart, width: float) -> list[float]:
             (x0, x1), (y0, y1) = ends_of(panel)
             return min(inside * abs((y1 - y0) / (x1 - x0)), 5.0)
         if panel.categories:
-            return max(0.8, _BAR_IN * len(panel.categories) * max(1, len(panel.of(Bars))) + 0.2)
+            bars = len(panel.categories) * max(1, len(panel.of(Bars)))
+            return min(max(0.8, _BAR_IN * bars + 0.2), _HIGHEST)
         return _PANEL_IN
 
     return [
@@ -239,10 +243,10 @@ def _rule_style(rule: Rule) -> dict[str, Any]:
     return {"color": GREY, "linewidth": 1.0, "linestyle": (0, strokes) if strokes else "-"}
 
 
-def _draw_panel(axes: Any, panel: Panel) -> Any:
-    """Draw a panel, and return its map if it has one."""
+def _draw_panel(axes: Any, panel: Panel, letters: int) -> Any:
+    """Draw a panel, its title of so many letters at most, and return its map if it has one."""
     image = None
-    axes.set_title(panel.title, loc="left", fontweight="bold")
+    axes.set_title(shortened(panel.title, letters), loc="left", fontweight="bold")
     for mark in panel.marks:
         if isinstance(mark, Curve):
             if mark.x.size:

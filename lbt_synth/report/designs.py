@@ -18,7 +18,13 @@ from lbt_synth.models.truth import stationary_vibrations
 from lbt_synth.plotting.figures import frequency_grid
 from lbt_synth.report.designs_assessment import DesignAssessment, assessed, require_fitting
 from lbt_synth.report.designs_simulation import DesignSimulation, common_settling, simulated
-from lbt_synth.report.making import SourceFile, read_source, time_of_making, versions
+from lbt_synth.report.making import (
+    SourceFile,
+    read_source,
+    require_letters,
+    time_of_making,
+    versions,
+)
 from lbt_synth.validation import FloatArray, frozen, instance
 
 _SOLVED = ("sdp", "lmi")  # routes of designs that a convex solver made
@@ -112,7 +118,8 @@ def design_report(
     Raises
     ------
     ProblemError
-        If there is no design, one does not fit the loop, or a true vibration drifts.
+        If there is no design, one does not fit the loop, a name cannot be shown, or a true
+        vibration drifts.
     FileError
         If the configuration or a gain file cannot be read.
 
@@ -131,6 +138,7 @@ def design_report(
         raise ProblemError(f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}.")
     for name, design in designs.items():
         instance(design, Design)
+        require_letters(name, "name of a design")
         require_fitting(name, design, config.hardware)
     made = time_of_making()
     source, content = read_source(config.source, "configuration")

@@ -54,6 +54,8 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
                 ),
             )
         )
+    if not report.stable:
+        return charts
     gain = number_text(report.real_gain)
     charts.append(
         Chart(
@@ -100,9 +102,7 @@ def robustness_charts(report: DesignReport) -> list[Chart]:
     """Strehl ratio and residual over the frequency error, and maps with the sensor gain."""
     if report.errors_hz.size == 1:
         return [_over_gain(report)]
-    charts = [_over_error(report)]
-    if report.stable:
-        charts.append(_residuals(report))
+    charts = [_over_error(report), _residuals(report)] if report.stable else []
     return [*charts, *_maps(report)]
 
 
@@ -112,14 +112,14 @@ def _over_error(report: DesignReport) -> Chart:
         f"{signed_text(float(one.curve.errors_hz[int(np.argmin(one.curve.strehl[0, 0]))]))} Hz"
         for one in report.stable
     ]
-    worst = 100 * min([float(np.min(one.curve.strehl)) for one in report.stable], default=0.0)
+    worst = 100 * min(float(np.min(one.curve.strehl)) for one in report.stable)
     return Chart(
         key="robustness",
         title="Strehl ratio over the frequency error",
         caption="Exact long-exposure Strehl ratio with every true vibration moved below the "
         "frequency that the design believes by the error, its rms kept, at the real sensor gain of "
         f"{number_text(report.real_gain)}.",
-        alt=f"One curve a design. {listing_text(ends)}." if ends else "No design is stable.",
+        alt=f"One curve a design. {listing_text(ends)}.",
         panels=(
             Panel(
                 x=_ERROR,
@@ -295,7 +295,7 @@ def dynamics_charts(report: DesignReport) -> list[Chart]:
                 alt="One complex plane a design, with the unit circle. Largest modulus of the "
                 f"closed loop's poles: {listing_text(radii)}.",
                 panels=tuple(panels),
-                columns=min(len(panels), 2),
+                columns=_columns(len(panels)),
             )
         )
     )
@@ -445,4 +445,4 @@ def _largest(report: DesignReport, name: str, words: str) -> str:
     parts = [
         f"{one.name} {number_text(float(np.max(getattr(one, name))), 3)}" for one in report.stable
     ]
-    return f"{words}: {listing_text(parts)}." if parts else "No loop is stable."
+    return f"{words}: {listing_text(parts)}."

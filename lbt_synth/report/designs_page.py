@@ -25,7 +25,7 @@ from lbt_synth.report.designs_tables import (
     versions_table,
 )
 from lbt_synth.report.designs_verdict import verdict
-from lbt_synth.report.making import creator, time_text
+from lbt_synth.report.making import creator, require_letters, time_text
 from lbt_synth.report.words import listing_text, number_text
 
 
@@ -59,7 +59,7 @@ def write_report(
     OutputError
         If a name ends in something else, or a file cannot be written.
     ProblemError
-        If the title is empty.
+        If the title is empty, or cannot be shown.
 
     Examples
     --------
@@ -120,12 +120,13 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     Raises
     ------
     ProblemError
-        If the title is empty.
+        If the title is empty, or cannot be shown.
     """
     source = report.config.source.name
     heading = f"Controllers for {source}" if title is None else title.strip()
     if not heading:
         raise ProblemError("title must hold at least one letter; got an empty text.")
+    require_letters(heading, "title")
     count = len(report.assessments)
     names = listing_text([one.name for one in report.assessments])
     sections = [
@@ -133,7 +134,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
         Section(
             key="transfer",
             title="Transfer functions",
-            blocks=tuple(transfer_charts(report)),
+            blocks=tuple(_transfer(report)),
         ),
         Section(key="errors", title="Robustness", blocks=tuple(robustness_charts(report))),
         Section(key="dynamics", title="Dynamics", blocks=tuple(dynamics_charts(report))),
@@ -206,6 +207,17 @@ def _situation(report: DesignReport) -> str:
         "Residuals and Strehl ratios are exact, by Lyapunov equations and integrals over transfer "
         "functions, unless they are called simulated."
     )
+
+
+def _transfer(report: DesignReport) -> list[Block]:
+    """Return the transfer functions; those of a loop need a stable one."""
+    charts: list[Block] = [*transfer_charts(report)]
+    if report.stable:
+        return charts
+    return [
+        Paragraph(text="No loop is stable, so none has a rejection or a noise transfer."),
+        *charts,
+    ]
 
 
 def _distinct(report: DesignReport) -> list[float]:

@@ -38,7 +38,7 @@ def summary_table(report: DesignReport) -> Table:
         ("Strehl ratio, exact [%]", lambda one, _: fixed_text(100 * one.strehl, 2)),
         ("Strehl ratio, simulated [%]", lambda one, _: _simulated(report, one)),
     ]  # fmt: skip
-    if report.limits.limit is not None:
+    if report.limits.limit is not None and report.limits.limit.rms_nm > 0:
         rows += [
             "Distance to the limit of any linear controller",
             (f"above the limit of {fixed_text(report.limits.limit.rms_nm, 1)} nm, frequency known "
@@ -51,7 +51,7 @@ def summary_table(report: DesignReport) -> Table:
             ("worst residual [nm rms]", lambda _, row: fixed_text(row.worst_nm, 1)),
             ("worst Strehl ratio [%]", lambda one, _: fixed_text(_worst(one), 2)),
         ]
-        if report.limits.band is not None:
+        if report.limits.band is not None and report.limits.band.rms_nm > 0:
             rows.append(
                 (f"above the limit of {fixed_text(report.limits.band.rms_nm, 1)} nm for this range "
                  "[%]", lambda _, row: fixed_text(row.above_band_limit_percent, 0))
@@ -125,7 +125,8 @@ def _measured(value: float) -> str:
 
 def _certificate(one: DesignAssessment) -> Cell:
     if one.certified:
-        return Cell(text=f"passed, {len(one.checks)} checks", tone="good")
+        count = len(one.checks)
+        return Cell(text=f"passed, {count} check{'s' if count > 1 else ''}", tone="good")
     failed = sum(not check.passed for check in one.checks)
     text = "NOT COMPUTED" if one.certificate_error else f"FAILED, {failed} of {len(one.checks)}"
     return Cell(text=text, tone="bad")

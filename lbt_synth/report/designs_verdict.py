@@ -76,11 +76,15 @@ def verdict(report: DesignReport) -> str:
 def _least(report: DesignReport) -> str:
     stable = report.stable
     best = min(stable, key=lambda one: one.residual_nm)
+    least = fixed_text(best.residual_nm, 1)
+    # who cannot be told from the best by the number that is read is as good
+    equal = [one.name for one in stable if fixed_text(one.residual_nm, 1) == least]
     several = len(stable) > 1
     where = " if the vibrations are where the configuration has them"
     sentence = (
-        f"{f'Of {len(stable)} stable designs, ' if several else ''}{best.name} leaves "
-        f"{'the least, ' if several else ''}{fixed_text(best.residual_nm, 1)} nm rms (Strehl ratio "
+        f"{f'Of {len(stable)} stable designs, ' if several else ''}{listing_text(equal)} "
+        f"{'leave' if len(equal) > 1 else 'leaves'} {'the least, ' if several else ''}{least} nm "
+        "rms (Strehl ratio "
         f"{fixed_text(100 * best.strehl, 1)} %){where if report.config.truth.vibrations else ''}"
     )
     limit = report.limits.limit
@@ -93,11 +97,12 @@ def _tolerance(report: DesignReport) -> list[str]:
     errors = report.errors_hz
     over = f"{signed_text(float(errors[0]))} to {signed_text(float(errors[-1]))} Hz"
     worst = {one.name: float(np.min(one.curve.strehl)) for one in report.stable}
-    toughest = max(worst, key=lambda name: worst[name])
+    most = fixed_text(100 * max(worst.values()), 1)
+    tough = [name for name, ratio in worst.items() if fixed_text(100 * ratio, 1) == most]
     sentences = [
         f"Over frequency errors of {over} the worst Strehl ratio is "
         + listing_text([f"{fixed_text(100 * v, 1)} % for {name}" for name, v in worst.items()])
-        + (f": {toughest} bears them best." if len(worst) > 1 else ".")
+        + (f": {_best(tough, len(worst))}." if len(worst) > 1 else ".")
     ]
     parts = []
     for one in report.stable:
@@ -111,6 +116,13 @@ def _tolerance(report: DesignReport) -> list[str]:
             )
     sentences.append(f"Within 10 % of its own best Strehl ratio stays {listing_text(parts)}.")
     return sentences
+
+
+def _best(tough: list[str], of: int) -> str:
+    """Return who bears errors best; equals are told as such."""
+    if len(tough) == of:
+        return "they bear them alike"
+    return f"{listing_text(tough)} {'bear' if len(tough) > 1 else 'bears'} them best"
 
 
 def _gains(report: DesignReport) -> str:
@@ -128,5 +140,11 @@ def _certificates(report: DesignReport) -> str:
     failed = [one.name for one in report.assessments if not one.certified]
     checks = sum(len(one.checks) for one in report.assessments)
     if not failed:
-        return f"All {checks} checks of the certificates were computed anew and passed."
+        # nobody shall take a proof about another loop for one about this
+        about = (
+            ""
+            if len(report.stable) == len(report.assessments)
+            else ("; they are about the loops that the designs were made for, not about this one")
+        )
+        return f"All {checks} checks of the certificates were computed anew and passed{about}."
     return f"The certificate of {listing_text(failed)} does NOT hold."

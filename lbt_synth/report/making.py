@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -15,6 +16,7 @@ import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
 
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
+_TURNING = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # directions of writing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,12 +47,33 @@ def read_source(path: str | os.PathLike[str], role: str) -> tuple[SourceFile, by
         If it cannot be read.
     """
     source = Path(path)
+    require_letters(source.name, f"name of the {role}")
     try:
         content = source.read_bytes()
     except OSError as error:
         raise FileError(f"cannot read {source}: {error.strerror}.", path=source) from error
     digest = hashlib.sha256(content).hexdigest()
     return SourceFile(name=source.name, role=role, sha256=digest), content
+
+
+def require_letters(text: str, what: str) -> str:
+    """Refuse a text that no page can show as it is.
+
+    Raises
+    ------
+    ProblemError
+        If it has control characters, bytes that are no letters, or turns the direction of writing.
+    """
+    for letter in text:
+        if (
+            unicodedata.category(letter) in ("Cc", "Cs")
+            or unicodedata.bidirectional(letter) in _TURNING
+            or letter in "\ufffe\uffff"
+        ):
+            raise ProblemError(
+                f"{what} must be of letters that a page can show; got {text!a}. Choose another."
+            )
+    return text
 
 
 def time_of_making() -> datetime:
