@@ -51,11 +51,14 @@ def connected(address: str) -> Iterator[Cluster]:
     """
     try:
         from distributed import Client
+        from distributed.comm import get_address_host_port
     except ImportError as error:
         raise MissingExtraError(
             '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
         ) from error
     try:
+        # a client of what is no address complains once more when it is thrown away
+        get_address_host_port(address if "://" in address else f"tcp://{address}", strict=True)
         client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
         text = " ".join(str(error).split()) or "no answer"

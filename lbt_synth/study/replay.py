@@ -21,7 +21,7 @@ from lbt_synth.study.point import EXPECTED_ERRORS, design_for, evaluate_row
 from lbt_synth.study.result import Failure
 from lbt_synth.study.results import stored_row
 from lbt_synth.study.sample import Sample, sample_of
-from lbt_synth.study.store import part_list, read_manifest, require_same
+from lbt_synth.study.store import part_list, read_manifest, require_same, require_unchanged
 from lbt_synth.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray, integer
 
@@ -98,6 +98,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     stored = {}
     if manifest is not None:
         require_same(manifest, study.digest, folder)
+        require_unchanged(folder, manifest)
         stored = stored_row(folder, study, row, part_list(folder))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
