@@ -53,7 +53,7 @@ def study(arguments: Namespace) -> Report:
 
 # ---------------------------------------------------------------- run
 def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
-    found: list[StudyStatistics] = []
+    found: list[tuple[StudyStatistics, bool]] = []
     files = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
     with _engine(arguments) as (executor, workers):
         made_directory(folder)
@@ -67,7 +67,9 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
                 jobs=arguments.jobs,
                 workers=workers,
                 progress=count,
-                whole=lambda results: found.append(_summarised(loaded, files, results)),
+                whole=lambda results: found.append(
+                    (_summarised(loaded, files, results), results.new)
+                ),
             )
     report = Report(
         data={
@@ -80,7 +82,7 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             "files": [str(path) for path in (run.results, run.failed, *files)],
         }
     )
-    statistics = found[0]
+    [(statistics, new)] = found
     varying = [p.name for p in loaded.parameters if p.distribution.varies]
     report.data["statistics"] = asdict(statistics)
     report.tables = [_text_of(table) for table in summary_tables(statistics)]
@@ -90,7 +92,7 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     report.notes.append(
         f"{run.computed} of {run.samples} samples computed in {_duration(run.computing_s)}; with "
         f"tables and page {_duration(run.seconds)}."
-        if run.computed
+        if new
         else f"{folder} is finished: {run.samples} samples in {run.results.name}; none computed."
     )
     report.notes += _sampling_notes(loaded)
@@ -100,7 +102,7 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             + (" Those that ended their process are tried again if it is started again."
                if run.retry else "")
         )  # fmt: skip
-    words = "written" if run.computed else "there"
+    words = "written" if new else "there"
     report.notes += [f"{words}: {path}" for path in report.data["files"]]
     return report
 
@@ -227,7 +229,7 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
 
 # ---------------------------------------------------------------- replay
 def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
-    if arguments.row < loaded.samples:  # else it is refused
+    if 0 <= arguments.row < loaded.samples:  # else it is refused
         made_directory(folder)
     with working("replaying", quiet=arguments.json):
         again = replay_row(loaded, folder, arguments.row)
@@ -257,6 +259,7 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         notes=[
             *([] if again.stored else ["note: the study has no result of this row yet."]),
             *(f"failed: {failure.controller}: {failure.error}" for failure in again.failures),
+            *([f"note: {again.unwritten}"] if again.unwritten else []),
             *(f"written: {path}" for path in again.files),
         ],
     )
