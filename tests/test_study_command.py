@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from test_cli import run
 from test_study_run import TWO, assert_whole, quick, table
 
 import lbt_synth as lbt
+from lbt_synth.study.cluster import connected
 from lbt_synth.study.store import part_list
 
 PARAMETERS = (
@@ -274,6 +276,17 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     status, _, error = run(capsys, *arguments)
     assert status == 0, error
     assert_whole(tmp_path / "out", lbt.load_study(path), lbt.evaluate_samples)
+
+
+@pytest.mark.e2e
+def test_dask_logs_no_tracebacks(capsys, cluster):
+    """A scheduler that is gone is told by our error alone."""
+    logger = logging.getLogger("distributed.client")
+    with connected(cluster.scheduler_address):
+        logger.error("a traceback")
+        assert not logger.isEnabledFor(logging.ERROR)
+    assert logger.isEnabledFor(logging.ERROR)
+    assert "a traceback" not in capsys.readouterr().err
 
 
 @pytest.mark.e2e
