@@ -59,7 +59,7 @@ INFO = StudyInfo(
     texts={"Study night.yaml": "samples: 300 # & <script>"},
     versions=(("numpy", "2.4"),),
     made=datetime(2026, 11, 21, tzinfo=UTC),
-    elapsed_s=75.0,
+    computing_s=75.0,
     replay="lbt-synth study night.yaml -o out --row {row}",
 )
 

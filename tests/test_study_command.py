@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from test_cli import run
 from test_study_run import TWO, assert_whole, quick, table
 
 import lbt_synth as lbt
+from lbt_synth.study.cluster import connected
 from lbt_synth.study.store import part_list
 
 PARAMETERS = (
@@ -65,8 +67,20 @@ def test_the_command(tmp_path, capsys):
     assert_whole(tmp_path / "out", study, lbt.evaluate_samples)
     assert b"<svg" in (tmp_path / "out" / "summary.html").read_bytes()
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out")
-    assert (status, out.count("\n")) == (0, 1)
-    assert "is finished: 200 samples in results.csv; nothing to do" in out
+    assert status == 0
+    assert "is finished: 200 samples in results.csv; none computed" in out
+    for text in ("50th percentile", "Worst samples of b", "sensor_gain", "there: "):
+        assert text in out
+    page = tmp_path / "out" / "summary.html"
+    page.write_text("changed")
+    assert run(capsys, "study", path, "-o", tmp_path / "out")[0] == 0
+    assert page.read_text() == "changed"
+    page.unlink()
+    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--pdf")
+    assert status == 0
+    assert "200 samples" in out
+    assert b"computing time, of all processes together" in page.read_bytes()
+    assert (tmp_path / "out" / "summary.pdf").read_bytes().startswith(b"%PDF")
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "7")
     assert status == 0
     assert "Row 7" in out
@@ -97,7 +111,9 @@ def test_json(tmp_path, capsys):
     ("arguments", "message"),
     [
         (("--jobs", "0"), "--jobs must be at least 1; got 0"),
+        (("--jobs", "100000"), "jobs must be at most"),
         (("--row", "-1"), "row must be at least 0"),
+        (("--row", "4"), "rows 0 to 3; got row 4"),
     ],
 )
 def test_wrong_arguments(tmp_path, capsys, arguments, message):
@@ -106,6 +122,8 @@ def test_wrong_arguments(tmp_path, capsys, arguments, message):
     assert (status, out) == (2, "")
     assert message in error
     assert error.count("\n") == 1
+    if "--row" in arguments:
+        assert not (tmp_path / "out").exists()
 
 
 def test_dask_without_its_package(tmp_path, capsys, monkeypatch):
@@ -261,7 +279,18 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport"])
+def test_dask_logs_no_tracebacks(capsys, cluster):
+    """A scheduler that is gone is told by our error alone."""
+    logger = logging.getLogger("distributed.client")
+    with connected(cluster.scheduler_address):
+        logger.error("a traceback")
+        assert not logger.isEnabledFor(logging.ERROR)
+    assert logger.isEnabledFor(logging.ERROR)
+    assert "a traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""])
 def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
     monkeypatch.setattr("lbt_synth.study.cluster._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
@@ -270,6 +299,7 @@ def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
     assert status == 2
     assert time.monotonic() - before < 10
     assert "no Dask scheduler answers at" in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.e2e

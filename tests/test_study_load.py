@@ -13,6 +13,7 @@ from studies import BASE, LBT_TEXT, loaded, study_file
 
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError, GainFileError, ProblemError
+from lbt_synth.study.distributions import Listed
 from lbt_synth.study.sample import sample_of
 
 ONE = "truth.vibrations[0].rms_nm"
@@ -96,6 +97,8 @@ def test_distributions(tmp_path):
     found, counts = np.unique(values[:, 3], return_counts=True)
     assert found.tolist() == [10, 20, 30]
     assert counts.tolist() == [1024, 1024, 2048]
+    huge = Listed(values=(1.0, 2.0, 3.0), weights=(1e308, 1e308, 1e308))  # their sum is infinite
+    assert huge.quantile(np.array([0.1, 0.5, 0.9])).tolist() == [1, 2, 3]
 
 
 def test_more_samples_begin_with_the_same(tmp_path):
@@ -232,7 +235,7 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
         ({"parameters": f"{{'{ONE}': {{uniform: [0, 5]}}}}"}, r"parameters\.truth.*rms_nm at 0: .*greater than 0", None),
         ({"parameters": "{'truth.vibrations[0].frequency_hz': {list: [20, 30, 401]}}"}, "at 401: .*below the Nyquist", None),
         ({"parameters": f"{{'{ONE}': {{normal: {{mean: 10, deviation: 20}}}}}}"}, "at -", None),
-        ({"parameters": "{loop.axes: {uniform: [1, 2]}}"}, "valid integer", None),
+        ({"parameters": "{loop.axes: {list: [1, 1.5]}}"}, "valid integer", None),
         ({"parameters": "{error.delay_frames: {uniform: [-1.5, 0]}}"}, "at -1.5: .*the real loop.*at least 1", None),
         ({"parameters": "{error.noise_factor: -1}"}, "the real loop.*at least 0", None),
         ({"controllers": "{9a: {design: kalman}}"}, "9a", None),
@@ -254,6 +257,8 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
         ({"controllers": "{a: {design: robust}}"}, "controllers.a: .*design.robust is missing", "design.robust"),
         ({"parameters": "{loop.frame_rate_hz: {list: [700, 800, 900]}}"}, "controllers.slow, parameters.loop.frame_rate_hz at 700: the controller must run at", None),
         ({"config": "none.yaml"}, "cannot read .*none.yaml", None),
+        ({"config": '"a\\0.yaml"'}, "cannot read .*null byte", None),
+        ({"parameters": "{simulation.frames: {uniform: [200, 400]}}"}, "it is an integer, which takes a list", "parameters.simulation.frames"),
     ],
 )  # fmt: skip
 def test_refusals(tmp_path, changes, message, path):

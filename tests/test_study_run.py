@@ -88,6 +88,11 @@ def test_a_finished_study_is_not_run_again(tmp_path):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     again = lbt.run_study(study, folder, evaluate=None, progress=counts.append)
     assert (again.computed, sum(counts)) == (0, 16)
+    seen = []
+    lbt.run_study(study, folder, evaluate=None, whole=seen.append)
+    assert not seen[0].new
+    assert seen[0].computing_s == json.loads(before["study.json"])["computing_seconds"] > 0
+    np.testing.assert_array_equal(seen[0].columns["row"], np.arange(16))
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
@@ -227,6 +232,11 @@ def test_other_studies_and_damage_are_refused(tmp_path):
     (folder / "study.json").write_text("{}")
     with pytest.raises(OutputError, match="no manifest of a study"):
         lbt.run_study(study, folder)
+    (folder / "study.json").write_text(
+        json.dumps({"schema": "lbt_synth study", "schema_version": 1})
+    )
+    with pytest.raises(OutputError, match="no manifest of a study"):
+        lbt.run_study(study, folder)
     (folder / "study.json").write_text("{")
     with pytest.raises(OutputError, match="cannot read"):
         lbt.run_study(study, folder)
@@ -274,6 +284,60 @@ def test_no_directory_and_inputs_in_the_way(tmp_path):
     study = loaded(tmp_path, controllers="{a: {file: b.fits}, b: {design: kalman}}")
     with pytest.raises(OutputError, match="must not replace the input"):
         lbt.run_study(study, tmp_path)
+
+
+def test_files_of_others_are_not_replaced(tmp_path):
+    study, folder = loaded(tmp_path), output(tmp_path)
+    for name in ("slow.fits", "results.csv", "summary.html", "summary.pdf"):
+        (folder / name).write_text("mine")
+        with pytest.raises(OutputError, match=f"{name} is of no study that was begun there"):
+            lbt.run_study(study, folder, evaluate=quick)
+        assert [path.name for path in folder.iterdir() if path.name != ".lock"] == [name]
+        (folder / name).unlink()
+
+
+def test_killed_before_the_designs_were_written(tmp_path, monkeypatch):
+    study, folder = loaded(tmp_path, controllers=TWO), output(tmp_path)
+
+    def interrupted(path, design):
+        if path.name == "b.fits":
+            raise KeyboardInterrupt
+        return lbt.save_gain(path, design)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lbt_synth.study.store.save_gain", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            lbt.run_study(study, folder, evaluate=quick)
+    assert (folder / "a.fits").exists()
+    assert not (folder / "b.fits").exists()
+    again = lbt.load_study(study.source, directory=folder)
+    lbt.run_study(again, folder, evaluate=quick)
+    assert_whole(folder, study)
+    assert set(json.loads((folder / "study.json").read_text())["designs"]) == {"a", "b"}
+
+
+def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
+    study, folder = loaded(tmp_path), output(tmp_path)
+    (folder / "parts").mkdir()
+    begun = [
+        folder / "parts" / ".0000000004-0000000008.npz.abcd_123",
+        folder / ".results.csv.abcd_123",
+        folder / ".summary.html.abcd_123",
+        folder / ".slow.fits.abcd_123",
+    ]
+    for path in begun:
+        path.write_bytes(b"half")
+    (folder / ".mine.csv.abcd_123").write_bytes(b"whole")
+    lbt.run_study(study, folder, evaluate=quick)
+    assert_whole(folder, study)
+    assert not any(path.exists() for path in begun)
+    assert (folder / ".mine.csv.abcd_123").exists()
+
+
+def test_jobs_without_number(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 10)
+    with pytest.raises(ProblemError, match="jobs must be at most 80 on this machine; got 81"):
+        lbt.run_study(loaded(tmp_path), output(tmp_path), jobs=81)
 
 
 def test_parquet_without_its_package(tmp_path, monkeypatch):
@@ -379,8 +443,14 @@ def test_processes_that_die(tmp_path, monkeypatch):
     assert [line.split(",")[0] for line in lines[1:]] == ["3"]
     assert DIED in lines[1]
     monkeypatch.delenv("STUDY_POISON")
+
+    def interrupted(results):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # its tables are new, what it knows of them is not
+        lbt.run_study(study, folder, evaluate=dies, whole=interrupted)
     again = lbt.run_study(study, folder, evaluate=dies)  # only that is tried again
-    assert (again.computed, again.failures, again.retry) == (1, 0, 0)
+    assert (again.computed, again.failures, again.retry) == (0, 0, 0)
     assert_whole(folder, study)
 
 
@@ -500,13 +570,33 @@ def test_a_row_whose_design_fails(tmp_path):
     assert [path.name for path in again.files] == ["row_1.yaml"]
 
 
+def test_a_row_without_noise(tmp_path):
+    study, folder = loaded(tmp_path, parameters="{error.noise_factor: 0}"), output(tmp_path)
+    again = lbt.replay_row(study, folder, 1)
+    assert again.fresh["slow.noise_nm"] == 0
+    assert again.fresh["slow.strehl"] > 0.1
+    assert again.files == ()
+    assert "row 1 has no noise, which no configuration takes" in again.unwritten
+
+
 def test_a_table_of_results_that_was_changed(tmp_path):
     study, folder = loaded(tmp_path), output(tmp_path)
     lbt.run_study(study, folder, evaluate=quick)
     lines = (folder / "results.csv").read_text().splitlines()
     (folder / "results.csv").write_text("\n".join(lines[:8]) + "\n")
-    with pytest.raises(OutputError, match="has no row 9 of this study"):
+    with pytest.raises(OutputError, match="is not as the study wrote it"):
         lbt.replay_row(study, folder, 9)
+    (folder / "results.csv").write_text("\n".join([*lines[:8], lines[8].replace("7", "8")]))
+    with pytest.raises(OutputError, match="is not as the study wrote it"):
+        lbt.run_study(study, folder, evaluate=quick)
+    (folder / "results.csv").unlink()
+    assert lbt.run_study(study, folder, evaluate=quick).computed == 16
+    (folder / "failed.csv").write_text("row,controller,error\n3,slow,made up\n")
+    with pytest.raises(OutputError, match=r"failed\.csv is not as the study wrote it"):
+        lbt.run_study(study, folder, evaluate=quick)
+    (folder / "failed.csv").unlink()
+    lbt.run_study(study, folder, evaluate=quick)
+    assert_whole(folder, study)
 
 
 # ---------------------------------------------------------------- what it will cost

@@ -338,6 +338,9 @@ def _add_study_command(command: Callable[..., argparse.ArgumentParser]) -> None:
     engine.add_argument(
         "--dask", metavar="ADDRESS", help="Dask scheduler that runs it instead, as tcp://host:8786"
     )
+    study.add_argument(
+        "--pdf", action="store_true", help="write the page as a PDF, too (summary.pdf)"
+    )
     instead = study.add_mutually_exclusive_group()
     instead.add_argument(
         "--dry-run",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from argparse import Namespace
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict
 from pathlib import Path
@@ -29,11 +29,10 @@ from lbt_synth.study import (
 from lbt_synth.study.cluster import connected
 from lbt_synth.study.estimate import estimate_study
 from lbt_synth.study.results import read_failures
-from lbt_synth.study.run import written_files
+from lbt_synth.study.run import Whole, written_files
+from lbt_synth.study.store import PAGE, PRINT
 from lbt_synth.study.summary import worst_table
-from lbt_synth.validation import FloatArray
 
-_PAGE = "summary.html"
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -44,7 +43,7 @@ def study(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     with working("reading the study, designing", quiet=arguments.json):
         loaded = load_study(arguments.study, directory=folder)
-    refuse_replacing([folder / _PAGE, *written_files(folder, loaded)], loaded.inputs)
+    refuse_replacing(written_files(folder, loaded), loaded.inputs)
     if arguments.dry_run:
         return _dry_run(loaded, arguments)
     if arguments.row is not None:
@@ -54,7 +53,8 @@ def study(arguments: Namespace) -> Report:
 
 # ---------------------------------------------------------------- run
 def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
-    found: list[StudyStatistics] = []
+    found: list[tuple[StudyStatistics, bool]] = []
+    files = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
     with _engine(arguments) as (executor, workers):
         made_directory(folder)
         with counting(
@@ -67,7 +67,9 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
                 jobs=arguments.jobs,
                 workers=workers,
                 progress=count,
-                whole=lambda columns: found.append(_summarised(loaded, folder, columns)),
+                whole=lambda results: found.append(
+                    (_summarised(loaded, files, results), results.new)
+                ),
             )
     report = Report(
         data={
@@ -77,15 +79,10 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             "retry": run.retry,
             "computing_seconds": run.computing_s,
             "seconds": run.seconds,
-            "files": [str(run.results), str(run.failed), str(folder / _PAGE)],
+            "files": [str(path) for path in (run.results, run.failed, *files)],
         }
     )
-    if not found:
-        report.notes.append(
-            f"{folder} is finished: {run.samples} samples in {run.results.name}; nothing to do."
-        )
-        return report
-    statistics = found[0]
+    [(statistics, new)] = found
     varying = [p.name for p in loaded.parameters if p.distribution.varies]
     report.data["statistics"] = asdict(statistics)
     report.tables = [_text_of(table) for table in summary_tables(statistics)]
@@ -95,6 +92,8 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     report.notes.append(
         f"{run.computed} of {run.samples} samples computed in {_duration(run.computing_s)}; with "
         f"tables and page {_duration(run.seconds)}."
+        if new
+        else f"{folder} is finished: {run.samples} samples in {run.results.name}; none computed."
     )
     report.notes += _sampling_notes(loaded)
     if run.failures:
@@ -103,7 +102,8 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             + (" Those that ended their process are tried again if it is started again."
                if run.retry else "")
         )  # fmt: skip
-    report.notes += [f"written: {path}" for path in report.data["files"]]
+    words = "written" if new else "there"
+    report.notes += [f"{words}: {path}" for path in report.data["files"]]
     return report
 
 
@@ -117,15 +117,27 @@ def _engine(arguments: Namespace) -> Iterator[tuple[Executor | None, int | None]
         yield cluster.executor, cluster.workers
 
 
-def _summarised(loaded: Study, folder: Path, columns: Mapping[str, FloatArray]) -> StudyStatistics:
-    """Compute the statistics of a whole study, and write its page."""
+def _summarised(loaded: Study, files: Sequence[Path], results: Whole) -> StudyStatistics:
+    """Compute the statistics of a whole study, and write its page if it is not there."""
+    page, *pdf = files
     statistics = study_statistics(
-        columns, loaded.parameter_names, [controller.name for controller in loaded.controllers]
+        results.columns,
+        loaded.parameter_names,
+        [controller.name for controller in loaded.controllers],
     )
-    failures = [
-        Failure(row=row, controller=name, error=error) for row, name, error in read_failures(folder)
-    ]
-    write_study_page(loaded, columns, folder / _PAGE, statistics=statistics, failures=failures)
+    if results.new or not all(path.exists() for path in files):
+        write_study_page(
+            loaded,
+            results.columns,
+            page,
+            statistics=statistics,
+            failures=[
+                Failure(row=row, controller=name, error=error)
+                for row, name, error in read_failures(page.parent)
+            ],
+            computing_s=results.computing_s,
+            pdf=pdf[0] if pdf else None,
+        )
     return statistics
 
 
@@ -217,7 +229,8 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
 
 # ---------------------------------------------------------------- replay
 def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
-    made_directory(folder)
+    if 0 <= arguments.row < loaded.samples:  # else it is refused
+        made_directory(folder)
     with working("replaying", quiet=arguments.json):
         again = replay_row(loaded, folder, arguments.row)
     names = loaded.result_columns
@@ -246,6 +259,7 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         notes=[
             *([] if again.stored else ["note: the study has no result of this row yet."]),
             *(f"failed: {failure.controller}: {failure.error}" for failure in again.failures),
+            *([f"note: {again.unwritten}"] if again.unwritten else []),
             *(f"written: {path}" for path in again.files),
         ],
     )

@@ -142,6 +142,8 @@ def read_mapping(source: Path) -> dict[str, Any]:
         raise ConfigError(f"cannot read {source}: {error.strerror}.") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{source} is not a text file: {error.reason}.") from error
+    except ValueError as error:  # a null character in the name
+        raise ConfigError(f"cannot read {str(source)!r}: {error}.") from error
     try:
         raw = YAML(typ="safe", pure=True).load(text)
     except (YAMLError, ValueError, KeyError, RecursionError) as error:

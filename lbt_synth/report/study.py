@@ -364,8 +364,8 @@ def _provenance(info: StudyInfo, statistics: StudyStatistics) -> Section:
         ("samples with results", f"{statistics.samples} of {info.samples}"),
         ("digest of the study", info.digest),
     ]
-    if info.elapsed_s is not None:
-        rows.append(("time", _duration(info.elapsed_s)))
+    if info.computing_s is not None:
+        rows.append(("computing time, of all processes together", _duration(info.computing_s)))
     return Section(
         key="origin",
         title="Files and versions",

@@ -22,7 +22,7 @@ def write_study_page(
     *,
     statistics: StudyStatistics | None = None,
     failures: Sequence[Failure] = (),
-    elapsed_s: float | None = None,
+    computing_s: float | None = None,
     pdf: str | os.PathLike[str] | None = None,
 ) -> tuple[Path, ...]:
     """Write the page of a study as one HTML file that opens offline, and as a PDF if wanted.
@@ -39,8 +39,8 @@ def write_study_page(
         Those of the columns, if they are known already.
     failures : sequence of Failure, optional
         What failed.
-    elapsed_s : float, optional
-        Time that the study took [s].
+    computing_s : float, optional
+        Time of all its batches, of all processes together [s].
     pdf : path-like, optional
         File to write, that ends in .pdf.
 
@@ -72,7 +72,9 @@ def write_study_page(
     if statistics is None:
         names = [each.name for each in study.controllers]
         statistics = study_statistics(columns, study.parameter_names, names)
-    info = study_info(study, directory=Path(path).parent, failures=failures, elapsed_s=elapsed_s)
+    info = study_info(
+        study, directory=Path(path).parent, failures=failures, computing_s=computing_s
+    )
     page = study_page(info, statistics, columns)
     contents: dict[str | os.PathLike[str], bytes] = {path: page_html(page)}
     if pdf is not None:

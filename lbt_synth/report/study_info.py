@@ -52,8 +52,8 @@ class StudyInfo:
         Programs and their versions.
     made : datetime
         When the page was made.
-    elapsed_s : float or None
-        Time that the study took [s].
+    computing_s : float or None
+        Time of all its batches, of all processes together [s].
     replay : str
         Command that replays a sample, with ``{row}`` for its number.
     """
@@ -71,7 +71,7 @@ class StudyInfo:
     texts: dict[str, str]
     versions: tuple[tuple[str, str], ...]
     made: datetime
-    elapsed_s: float | None
+    computing_s: float | None
     replay: str
 
 
@@ -80,7 +80,7 @@ def study_info(
     *,
     directory: str | os.PathLike[str],
     failures: Sequence[Failure] = (),
-    elapsed_s: float | None = None,
+    computing_s: float | None = None,
 ) -> StudyInfo:
     """Collect what a page says of a study.
 
@@ -92,8 +92,8 @@ def study_info(
         Where its results are; for the command that replays a sample.
     failures : sequence of Failure, optional
         What failed.
-    elapsed_s : float, optional
-        Time that it took [s].
+    computing_s : float, optional
+        Time of all its batches, of all processes together [s].
 
     Returns
     -------
@@ -132,7 +132,7 @@ def study_info(
         texts=texts,
         versions=versions(),
         made=time_of_making(),
-        elapsed_s=elapsed_s,
+        computing_s=computing_s,
         replay=shlex.join(["lbt-synth", "study", os.fspath(study.source)])
         + f" -o {shlex.quote(os.fspath(directory))} --row {{row}}",
     )

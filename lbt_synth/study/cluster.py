@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import pkgutil
 import sys
 from collections.abc import Iterator
@@ -51,11 +52,14 @@ def connected(address: str) -> Iterator[Cluster]:
     """
     try:
         from distributed import Client
+        from distributed.comm import get_address_host_port
     except ImportError as error:
         raise MissingExtraError(
             '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
         ) from error
     try:
+        # a client of what is no address complains once more when it is thrown away
+        get_address_host_port(address if "://" in address else f"tcp://{address}", strict=True)
         client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
         text = " ".join(str(error).split()) or "no answer"
@@ -63,7 +67,7 @@ def connected(address: str) -> Iterator[Cluster]:
             f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
             "such as tcp://host:8786; start one with dask scheduler, and dask worker."
         ) from error
-    with client:
+    with _silent(), client:
         try:
             client.wait_for_workers(1, timeout=_TIMEOUT_S)
         except TimeoutError as error:
@@ -73,6 +77,17 @@ def connected(address: str) -> Iterator[Cluster]:
         _require_versions(address, client)
         count = sum(client.ncores().values())
         yield Cluster(executor=client.get_executor(pure=False), workers=count)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Let nothing be logged: a lost scheduler is told by an error, not by tracebacks."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _require_versions(address: str, client: Any) -> None:

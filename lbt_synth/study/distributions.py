@@ -145,7 +145,9 @@ class Normal:
         share = np.clip(level, _EDGE, 1 - _EDGE)
         share = share if sign > 0 else 1 - share
         standard = sign * ndtri(start + share * (stop - start))
-        return np.clip(self.mean + self.deviation * standard, self.low, self.high)
+        with np.errstate(over="ignore"):  # what is infinite is refused as a value
+            found = self.mean + self.deviation * standard
+        return np.clip(found, self.low, self.high)
 
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the ends, or where half a sample is expected beyond."""
@@ -186,7 +188,8 @@ class Listed:
 
     def quantile(self, level: FloatArray) -> FloatArray:
         """Return the values at levels in [0, 1)."""
-        bounds = np.cumsum(self.weights) / np.sum(self.weights)
+        shares = np.array(self.weights) / max(self.weights)  # large ones add up to no infinity
+        bounds = np.cumsum(shares) / np.sum(shares)
         index = np.searchsorted(bounds[:-1], level, side="right")
         return np.array(self.values, dtype=np.float64)[index]
 

@@ -27,7 +27,7 @@ from lbt_synth.study.distributions import (
     equal_weights,
     middle,
 )
-from lbt_synth.study.paths import Keys, keys_of, require_number
+from lbt_synth.study.paths import Keys, is_integer, keys_of, require_number
 from lbt_synth.study.point import closed_loop
 from lbt_synth.study.sample import Sample, sample_of
 from lbt_synth.study.schema import ParameterSection, StudySection
@@ -207,6 +207,12 @@ def _parameters(settings: StudySection, config: Config, source: Path) -> tuple[P
                         raise ConfigError(f"{place} is given twice, by {other} and {name}.")
                     places.append(keys)
             distribution = _distribution(section)
+            for keys in places:
+                if is_integer(full, keys) and isinstance(distribution, Uniform | Normal):
+                    raise ConfigError(
+                        "it is an integer, which takes a list of values; got a distribution of "
+                        "all numbers."
+                    )
         except LbtSynthError as error:
             raise ConfigError(f"{source}: {key}: {error}", path=key) from error
         out.append(Parameter(name=name, places=tuple(places), distribution=distribution))

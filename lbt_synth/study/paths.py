@@ -86,6 +86,11 @@ def _seen(value: Any) -> str:
     return "it is not set" if value is None else f"it is {value!r}"
 
 
+def is_integer(content: Mapping[str, Any], keys: Keys) -> bool:
+    """Whether a place that :func:`require_number` lets pass takes integers only."""
+    return isinstance(number_at(content, keys), int)
+
+
 def number_at(content: Mapping[str, Any], keys: Keys) -> float | int:
     """Return the number at a place that :func:`require_number` lets pass."""
     here: Any = content

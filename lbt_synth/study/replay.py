@@ -21,9 +21,13 @@ from lbt_synth.study.point import EXPECTED_ERRORS, design_for, evaluate_row
 from lbt_synth.study.result import Failure
 from lbt_synth.study.results import stored_row
 from lbt_synth.study.sample import Sample, sample_of
-from lbt_synth.study.store import part_list, read_manifest, require_same
+from lbt_synth.study.store import part_list, read_manifest, require_same, require_unchanged
 from lbt_synth.study.study import DELAY_ERROR, NOISE_FACTOR, Study
-from lbt_synth.validation import FloatArray, integer
+from lbt_synth.validation import integer
+
+_NOISELESS = (
+    "row {row} has no noise, which no configuration takes: there is none to simulate it with."
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,6 +48,8 @@ class Replay:
         What failed now.
     files : tuple of pathlib.Path
         What was written: the configuration, and the designs that are for this sample.
+    unwritten : str
+        Why there is no configuration of it; empty if there is one.
     """
 
     row: int
@@ -52,6 +58,7 @@ class Replay:
     fresh: dict[str, float]
     failures: tuple[Failure, ...]
     files: tuple[Path, ...]
+    unwritten: str = ""
 
 
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
@@ -98,6 +105,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     stored = {}
     if manifest is not None:
         require_same(manifest, study.digest, folder)
+        require_unchanged(folder, manifest)
         stored = stored_row(folder, study, row, part_list(folder))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
@@ -108,19 +116,20 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
         stored=stored,
         fresh=fresh,
         failures=failures,
-        files=_written(study, folder, row, sample, values),
+        files=_written(study, folder, row, sample),
+        unwritten="" if sample.noise_factor > 0 else _NOISELESS.format(row=row),
     )
 
 
-def _written(
-    study: Study, folder: Path, row: int, sample: Sample, values: FloatArray
-) -> tuple[Path, ...]:
+def _written(study: Study, folder: Path, row: int, sample: Sample) -> tuple[Path, ...]:
     own = [controller for controller in study.controllers if controller.for_sample]
     path = folder / f"row_{row}.yaml"
     gains = {c.name: folder / f"row_{row}_{c.name}.fits" for c in own}
     refuse_replacing([path, *gains.values()], study.inputs)
-    settings, comments = row_settings(study, row, sample)
-    files = [save_config(path, settings, comments=comments)]
+    files = []
+    if sample.noise_factor > 0:
+        settings, comments = row_settings(study, row, sample)
+        files.append(save_config(path, settings, comments=comments))
     for controller in own:
         try:
             design = design_for(controller, sample)

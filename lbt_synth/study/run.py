@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import lbt_synth
-from lbt_synth.errors import OutputError
+from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import refuse_replacing
 from lbt_synth.processes import alone_in
 from lbt_synth.study.batch import evaluate_samples
@@ -28,14 +28,19 @@ from lbt_synth.study.results import (
 from lbt_synth.study.store import (
     FAILED,
     MANIFEST,
+    PAGE,
     PARTS,
+    PRINT,
     Part,
+    file_digest,
     missing_rows,
     part_list,
     read_manifest,
     read_part,
     remove_parts,
+    remove_remains,
     require_same,
+    require_unchanged,
     stored_design,
     write_designs,
     write_manifest,
@@ -43,6 +48,27 @@ from lbt_synth.study.store import (
 )
 from lbt_synth.study.study import Study
 from lbt_synth.validation import FloatArray, instance, integer
+
+_MOST_JOBS = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Whole:
+    """All results of a study.
+
+    Attributes
+    ----------
+    columns : dict of str to (n,) ndarray
+        All columns by their names.
+    computing_s : float
+        Time of all batches, of all processes together [s].
+    new : bool
+        Whether some were computed now; else they are those of the table.
+    """
+
+    columns: dict[str, FloatArray]
+    computing_s: float
+    new: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +111,7 @@ def run_study(
     workers: int | None = None,
     evaluate: Evaluate = evaluate_samples,
     progress: Callable[[int], None] | None = None,
-    whole: Callable[[dict[str, FloatArray]], None] | None = None,
+    whole: Callable[[Whole], None] | None = None,
 ) -> StudyRun:
     """Run what is missing of a study, and write its results.
 
@@ -103,7 +129,8 @@ def run_study(
     executor : concurrent.futures.Executor, optional
         Runs the batches: any, a Dask ``Client.get_executor()`` too. It is left open.
     jobs : int, optional
-        Processes, if there is no executor; 1 runs in this one.
+        Processes, if there is no executor, at most eight times those that the machine has at once
+        (or 64); 1 runs in this one.
     workers : int, optional
         How many batches the executor runs at once, as far as it does not tell; twice as many are
         in flight.
@@ -113,8 +140,8 @@ def run_study(
     progress : callable, optional
         Called with the number of rows that were found or finished since its last call.
     whole : callable, optional
-        Called with all columns, each under its name, when all rows are there: before the manifest
-        says so, so that what it does is done again if it fails.
+        Called with all results when all rows are there: before the manifest says so, so that
+        what it does is done again if it fails. A study that was finished before calls it, too.
 
     Returns
     -------
@@ -123,8 +150,11 @@ def run_study(
 
     Raises
     ------
+    ProblemError
+        If there are too many or too few jobs.
     OutputError
-        If the directory is of another study, is in use, or cannot be written.
+        If the directory is of another study, is in use or cannot be written, files in it would be
+        replaced, or its results were changed.
     NumericalError
         If processes die without end, or an executor breaks; what is finished is kept.
     MissingExtraError
@@ -145,6 +175,9 @@ def run_study(
     """
     instance(study, Study)
     jobs = integer(jobs, "jobs", at_least=1)
+    most = max(_MOST_JOBS, 8 * (os.cpu_count() or 1))
+    if jobs > most:
+        raise ProblemError(f"jobs must be at most {most} on this machine; got {jobs}.")
     if executor is not None:
         known = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
         workers = integer(known, "workers", at_least=1)
@@ -154,22 +187,34 @@ def run_study(
     refuse_replacing(written_files(folder, study), study.inputs)
     began = time.perf_counter()
     with alone_in(folder, "study"):
+        remove_remains(folder, [path.name for path in written_files(folder, study)])
         manifest = _begun(folder, study)
-        finished = bool(manifest["finished"]) and results_path(folder, study).exists()
+        tables = (results_path(folder, study), folder / FAILED)
+        finished = bool(manifest["finished"]) and all(path.exists() for path in tables)
+        if finished:
+            require_unchanged(folder, manifest)
         parts = _usable_parts(folder, study)
         if finished and not manifest["retry"]:
             remove_parts(folder)  # killed while it removed them
             parts = []
         computed, computing_s = 0, 0.0
         if not finished or manifest["retry"]:
+            if manifest["finished"]:  # until its tables are those of all parts again
+                manifest = manifest | {"finished": False, "tables": {}}
+                write_manifest(folder, manifest)
             computed = _complete(
                 study, folder, parts, executor=executor, jobs=jobs, workers=workers,
                 evaluate=evaluate, progress=progress,
             )  # fmt: skip
             computing_s = time.perf_counter() - began
             manifest = _written(folder, study, manifest, computed, began, whole)
-        elif progress is not None:
-            progress(study.samples)
+        else:
+            if progress is not None:
+                progress(study.samples)
+            if whole is not None:
+                columns = read_results(folder, study)
+                spent = manifest["computing_seconds"]
+                whole(Whole(columns=columns, computing_s=spent, new=False))
     return StudyRun(
         directory=folder,
         results=results_path(folder, study),
@@ -186,7 +231,8 @@ def run_study(
 def written_files(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, but for its parts."""
     made = [c.name for c in study.controllers if c.request is not None and c.design is not None]
-    names = [MANIFEST, FAILED, results_path(folder, study).name, *(f"{n}.fits" for n in made)]
+    tables = [results_path(folder, study).name, FAILED, PAGE, PRINT]
+    names = [MANIFEST, *tables, *(f"{name}.fits" for name in made)]
     return [folder / name for name in names]
 
 
@@ -204,6 +250,13 @@ def _begun(folder: Path, study: Study) -> dict[str, Any]:
             path=folder,
         )
     else:
+        for path in written_files(folder, study):
+            if path.exists():
+                raise OutputError(
+                    f"{path} is of no study that was begun there, and would be replaced. Name "
+                    "another directory, or delete it.",
+                    path=path,
+                )
         manifest = {
             "digest": study.digest,
             "version": lbt_synth.__version__,
@@ -212,7 +265,8 @@ def _begun(folder: Path, study: Study) -> dict[str, Any]:
             "evaluation": study.settings.evaluation,
             "parameters": {p.name: p.distribution.text for p in study.parameters},
             "controllers": {c.name: c.origin for c in study.controllers},
-            "designs": write_designs(folder, study),
+            "designs": {},
+            "tables": {},
             "settings": study.settings.model_dump(by_alias=True, exclude_none=True),
             "finished": False,
             "failures": 0,
@@ -220,6 +274,10 @@ def _begun(folder: Path, study: Study) -> dict[str, Any]:
             "seconds": 0.0,
             "computing_seconds": 0.0,
         }
+        write_manifest(folder, manifest)
+    wanted = {c.name for c in study.controllers if c.request is not None and not c.for_sample}
+    if set(manifest["designs"]) != wanted:  # begun now, or killed before they were written
+        manifest = manifest | {"designs": write_designs(folder, study)}
         write_manifest(folder, manifest)
     return manifest
 
@@ -269,19 +327,20 @@ def _written(
     manifest: dict[str, Any],
     computed: int,
     began: float,
-    whole: Callable[[dict[str, FloatArray]], None] | None,
+    whole: Callable[[Whole], None] | None,
 ) -> dict[str, Any]:
     """Write the results of all parts, then the manifest, then remove the parts."""
     parts = part_list(folder)
     failures = failures_in(study, parts)
-    write_results(folder, study, parts)
-    write_failures(folder, failures)
-    if whole is not None:
-        whole(read_results(folder, study, parts))
-    retry = sum(failure.retry for failure in failures)
+    tables = (write_results(folder, study, parts), write_failures(folder, failures))
     spent = sum(read_part(part, study)[2] for part in parts)
+    if whole is not None:
+        whole(Whole(columns=read_results(folder, study, parts), computing_s=spent, new=True))
+    retry = sum(failure.retry for failure in failures)
     manifest = manifest | {
         "finished": True,
+        "tables": {path.name: file_digest(path) for path in tables},
+        "settings": study.settings.model_dump(by_alias=True, exclude_none=True),
         "failures": len(failures),
         "retry": retry,
         "computed_last": computed,

@@ -7,9 +7,10 @@ seen from the names, whatever the batches were.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +31,19 @@ from lbt_synth.validation import FloatArray
 
 SCHEMA, SCHEMA_VERSION = "lbt_synth study", 1
 MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"
+PAGE, PRINT = "summary.html", "summary.pdf"
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
+_REMAINS = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # what files.write_atomically writes first
+_NEEDED: dict[str, type | tuple[type, ...]] = {
+    "digest": str,
+    "designs": dict,
+    "tables": dict,
+    "finished": bool,
+    "failures": int,
+    "retry": int,
+    "seconds": (int, float),
+    "computing_seconds": (int, float),
+}
 Rows = tuple[int, int]
 
 
@@ -72,6 +85,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         not isinstance(content, dict)
         or content.get("schema") != SCHEMA
         or content.get("schema_version") != SCHEMA_VERSION
+        or any(not isinstance(content.get(name), kind) for name, kind in _NEEDED.items())
     ):
         raise OutputError(
             f"{path} is no manifest of a study that this version reads. Name another directory.",
@@ -237,6 +251,49 @@ def blocks(parts: list[Part], study: Study, size: int) -> Iterator[tuple[int, Fl
         rows += len(results)
     if rows:
         yield start, np.concatenate(held)
+
+
+def remove_remains(folder: Path, names: Collection[str]) -> None:
+    """Remove what a process that was killed had begun to write: parts, and files of some names."""
+    for place in (folder, folder / PARTS):
+        with contextlib.suppress(OSError):
+            for path in list(place.iterdir()):
+                found = _REMAINS.fullmatch(path.name)
+                if found is not None and (_PART.fullmatch(found[1]) or found[1] in names):
+                    path.unlink()
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise OutputError(f"cannot read {path}: {error.strerror}.", path=path) from error
+
+
+def require_unchanged(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Refuse tables of a finished study that are not as they were written.
+
+    Raises
+    ------
+    OutputError
+        If one differs; one that is not there is none that differs.
+    """
+    for name, digest in manifest.get("tables", {}).items():
+        path = folder / name
+        if path.exists() and file_digest(path) != digest:
+            raise OutputError(
+                f"{path} is not as the study wrote it. Put that back, or delete it, and it is "
+                "computed again.",
+                path=path,
+            )
 
 
 def remove_parts(folder: Path) -> None:
