@@ -106,6 +106,17 @@ def test_resonances_and_vibrations_of_the_model(tmp_path):
     agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
 
 
+def test_a_vibration_of_the_model_that_is_several_lines(tmp_path):
+    """The truth's vibrations are the model's, spread over a band; other numbers vary."""
+    base = BASE.replace("rms_nm: 500.0}]", "rms_nm: 500.0, spread_hz: 1.0, lines: 3}]", 1).replace(
+        "[{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]", "model"
+    )
+    assert "lines: 3" in base
+    assert "vibrations: model" in base
+    parameters = "{sensor.noise_nm: {uniform: [5, 30]}, truth.sensor_gain: {uniform: [0.4, 1.1]}}"
+    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
+
+
 def test_a_mirror_with_dynamics(tmp_path):
     base = LBT_TEXT.replace(
         "mirror:\n",
