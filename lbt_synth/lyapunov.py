@@ -10,9 +10,14 @@ from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 from lbt_synth.stacks import norms, symmetrised, transposed
 from lbt_synth.validation import FloatArray
 
+_SOLVED = 1e-14  # relative residual of an equation that is solved to rounding
+
 
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Solve ``X = A X A' + Q`` for a stable A, with one step of iterative refinement.
+    """Solve ``X = A X A' + Q`` for a stable A, with iterative refinement.
+
+    By squaring; where that leaves a residual, by a bilinear transformation if it leaves less. The
+    latter inverts ``A + I``, which is all but singular for states in very different units.
 
     Parameters
     ----------
@@ -33,12 +38,17 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     >>> float(stationary_covariance(np.array([[0.6]]), np.array([[64.0]]))[0, 0])
     100.0
     """
+    squared, residuals = stationary_covariances(A[None], Q[None])
+    if residuals[0] < _SOLVED:
+        return np.asarray(squared[0])
     with warnings.catch_warnings():
         # states of very different sizes; whoever uses X measures its residual
         warnings.simplefilter("ignore", LinAlgWarning)
+        warnings.simplefilter("ignore", RuntimeWarning)
         X = solve_discrete_lyapunov(A, Q)
         X = X + solve_discrete_lyapunov(A, A @ X @ A.T - X + Q)
-    return np.asarray((X + X.T) / 2)
+    other: FloatArray = np.asarray((X + X.T) / 2, dtype=np.float64)
+    return np.asarray(squared[0]) if residuals[0] <= lyapunov_residual(A, Q, other) else other
 
 
 def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:

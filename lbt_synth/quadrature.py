@@ -34,11 +34,11 @@ def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]
     >>> round(float(w @ x**7), 9)                     # 3^8 / 8
     820.125
     """
-    nodes, weights = _panel_rule(edges[:-1], edges[1:], order)
+    nodes, weights = panel_rule(edges[:-1], edges[1:], order)
     return nodes.ravel(), weights.ravel()
 
 
-def _panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+def panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
     """Nodes and weights (panels, order) of panels that need not touch."""
     x, w = np.polynomial.legendre.leggauss(order)
     half, middle = (high - low)[:, None] / 2, (high + low)[:, None] / 2
@@ -86,7 +86,7 @@ def adaptive_integral(
     """
 
     def panels(low: FloatArray, high: FloatArray) -> FloatArray:
-        nodes, weights = _panel_rule(low, high, order)
+        nodes, weights = panel_rule(low, high, order)
         values = integrand(nodes.ravel())
         values = values.reshape(low.size, order, *values.shape[1:])
         return np.asarray(np.einsum("po,po...->p...", weights, values))
@@ -180,7 +180,7 @@ def settled_panels(
     """
 
     def panels(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-        nodes, weights = _panel_rule(low, high, order)
+        nodes, weights = panel_rule(low, high, order)
         values = integrand(nodes.ravel()).reshape(low.size, order, -1)
         size = np.sum(weights * np.abs(values[..., 0]), axis=1)
         return np.einsum("po,pok->pk", weights, values), size

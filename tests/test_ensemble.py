@@ -11,7 +11,9 @@ import lbt_synth as lbt
 from lbt_synth.ensemble.panels import graded_edges
 from lbt_synth.ensemble.parts import independent_parts
 from lbt_synth.ensemble.responses import stacked_response
+from lbt_synth.loop.budget import distinct_edges, pole_edges
 from lbt_synth.models.flows import _octave_splines
+from lbt_synth.quadrature import adaptive_integral
 from lbt_synth.statespace import pointwise_response
 
 RATE = 800
@@ -177,6 +179,105 @@ def test_a_mirror_with_dynamics(kalman):
         design.controller, design.hardware, ensemble_of(w, turbulence=AIR)
     )
     agree(found, design, w, lambda i: AIR)
+
+
+class Peak:
+    """A spectrum that says nothing of its shape."""
+
+    def psd(self, frequency_hz):
+        return 1e3 / (1 + ((np.asarray(frequency_hz) - 111.3) / 0.3) ** 2)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [AIR, lbt.Vibration(frequency_hz=133.3, damping=1e-5, rms_nm=500).ar_model(RATE)],
+        [AIR, lbt.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])],
+        [Peak(), AIR, SLOW],
+    ],
+)
+def test_sums_of_spectra(kalman, parts):
+    """A peak that no pole of the loop is near."""
+    spectrum = lbt.SumSpectrum(parts=parts)
+    found = lbt.ensemble_residuals(
+        kalman.controller, kalman.hardware, lbt.LoopEnsemble(turbulence=spectrum)
+    )
+    loop = lbt.close_loop(kalman.hardware, kalman.controller)
+    single = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum))
+    assert found.turbulence_nm[0] == pytest.approx(single.turbulence_nm, rel=5e-7)
+
+
+@pytest.mark.parametrize("outer", [None, 7.0, 200.0])
+@pytest.mark.parametrize("leak", [0.95, 1.0])
+@pytest.mark.parametrize(
+    "wind", [[0.01, 0.3, 3.4, 22.0, 95.0], [9.4, 12.0, 21.9, 32.2], [5.4], [40.2]]
+)
+def test_slow_and_fast_winds_together(wind, leak, outer):
+    """With a leak the slowest parts of the spectrum remain, to the flat end of Kolmogorov's."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    controller = lbt.Controller(A=leak, B=0.3, C=1.0, D=0.0, dt_s=1 / RATE)
+    air = replace(AIR, outer_scale_m=outer)
+    flows = lbt.FrozenFlows(atmosphere=air, wind_speed_m_s=wind)
+    found = lbt.ensemble_residuals(controller, path, lbt.LoopEnsemble(turbulence=flows))
+    loop = lbt.close_loop(path, controller)
+    for speed, residual in zip(wind, found.turbulence_nm, strict=True):
+        truth = lbt.Truth(turbulence=replace(air, wind_speed_m_s=speed))
+        assert residual == pytest.approx(lbt.residual_budget(loop, truth).turbulence_nm, rel=1e-6)
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e-5, 1e-7])
+@pytest.mark.parametrize("delay", [2.3, 3.0, 4.7])
+def test_next_to_instability(delay, distance):
+    """A process, whose residual is a Lyapunov equation's, as a spectrum."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
+    low, high = 0.0, 2.0
+    for _ in range(50):
+        middle = (low + high) / 2
+        controller = lbt.Controller(A=1.0, B=middle, C=1.0, D=0.0, dt_s=1 / RATE)
+        stable = lbt.close_loop(path, controller).is_stable
+        low, high = (middle, high) if stable else (low, middle)
+    controller = replace(controller, B=np.array([[low * (1 - distance)]]))
+    loop = lbt.close_loop(path, controller)
+    exact = lbt.residual_budget(loop, lbt.Truth(turbulence=SLOW)).turbulence_nm
+    spectrum = lbt.SumSpectrum(parts=[SLOW])
+    single = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum)).turbulence_nm
+    assert single == pytest.approx(exact, rel=5e-7)
+    found = lbt.ensemble_residuals(controller, path, lbt.LoopEnsemble(turbulence=spectrum))
+    assert found.turbulence_nm[0] == pytest.approx(exact, rel=5e-7)
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-8])
+def test_a_peak_upon_much_that_is_flat(distance):
+    """Of poles next to the unit circle, by Poisson's kernel; a part of 0.002 of the whole."""
+    radius, turn = 1 - distance, 0.7
+
+    def kernel(x):
+        below = distance**2 + 4 * radius * np.sin(x / 2) ** 2
+        return (1 - radius**2) / below
+
+    def density(x):
+        peak = kernel(np.pi * x - turn) + kernel(np.pi * x + turn)
+        return (1000 + peak)[:, None, None]
+
+    poles = radius * np.exp(1j * np.array([turn, -turn]))
+    edges = np.concatenate([[0.0], np.geomspace(1e-6, 1, 40), pole_edges(poles)])
+    found = adaptive_integral(density, distinct_edges(edges))
+    assert found[0, 0] == pytest.approx(1002, rel=3e-7)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_states_in_any_units_leave_the_same(seed):
+    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=600)
+    design = lbt.kalman(plant(mirror=shell, delay_frames=3))
+    k = design.controller
+    units = 10 ** np.random.default_rng(seed).uniform(-6, 6, k.n_states)
+    odd = lbt.Controller(
+        A=k.A * units[:, None] / units, B=k.B * units[:, None], C=k.C / units, D=k.D, dt_s=k.dt_s
+    )
+    truth = lbt.Truth(turbulence=SLOW, noise_nm=15.5, vibrations=(LINE,))
+    one, two = (lbt.residual_budget(lbt.close_loop(design.hardware, c), truth) for c in (k, odd))
+    for name in ("turbulence_nm", "noise_nm", "vibration_nm"):
+        assert getattr(two, name) == pytest.approx(getattr(one, name), rel=1e-7)
 
 
 def test_a_controller_for_each_loop():

@@ -106,6 +106,17 @@ def test_resonances_and_vibrations_of_the_model(tmp_path):
     agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
 
 
+def test_a_vibration_of_the_model_that_is_several_lines(tmp_path):
+    """The truth's vibrations are the model's, spread over a band; other numbers vary."""
+    base = BASE.replace("rms_nm: 500.0}]", "rms_nm: 500.0, spread_hz: 1.0, lines: 3}]", 1).replace(
+        "[{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]", "model"
+    )
+    assert "lines: 3" in base
+    assert "vibrations: model" in base
+    parameters = "{sensor.noise_nm: {uniform: [5, 30]}, truth.sensor_gain: {uniform: [0.4, 1.1]}}"
+    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
+
+
 def test_a_mirror_with_dynamics(tmp_path):
     base = LBT_TEXT.replace(
         "mirror:\n",
@@ -125,6 +136,39 @@ def test_a_diagonal_vibration(tmp_path):
     )
     parameters = "{'truth.vibrations[0].frequency_hz': {uniform: [19, 21]}}"
     agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=4)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "path", "values"),
+    [
+        ("axis: both,", "direction_deg: 0,", "model.vibrations[0].direction_deg", "[30, 0]"),
+        *(
+            ("mirror:\n", "mirror:\n  influence_matrix: [[1.0, 0.0], [0.0, 1.0]]\n", path, values)
+            for path, values in (
+                ("mirror.influence_matrix[0][1]", "[0.3, 0]"),
+                ("mirror.influence_matrix[1][1]", "[1, 1.3]"),
+            )
+        ),
+    ],
+)
+def test_samples_whose_axes_are_no_longer_independent(tmp_path, old, new, path, values):
+    """The configuration as it stands has filters of single axes, some of its samples have not."""
+    assert old in LBT_TEXT
+    parameters = f"{{'{path}': {{list: {values}}}, truth.sensor_gain: {{uniform: [0.5, 1]}}}}"
+    agree(tmp_path, base=LBT_TEXT.replace(old, new), controllers=TOLD, parameters=parameters)
+
+
+def test_an_image_that_is_gone(tmp_path):
+    """A jitter of more than the Strehl ratio is integrated for leaves none, either way."""
+    parameters = """{
+      'truth.vibrations[0].rms_mas': {list: [40, 1.0e+6]},
+      truth.sensor_gain: {uniform: [0.5, 1]}
+    }"""
+    _, found = agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters)
+    assert not found.failures
+    strehl = found.columns["slow.strehl"]
+    assert (strehl == 0).sum() == COUNT / 2 == (strehl > 0).sum()
+    assert (found.columns["slow.stable"] == 1).all()
 
 
 def test_the_delay_that_designs_are_told(tmp_path):

@@ -99,7 +99,7 @@ def plant_of(
                     rms_nm=rms_nm(section, settings, key),
                     direction=direction,
                 )
-                lines += _spread(line, section, loop.frame_rate_hz, i)
+                lines += lines_of(line, section, loop.frame_rate_hz, i)
     return tip_tilt_plant(
         frame_rate_hz=loop.frame_rate_hz,
         delay_frames=loop.delay_frames,
@@ -183,7 +183,7 @@ def _mirror(section: LocalLoopSection | None) -> PositionLoop | None:
         raise ConfigError(f"{key}: {error}", path=key) from error
 
 
-def _spread(
+def lines_of(
     line: Vibration, section: VibrationSection, frame_rate_hz: float, index: int
 ) -> list[Vibration]:
     """Return the lines that stand for a vibration of the model."""

@@ -15,15 +15,20 @@ from lbt_synth.ensemble.loops import DelayGroup
 from lbt_synth.ensemble.panels import graded_edges
 from lbt_synth.ensemble.parts import LoopPart
 from lbt_synth.ensemble.responses import stacked_response
-from lbt_synth.models.atmosphere import Atmosphere
+from lbt_synth.models.ar import ARModel
+from lbt_synth.models.atmosphere import LOWEST, Atmosphere
 from lbt_synth.models.flows import FrozenFlows
-from lbt_synth.models.truth import breakpoints_below
-from lbt_synth.quadrature import gauss_panels
+from lbt_synth.models.truth import SumSpectrum, TabulatedSpectrum, breakpoints_below
+from lbt_synth.quadrature import gauss_panels, panel_rule
 from lbt_synth.statespace import StateSpace, swept_response
 from lbt_synth.validation import ComplexArray, FloatArray
 
 ORDER = 10  # nodes a panel
-_RIPPLES = np.concatenate([np.arange(1, 12, 0.5), np.geomspace(12, 60, 12)])
+_RIPPLES = np.concatenate([np.arange(1, 3, 0.5), np.arange(3, 26, 1.25), np.geomspace(26, 60, 8)])
+_ALIKE, _STEP = 3.5, 0.08  # winds further apart share panels that widen with frequency
+_FLAT = 0.02  # of the frequency V / L0, below which a spectrum is flat
+_SETTLED, _HALVINGS = 1e-8, 20  # of a panel of a spectrum of unknown shape
+_COVERED = 1e-6  # part of Nyquist above which there are geometric panels in any case
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,15 +96,63 @@ def _response(
 
 def _structure(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     """Frequencies between which a spectrum is smooth [Hz]."""
-    if not isinstance(spectrum, Atmosphere | FrozenFlows):
+    if isinstance(spectrum, SumSpectrum):
+        return np.concatenate([_structure(part, nyquist_hz) for part in spectrum.parts])
+    if isinstance(spectrum, TabulatedSpectrum):
         return breakpoints_below(spectrum, nyquist_hz)
-    # the tilt filter ripples with the inverse of the time that the wind takes over the pupil
+    if not isinstance(spectrum, Atmosphere | FrozenFlows):
+        return _halved(spectrum, nyquist_hz)
     air = spectrum if isinstance(spectrum, Atmosphere) else spectrum.atmosphere
-    wind = np.atleast_1d(spectrum.wind_speed_m_s) / air.diameter_m
-    ripples = _RIPPLES * float(np.min(wind)), _RIPPLES[-1] * float(np.max(wind))
-    reach = np.geomspace(ripples[0][-1], max(ripples[1], ripples[0][-1]), 8)
-    points = np.concatenate([ripples[0], reach])
+    wind = np.unique(spectrum.wind_speed_m_s) / air.diameter_m
+    slow, fast = float(wind[0]), float(wind[-1])
+    # the tilt filter ripples with the inverse of the time that the wind takes over the pupil
+    if fast > _ALIKE * slow:
+        ripples = np.geomspace(slow, fast * _RIPPLES[-1], int(np.log(60 * fast / slow) / _STEP) + 2)
+    else:
+        reach = np.geomspace(slow * _RIPPLES[-1], fast * _RIPPLES[-1], 8)
+        ripples = np.concatenate([slow * _RIPPLES, reach])
+    # below them it is flat, up to where the outer scale bends it
+    outer = spectrum.outer_scale_m
+    bend = LOWEST if outer is None else max(LOWEST, _FLAT * air.diameter_m / float(np.max(outer)))
+    lowest = np.geomspace(min(bend, 1.0) * slow, slow, 18)
+    points = np.concatenate([lowest[lowest < _COVERED * nyquist_hz], ripples])
+    if bend == LOWEST:
+        points = np.concatenate([points, LOWEST * wind])
     return points[points < nyquist_hz]
+
+
+def _halved(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
+    """Frequencies between which a spectrum of unknown shape needs no shorter panels [Hz].
+
+    Peaks that are narrower than its first panels are found where it says that it has kinks, or at
+    the poles if it is auto-regressive.
+    """
+    grid = np.geomspace(_COVERED, 1, 200) * nyquist_hz
+    edges = [np.zeros(1), grid, breakpoints_below(spectrum, nyquist_hz)]
+    if isinstance(spectrum, ARModel):
+        poles = np.linalg.eigvals(spectrum.companion).astype(np.complex128)
+        edges.append(graded_edges(poles) * nyquist_hz)
+    first = np.unique(np.concatenate(edges))
+    low, high = first[:-1], first[1:]
+    done = [high[-1:]]
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        fine = _sums(spectrum, low, middle) + _sums(spectrum, middle, high)
+        open_ = np.abs(fine - _sums(spectrum, low, high)) > _SETTLED * np.abs(fine)
+        done.append(low[~open_])
+        low, high = (
+            np.concatenate([low[open_], middle[open_]]),
+            np.concatenate([middle[open_], high[open_]]),
+        )
+        if not low.size:
+            break
+    return np.unique(np.concatenate([*done, low]))
+
+
+def _sums(spectrum: Turbulence, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Integrals of a spectrum over panels that need not touch."""
+    nodes, weights = panel_rule(low, high, ORDER)
+    return np.asarray(np.sum(weights * spectrum.psd(nodes.ravel()).reshape(nodes.shape), axis=1))
 
 
 def spectral_covariances(

@@ -154,7 +154,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
 
 def noise_covariance(loop: ClosedLoop, truth: Truth) -> FloatArray:
     """Covariance of the residual that a truth's white noise on each measurement leaves."""
-    n, s = loop.hardware.modes, loop.system
+    n, s = loop.hardware.modes, loop.system.balanced()
     noise_nm = truth.noise_of(loop.hardware.n_measurements)
     B, D = s.B[:, n:] * noise_nm, s.D[:n, n:] * noise_nm
     states = stationary_covariance(s.A, B @ B.T)
@@ -175,7 +175,7 @@ def ar_covariance(loop: ClosedLoop, model: ARModel, directions: FloatArray) -> F
 
 
 def _directed_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray) -> FloatArray:
-    n, s, order = loop.hardware.modes, loop.system, model.order
+    n, s, order = loop.hardware.modes, loop.system.balanced(), model.order
     # the newest sample of the process, x(k), acts on frame k
     entry = np.zeros((s.n_states, order))
     entry[:, 0] = s.B[:, :n] @ direction
@@ -210,13 +210,18 @@ def resonance_edges(loop: ClosedLoop) -> FloatArray:
 
 
 def pole_edges(poles: ComplexArray) -> FloatArray:
-    """Edges of panels around sharp poles, in units of the Nyquist frequency; in no order."""
-    offsets = np.array([0.0, 1.0, 4.0, 16.0])
+    """Edges of panels around sharp poles, in units of the Nyquist frequency; in no order.
+
+    They widen with the distance until other panels are as fine: a narrow peak's flank that lies
+    in one long panel is between the nodes of its halves, too.
+    """
     edges = [np.zeros(0)]
     for pole in np.ravel(poles):
         centre, width = abs(np.angle(pole)) / np.pi, max(1 - abs(pole), 1e-9) / np.pi
-        if 1e-6 < width < 0.1:
-            edges += [centre + offsets * width, centre - offsets * width]
+        if width < 0.1:
+            steps = max(3, 1 + int(np.log(0.3 / width) / np.log(4)))
+            offsets = np.concatenate([[0.0], width * 4.0 ** np.arange(steps)])
+            edges += [centre + offsets, centre - offsets]
     return np.concatenate(edges)
 
 

@@ -20,6 +20,7 @@ from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray, number, real_array
 
 ARCSEC_RAD = np.pi / 180 / 3600
+LOWEST = 1e-4  # frequency below which spectra are taken to be constant, in units of V / D
 _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
 
 
@@ -208,7 +209,7 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
     from scipy.interpolate import CubicSpline  # slow to import
 
     frequency = np.concatenate(
-        [np.geomspace(1e-4, 0.3, 120, endpoint=False), np.linspace(0.3, 12, 480, endpoint=False),
+        [np.geomspace(LOWEST, 0.3, 120, endpoint=False), np.linspace(0.3, 12, 480, endpoint=False),
          np.linspace(12, 120, 400)]
     )  # fmt: skip
     fy, wy = _spatial_panels()

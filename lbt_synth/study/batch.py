@@ -10,7 +10,6 @@ import numpy as np
 from lbt_synth.ensemble import EnsembleResiduals
 from lbt_synth.ensemble.residuals import residuals_of_matrices, textbook_matrices
 from lbt_synth.errors import CertificateError
-from lbt_synth.loop import Imaging
 from lbt_synth.study import point
 from lbt_synth.study.meeting import (
     changes_beliefs_only,
@@ -25,6 +24,7 @@ from lbt_synth.study.told import (
     changes_numbers_of_designs,
     designed_for_samples,
     designs_by_axis,
+    designs_filters,
 )
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -76,10 +76,10 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     left: dict[int, list[StudyController]] = {}  # what is done point by point, by sample
     for controller in study.controllers:
         done = np.zeros(len(values), dtype=np.bool_)
-        for rows, found, imaging in _evaluated_together(study, controller, values):
+        for rows, found, strehl in _evaluated_together(study, controller, values):
             done[rows] = True
             results = {
-                "strehl": found.strehl(imaging),
+                "strehl": strehl,
                 "residual_nm": found.rms_nm,
                 "turbulence_nm": found.turbulence_nm,
                 "vibration_nm": found.vibration_nm,
@@ -108,8 +108,8 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
 
 def _evaluated_together(
     study: Study, controller: StudyController, values: FloatArray
-) -> Iterator[tuple[IntArray, EnsembleResiduals, Imaging]]:
-    """Yield what could be evaluated together, with the rows that it is of."""
+) -> Iterator[tuple[IntArray, EnsembleResiduals, FloatArray]]:
+    """Yield what could be evaluated together: rows, residuals, Strehl ratios."""
     if study.settings.evaluation != "exact":
         return
     if controller.design is not None:
@@ -118,7 +118,7 @@ def _evaluated_together(
         def together(keys: Keys) -> bool:
             return changes_numbers_only(study, keys) or changes_beliefs_only(study, keys)
 
-    elif designs_by_axis(study, controller):
+    elif designs_filters(controller):
         matrices = None
 
         def together(keys: Keys) -> bool:
@@ -133,6 +133,8 @@ def _evaluated_together(
     for group in _groups(study, values, together):
         try:
             sample = sample_of(study, values[group[0]])
+            if matrices is None and not designs_by_axis(sample.config):
+                continue
             rows = rows_of(study, sample, values[group])
             good = rows.valid()
             rows, group = rows.taken(np.flatnonzero(good)), group[good]
@@ -141,9 +143,10 @@ def _evaluated_together(
             with np.errstate(over="raise", divide="raise", invalid="raise"):
                 own = designed_for_samples(rows) if matrices is None else matrices
                 found = residuals_of_matrices(own, sample.hardware, rows.ensemble())
+            strehl = found.strehl(sample.config.imaging)
         except point.EXPECTED_ERRORS:
             continue  # one of them fails; which one is found point by point
-        yield group, found, sample.config.imaging
+        yield group, found, strehl
 
 
 def _require_agreement(

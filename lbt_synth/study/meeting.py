@@ -16,10 +16,10 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.config.axes import axes_of, directions_of
 from lbt_synth.config.needs import nm_of_mas
-from lbt_synth.config.parts import noise_of, rms_nm
+from lbt_synth.config.parts import lines_of, noise_of, rms_nm
 from lbt_synth.config.schema import SensorSection
 from lbt_synth.ensemble import EnsembleVibration, LoopEnsemble
-from lbt_synth.models import FrozenFlows
+from lbt_synth.models import FrozenFlows, Vibration
 from lbt_synth.study.paths import Keys
 from lbt_synth.study.sample import Sample
 from lbt_synth.study.study import DELAY_ERROR, NOISE_FACTOR, Study
@@ -123,13 +123,19 @@ class Rows:
                 rms = given["rms_mas"] * nm_of_mas(settings, 1.0, f"{key}.rms_mas")
             frequency, damping = given["frequency_hz"], given["damping"]
             for direction in directions_of(section, axes_of(settings), key):
-                numbers = {
+                numbers: dict[str, Any] = {
                     "frequency_hz": section.frequency_hz if frequency is None else frequency,
                     "rms_nm": rms_nm(section, settings, key) if rms is None else rms,
                     "damping": section.damping if damping is None else damping,
                     "direction": direction,
                 }
-                yield numbers, key
+                if getattr(section, "spread_hz", None) is None:
+                    yield numbers, key
+                    continue
+                # nothing varies of vibrations where one of them is several
+                whole = Vibration(**numbers)
+                for line in lines_of(whole, section, self.config.hardware.frame_rate_hz, i):
+                    yield {name: getattr(line, name) for name in numbers}, key
 
     def ensemble(self) -> LoopEnsemble:
         """Return what the real loops meet."""

@@ -10,6 +10,7 @@ from lbt_synth.config.designing import designed
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, strehl
+from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
 from lbt_synth.simulation import settling_frames, simulate
 from lbt_synth.study.result import BatchResult, Failure
 from lbt_synth.study.sample import Sample, sample_of
@@ -112,9 +113,11 @@ def closed_loop(sample: Sample, design: Design) -> ClosedLoop:
 
 def exact(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
     """Return the exact residual of a stable loop by origin, and its Strehl ratio."""
-    budget = residual_budget(loop, sample.truth)
+    budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
+    spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
     return {
-        "strehl": strehl(budget, sample.config.imaging),
+        # the image is gone, as EnsembleResiduals.strehl has it
+        "strehl": strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0,
         "residual_nm": budget.rms_nm,
         "turbulence_nm": budget.turbulence_nm,
         "vibration_nm": budget.vibration_nm,

@@ -18,13 +18,16 @@ from lbt_synth.validation import FloatArray
 Matrices = tuple[FloatArray, ...]
 
 
-def designs_by_axis(study: Study, controller: StudyController) -> bool:
-    """Whether a controller's designs for the samples are Kalman filters, an axis at a time."""
-    request, config = controller.request, study.config
+def designs_filters(controller: StudyController) -> bool:
+    """Whether a controller is a Kalman filter that is designed for each sample."""
+    request = controller.request
     if request is None or controller.design is not None:
         return False
-    if request.method != "kalman" or request.options:
-        return False
+    return request.method == "kalman" and not request.options
+
+
+def designs_by_axis(config: Config) -> bool:
+    """Whether the Kalman filter of a configuration is one of each axis by itself."""
     hardware, settings = config.hardware, config.settings
     diagonal = all(
         matrix.shape[0] == matrix.shape[1] and not np.any(matrix - np.diag(np.diag(matrix)))
