@@ -78,6 +78,20 @@ def test_filters_told_their_samples(tmp_path, monkeypatch):
     assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
 
 
+def test_the_sensor_gain_that_designs_believe_in(tmp_path, monkeypatch):
+    """A fixed controller does not notice; a filter for the sample does, and so does the loop not."""
+    parameters = """{
+      model.sensor_gain: {uniform: [0.6, 1.2]},
+      truth.sensor_gain: {uniform: [0.5, 1.1]}
+    }"""
+    study, _ = agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=6)
+    rows = counted(monkeypatch)
+    lbt.evaluate_samples(study, study.values(0, 6), 0)
+    assert rows == [3, 3]  # all at once, one by itself for each controller
+    one = "{model.sensor_gain: {uniform: [0.6, 1.2]}}"
+    agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=one, count=5)
+
+
 def test_one_axis_and_the_turbulence_of_the_model(tmp_path):
     parameters = """{
       'truth.vibrations[0].rms_nm': {uniform: [100, 900]},
@@ -240,12 +254,13 @@ def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
         ("sensor", "pyramid", "photons"),
     ]
     assert all(changes_numbers_only(study, keys) for keys in numbers)
-    others = [("telescope", "diameter_m"), ("model", "sensor_gain"), ("loop", "frame_rate_hz"),
+    others = [("telescope", "diameter_m"), ("model", "turbulence"), ("loop", "frame_rate_hz"),
               ("model", "vibrations", 0, "rms_mas"), ("imaging", "wavelength_um"),
               ("atmosphere", "seeing_wavelength_um")]  # fmt: skip
     assert not any(changes_numbers_only(study, keys) for keys in others)
     assert changes_beliefs_only(study, ("model", "vibrations", 0, "rms_mas"))
-    assert not changes_beliefs_only(study, ("model", "sensor_gain"))
+    assert changes_beliefs_only(study, ("model", "sensor_gain"))
+    assert not changes_beliefs_only(study, ("model", "turbulence", "driving_rms_nm"))
 
 
 def test_two_answers_stop_a_study(tmp_path, monkeypatch):

@@ -26,6 +26,7 @@ from lbt_synth.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
+BELIEVED_GAIN = ("model", "sensor_gain")
 _GAIN, _DELAY = ("truth", "sensor_gain"), ("loop", "delay_frames")
 _LINE = ("frequency_hz", "rms_nm", "rms_mas", "damping")
 _SENSOR = (
@@ -204,6 +205,9 @@ def changes_numbers_only(study: Study, keys: Keys) -> bool:
 def changes_beliefs_only(study: Study, keys: Keys) -> bool:
     """Whether a parameter at a place changes what designs believe, and nothing else."""
     settings = study.config.settings
+    if keys == BELIEVED_GAIN:
+        # the real sensor is its matrix times truth.sensor_gain, whatever designs believe
+        return not isinstance(settings.truth.sensor_gain, list)
     return (
         is_line(keys, "model")
         and isinstance(settings.truth.vibrations, list)

@@ -10,7 +10,7 @@ from lbt_synth.config.schema import Ar1Section
 from lbt_synth.modal import ModalFilters, modal_filters
 from lbt_synth.models import ARModel, ModalTurbulence, Vibration
 from lbt_synth.models.turbulence import ar1_flows
-from lbt_synth.study.meeting import WEATHER, Rows, is_line, turbulence_kinds
+from lbt_synth.study.meeting import BELIEVED_GAIN, WEATHER, Rows, is_line, turbulence_kinds
 from lbt_synth.study.paths import Keys
 from lbt_synth.study.study import Study, StudyController
 from lbt_synth.validation import FloatArray
@@ -47,7 +47,7 @@ def changes_numbers_of_designs(study: Study, keys: Keys) -> bool:
         return keys[1] in WEATHER and "ar2" not in kinds
     if keys[0] == "sensor":
         return "ar2" not in kinds
-    return keys[0] == "truth" or is_line(keys, "model")
+    return keys[0] == "truth" or keys == BELIEVED_GAIN or is_line(keys, "model")
 
 
 def designed_for_samples(rows: Rows) -> Matrices:
@@ -74,7 +74,7 @@ def designed_for_samples(rows: Rows) -> Matrices:
     hardware = config.hardware
     axes = hardware.modes
     noise = np.broadcast_to(rows.told_noise(), (count, axes))
-    gains = believed_gains(config.settings)
+    gains = _believed_gains(rows)
     numbers = _lines_by_axis(rows)
     designs: list[ModalFilters] = []
     for axis in range(axes):
@@ -93,11 +93,18 @@ def designed_for_samples(rows: Rows) -> Matrices:
                 noise_nm=noise[:, axis],
                 vibrations=lines,
                 delay_frames=hardware.delay_frames,
-                sensor_gain=float(gains[axis]),
+                sensor_gain=gains[:, axis],
                 mirror=hardware.mirror,
             )
         )
     return _side_by_side(designs)
+
+
+def _believed_gains(rows: Rows) -> FloatArray:
+    """Sensor gain of each axis that designs believe in, (b, axes)."""
+    given = rows.number(*BELIEVED_GAIN)
+    each = believed_gains(rows.config.settings) if given is None else given[:, None]
+    return np.broadcast_to(each, (rows.count, rows.config.hardware.modes))
 
 
 def _lines_by_axis(rows: Rows) -> list[FloatArray]:
@@ -125,7 +132,7 @@ def _same_axis(
         and numbers[axis].shape == numbers[0].shape
         and np.array_equal(numbers[axis], numbers[0])
         and np.array_equal(noise[:, axis], noise[:, 0])
-        and gains[axis] == gains[0]
+        and np.array_equal(gains[:, axis], gains[:, 0])
     )
 
 
