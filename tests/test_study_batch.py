@@ -200,7 +200,7 @@ def test_groups_of_what_makes_another_configuration(tmp_path, monkeypatch):
     }"""
     agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, samples="16", count=16)
     # one of each group and controller, then those of the evaluation that it is held against
-    assert len(rows) == 2 + 16
+    assert len(rows) == 4 + 16
 
 
 def test_samples_that_the_configuration_refuses(tmp_path):

@@ -39,8 +39,8 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     Samples whose configurations differ by numbers only are evaluated together by
     :func:`ensemble_residuals`; Kalman filters for samples are designed together by
     :func:`modal_filters`. Other designs, simulations, and samples that a configuration refuses
-    are evaluated one after the other. So is one sample of those that were evaluated together, and
-    the two answers have to agree.
+    are evaluated one after the other. So is one sample of each group that is evaluated together,
+    and the two answers have to agree.
 
     Parameters
     ----------
@@ -88,14 +88,12 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
             }
             for name, result in results.items():
                 columns[f"{controller.name}.{name}"][rows] = result
-        for i in np.flatnonzero(~done).tolist():
-            left.setdefault(i, []).append(controller)
-        if done.any():
-            together = np.flatnonzero(done)
             _require_agreement(
                 replace(study, controllers=(controller,)), values, start,
-                int(together[together.size // 2]), columns,
+                int(rows[rows.size // 2]), columns,
             )  # fmt: skip
+        for i in np.flatnonzero(~done).tolist():
+            left.setdefault(i, []).append(controller)
     for i, controllers in sorted(left.items()):
         some = replace(study, controllers=tuple(controllers))
         with np.errstate(all="ignore"):  # what overflows fails its checks
