@@ -219,7 +219,7 @@ def test_a_page_from_a_study_file(study, tmp_path):
     for words in (
         "3 of 4096 samples",
         "normal, 20 with deviation 0.5, from 18, to 22",
-        "hinf for the configuration",
+        "hinf (gamma_ratio 1.2) for the configuration",
         study.digest,
         "samples: 4096",
         "diameter_m: 8.22",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -60,17 +61,22 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         with counting(
             total=loaded.samples, what="samples", quiet=arguments.json, rate=True
         ) as count:
-            run = run_study(
-                loaded,
-                folder,
-                executor=executor,
-                jobs=arguments.jobs,
-                workers=workers,
-                progress=count,
-                whole=lambda results: found.append(
-                    (_summarised(loaded, files, results), results.new)
-                ),
-            )
+            try:
+                run = run_study(
+                    loaded,
+                    folder,
+                    executor=executor,
+                    jobs=arguments.jobs,
+                    workers=workers,
+                    progress=count,
+                    whole=lambda results: found.append(
+                        (_summarised(loaded, files, results), results.new)
+                    ),
+                )
+            except KeyboardInterrupt:
+                kept = f"lbt-synth: what is finished is kept in {folder}; start again, it goes on"
+                print(kept, file=sys.stderr)
+                raise
     report = Report(
         data={
             "samples": run.samples,

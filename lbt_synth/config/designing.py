@@ -56,6 +56,12 @@ class DesignRequest:
     method: str
     options: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def text(self) -> str:
+        """Description for people."""
+        given = ", ".join(f"{name} {value}" for name, value in self.options.items())
+        return f"{self.method} ({given})" if given else self.method
+
 
 def designed(config: Config, request: DesignRequest) -> Design:
     """Design for a configuration as it stands.

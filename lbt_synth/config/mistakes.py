@@ -32,6 +32,8 @@ def described(error: ValidationError, schema: type[BaseModel] = FileSection) -> 
     if first["type"] == "union_tag_invalid":
         expected, got = first["ctx"]["expected_tags"], first["ctx"]["tag"]
         return f"{key}.kind must be one of {expected}; got {got!r}.{more}", key
+    if first["type"] == "model_type":
+        return f"{key} must be a mapping of keys; got {first['input']!r}.{more}", key
     text = first["msg"][0].lower() + first["msg"][1:]
     return f"{key}: {text}; got {first['input']!r}.{more}", key
 

@@ -118,7 +118,7 @@ def load_study(
             design = None if own else stored.get(name) or _made(name, request, config, source)
             words = "for each sample" if own else "for the configuration"
             entry = StudyController(
-                name=name, request=request, design=design, origin=f"{section.design} {words}"
+                name=name, request=request, design=design, origin=f"{request.text} {words}"
             )
         controllers.append(entry)
         if entry.design is not None:

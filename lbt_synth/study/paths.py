@@ -49,6 +49,7 @@ def require_number(content: Mapping[str, Any], path: str) -> None:
         Saying which keys there are.
     """
     here: Any = content
+    parent: Any = {}
     walked = ""
     for key in keys_of(path):
         place = walked or "the configuration"
@@ -71,9 +72,14 @@ def require_number(content: Mapping[str, Any], path: str) -> None:
                     f"{path}: {place} has no {key}; {hint}there are {', '.join(sorted(here))}."
                 )
             walked += f".{key}" if walked else key
-        here = here[key]
+        parent, here = here, here[key]
     if here is None:
-        raise ConfigError(f"{path} is not set in the configuration, so it cannot be varied.")
+        entries = parent.items() if isinstance(parent, Mapping) else ()
+        there = [k for k, v in entries if type(v) in (int, float)]
+        others = f" Numbers that are set there: {', '.join(sorted(there))}." if there else ""
+        raise ConfigError(
+            f"{path} is not set in the configuration, so it cannot be varied.{others}"
+        )
     if isinstance(here, bool | str) or not isinstance(here, int | float):
         raise ConfigError(f"{path} must lead to a number of the configuration; {_seen(here)}.")
 
