@@ -97,3 +97,10 @@ ENSEMBLE = (
     ("many loops of a gain file at once (loop by loop)", "loops", fixed_design),
     ("Kalman filters for samples, designed and evaluated (one by one)", "samples", told_designs),
 )
+
+
+if __name__ == "__main__":
+    for title, size, case in ENSEMBLE:
+        print(title)
+        for count, row in case().items():
+            print(f"  {count:5d} {size}: {1e3 * row['ours_s']:8.1f} ms, {row['ratio']:6.0f} times")
