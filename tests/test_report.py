@@ -492,8 +492,8 @@ def test_bad_input_ends_in_one_line(gains, capsys, monkeypatch, arguments, text)
 
 def test_both_files_or_none(report, tmp_path, monkeypatch):
     (tmp_path / "a.html").write_text("old")
-    monkeypatch.setattr("lbt_synth.report.designs_page.page_html", lambda page: b"new")
-    monkeypatch.setattr("lbt_synth.report.designs_page.page_pdf", lambda page: 1 / 0)
+    monkeypatch.setattr("lbt_synth.pages.writing.page_html", lambda page: b"new")
+    monkeypatch.setattr("lbt_synth.pages.writing.page_pdf", lambda page: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         lbt.write_report(report, tmp_path / "a.html", pdf=tmp_path / "a.pdf")
     assert (tmp_path / "a.html").read_text() == "old"

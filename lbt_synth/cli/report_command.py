@@ -11,9 +11,10 @@ from lbt_synth.cli.output import Report, TableText, counting, fixed
 from lbt_synth.config import load_config
 from lbt_synth.distance import LimitRow
 from lbt_synth.errors import ProblemError
+from lbt_synth.pages.writing import require_page_names
 from lbt_synth.report.designs import DesignReport, design_report, steps_of
 from lbt_synth.report.designs_assessment import DesignAssessment
-from lbt_synth.report.designs_page import require_page_names, write_report
+from lbt_synth.report.designs_page import write_report
 from lbt_synth.report.designs_verdict import good_range, verdict
 from lbt_synth.report.making import require_letters, time_text
 

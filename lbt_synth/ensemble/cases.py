@@ -129,10 +129,10 @@ class LoopEnsemble:
                     word = "above" if name == "sensor_gain" else "at least"
                     raise ProblemError(f"{name} must be {word} {bound:g}; got {value.min():.6g}.")
                 set_(self, name, value)
-        lengths = {f"{name} of all": len(v) for name, v in self._arrays().items()}
+        lengths = {name: len(values) for name, values in self._arrays().items()}
         lengths |= {} if self.loops == 0 else {"loops": self.loops}
         if len(set(lengths.values()) - {1}) > 1:
-            text = ", ".join(f"{name.removesuffix(' of all')} {n}" for name, n in lengths.items())
+            text = ", ".join(f"{name} {length}" for name, length in lengths.items())
             raise DimensionError(f"all must have one entry a loop; got {text}.")
         if 0 in lengths.values():
             raise DimensionError("an ensemble needs at least one loop; got none.")

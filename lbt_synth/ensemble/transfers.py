@@ -218,9 +218,8 @@ def _scalar(
     rejection = 1 / ((1 + g * real) ** 2 + (g * imaginary) ** 2)
     square = (real**2 + imaginary**2) / part.sensor[0, 0] ** 2
     turbulence = np.zeros(len(gains))
-    for density, modes in densities:
-        if modes:
-            turbulence += _integral(rejection, density)
+    for density, _ in densities:  # all of them are of the one mode
+        turbulence += _integral(rejection, density)
     noise = noise_nm[:, 0] ** 2 * _integral(rejection * square, white)
     return turbulence[:, None, None], noise[:, None, None]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.files import require_writable, write_together
+from lbt_synth.errors import ProblemError
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.truth import stationary_vibrations
-from lbt_synth.pages import Listing, Notice, Page, Paragraph, Section, page_html, page_pdf
+from lbt_synth.pages import Listing, Notice, Page, Paragraph, Section
 from lbt_synth.pages.blocks import Block
+from lbt_synth.pages.writing import require_page_names, write_page
 from lbt_synth.report.designs import DesignReport
 from lbt_synth.report.designs_charts import (
     dynamics_charts,
@@ -72,34 +72,7 @@ def write_report(
     ['a.html']
     """
     require_page_names(path, pdf)
-    page = design_page(report, title=title)
-    contents: dict[str | os.PathLike[str], bytes] = {path: page_html(page)}
-    if pdf is not None:
-        contents[pdf] = page_pdf(page)
-    return write_together(contents)
-
-
-def require_page_names(
-    path: str | os.PathLike[str],
-    pdf: str | os.PathLike[str] | None = None,
-    *,
-    inputs: tuple[str | os.PathLike[str], ...] = (),
-) -> None:
-    """Refuse names of pages that cannot be written, or would replace an input.
-
-    Raises
-    ------
-    OutputError
-        Before any work is done.
-    """
-    given: list[tuple[str | os.PathLike[str], str]] = [(path, ".html")]
-    if pdf is not None:
-        given.append((pdf, ".pdf"))
-    for name, ending in given:
-        target = Path(name)
-        if target.suffix.lower() != ending:
-            raise OutputError(f"a page must end in {ending}; got {target.name!r}.", path=target)
-    require_writable(*(name for name, _ in given), inputs=inputs)
+    return write_page(design_page(report, title=title), path, pdf)
 
 
 def design_page(report: DesignReport, *, title: str | None = None) -> Page:

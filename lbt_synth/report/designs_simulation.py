@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import get_window, welch
 
 from lbt_synth.design import Design
 from lbt_synth.loop import Imaging, close_loop
@@ -91,6 +90,8 @@ def simulated(
     DesignSimulation
         What came out.
     """
+    from scipy.signal import welch  # slow to import
+
     run = simulate(
         design.controller, truth, hardware=hardware, frames=frames, cases=cases, seed=seed,
         settle_frames=settle_frames,
@@ -149,6 +150,8 @@ def exact_spectrum(
     Welch's method makes of it with a Hann window w of that length:
     ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the window's Fourier transform.
     """
+    from scipy.signal import get_window  # slow to import
+
     n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
     inside = np.clip(frequency_hz, frequency_hz[1] / 2, None)  # spectra may be infinite at 0
     rejection = loop.sensitivity(inside)

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.files import write_together
-from lbt_synth.pages import page_html, page_pdf
-from lbt_synth.report.designs_page import require_page_names
+from lbt_synth.pages.writing import require_page_names, write_page
 from lbt_synth.report.study import study_page
 from lbt_synth.report.study_info import study_info
 from lbt_synth.study import Failure, Study, StudyStatistics, study_statistics
@@ -75,8 +73,4 @@ def write_study_page(
     info = study_info(
         study, directory=Path(path).parent, failures=failures, computing_s=computing_s
     )
-    page = study_page(info, statistics, columns)
-    contents: dict[str | os.PathLike[str], bytes] = {path: page_html(page)}
-    if pdf is not None:
-        contents[pdf] = page_pdf(page)
-    return write_together(contents)
+    return write_page(study_page(info, statistics, columns), path, pdf)

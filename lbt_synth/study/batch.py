@@ -12,6 +12,7 @@ from lbt_synth.ensemble.residuals import residuals_of_matrices, textbook_matrice
 from lbt_synth.errors import CertificateError
 from lbt_synth.study import point
 from lbt_synth.study.meeting import (
+    TOLD_DELAY,
     changes_beliefs_only,
     changes_numbers_only,
     rows_of,
@@ -30,7 +31,6 @@ from lbt_synth.validation import FloatArray, IntArray
 
 _AGREEMENT = 1e-5  # of a sample evaluated both ways; a residual of less than 1 nm counts as 1 nm
 _FEWEST = 4  # samples of a group that are worth an ensemble
-_DELAY = ("loop", "delay_frames")
 
 
 def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResult:
@@ -114,15 +114,15 @@ def _evaluated_together(
         matrices = textbook_matrices([controller.design.controller])
 
         def together(keys: Keys) -> bool:
-            return changes_numbers_only(study, keys) or changes_beliefs_only(study, keys)
+            return _changes_numbers(study, keys)
 
     elif designs_filters(controller):
         matrices = None
 
         def together(keys: Keys) -> bool:
             return (
-                keys != _DELAY
-                and (changes_numbers_only(study, keys) or changes_beliefs_only(study, keys))
+                keys != TOLD_DELAY
+                and _changes_numbers(study, keys)
                 and changes_numbers_of_designs(study, keys)
             )
 
@@ -145,6 +145,11 @@ def _evaluated_together(
         except point.EXPECTED_ERRORS:
             continue  # one of them fails; which one is found point by point
         yield group, found, strehl
+
+
+def _changes_numbers(study: Study, keys: Keys) -> bool:
+    """Whether a fixed controller meets samples that differ there in one ensemble."""
+    return changes_numbers_only(study, keys) or changes_beliefs_only(study, keys)
 
 
 def _require_agreement(

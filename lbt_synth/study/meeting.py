@@ -27,7 +27,8 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
 BELIEVED_GAIN = ("model", "sensor_gain")
-_GAIN, _DELAY = ("truth", "sensor_gain"), ("loop", "delay_frames")
+TOLD_DELAY = ("loop", "delay_frames")
+_GAIN = ("truth", "sensor_gain")
 _LINE = ("frequency_hz", "rms_nm", "rms_mas", "damping")
 _SENSOR = (
     ("sensor", "noise_nm"),
@@ -106,7 +107,7 @@ class Rows:
 
     def told_delay(self) -> FloatArray:
         """Delay that designs are told [frames], (b,)."""
-        told = self.number(*_DELAY)
+        told = self.number(*TOLD_DELAY)
         return np.full(self.count, self.config.hardware.delay_frames) if told is None else told
 
     def real_delay(self) -> FloatArray:
@@ -162,7 +163,7 @@ class Rows:
         good = np.ones(self.count, dtype=np.bool_)
         nyquist = self.config.hardware.frame_rate_hz / 2
         for keys, values in self.places.items():
-            if keys == _DELAY:
+            if keys == TOLD_DELAY:
                 good &= (values >= 1) & (values <= _LONGEST_DELAY)
             elif keys == ("sensor", "pyramid", "read_noise_electrons"):
                 good &= values >= 0
@@ -188,7 +189,7 @@ def _true_sections(config: Config) -> tuple[str, Sequence[Any]]:
 def changes_numbers_only(study: Study, keys: Keys) -> bool:
     """Whether a parameter at a place only changes numbers of what the loops meet."""
     settings = study.config.settings
-    if keys in (_GAIN, _DELAY):
+    if keys in (_GAIN, TOLD_DELAY):
         return True  # a list has other places, such as truth.sensor_gain[0]
     if keys in _SENSOR:
         return not (

@@ -73,11 +73,6 @@ def read_failures(folder: Path) -> list[tuple[int, str, str]]:
         return [(int(row), name, error) for row, name, error in list(csv.reader(stream))[1:]]
 
 
-def failures_in(study: Study, parts: Sequence[Part]) -> list[Failure]:
-    """Return the failures of all parts."""
-    return [failure for part in parts for failure in read_part(part, study)[1]]
-
-
 def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict[str, FloatArray]:
     """Return all columns: of the parts if there are some, else of the table of results.
 

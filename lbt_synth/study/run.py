@@ -19,7 +19,6 @@ from lbt_synth.study.batch import evaluate_samples
 from lbt_synth.study.engine import Evaluate, run_batches
 from lbt_synth.study.parquet import require_parquet
 from lbt_synth.study.results import (
-    failures_in,
     read_results,
     results_path,
     write_failures,
@@ -331,9 +330,10 @@ def _written(
 ) -> dict[str, Any]:
     """Write the results of all parts, then the manifest, then remove the parts."""
     parts = part_list(folder)
-    failures = failures_in(study, parts)
+    recorded = [read_part(part, study)[1:] for part in parts]
+    failures = [failure for failed, _ in recorded for failure in failed]
+    spent = sum(seconds for _, seconds in recorded)
     tables = (write_results(folder, study, parts), write_failures(folder, failures))
-    spent = sum(read_part(part, study)[2] for part in parts)
     if whole is not None:
         whole(Whole(columns=read_results(folder, study, parts), computing_s=spent, new=True))
     retry = sum(failure.retry for failure in failures)
