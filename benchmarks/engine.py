@@ -10,15 +10,16 @@ import slycot
 from harness import Row, once, paired, seconds, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.riccati import kalman_riccati, least_gamma
+from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.gamma import least_gamma
 
 RATE_HZ = 800.0
 POINTS = 10_000
 
 
-def plant(vibrations: int) -> lbt.TipTiltPlant:
+def plant(vibrations: int) -> lbt.models.TipTiltPlant:
     """One axis, AR1 turbulence, some lines from 10 to 120 Hz: 2 states a line and 2 more."""
-    slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE_HZ)
+    slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE_HZ)
     lines = [
         lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=100, direction=(1,))
         for f in np.linspace(10, 120, vibrations)
@@ -108,7 +109,7 @@ def least_gamma_lmi() -> dict[int, Row]:
     rows: dict[int, Row] = {}
     for lines, bar_s in ((1, None), (4, None), (12, 3.0), (20, 60.0)):
         p = plant(lines)
-        designs: list[lbt.FilterDesign] = []
+        designs: list[lbt.design.FilterDesign] = []
         row: Row = {"ours_s": seconds(lambda q=p, d=designs: d.append(lbt.hinf(q)), 1)}
         row["status"] = designs[-1].solver.status
         if bar_s is not None:
@@ -145,7 +146,7 @@ def textbook_lmi(p: lbt.EstimationProblem) -> str:
     return str(programme.status)
 
 
-def error_system(lines: int) -> lbt.StateSpace:
+def error_system(lines: int) -> lbt.linear.StateSpace:
     p = plant(lines)
     return p.error_system(kalman_riccati(p).gain_predictor)
 
@@ -173,7 +174,7 @@ def responses() -> dict[int, Row]:
         G = error_system(lines)
         peer = G.to_control()
         rows[G.n_states] = paired(
-            lambda g=G: lbt.largest_singular_values(g, frequency),
+            lambda g=G: lbt.linear.largest_singular_values(g, frequency),
             lambda g=peer: control.singular_values_response(g, 2 * np.pi * frequency),
             9,
             calls=3,
@@ -194,26 +195,26 @@ def shaped(functions: int, bands: int) -> Row:
     """Shape one mode: turbulence, noise and vibrations in bands, under four demands."""
     air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
     terms = [
-        lbt.ResidualVariance(turbulence=air, noise_nm=15.5),
+        lbt.design.shaping.ResidualVariance(turbulence=air, noise_nm=15.5),
         *(
-            lbt.VibrationBand(low_hz=low, high_hz=low + 3.0, rms_nm=100.0)
+            lbt.design.shaping.VibrationBand(low_hz=low, high_hz=low + 3.0, rms_nm=100.0)
             for low in np.linspace(16.5, 80.0, bands)
         ),
     ]
-    spec = lbt.Specification(
-        objective=lbt.Total(terms=tuple(terms)),
+    spec = lbt.design.shaping.Specification(
+        objective=lbt.design.shaping.Total(terms=tuple(terms)),
         demands=(
-            lbt.ModulusMargin(at_least=0.45),
-            lbt.SensorGainRange(low=0.25, high=1.3),
-            lbt.Attenuation(low_hz=0, high_hz=1, at_most=0.05),
-            lbt.DelayError(frames=0.3),
+            lbt.design.shaping.ModulusMargin(at_least=0.45),
+            lbt.design.shaping.SensorGainRange(low=0.25, high=1.3),
+            lbt.design.shaping.Attenuation(low_hz=0, high_hz=1, at_most=0.05),
+            lbt.design.shaping.DelayError(frames=0.3),
         ),
     )
     path = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=1)
-    designs: list[lbt.ShapedDesign] = []
+    designs: list[lbt.design.ShapedDesign] = []
 
     def whole() -> None:
-        designs.append(lbt.shape(path, spec, functions=functions, states=None))
+        designs.append(lbt.design.shape(path, spec, functions=functions, states=None))
 
     return {"ours_s": seconds(whole, 3), "status": designs[-1].solver.status}
 

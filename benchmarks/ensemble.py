@@ -10,7 +10,7 @@ import numpy as np
 from harness import Row, paired, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.study import point
+from lbt_synth.studies.study import reference_evaluation as point
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 FEW = 16  # loops that the peer does; its time is scaled up
@@ -40,16 +40,16 @@ def fixed_design() -> dict[int, Row]:
     for count in (64, 512, 4096):
         frequency = rng.uniform(18, 22, count)
         gain, delay = rng.uniform(0.4, 1.1, count), rng.uniform(2, 2.3, count)
-        ensemble = lbt.LoopEnsemble(
+        ensemble = lbt.loop.LoopEnsemble(
             sensor_gain=gain,
             delay_frames=delay,
             noise_nm=config.noise_nm,
             turbulence=config.atmosphere,
-            vibrations=(lbt.EnsembleVibration(frequency_hz=frequency, rms_nm=line.rms_nm),),
+            vibrations=(lbt.loop.EnsembleVibration(frequency_hz=frequency, rms_nm=line.rms_nm),),
         )
 
-        def ours(met: lbt.LoopEnsemble = ensemble) -> object:
-            return lbt.ensemble_residuals(controller, hardware, met).strehl(config.imaging)
+        def ours(met: lbt.loop.LoopEnsemble = ensemble) -> object:
+            return lbt.loop.ensemble_residuals(controller, hardware, met).strehl(config.imaging)
 
         def peer(f: np.ndarray = frequency, g: np.ndarray = gain, d: np.ndarray = delay) -> object:
             found = []
@@ -74,12 +74,12 @@ def told_designs() -> dict[int, Row]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "told.yaml"
         file.write_text(TOLD.format(config=EXAMPLES / "lbt.yaml"))
-        study = lbt.load_study(file)
+        study = lbt.studies.load_study(file)
     rows = {}
     for count in (64, 512, 4096):
         values = study.values(0, count)
         row = paired(
-            lambda v=values: lbt.evaluate_samples(study, v, 0),
+            lambda v=values: lbt.studies.evaluate_samples(study, v, 0),
             lambda v=values: point.evaluate_samples(study, v[:FEW], 0),
             3,
         )

@@ -78,12 +78,13 @@ def frame(design: lbt.Design, *, single: bool) -> Row:
     real, dtype = ("float", np.float32) if single else ("double", np.float64)
     with tempfile.TemporaryDirectory() as folder:
         at = Path(folder)
-        lbt.export_c(at / "ctl.c", design, precision="single" if single else "double")
+        lbt.interop.export_c(at / "ctl.c", design, precision="single" if single else "double")
         (at / "driver.c").write_text(f"#define REAL {real}\n{DRIVER}")
         subprocess.run(
             ["cc", "-std=c99", "-O2", "-shared", "-fPIC", "ctl.c", "driver.c", "-o", "ctl.so"],
-            cwd=at, check=True,
-        )  # fmt: skip
+            cwd=at,
+            check=True,
+        )
         library = ctypes.CDLL(str(at / "ctl.so"))
     library.time_step.restype = library.time_gemv.restype = ctypes.c_double
 
@@ -100,9 +101,7 @@ def frame(design: lbt.Design, *, single: bool) -> Row:
     mine, theirs = [], []
     for _ in range(REPEATS):
         mine.append(library.time_step(library.ctl_step, state[1], n, y[1], u[1], FRAMES))
-        theirs.append(
-            library.time_gemv(gemv, matrix[1], n + m, n + q, x[1], out[1], n, FRAMES)
-        )  # fmt: skip
+        theirs.append(library.time_gemv(gemv, matrix[1], n + m, n + q, x[1], out[1], n, FRAMES))
     scale = np.max(np.abs(out[0][n:]))  # both end in the same frame of the same input
     assert np.max(np.abs(u[0] - out[0][n:])) < (1e-4 if single else 1e-11) * scale
     return {
@@ -122,9 +121,9 @@ def turned(design: lbt.Design) -> lbt.Design:
 
 def compiled_frames() -> dict[str, Row]:
     config = lbt.load_config(ROOT / "examples" / "lbt.yaml")
-    prior = lbt.kalman(lbt.spread_plant(config.plant, half_width_hz=3.5, lines=15))
+    prior = lbt.kalman(lbt.models.spread_plant(config.plant, half_width_hz=3.5, lines=15))
     designs = {
-        "integrator": lbt.optimal_integrator(config.hardware, config.truth),
+        "integrator": lbt.design.optimal_integrator(config.hardware, config.truth),
         "Kalman": lbt.kalman(config.plant),
         "H-infinity 1.2": lbt.hinf(config.plant, gamma_ratio=1.2),
         "Kalman, 15 lines an axis": prior,

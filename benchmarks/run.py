@@ -42,9 +42,15 @@ def imports() -> dict[str, Row]:
     for name, arguments in (
         ("import lbt_synth", ["-c", "import lbt_synth"]),
         ("lbt-synth --help", ["-m", "lbt_synth.cli.main", "--help"]),
-        ("first Kalman design", ["-c", "import lbt_synth as l; l.kalman(l.EstimationProblem("
-                                 "A=1., B=[[1., 0.]], C=1., D=[[0., 1.]], L=1.))"]),
-    ):  # fmt: skip
+        (
+            "first Kalman design",
+            [
+                "-c",
+                "import lbt_synth as l; l.kalman(l.EstimationProblem("
+                "A=1., B=[[1., 0.]], C=1., D=[[0., 1.]], L=1.))",
+            ],
+        ),
+    ):
         figures = paired(interpreter(arguments), base, 7)
         out[name] = figures | {"ratio": 1 / figures["ratio"], "bar": 1.5}
     del out["first Kalman design"]["bar"]
@@ -59,7 +65,7 @@ def time_domain() -> dict[str, Row]:
     out = {}
     one = rng.standard_normal((FRAMES, system.B.shape[1]))
     first = paired(
-        lambda: lbt.filter_series(system, one),
+        lambda: lbt.loop.filter_series(system, one),
         lambda: control.forced_response(peer, U=one.T),
         9,
         calls=20,
@@ -68,7 +74,7 @@ def time_domain() -> dict[str, Row]:
     many = rng.standard_normal((1000, FRAMES, system.B.shape[1]))
     # the peer knows one case a call: ten calls stand for a thousand
     figures = paired(
-        lambda: lbt.filter_series(system, many),
+        lambda: lbt.loop.filter_series(system, many),
         lambda: [control.forced_response(peer, U=case.T) for case in many[:10]],
         3,
     )
@@ -79,7 +85,9 @@ def time_domain() -> dict[str, Row]:
         "bar": 50,
     }
     _, expected = control.forced_response(peer, U=one.T)
-    error = np.max(np.abs(lbt.filter_series(system, one) - expected.T)) / np.max(np.abs(expected))
+    error = np.max(np.abs(lbt.loop.filter_series(system, one) - expected.T)) / np.max(
+        np.abs(expected)
+    )
     assert error < 1e-10, error
     return out
 
@@ -109,8 +117,10 @@ def maps() -> dict[str, Row]:
         loop = lbt.close_loop(config.hardware, design.controller, sensor_gain=gain)
         return lbt.strehl(lbt.residual_budget(loop, met), config.imaging)
 
-    def mapped() -> lbt.StrehlMap:
-        return lbt.strehl_map(design, truth, config.imaging, errors_hz=errors, sensor_gains=gains)
+    def mapped() -> lbt.studies.StrehlMap:
+        return lbt.studies.strehl_map(
+            design, truth, config.imaging, errors_hz=errors, sensor_gains=gains
+        )
 
     # the peer knows one point a call: 25 of them stand for all 1681
     some = np.arange(0, 41, 10)

@@ -23,7 +23,13 @@ from typing import Any
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.plotting.style import house_style, looks, new_figure, number_ticks, save_figure
+from lbt_synth.report.figures.style import (
+    house_style,
+    looks,
+    new_figure,
+    number_ticks,
+    save_figure,
+)
 
 FILE = Path(__file__).parent / "data" / "eris_vibrations_psd.fits"
 BACKGROUND_NM2_HZ = 4e4  # at 1 Hz, falling with the square of the frequency; see docs/eris.md
@@ -39,10 +45,10 @@ AIR = lbt.Atmosphere(
 WAVELENGTHS_UM = (1.25, 1.65, 2.2)  # of J, H and K; modes other than tip and tilt are perfect
 SHIFT_HZ = 0.5
 BANDS = (  # of the robust design: half a hertz around the strongest lines
-    lbt.VibrationBand(low_hz=9.5, high_hz=10.5, rms_nm=27.0),
-    lbt.VibrationBand(low_hz=45.0, high_hz=46.0, rms_nm=11.0),
-    lbt.VibrationBand(low_hz=47.6, high_hz=48.9, rms_nm=26.0),
-    lbt.VibrationBand(low_hz=72.0, high_hz=73.1, rms_nm=12.0),
+    lbt.design.shaping.VibrationBand(low_hz=9.5, high_hz=10.5, rms_nm=27.0),
+    lbt.design.shaping.VibrationBand(low_hz=45.0, high_hz=46.0, rms_nm=11.0),
+    lbt.design.shaping.VibrationBand(low_hz=47.6, high_hz=48.9, rms_nm=26.0),
+    lbt.design.shaping.VibrationBand(low_hz=72.0, high_hz=73.1, rms_nm=12.0),
 )
 
 
@@ -56,26 +62,27 @@ class Disturbance:
         The assumed atmosphere; the formula in the file; what the file has beyond it.
     """
 
-    turbulence: tuple[lbt.Spectrum, ...]
-    background: tuple[lbt.Spectrum, ...]
-    lines: tuple[lbt.Spectrum, ...]
+    turbulence: tuple[lbt.models.Spectrum, ...]
+    background: tuple[lbt.models.Spectrum, ...]
+    lines: tuple[lbt.models.Spectrum, ...]
 
     @property
     def whole(self) -> lbt.Truth:
         """All of it, with the noise of the sensor."""
         parts = zip(self.turbulence, self.background, self.lines, strict=True)
         return lbt.Truth(
-            turbulence=[lbt.SumSpectrum(parts=list(each)) for each in parts], noise_nm=NOISE_NM
+            turbulence=[lbt.models.SumSpectrum(parts=list(each)) for each in parts],
+            noise_nm=NOISE_NM,
         )
 
 
-def record(averages: int = AVERAGES) -> lbt.SpectrumRecord:
+def record(averages: int = AVERAGES) -> lbt.identification.SpectrumRecord:
     """Read the file; its columns have no names, and it does not tell their unit.
 
     The rows are taken for frequency, tip and tilt.
     """
     found = lbt.load_record(FILE, kind="spectrum", unit="nm^2/Hz", averages=averages)
-    assert isinstance(found, lbt.SpectrumRecord)
+    assert isinstance(found, lbt.identification.SpectrumRecord)
     return found
 
 
@@ -95,7 +102,7 @@ def peaks(frequency_hz: np.ndarray, density_nm2_hz: np.ndarray) -> list[tuple[fl
     ]
 
 
-def disturbance(seen: lbt.SpectrumRecord, *, shift_hz: float = 0.0) -> Disturbance:
+def disturbance(seen: lbt.identification.SpectrumRecord, *, shift_hz: float = 0.0) -> Disturbance:
     """Take the file apart, and move its lines."""
     f = seen.frequency_hz
     formula = BACKGROUND_NM2_HZ / f**2
@@ -103,11 +110,11 @@ def disturbance(seen: lbt.SpectrumRecord, *, shift_hz: float = 0.0) -> Disturban
     return Disturbance(
         turbulence=(AIR,) * seen.axes,
         background=tuple(
-            lbt.TabulatedSpectrum(frequency_hz=f, density_nm2_hz=np.minimum(column, formula))
+            lbt.models.TabulatedSpectrum(frequency_hz=f, density_nm2_hz=np.minimum(column, formula))
             for column in columns
         ),
         lines=tuple(
-            lbt.TabulatedSpectrum(
+            lbt.models.TabulatedSpectrum(
                 frequency_hz=f + shift_hz, density_nm2_hz=np.maximum(column - formula, 0.0)
             )
             for column in columns
@@ -115,13 +122,13 @@ def disturbance(seen: lbt.SpectrumRecord, *, shift_hz: float = 0.0) -> Disturban
     )
 
 
-def composed(model: lbt.IdentifiedModel) -> lbt.TipTiltPlant:
+def composed(model: lbt.identification.IdentifiedModel) -> lbt.models.TipTiltPlant:
     """Make a plant of the identified spectrum, the turbulence and the noise of a sensor.
 
     The slow part of the identified spectrum, which is that of the background, takes the place
     of the turbulence. The turbulence, an AR2 process, is one more resonance of each axis.
     """
-    air = lbt.ar2_turbulence(AIR, frame_rate_hz=FRAME_RATE_HZ, noise_nm=NOISE_NM)
+    air = lbt.models.ar2_turbulence(AIR, frame_rate_hz=FRAME_RATE_HZ, noise_nm=NOISE_NM)
     pole = np.log(np.roots([1.0, *-air.coefficients])[0].astype(complex)) * FRAME_RATE_HZ
     vibrations = []
     for i, axis in enumerate(model.axes):
@@ -144,23 +151,23 @@ def composed(model: lbt.IdentifiedModel) -> lbt.TipTiltPlant:
     )
 
 
-def designs(plant: lbt.TipTiltPlant, met: Disturbance) -> dict[str, lbt.Design]:
+def designs(plant: lbt.models.TipTiltPlant, met: Disturbance) -> dict[str, lbt.Design]:
     """Design for the model; only the robust one takes bands and the spectra without lines."""
     f = np.geomspace(0.02, 0.499 * FRAME_RATE_HZ, 300)  # a gain file keeps tables, no sums
-    slow = lbt.SumSpectrum(parts=[met.turbulence[0], met.background[0]]).psd(f)
-    table = lbt.TabulatedSpectrum(frequency_hz=f, density_nm2_hz=slow)
+    slow = lbt.models.SumSpectrum(parts=[met.turbulence[0], met.background[0]]).psd(f)
+    table = lbt.models.TabulatedSpectrum(frequency_hz=f, density_nm2_hz=slow)
     return {
-        "integrator": lbt.model_integrator(plant),
+        "integrator": lbt.design.model_integrator(plant),
         "Kalman": lbt.kalman(plant),
         "H-infinity": lbt.hinf(plant, gamma_ratio=1.2, method="riccati"),
         "robust": lbt.robust(plant, bands=BANDS, turbulence=table),
     }
 
 
-def residual(loop: lbt.ClosedLoop, met: Disturbance) -> dict[str, np.ndarray]:
+def residual(loop: lbt.loop.ClosedLoop, met: Disturbance) -> dict[str, np.ndarray]:
     """Return the covariances [nm^2] that each part of the disturbance and the noise leave."""
 
-    def left(spectra: tuple[lbt.Spectrum, ...] | None, noise_nm: float = 0.0) -> np.ndarray:
+    def left(spectra: tuple[lbt.models.Spectrum, ...] | None, noise_nm: float = 0.0) -> np.ndarray:
         budget = lbt.residual_budget(loop, lbt.Truth(turbulence=spectra, noise_nm=noise_nm))
         return np.asarray(budget.total_nm2)
 
@@ -182,14 +189,16 @@ def strehls(covariance_nm2: np.ndarray) -> list[float]:
     """Return the Strehl ratios [%] of J, H and K."""
     return [
         100
-        * lbt.jitter_strehl(
+        * lbt.loop.jitter_strehl(
             covariance_nm2, imaging=lbt.Imaging(obstruction=AIR.obstruction, wavelength_um=wave)
         )
         for wave in WAVELENGTHS_UM
     ]
 
 
-def print_lines(seen: lbt.SpectrumRecord, model: lbt.IdentifiedModel) -> None:
+def print_lines(
+    seen: lbt.identification.SpectrumRecord, model: lbt.identification.IdentifiedModel
+) -> None:
     """Print identified lines beside the peaks of the file."""
     f = seen.frequency_hz
     inside = float(np.sqrt(accumulated(f, BACKGROUND_NM2_HZ / f**2)[-1]))
@@ -232,7 +241,11 @@ def print_table(rows: Mapping[str, Mapping[str, np.ndarray]]) -> None:
         print("".join(f"{value:9.1f}" for value in strehls(parts["total"])))
 
 
-def figure(seen: lbt.SpectrumRecord, loops: Mapping[str, lbt.ClosedLoop], met: Disturbance) -> Any:
+def figure(
+    seen: lbt.identification.SpectrumRecord,
+    loops: Mapping[str, lbt.loop.ClosedLoop],
+    met: Disturbance,
+) -> Any:
     """Draw what the loops reject, and what they leave accumulated over the frequencies."""
     f = np.union1d(np.geomspace(0.5, 499.0, 1500), seen.frequency_hz)
     whole = met.whole.turbulence_of(seen.axes)
@@ -286,7 +299,7 @@ def main(folder: str = "out", averages: int = AVERAGES) -> None:
 
     print("\nunder the spectrum of the file")
     print_table({name: residual(loop, met) for name, loop in loops.items()})
-    limit = lbt.least_residual(plant.hardware, met.whole)
+    limit = lbt.loop.least_residual(plant.hardware, met.whole)
     print(f"{'any linear controller':28s}{'at least':>44s}{limit.rms_nm:11.1f}", end="")
     best = np.diag(limit.variance_nm2)
     print("".join(f"{value:9.1f}" for value in strehls(best)))
@@ -296,7 +309,7 @@ def main(folder: str = "out", averages: int = AVERAGES) -> None:
     print("\nunder the model; certificate; states of the controller; modulus margin")
     for name, loop in loops.items():
         passed = "passed" if made[name].certificate.passed else "failed"
-        budget = lbt.model_budget(loop, plant)
+        budget = lbt.loop.model_budget(loop, plant)
         states = made[name].controller.n_states
         margin = lbt.loop_margins(loop).modulus
         print(f"{name:28s}{budget.rms_nm:11.1f} nm   {passed}{states:8d}{margin:8.2f}")
@@ -304,7 +317,7 @@ def main(folder: str = "out", averages: int = AVERAGES) -> None:
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
     for name, drawn in (
-        ("eris_identified.png", lbt.identification_figure(model)),
+        ("eris_identified.png", lbt.report.figures.identification_figure(model)),
         ("eris_residual.png", figure(seen, loops, met)),
     ):
         print("wrote", save_figure(drawn, out / name))

@@ -12,15 +12,15 @@ import numpy as np
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.paper.parameters import (
+from lbt_synth.linear.riccati.gamma import gamma_riccati
+from lbt_synth.studies.paper.parameters import (
     KALMAN_DAMPING,
     PAPER_TRUTH,
     TRUTH_SENSOR_GAIN,
     imaging,
     turbulence_model,
 )
-from lbt_synth.paper.published import TABLE_III
-from lbt_synth.riccati import gamma_riccati
+from lbt_synth.studies.paper.published import TABLE_III
 
 NOISE_NM = PAPER_TRUTH.noise_nm
 TARGET = np.array([row.hinf for row in TABLE_III])
@@ -29,14 +29,14 @@ FREQUENCIES_HZ = np.array([row.model_hz for row in TABLE_III])
 
 def axis_plant(
     frequency_hz: float, damping: float, weights: tuple[float, float]
-) -> lbt.TipTiltPlant:
+) -> lbt.models.TipTiltPlant:
     """One axis; ``weights`` are the driving noises of vibration and turbulence over the noise."""
     pole = turbulence_model().coefficients
     unit = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=1.0, direction=(1,))
     rms_nm = weights[0] * NOISE_NM / unit.ar_model(800).driving_rms_nm
     return lbt.tip_tilt_plant(
         frame_rate_hz=800,
-        turbulence=lbt.ARModel(
+        turbulence=lbt.models.ARModel(
             coefficients=pole, driving_rms_nm=weights[1] * NOISE_NM, frame_rate_hz=800
         ),
         vibrations=[
@@ -68,7 +68,7 @@ def column(parameters: np.ndarray) -> np.ndarray:
             noise_nm=NOISE_NM,
             sensor_gain=TRUTH_SENSOR_GAIN,
             vibrations=(
-                lbt.SinusoidalVibration(
+                lbt.models.SinusoidalVibration(
                     frequency_hz=20, rms_nm=PAPER_TRUTH.vibrations[0].rms_nm, direction=(1,)
                 ),
             ),
@@ -76,7 +76,7 @@ def column(parameters: np.ndarray) -> np.ndarray:
         budget = lbt.residual_budget(loop, shaken)
         tilt = budget.turbulence_nm2[0, 0] + budget.noise_nm2[0, 0]  # the axis without vibration
         lines = np.array([[budget.line_amplitudes_nm[0, 0], 0]])
-        out[i] = 100 * lbt.jitter_strehl(
+        out[i] = 100 * lbt.loop.jitter_strehl(
             np.diag([tilt, tilt]), imaging=imaging(), line_amplitudes_nm=lines
         )
     return out

@@ -7,12 +7,12 @@ Run with ``python examples/tracking.py [figure.png]`` from the repository (some 
 import sys
 
 import lbt_synth as lbt
-from lbt_synth.plotting import save_figure
+from lbt_synth.report.figures.style import save_figure
 
 SETTLE_S, DRIFT_S, RATE_HZ = 10, 60, 800
 
 config = lbt.load_config("examples/lbt.yaml")
-turbulence = lbt.ar2_turbulence(config.atmosphere, frame_rate_hz=RATE_HZ, noise_nm=15.5)
+turbulence = lbt.models.ar2_turbulence(config.atmosphere, frame_rate_hz=RATE_HZ, noise_nm=15.5)
 
 # what the design believes at first: 20 Hz
 line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=797, direction=(1,))
@@ -21,12 +21,14 @@ plant = lbt.tip_tilt_plant(
 )
 
 # what is there
-shake = lbt.DriftingVibration(
+shake = lbt.models.DriftingVibration(
     start_hz=17, end_hz=23, duration_s=DRIFT_S, rms_nm=797, direction=(1,)
 )
 truth = lbt.Truth(turbulence=turbulence, vibrations=(shake,), noise_nm=15.5)
 
-tracker = lbt.TrackingController(plant, lbt.LineFollower(plant), window_s=4, update_s=1)
+tracker = lbt.identification.TrackingController(
+    plant, lbt.identification.LineFollower(plant), window_s=4, update_s=1
+)
 controllers = {"tracking": tracker, "fixed at 20 Hz": lbt.kalman(plant).controller}
 runs = {
     name: lbt.simulate(
@@ -50,5 +52,7 @@ for update in tracker.history[::10]:
         f"{update.frequencies_hz[0]:6.3f} Hz {update.reason}"
     )
 if len(sys.argv) > 1:
-    figure = lbt.tracking_figure(tracker.history, runs, truth=[shake], start_s=SETTLE_S)
+    figure = lbt.report.figures.tracking_figure(
+        tracker.history, runs, truth=[shake], start_s=SETTLE_S
+    )
     print(save_figure(figure, sys.argv[1]))

@@ -10,8 +10,14 @@ import subprocess
 import numpy as np
 
 STRICT = [
-    "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion", "-Wconversion",
-]  # fmt: skip
+    "-std=c99",
+    "-pedantic",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+    "-Wdouble-promotion",
+    "-Wconversion",
+]
 PLAIN = ["-O2", "-ffp-contract=off"]  # each product and each sum is rounded
 _fresh = itertools.count()
 

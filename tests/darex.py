@@ -76,12 +76,35 @@ def example_2_5(tau):
 # the solution has X[2, 2] = -9.9, with A[1, 2] = 0.1 it is 0. Both are here.
 EXAMPLES = (
     _example("1.1", [[2, -1], [1, 0]], [[1], [0]], np.diag([0, 1]), [[0]], np.eye(2)),
-    _example("1.3", [[0, 1], [0, 0]], [[0], [1]], [[1, 2], [2, 4]], [[1]], [[1, 2], [2, 2 + np.sqrt(5)]]),
-    _example("1.4 A=0.01", [[0, 0.1, 0], [0, 0, 0.01], [0, 0, 0]], [[1, 0], [0, 0], [0, 1]], np.diag([1e5, 1e3, -10]), np.diag([0, 1]), np.diag([1e5, 1e3, -9.9])),
-    _example("1.4 A=0.1", [[0, 0.1, 0], [0, 0, 0.1], [0, 0, 0]], [[1, 0], [0, 0], [0, 1]], np.diag([1e5, 1e3, -10]), np.diag([0, 1]), np.diag([1e5, 1e3, 0])),
+    _example(
+        "1.3", [[0, 1], [0, 0]], [[0], [1]], [[1, 2], [2, 4]], [[1]], [[1, 2], [2, 2 + np.sqrt(5)]]
+    ),
+    _example(
+        "1.4 A=0.01",
+        [[0, 0.1, 0], [0, 0, 0.01], [0, 0, 0]],
+        [[1, 0], [0, 0], [0, 1]],
+        np.diag([1e5, 1e3, -10]),
+        np.diag([0, 1]),
+        np.diag([1e5, 1e3, -9.9]),
+    ),
+    _example(
+        "1.4 A=0.1",
+        [[0, 0.1, 0], [0, 0, 0.1], [0, 0, 0]],
+        [[1, 0], [0, 0], [0, 1]],
+        np.diag([1e5, 1e3, -10]),
+        np.diag([0, 1]),
+        np.diag([1e5, 1e3, 0]),
+    ),
     *(example_2_1(delta) for delta in (1e6, 1e-6, 1.0, 1e10)),
     *(example_2_3(epsilon) for epsilon in (1e6, 1e3, 1.0)),
     *(example_2_4(epsilon) for epsilon in (1e6, 1.0, 1e-6)),
     *(example_2_5(tau) for tau in (1e8, 1e6, 1e4)),
-    _example("4.1 n=100", np.eye(100, k=1), np.eye(100)[:, -1:], np.eye(100), [[1]], np.diag(np.arange(1.0, 101))),
-)  # fmt: skip
+    _example(
+        "4.1 n=100",
+        np.eye(100, k=1),
+        np.eye(100)[:, -1:],
+        np.eye(100),
+        [[1]],
+        np.diag(np.arange(1.0, 101)),
+    ),
+)

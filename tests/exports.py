@@ -22,8 +22,10 @@ def bare_design(controller, **changes):
         **{
             "method": "kalman",
             "controller": controller,
-            "certificate": lbt.Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
-            "solver": lbt.SolverReport(route="riccati", status="made", iterations=0),
+            "certificate": lbt.design.Certificate(
+                checks=(), gamma=np.nan, rms_per_output=np.zeros(0)
+            ),
+            "solver": lbt.design.SolverReport(route="riccati", status="made", iterations=0),
             **changes,
         }
     )
@@ -39,12 +41,12 @@ def lbt_designs():
     config = lbt_config()
 
     def prior(lines):
-        return lbt.kalman(lbt.spread_plant(config.plant, half_width_hz=3.5, lines=lines))
+        return lbt.kalman(lbt.models.spread_plant(config.plant, half_width_hz=3.5, lines=lines))
 
     return {
         "kalman": lbt.kalman(config.plant),
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
-        "integrator": lbt.optimal_integrator(config.hardware, config.truth),
+        "integrator": lbt.design.optimal_integrator(config.hardware, config.truth),
         "prior": prior(15),
         "turned": turned(prior(3)),
     }

@@ -6,24 +6,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from lbt_synth.pages import (
-    Area,
-    Axis,
-    Bars,
-    Cell,
-    Chart,
-    Curve,
-    Listing,
-    Map,
-    Notice,
-    Page,
-    Panel,
-    Paragraph,
-    Rule,
-    Section,
-    Span,
-    Table,
-)
+from lbt_synth.report.page.blocks import Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.page.charts import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule, Span
+from lbt_synth.storage.tables import Cell, Table
 
 HOSTILE = "</script><script>alert(1)</script><b>&\"'$x$ $$y$$ _z"
 VOID = {"meta", "br", "hr", "img", "input", "link"}
@@ -113,14 +98,21 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
                 y=Axis(label="gain", unit="-"),
                 marks=(
                     Map(
-                        x=np.arange(6.0), y=[0.2, 0.4, 0.7, 1.0, 1.4], values=values, low=0,
-                        high=30, label="ratio", unit="%", levels=(10, 20), blank="unstable",
+                        x=np.arange(6.0),
+                        y=[0.2, 0.4, 0.7, 1.0, 1.4],
+                        values=values,
+                        low=0,
+                        high=30,
+                        label="ratio",
+                        unit="%",
+                        levels=(10, 20),
+                        blank="unstable",
                     ),
                 ),
             )
             for title in (name, "other")
         ),
-    )  # fmt: skip
+    )
     turn = np.linspace(0, 2 * np.pi, 61)
     rest = Chart(
         key="rest",

@@ -15,7 +15,7 @@ LBT_YAML = ROOT / "examples" / "lbt.yaml"
 def lbt_axis_plant(*, modes: int = 1, delay_frames: float = 2.0, damping: float = 0.01):
     """The LBT's numbers: 564 nm of vibration at 20 Hz, 592 nm of AR1 turbulence, 15.5 nm noise."""
     pole = 0.98860
-    turbulence = lbt.ARModel(
+    turbulence = lbt.models.ARModel(
         coefficients=[pole], driving_rms_nm=592 * np.sqrt(1 - pole**2), frame_rate_hz=800
     )
     vibrations = [
@@ -39,6 +39,9 @@ def random_problem(rng: np.random.Generator, n: int, q: int = 1, p: int | None =
     A *= rng.uniform(0.5, 1.05) / max(abs(np.linalg.eigvals(A)))
     D = rng.standard_normal((q, p))
     return lbt.EstimationProblem(
-        A=A, B=rng.standard_normal((n, p)), C=rng.standard_normal((q, n)), D=D,
+        A=A,
+        B=rng.standard_normal((n, p)),
+        C=rng.standard_normal((q, n)),
+        D=D,
         L=rng.standard_normal((l, n)),
-    )  # fmt: skip
+    )

@@ -80,9 +80,13 @@ def simulated(controller, config):
     """Commands in the loop of a configuration, from the first frame on."""
     loaded = lbt.load_config(config)
     return lbt.simulate(
-        controller, loaded.truth, hardware=loaded.hardware, frames=FRAMES, seed=SEED,
+        controller,
+        loaded.truth,
+        hardware=loaded.hardware,
+        frames=FRAMES,
+        seed=SEED,
         settle_frames=0,
-    ).commands[0]  # fmt: skip
+    ).commands[0]
 
 
 def main(precision, output, config, *named):

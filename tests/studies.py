@@ -41,8 +41,8 @@ def study_file(folder: Path, *, base: str = BASE, **changes: str) -> Path:
     return path
 
 
-def loaded(folder: Path, **changes: str) -> lbt.Study:
-    return lbt.load_study(study_file(folder, **changes))
+def loaded(folder: Path, **changes: str) -> lbt.studies.Study:
+    return lbt.studies.load_study(study_file(folder, **changes))
 
 
 LBT_TEXT = LBT_YAML.read_text()

@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.report.study import study_page
-from lbt_synth.report.study_info import StudyInfo
+from lbt_synth.report.study.info import StudyInfo
+from lbt_synth.report.study.page import study_page
 
 PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")
 
@@ -52,7 +52,7 @@ INFO = StudyInfo(
     digests={"steady": "0123456789abcdef" * 4},
     digest="fedcba98" * 8,
     failures=tuple(
-        lbt.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
+        lbt.studies.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
         for row in range(0, 300, 20)
     ),
     files=(),
@@ -65,5 +65,5 @@ INFO = StudyInfo(
 
 
 def page_of(columns, controllers=CONTROLLERS, parameters=PARAMETERS, info=INFO):
-    statistics = lbt.study_statistics(columns, parameters, controllers)
+    statistics = lbt.studies.study_statistics(columns, parameters, controllers)
     return study_page(info, statistics, columns)

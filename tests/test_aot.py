@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from test_telemetry import full, same, telemetries
 
 import lbt_synth as lbt
-from lbt_synth.telemetry import losses
+from lbt_synth.files.telemetry.aot import losses
 
 pytestmark = pytest.mark.e2e
 
@@ -52,20 +52,20 @@ def strictly_read(path):
 @pytest.mark.parametrize("with_slopes", [True, False])
 def test_what_the_standard_carries_comes_back(tmp_path, with_slopes):
     seen = full(with_slopes=with_slopes, slope_unit="pixel" if with_slopes else "")
-    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    back = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     lost = losses(seen)
     assert lost == ("residual_nm", "total_nm", "controller")
     assert same(seen, back, but=lost, rtol=ROUNDING)
     assert all(getattr(back, name) is None for name in lost)
     assert not losses(back)
-    again = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "u.aot.fits", back))
+    again = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "u.aot.fits", back))
     assert same(back, again, rtol=ROUNDING)
 
 
 def test_the_file_says_what_the_telemetry_says(tmp_path):
     """Field by field, through aotpy alone."""
     seen = full()
-    system = strictly_read(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    system = strictly_read(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     assert (system.ao_mode, system.name) == ("SCAO", "LBT, c?t? gauche")
     assert system.strehl_ratio == 0.83
     assert system.strehl_wavelength == pytest.approx(2.2e-6)
@@ -128,11 +128,18 @@ def test_the_file_says_what_the_telemetry_says(tmp_path):
 def test_aotpy_finds_nothing_wrong(tmp_path, capsys):
     for name, seen in (
         ("full", full()),
-        ("least", lbt.Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])),
-        ("wide", full(commands=np.ones((6, 5)), influence_matrix=np.ones((2, 5)),
-                      controller=None, integrator_gains=None)),
-    ):  # fmt: skip
-        path = lbt.save_telemetry(tmp_path / f"{name}.aot.fits", seen)
+        ("least", lbt.files.Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])),
+        (
+            "wide",
+            full(
+                commands=np.ones((6, 5)),
+                influence_matrix=np.ones((2, 5)),
+                controller=None,
+                integrator_gains=None,
+            ),
+        ),
+    ):
+        path = lbt.files.save_telemetry(tmp_path / f"{name}.aot.fits", seen)
         strictly_read(path)
         aotpy.verify_file(path)
         said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("[")]
@@ -151,7 +158,7 @@ def test_aotpy_finds_nothing_wrong(tmp_path, capsys):
 @given(seen=telemetries())
 def test_any_telemetry_comes_back_as_far_as_it_goes(tmp_path, seen):
     rounded = ("commands", "measurements", "total_nm", "obstruction")
-    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    back = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     # below, a command in metres is denormal
     assert np.allclose(back.commands, seen.commands, rtol=ROUNDING, atol=1e-290)
     assert np.array_equal(back.measurements, seen.measurements)
@@ -164,7 +171,7 @@ def test_any_telemetry_comes_back_as_far_as_it_goes(tmp_path, seen):
 def test_texts_that_fits_cards_mangle(tmp_path, text):
     """Astropy loses "'/" in a text that goes over several cards."""
     seen = full(name=text, metadata={text: text, "&/'": "'/", "long": "x' /" * 60})
-    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    back = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     assert (back.name, dict(back.metadata)) == (text, dict(seen.metadata))
 
 
@@ -172,11 +179,11 @@ def test_the_loop_equation_holds_in_the_aot_file(tmp_path):
     """An integrator, from the standard's fields alone: its matrix, its filter, its delay."""
     path = lbt.LoopHardware(frame_rate_hz=500, sensor_matrix=[[1.0, 0.2], [0.0, 0.9], [0.3, 0.1]])
     design = lbt.integrator(path, gain=0.3)
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
     truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=50)
-    seen = lbt.telemetry_of(run, path, design=design, sensor_gain=1.0)
-    system = strictly_read(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    seen = lbt.files.telemetry_of(run, path, design=design, sensor_gain=1.0)
+    system = strictly_read(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     loop = system.loops[0]
     y = loop.input_sensor.measurements.data.reshape(50, -1)
     inside = y @ loop.control_matrix.data.reshape(2, -1).T
@@ -191,45 +198,47 @@ def test_the_loop_equation_holds_in_the_aot_file(tmp_path):
     assert np.abs(right).max() > 1
     assert np.allclose(1e9 * loop.residual_commands.data, inside)
     assert loop.delay == 2
-    assert lbt.load_telemetry(tmp_path / "t.aot.fits").integrator_gains == pytest.approx([0.3] * 2)
+    assert lbt.files.load_telemetry(tmp_path / "t.aot.fits").integrator_gains == pytest.approx(
+        [0.3] * 2
+    )
 
 
 def test_an_obstruction_needs_a_diameter(tmp_path):
     seen = full(diameter_m=None)
     assert losses(seen) == ("residual_nm", "total_nm", "controller", "obstruction")
-    back = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.aot.fits", seen))
+    back = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     assert (back.diameter_m, back.obstruction) == (None, None)
 
 
 def test_gains_alone_make_a_time_filter(tmp_path):
     """Of a loop whose controller is told by its gains only."""
     seen = full(controller=None, integrator_gains=[0.2, 0.7])
-    path = lbt.save_telemetry(tmp_path / "t.aot.fits", seen)
+    path = lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen)
     loop = strictly_read(path).loops[0]
     assert loop.time_filter_num.data.tolist() == [[0.0, 0.2], [0.0, 0.7]]
     assert np.array_equal(loop.control_matrix.data, seen.reconstructor.reshape(2, 2, 4))
     none = full(controller=None, integrator_gains=None)
-    loop = strictly_read(lbt.save_telemetry(path, none)).loops[0]
+    loop = strictly_read(lbt.files.save_telemetry(path, none)).loops[0]
     assert loop.time_filter_num is loop.control_matrix is loop.residual_commands is None
 
 
 def test_float32(tmp_path):
     seen = full()
-    path = lbt.save_telemetry(tmp_path / "t.aot.fits", seen, precision="float32")
+    path = lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen, precision="float32")
     loop = strictly_read(path).loops[0]
     assert loop.commands.data.dtype.itemsize == 4
     assert loop.commands_to_modes.data.dtype.itemsize == 8
-    assert np.allclose(lbt.load_telemetry(path).commands, seen.commands, rtol=1e-7)
+    assert np.allclose(lbt.files.load_telemetry(path).commands, seen.commands, rtol=1e-7)
 
 
 def test_the_header_says_which_layout_it_is(tmp_path):
     """Not the name: an AOT file may be called anything that ends in .fits."""
     seen = full()
-    aot = lbt.save_telemetry(tmp_path / "t.fits", seen, format="aot")
-    assert lbt.load_telemetry(aot).residual_nm is None
-    own = lbt.save_telemetry(tmp_path / "own.fits", seen)
+    aot = lbt.files.save_telemetry(tmp_path / "t.fits", seen, format="aot")
+    assert lbt.files.load_telemetry(aot).residual_nm is None
+    own = lbt.files.save_telemetry(tmp_path / "own.fits", seen)
     own.rename(tmp_path / "own.aot.fits")
-    assert same(seen, lbt.load_telemetry(tmp_path / "own.aot.fits"))
+    assert same(seen, lbt.files.load_telemetry(tmp_path / "own.aot.fits"))
 
 
 # ---------------------------------------------------------------- files of others
@@ -273,7 +282,7 @@ def foreign(tmp_path, *, edit=lambda system: None, second=False):
 
 def test_a_file_of_somebody_else(tmp_path):
     path, system = foreign(tmp_path)
-    seen = lbt.load_telemetry(path)
+    seen = lbt.files.load_telemetry(path)
     loop = system.loops[0]
     assert np.allclose(seen.commands, 1e9 * loop.commands.data)  # metres are the standard's unit
     assert np.array_equal(seen.measurements, loop.input_sensor.measurements.data.reshape(3, 6))
@@ -288,7 +297,7 @@ def test_a_file_of_somebody_else(tmp_path):
 
 
 def test_the_first_loop_with_series_is_taken(tmp_path):
-    seen = lbt.load_telemetry(foreign(tmp_path, second=True)[0])
+    seen = lbt.files.load_telemetry(foreign(tmp_path, second=True)[0])
     assert seen.metadata["aot_loop"] == "HO loop"
 
 
@@ -296,7 +305,7 @@ def test_the_rate_of_the_detector(tmp_path):
     def edit(system):
         system.wavefront_sensors[0].detector = aotpy.Detector("D", frame_rate=640.0)
 
-    assert lbt.load_telemetry(foreign(tmp_path, edit=edit)[0]).frame_rate_hz == 640
+    assert lbt.files.load_telemetry(foreign(tmp_path, edit=edit)[0]).frame_rate_hz == 640
 
 
 def drop(name):
@@ -334,8 +343,8 @@ def still(system):
     ],
 )
 def test_files_that_do_not_fit(tmp_path, edit, text):
-    with pytest.raises(lbt.TelemetryError, match=text) as caught:
-        lbt.load_telemetry(foreign(tmp_path, edit=edit)[0])
+    with pytest.raises(lbt.errors.TelemetryError, match=text) as caught:
+        lbt.files.load_telemetry(foreign(tmp_path, edit=edit)[0])
     assert "\n" not in str(caught.value)
 
 
@@ -347,18 +356,18 @@ def test_a_file_that_refers_to_others_is_not_followed(tmp_path):
         system.loops[0].commands = aotpy.io.FITSFileImage(tmp_path / "else.fits", 1)
         system.loops[0].commands.time = None
 
-    with pytest.raises(lbt.TelemetryError, match="External image"):
-        lbt.load_telemetry(foreign(tmp_path, edit=edit)[0])
+    with pytest.raises(lbt.errors.TelemetryError, match="External image"):
+        lbt.files.load_telemetry(foreign(tmp_path, edit=edit)[0])
 
 
 def test_damage_is_refused(tmp_path):
     seen = full()
-    path = lbt.save_telemetry(tmp_path / "t.aot.fits", seen)
+    path = lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen)
     content = path.read_bytes()
     for length in np.linspace(2880, len(content) - 40, 12).astype(int):
         path.write_bytes(content[:length])
-        with pytest.raises(lbt.TelemetryError) as caught:
-            lbt.load_telemetry(path)
+        with pytest.raises(lbt.errors.TelemetryError) as caught:
+            lbt.files.load_telemetry(path)
         assert "\n" not in str(caught.value)
     rng = np.random.default_rng(1)
     found = 0
@@ -367,8 +376,8 @@ def test_damage_is_refused(tmp_path):
         damaged[rng.integers(len(content))] ^= 1 << rng.integers(8)
         path.write_bytes(bytes(damaged))
         try:
-            back = lbt.load_telemetry(path)
-        except lbt.TelemetryError:
+            back = lbt.files.load_telemetry(path)
+        except lbt.errors.TelemetryError:
             found += 1
         else:
             assert same(seen, back, but=losses(seen), rtol=ROUNDING)
@@ -382,18 +391,18 @@ def test_only_the_mark_is_aot(tmp_path):
     units[0].header["AOT-VERS"] = "9.0.0"
     units.writeto(buffer)
     path.write_bytes(buffer.getvalue())
-    with pytest.raises(lbt.TelemetryError, match="Unknown version '9.0.0'"):
-        lbt.load_telemetry(path)
+    with pytest.raises(lbt.errors.TelemetryError, match="Unknown version '9.0.0'"):
+        lbt.files.load_telemetry(path)
 
 
 # ---------------------------------------------------------------- without the extra
 def test_without_aotpy_it_says_what_to_install(tmp_path, monkeypatch):
-    path = lbt.save_telemetry(tmp_path / "t.aot.fits", full())
+    path = lbt.files.save_telemetry(tmp_path / "t.aot.fits", full())
     monkeypatch.setitem(sys.modules, "aotpy", None)
-    with pytest.raises(lbt.TelemetryError, match=r'pip install "lbt-synth\[aot\]"'):
-        lbt.load_telemetry(path)
-    with pytest.raises(lbt.OutputError, match=r'pip install "lbt-synth\[aot\]"'):
-        lbt.save_telemetry(tmp_path / "u.aot.fits", full())
+    with pytest.raises(lbt.errors.TelemetryError, match=r'pip install "lbt-synth\[aot\]"'):
+        lbt.files.load_telemetry(path)
+    with pytest.raises(lbt.errors.OutputError, match=r'pip install "lbt-synth\[aot\]"'):
+        lbt.files.save_telemetry(tmp_path / "u.aot.fits", full())
     assert not (tmp_path / "u.aot.fits").exists()
-    own = lbt.save_telemetry(tmp_path / "t.fits", full())  # needs no extra
-    assert lbt.load_telemetry(own).seed == 7
+    own = lbt.files.save_telemetry(tmp_path / "t.fits", full())  # needs no extra
+    assert lbt.files.load_telemetry(own).seed == 7

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lbt_synth.campaign import run_cases
 from lbt_synth.errors import NumericalError, OutputError, ProblemError, UnstableLoopError
+from lbt_synth.storage import run_cases
 
 CASES = {f"case-{i}": {"x": i} for i in range(6)}
 
@@ -145,7 +145,7 @@ def test_no_directory(tmp_path):
 
 SCRIPT = """
     import os, sys, time, pathlib
-    from lbt_synth.campaign import run_cases
+    from lbt_synth.storage import run_cases
 
     def slow(case):
         with pathlib.Path(os.environ["RUNS"]).open("a") as stream:   # one line a run that ended

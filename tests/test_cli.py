@@ -91,10 +91,10 @@ def test_verification_that_fails_has_status_1(tmp_path, capsys, monkeypatch, gai
     def strict(self):
         found = honest(self)
         checks = tuple(
-            lbt.Check(name=c.name, value=c.limit + 1, limit=c.limit, method=c.method)
+            lbt.design.Check(name=c.name, value=c.limit + 1, limit=c.limit, method=c.method)
             for c in found.checks
         )
-        return lbt.Certificate(
+        return lbt.design.Certificate(
             checks=checks, gamma=found.gamma, rms_per_output=found.rms_per_output
         )
 
@@ -162,11 +162,31 @@ def test_an_unstable_loop_has_status_1(capsys, gains):
 BAD = [
     (("design", CONFIG, "--method", "hinf", "--gamma", "10", "-o", "OUT.fits"), 1, "at least 15"),
     (("design", CONFIG, "--method", "hinf", "--gamma", "nan", "-o", "OUT.fits"), 2, "finite"),
-    (("design", CONFIG, "--method", "hinf", "--gamma-ratio", "0.5", "-o", "OUT.fits"), 2, "at least 1"),
-    (("design", CONFIG, "--method", "kalman", "--gamma", "200", "-o", "OUT.fits"), 2, "goes with --method hinf"),
-    (("design", CONFIG, "--method", "kalman", "--route", "lmi", "-o", "OUT.fits"), 2, "takes riccati or sdp"),
-    (("design", CONFIG, "--method", "kalman", "--gain", "0.5", "-o", "OUT.fits"), 2, "goes with --method integrator"),
-    (("design", CONFIG, "--method", "integrator", "--gain", "1.5", "-o", "OUT.fits"), 1, "failed its certificate"),
+    (
+        ("design", CONFIG, "--method", "hinf", "--gamma-ratio", "0.5", "-o", "OUT.fits"),
+        2,
+        "at least 1",
+    ),
+    (
+        ("design", CONFIG, "--method", "kalman", "--gamma", "200", "-o", "OUT.fits"),
+        2,
+        "goes with --method hinf",
+    ),
+    (
+        ("design", CONFIG, "--method", "kalman", "--route", "lmi", "-o", "OUT.fits"),
+        2,
+        "takes riccati or sdp",
+    ),
+    (
+        ("design", CONFIG, "--method", "kalman", "--gain", "0.5", "-o", "OUT.fits"),
+        2,
+        "goes with --method integrator",
+    ),
+    (
+        ("design", CONFIG, "--method", "integrator", "--gain", "1.5", "-o", "OUT.fits"),
+        1,
+        "failed its certificate",
+    ),
     (("design", CONFIG, "--method", "kalman", "-o", "OUT.txt"), 2, "must end in .fits"),
     (("design", CONFIG, "--method", "kalman", "-o", "none/OUT.fits"), 2, "cannot write"),
     (("design", "none.yaml", "--method", "kalman", "-o", "OUT.fits"), 2, "cannot read none.yaml"),
@@ -191,7 +211,7 @@ BAD = [
     (("paper", "-o", "FILE"), 2, "cannot make the directory"),
     (("frobnicate",), 2, "invalid choice"),
     ((), 2, "required"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("arguments", "expected", "text"), BAD)
@@ -242,9 +262,17 @@ def loaded_after(code):
 def test_imports_are_quick(code):
     """Nothing heavier than the standard library before a name is used."""
     heavy = {
-        "cvxpy", "control", "matplotlib", "astropy", "scipy", "pydantic", "rich", "numpy", "bokeh",
+        "cvxpy",
+        "control",
+        "matplotlib",
+        "astropy",
+        "scipy",
+        "pydantic",
+        "rich",
+        "numpy",
+        "bokeh",
         "jinja2",
-    }  # fmt: skip
+    }
     assert not heavy & loaded_after(code)
 
 

@@ -65,13 +65,33 @@ def test_the_example_is_the_papers_table_i(config):
         (("atmosphere",), ..., "atmosphere", "is missing"),
         (("model", "turbulence", "kind"), "ar9", "model.turbulence", "ar9"),
         (("model", "vibrations"), [], "model.vibrations", "leave the key out"),
-        (("model", "vibrations", 0, "rms_mas"), -80, "model.vibrations[0].rms_mas", "greater than 0"),
+        (
+            ("model", "vibrations", 0, "rms_mas"),
+            -80,
+            "model.vibrations[0].rms_mas",
+            "greater than 0",
+        ),
         (("model", "vibrations", 0, "damping"), 1.0, "model.vibrations[0].damping", "less than 1"),
         (("model", "vibrations", 0, "damping"), 0, "model.vibrations[0].damping", "greater than 0"),
         (("model", "vibrations", 0, "rms_nm"), 5.0, "model.vibrations[0]", "exactly one of rms_nm"),
-        (("model", "vibrations", 0, "direction_deg"), 5.0, "model.vibrations[0]", "exactly one of axis"),
-        (("model", "vibrations", 0, "frequency_hz"), 500, "model.vibrations[0].frequency_hz", "Nyquist"),
-        (("truth", "vibrations", 0, "frequency_hz"), 500, "truth.vibrations[0].frequency_hz", "Nyquist"),
+        (
+            ("model", "vibrations", 0, "direction_deg"),
+            5.0,
+            "model.vibrations[0]",
+            "exactly one of axis",
+        ),
+        (
+            ("model", "vibrations", 0, "frequency_hz"),
+            500,
+            "model.vibrations[0].frequency_hz",
+            "Nyquist",
+        ),
+        (
+            ("truth", "vibrations", 0, "frequency_hz"),
+            500,
+            "truth.vibrations[0].frequency_hz",
+            "Nyquist",
+        ),
         (("truth", "vibrations", 0, "damping"), 0.1, "truth.vibrations[0]", "damping goes with"),
         (("loop", "delay_frames"), 0.5, "loop.delay_frames", "greater than or equal to 1"),
         (("loop", "delay_frames"), "2", "loop.delay_frames", "valid number"),
@@ -80,7 +100,12 @@ def test_the_example_is_the_papers_table_i(config):
         (("loop", "frame_rate_hz"), float("inf"), "loop.frame_rate_hz", "finite number"),
         (("sensor", "noise_nm"), 3.0, "sensor", "exactly one of noise_nm, noise_mas, pyramid"),
         (("sensor", "matrix"), [[1, 2], [3]], "", "sensor_matrix must be a rectangular array"),
-        (("imaging", "other_modes_strehl"), 1.2, "imaging.other_modes_strehl", "less than or equal"),
+        (
+            ("imaging", "other_modes_strehl"),
+            1.2,
+            "imaging.other_modes_strehl",
+            "less than or equal",
+        ),
         (("design", "gamma_ratio"), 0.9, "design.gamma_ratio", "greater than or equal to 1"),
         (("version",), 2, "version", "1"),
         (("version",), True, "version", "valid integer"),
@@ -88,12 +113,16 @@ def test_the_example_is_the_papers_table_i(config):
         (("atmosphere", "seeing_arcsec"), 1e-320, "", "far from any telescope"),
         (("sensor", "pyramid", "photons"), 1e300, "", "far from any telescope"),
         (("mirror", "influence_matrix"), [[0, 0], [0, 0]], "", "got only zeros"),
-        (("model", "turbulence"), {"kind": "ar", "coefficients": [1.2], "driving_rms_nm": 1.0},
-         "model.turbulence.coefficients", "must be stationary"),
+        (
+            ("model", "turbulence"),
+            {"kind": "ar", "coefficients": [1.2], "driving_rms_nm": 1.0},
+            "model.turbulence.coefficients",
+            "must be stationary",
+        ),
     ],
-)  # fmt: skip
+)
 def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
-    with pytest.raises(lbt.ConfigError) as caught:
+    with pytest.raises(lbt.errors.ConfigError) as caught:
         lbt.load_config(write(tmp_path, changed(path, value)))
     message = str(caught.value)
     assert text in message
@@ -119,19 +148,19 @@ def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
     ],
 )
 def test_other_texts_are_refused(tmp_path, content, text):
-    with pytest.raises(lbt.ConfigError, match=text) as caught:
+    with pytest.raises(lbt.errors.ConfigError, match=text) as caught:
         lbt.load_config(write(tmp_path, content))
     assert "\n" not in str(caught.value)
 
 
 def test_unreadable_files(tmp_path):
-    with pytest.raises(lbt.ConfigError, match="cannot read .*No such file"):
+    with pytest.raises(lbt.errors.ConfigError, match="cannot read .*No such file"):
         lbt.load_config(tmp_path / "none.yaml")
-    with pytest.raises(lbt.ConfigError, match="cannot read .*directory"):
+    with pytest.raises(lbt.errors.ConfigError, match="cannot read .*directory"):
         lbt.load_config(tmp_path)
     binary = tmp_path / "b.yaml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(lbt.ConfigError, match="not a text file"):
+    with pytest.raises(lbt.errors.ConfigError, match="not a text file"):
         lbt.load_config(binary)
 
 
@@ -142,7 +171,7 @@ def test_every_kind_of_turbulence_and_noise(tmp_path):
     ar = lbt.load_config(write(tmp_path, changed(("model", "turbulence"), given)))
     assert ar.plant.turbulence[0].coefficients.tolist() == [0.9, 0.05]
     mas = lbt.load_config(write(tmp_path, changed(("sensor",), {"noise_mas": 2.0})))
-    assert mas.noise_nm == pytest.approx(2 * lbt.nm_per_mas(8.22))
+    assert mas.noise_nm == pytest.approx(2 * lbt.models.nm_per_mas(8.22))
 
 
 def test_directions(tmp_path):
@@ -203,22 +232,53 @@ def test_no_telescope_and_no_atmosphere(tmp_path):
 @pytest.mark.parametrize(
     ("sections", "key", "text"),
     [
-        ({"sensor": {"noise_nm": None, "noise_mas": 2.0}}, "telescope",
-         "telescope is missing: sensor.noise_mas is in mas"),
-        ({"sensor": {"noise_nm": None, "pyramid": GOOD["sensor"]["pyramid"]}}, "telescope",
-         "telescope is missing: the noise of sensor.pyramid"),
-        ({"model": {"turbulence": {"kind": "ar1"}}}, "atmosphere",
-         "atmosphere is missing: model.turbulence of kind ar1"),
-        ({"model": {"turbulence": [AR, {"kind": "ar2"}]}}, "atmosphere",
-         r"atmosphere is missing: model.turbulence\[1\] of kind ar2"),
-        ({"model": {"vibrations": [
-            {"axis": "tip", "frequency_hz": 20.0, "damping": 0.01, "rms_mas": 30.0}]}},
-         "telescope", r"telescope is missing: model.vibrations\[0\].rms_mas is in mas"),
-        ({"truth": {"vibrations": [
-            {"kind": "sinusoid", "axis": "tip", "frequency_hz": 20.0, "rms_mas": 30.0}]}},
-         "telescope", r"telescope is missing: truth.vibrations\[0\].rms_mas"),
-        ({"truth": {"turbulence": "frozen_flow"}}, "atmosphere",
-         "atmosphere is missing: truth.turbulence: frozen_flow"),
+        (
+            {"sensor": {"noise_nm": None, "noise_mas": 2.0}},
+            "telescope",
+            "telescope is missing: sensor.noise_mas is in mas",
+        ),
+        (
+            {"sensor": {"noise_nm": None, "pyramid": GOOD["sensor"]["pyramid"]}},
+            "telescope",
+            "telescope is missing: the noise of sensor.pyramid",
+        ),
+        (
+            {"model": {"turbulence": {"kind": "ar1"}}},
+            "atmosphere",
+            "atmosphere is missing: model.turbulence of kind ar1",
+        ),
+        (
+            {"model": {"turbulence": [AR, {"kind": "ar2"}]}},
+            "atmosphere",
+            r"atmosphere is missing: model.turbulence\[1\] of kind ar2",
+        ),
+        (
+            {
+                "model": {
+                    "vibrations": [
+                        {"axis": "tip", "frequency_hz": 20.0, "damping": 0.01, "rms_mas": 30.0}
+                    ]
+                }
+            },
+            "telescope",
+            r"telescope is missing: model.vibrations\[0\].rms_mas is in mas",
+        ),
+        (
+            {
+                "truth": {
+                    "vibrations": [
+                        {"kind": "sinusoid", "axis": "tip", "frequency_hz": 20.0, "rms_mas": 30.0}
+                    ]
+                }
+            },
+            "telescope",
+            r"telescope is missing: truth.vibrations\[0\].rms_mas",
+        ),
+        (
+            {"truth": {"turbulence": "frozen_flow"}},
+            "atmosphere",
+            "atmosphere is missing: truth.turbulence: frozen_flow",
+        ),
         ({"atmosphere": GOOD["atmosphere"]}, "telescope", "telescope is missing: the turbulence"),
         # lists of another length, or of other things
         ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one a measurement \(2\); got 1"),
@@ -227,35 +287,76 @@ def test_no_telescope_and_no_atmosphere(tmp_path):
         ({"sensor": {"noise_nm": "15"}}, "sensor.noise_nm", "valid number"),
         ({"model": {"turbulence": [AR]}}, "model.turbulence", r"one an axis \(2\); got 1"),
         ({"model": {"turbulence": []}}, "model.turbulence", "at least 1 item"),
-        ({"model": {"turbulence": [AR, {**AR, "coefficients": [1.2]}]}},
-         "model.turbulence[1].coefficients", "must be stationary"),
-        ({"model": {"turbulence": [AR, {**AR, "coefficient": 1}]}},
-         "model.turbulence[1].coefficient", "did you mean coefficients"),
+        (
+            {"model": {"turbulence": [AR, {**AR, "coefficients": [1.2]}]}},
+            "model.turbulence[1].coefficients",
+            "must be stationary",
+        ),
+        (
+            {"model": {"turbulence": [AR, {**AR, "coefficient": 1}]}},
+            "model.turbulence[1].coefficient",
+            "did you mean coefficients",
+        ),
         ({"model": {"sensor_gain": [1.0, 1.0, 1.0]}}, "model.sensor_gain", "got 3"),
         ({"truth": {"sensor_gain": [1.0]}}, "truth.sensor_gain", "got 1"),
         ({"truth": {"sensor_gain": [1.0, 0.9]}}, "truth.sensor_gain", "got the factors 1, 0.9"),
         ({"truth": {"vibrations": "same"}}, "truth.vibrations", "model"),
-        ({"sensor": {"noise_nm": [1.0, 2.0, 3.0], "matrix": [[1, 0], [0, 1], [1, 1]]},
-          "model": {"turbulence": {"kind": "ar2"}}}, "model.turbulence", "3 for 2 axes"),
+        (
+            {
+                "sensor": {"noise_nm": [1.0, 2.0, 3.0], "matrix": [[1, 0], [0, 1], [1, 1]]},
+                "model": {"turbulence": {"kind": "ar2"}},
+            },
+            "model.turbulence",
+            "3 for 2 axes",
+        ),
         # one axis
         ({"loop": {"axes": 3}}, "loop.axes", "less than or equal to 2"),
-        ({"loop": {"axes": 1}, "sensor": {"matrix": [[1, 0], [0, 1]]}}, "sensor.matrix",
-         "must have 1 columns, as loop.axes says; got 2"),
-        ({"loop": {"axes": 1}, "model": {"vibrations": [
-            {"axis": "tilt", "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 30.0}]}},
-         "model.vibrations[0]", "one axis: leave axis and direction_deg out"),
-        ({"loop": {"axes": 1}, "truth": {"vibrations": [
-            {"kind": "sinusoid", "direction_deg": 3.0, "frequency_hz": 20.0, "rms_nm": 30.0}]}},
-         "truth.vibrations[0]", "one axis"),
-        ({"model": {"vibrations": [{"frequency_hz": 20.0, "damping": 0.01, "rms_nm": 30.0}]}},
-         "model.vibrations[0]", "expected exactly one of axis, direction_deg"),
+        (
+            {"loop": {"axes": 1}, "sensor": {"matrix": [[1, 0], [0, 1]]}},
+            "sensor.matrix",
+            "must have 1 columns, as loop.axes says; got 2",
+        ),
+        (
+            {
+                "loop": {"axes": 1},
+                "model": {
+                    "vibrations": [
+                        {"axis": "tilt", "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 30.0}
+                    ]
+                },
+            },
+            "model.vibrations[0]",
+            "one axis: leave axis and direction_deg out",
+        ),
+        (
+            {
+                "loop": {"axes": 1},
+                "truth": {
+                    "vibrations": [
+                        {
+                            "kind": "sinusoid",
+                            "direction_deg": 3.0,
+                            "frequency_hz": 20.0,
+                            "rms_nm": 30.0,
+                        }
+                    ]
+                },
+            },
+            "truth.vibrations[0]",
+            "one axis",
+        ),
+        (
+            {"model": {"vibrations": [{"frequency_hz": 20.0, "damping": 0.01, "rms_nm": 30.0}]}},
+            "model.vibrations[0]",
+            "expected exactly one of axis, direction_deg",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_missing_or_does_not_fit_is_said(tmp_path, sections, key, text):
     content = small(**sections)
     if content["sensor"]["noise_nm"] is None:
         del content["sensor"]["noise_nm"]
-    with pytest.raises(lbt.ConfigError, match=text) as caught:
+    with pytest.raises(lbt.errors.ConfigError, match=text) as caught:
         lbt.load_config(write(tmp_path, content))
     assert caught.value.path == key
     assert "c.yaml" in str(caught.value)
@@ -285,7 +386,7 @@ def test_ar2_is_fitted_above_the_noise_of_its_axis(tmp_path, air):
     content["model"]["turbulence"] = {"kind": "ar2"}
     models = lbt.load_config(write(tmp_path, content)).plant.turbulence
     for model, noise in zip(models, (15.5, 60.0), strict=True):
-        alone = lbt.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise)
+        alone = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise)
         np.testing.assert_array_equal(model.coefficients, alone.coefficients)
     content["model"]["turbulence"] = [{"kind": "ar1"}, AR]
     first, second = lbt.load_config(write(tmp_path, content)).plant.turbulence
@@ -305,7 +406,7 @@ def test_one_axis(tmp_path, direction):
     truth = lbt.Truth(
         turbulence=both.plant.turbulence, vibrations=both.plant.vibrations, noise_nm=15.5
     )
-    limit = lbt.least_residual(both.hardware, truth)
+    limit = lbt.loop.least_residual(both.hardware, truth)
     assert lbt.kalman(config.plant).rms ** 2 == pytest.approx(limit.variance_nm2[0], rel=1e-6)
 
 
@@ -317,13 +418,15 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     lbt.config.robust_design(config)  # with the model's turbulence, as there is no atmosphere
     for change, text in (
         ({"turbulence": "frozen_flow"}, "atmosphere is missing: design.robust.turbulence"),
-        ({"bands": [{"low_hz": 18.0, "high_hz": 22.0, "rms_mas": 9.0}]},
-         r"telescope is missing: design.robust.bands\[0\].rms_mas"),
-    ):  # fmt: skip
+        (
+            {"bands": [{"low_hz": 18.0, "high_hz": 22.0, "rms_mas": 9.0}]},
+            r"telescope is missing: design.robust.bands\[0\].rms_mas",
+        ),
+    ):
         content["design"] = {"robust": {**robust, **change}}
-        with pytest.raises(lbt.ConfigError, match=text):
+        with pytest.raises(lbt.errors.ConfigError, match=text):
             lbt.config.robust_design(lbt.load_config(write(tmp_path, content)))
     content["design"] = {"robust": {**robust, "command_step_nm": 500.0}}
     content["model"]["turbulence"] = [AR, OTHER]
-    with pytest.raises(lbt.ConfigError, match="hold under one turbulence for all axes"):
+    with pytest.raises(lbt.errors.ConfigError, match="hold under one turbulence for all axes"):
         lbt.config.robust_design(lbt.load_config(write(tmp_path, content)))

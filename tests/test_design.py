@@ -93,22 +93,24 @@ def test_scalar_hinf_against_a_search():
 def test_at_the_least_gamma_the_error_is_all_pass(axis_plant):
     design = lbt.hinf(axis_plant, method="riccati")
     error = axis_plant.error_system(design.gain_predictor)
-    sigma = lbt.largest_singular_values(error, np.linspace(0.1, 400, 200))
+    sigma = lbt.linear.largest_singular_values(error, np.linspace(0.1, 400, 200))
     assert np.ptp(sigma) / sigma.mean() < 1e-4
 
 
 def test_hinf_costs_sensor_gain_robustness(axis_plant):
     """Kalman [.075, 1.9], 1.05 gamma_min [.70, 1.6]."""
-    low, high = lbt.stable_sensor_gains(axis_plant.hardware, lbt.kalman(axis_plant).controller)
+    low, high = lbt.loop.stable_sensor_gains(axis_plant.hardware, lbt.kalman(axis_plant).controller)
     assert (low, high) == pytest.approx((0.075, 1.9), abs=0.03)
     design = lbt.hinf(axis_plant, gamma_ratio=1.05)
-    low, high = lbt.stable_sensor_gains(axis_plant.hardware, design.controller)
+    low, high = lbt.loop.stable_sensor_gains(axis_plant.hardware, design.controller)
     assert (low, high) == pytest.approx((0.70, 1.6), abs=0.05)
 
 
 def test_gamma_below_the_least_names_the_least(axis_plant):
     for method in ("lmi", "riccati"):
-        with pytest.raises(lbt.InfeasibleError, match=r"at least 155\.537.*got 150") as caught:
+        with pytest.raises(
+            lbt.errors.InfeasibleError, match=r"at least 155\.537.*got 150"
+        ) as caught:
             lbt.hinf(axis_plant, gamma=150, method=method)
         assert caught.value.gamma == 150
         assert caught.value.gamma_least == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
@@ -125,13 +127,13 @@ def test_gamma_below_the_least_names_the_least(axis_plant):
     ],
 )
 def test_wrong_arguments_are_refused(axis_plant, arguments, text):
-    with pytest.raises(lbt.ProblemError, match=text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
         lbt.hinf(axis_plant, **arguments)
 
 
 def test_nothing_to_estimate_is_refused():
     known = lbt.EstimationProblem(A=0.5, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.ProblemError, match="must have an estimation error"):
+    with pytest.raises(lbt.errors.ProblemError, match="must have an estimation error"):
         lbt.hinf(known)
     assert lbt.kalman(known).rms == 0
 
@@ -150,7 +152,7 @@ def test_a_wrong_solver_answer_does_not_leave_the_library(monkeypatch, axis_plan
     right = module.kalman_riccati(axis_plant)
     wrong = dataclasses.replace(right, gain_predictor=right.gain_predictor * 1.001)
     monkeypatch.setattr(module, "kalman_riccati", lambda _: wrong)
-    with pytest.raises(lbt.CertificateError, match="least-variance gain") as caught:
+    with pytest.raises(lbt.errors.CertificateError, match="least-variance gain") as caught:
         lbt.kalman(axis_plant)
     assert caught.value.failed == ("distance from the least-variance gain",)
 
@@ -163,7 +165,7 @@ def test_an_unstable_optimal_filter_does_not_leave_the_library(monkeypatch, axis
             return dataclasses.replace(super().at(gamma), gain_predictor=np.full((4, 1), 5.0))
 
     monkeypatch.setattr(module, "_RiccatiRoute", Liar)
-    with pytest.raises(lbt.CertificateError, match="spectral radius of the filter"):
+    with pytest.raises(lbt.errors.CertificateError, match="spectral radius of the filter"):
         lbt.hinf(axis_plant, gamma_ratio=1.2, method="riccati")
 
 
@@ -174,11 +176,13 @@ def test_certificate_checks_are_independent(axis_plant):
     assert "norm of the estimation error" in names
     assert "spectral radius of the closed loop" in names
     assert design.recertified().passed
-    tighter = lbt.certify_filter(axis_plant, design.gain_predictor, gamma=0.99 * design.gamma)
+    tighter = lbt.design.certify_filter(
+        axis_plant, design.gain_predictor, gamma=0.99 * design.gamma
+    )
     assert not tighter.passed
-    with pytest.raises(lbt.CertificateError, match="norm of the estimation error"):
+    with pytest.raises(lbt.errors.CertificateError, match="norm of the estimation error"):
         tighter.require()
-    assert not lbt.certify_filter(axis_plant, np.full((4, 1), 9.0)).passed
+    assert not lbt.design.certify_filter(axis_plant, np.full((4, 1), 9.0)).passed
 
 
 def test_to_control_is_the_same_controller(axis_plant):
@@ -193,7 +197,7 @@ def test_to_control_is_the_same_controller(axis_plant):
 
 
 def test_a_mirror_without_vibration_needs_no_special_case():
-    turbulence = lbt.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=800)
+    turbulence = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=800)
     plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=turbulence, noise_nm=15)
     assert lbt.kalman(plant).certificate.passed
     assert lbt.hinf(plant, gamma_ratio=1.2).certificate.passed
@@ -264,7 +268,7 @@ def test_a_very_large_bound_is_the_kalman_filter(axis_plant):
     for method in ("lmi", "riccati"):
         design = lbt.hinf(axis_plant, gamma_ratio=1e6, method=method)
         assert design.rms == pytest.approx(kalman.rms, rel=1e-6)
-    with pytest.raises(lbt.ProblemError, match="at most"):
+    with pytest.raises(lbt.errors.ProblemError, match="at most"):
         lbt.hinf(axis_plant, gamma=1e300)
 
 
@@ -272,13 +276,15 @@ def test_a_filter_below_the_infeasible_level_does_not_leave_the_library(monkeypa
     module = sys.modules["lbt_synth.design.hinf"]
     honest = module.infeasible_level
     monkeypatch.setattr(module, "infeasible_level", lambda *parts: 1.001 * honest(*parts))
-    with pytest.raises(lbt.NumericalError, match="no filter should have a norm below"):
+    with pytest.raises(lbt.errors.NumericalError, match="no filter should have a norm below"):
         lbt.hinf(axis_plant, method="riccati")
 
 
 def test_only_problems_are_designed_for():
     for make in (lbt.kalman, lbt.hinf):
-        with pytest.raises(lbt.ProblemError, match="expected an EstimationProblem.*got ndarray"):
+        with pytest.raises(
+            lbt.errors.ProblemError, match="expected an EstimationProblem.*got ndarray"
+        ):
             make(np.eye(2))
 
 
@@ -294,9 +300,12 @@ def test_a_variance_that_rounding_has_spoilt_is_not_certified():
         )
         A = turn @ np.diag([0.5, 0.4, 0.3, 0.2]) @ np.linalg.inv(turn)
         problem = lbt.EstimationProblem(
-            A=A, B=rng.standard_normal((4, 5)), C=rng.standard_normal((1, 4)),
-            D=rng.standard_normal((1, 5)), L=rng.standard_normal((1, 4)),
-        )  # fmt: skip
+            A=A,
+            B=rng.standard_normal((4, 5)),
+            C=rng.standard_normal((1, 4)),
+            D=rng.standard_normal((1, 5)),
+            L=rng.standard_normal((1, 4)),
+        )
         try:
             design = lbt.kalman(problem)
         except lbt.LbtSynthError:
@@ -309,7 +318,7 @@ def test_a_variance_that_rounding_has_spoilt_is_not_certified():
 
 def test_many_states_take_the_equation_by_default():
     lines = [lbt.Vibration(frequency_hz=12.0 + 3 * i, damping=0.01, rms_nm=20.0) for i in range(9)]
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
     routes = {}
     for count in (2, 9):
         plant = lbt.tip_tilt_plant(

@@ -14,16 +14,16 @@ from scipy.signal import hilbert
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.endtoend.cases import _vibration, case_of
+from lbt_synth.interop.specula.cases import _vibration, case_of
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models.truth import fitted_direction
-from lbt_synth.simulation import draw_disturbance
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
 
 
 def drifting(**changes):
     given = {"start_hz": 17, "end_hz": 23, "duration_s": 10, "rms_nm": 100, "direction": (1,)}
-    return lbt.DriftingVibration(**(given | changes))
+    return lbt.models.DriftingVibration(**(given | changes))
 
 
 def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):
@@ -66,7 +66,7 @@ def test_the_phase_is_the_integral_of_the_frequency():
 def test_without_a_drift_it_is_the_sinusoid_and_the_resonance():
     still = drifting(start_hz=20, end_hz=20)
     (series,) = drawn(still, frames=4000, zero_frame=321)
-    plain = lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
+    plain = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
     a, b = np.cos(2 * np.pi * 20 * np.arange(4000) / 800), np.sin(2 * np.pi * np.arange(4000) / 40)
     basis = np.stack([a, b], axis=1)
     left = series - basis @ np.linalg.lstsq(basis, series, rcond=None)[0]
@@ -82,17 +82,20 @@ def test_without_a_drift_it_is_the_sinusoid_and_the_resonance():
 
 
 @given(
-    start=st.floats(5, 60), end=st.floats(5, 60), duration=st.floats(2, 30),
+    start=st.floats(5, 60),
+    end=st.floats(5, 60),
+    duration=st.floats(2, 30),
     damping=st.floats(0.02, 0.3),
-)  # fmt: skip
+)
 def test_the_variance_of_the_resonance_is_held_exactly(start, end, duration, damping):
     """Against the recursion of the covariance of two frames, whatever the drift."""
-    line = drifting(start_hz=start, end_hz=max(end, 0.5 * start), duration_s=duration,
-                    damping=damping)  # fmt: skip
+    line = drifting(
+        start_hz=start, end_hz=max(end, 0.5 * start), duration_s=duration, damping=damping
+    )
     time_s = (np.arange(600) - 100) / 800
     try:
         a1, a2, driving = line.ar_process(time_s, 800)
-    except lbt.ProblemError:
+    except lbt.errors.ProblemError:
         assert end < start  # only a falling frequency pumps up the amplitude
         return
     together = a1[0] / (1 - a2)
@@ -142,14 +145,16 @@ def test_what_needs_a_stationary_truth_refuses_it(config):
     hw = plant.hardware
     for refused in (
         lambda: lbt.residual_budget(loop, truth),
-        lambda: lbt.least_residual(hw, truth),
-        lambda: lbt.least_worst_residual(hw, truth, band_hz=(15, 25), rms_nm=100, direction=(1,)),
-        lambda: lbt.strehl_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
-        lambda: lbt.limit_study({"kalman": design}, hw, truth, camera),
-        lambda: list(lbt.frequency_robustness(plant, truth, camera, errors_hz=[0])),
-        lambda: lbt.optimal_integrator(hw, truth),
+        lambda: lbt.loop.least_residual(hw, truth),
+        lambda: lbt.loop.least_worst_residual(
+            hw, truth, band_hz=(15, 25), rms_nm=100, direction=(1,)
+        ),
+        lambda: lbt.studies.strehl_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
+        lambda: lbt.studies.limit_study({"kalman": design}, hw, truth, camera),
+        lambda: list(lbt.studies.frequency_robustness(plant, truth, camera, errors_hz=[0])),
+        lambda: lbt.design.optimal_integrator(hw, truth),
     ):
-        with pytest.raises(lbt.ProblemError, match="drifts from 17 to 23 Hz. Simulate it"):
+        with pytest.raises(lbt.errors.ProblemError, match="drifts from 17 to 23 Hz. Simulate it"):
             refused()
 
 
@@ -163,18 +168,20 @@ def test_wrong_drifts_are_refused():
         ({"direction": (0,)}, "direction must be a vector"),
         ({"damping": 0.5, "end_hz": 8}, "frequency above that"),
     ):
-        with pytest.raises(lbt.ProblemError, match=words):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
             drifting(**wrong)
-    with pytest.raises(lbt.ProblemError, match="time_s must be finite"):
+    with pytest.raises(lbt.errors.ProblemError, match="time_s must be finite"):
         drifting().frequency_hz_at(np.nan)
-    with pytest.raises(lbt.ProblemError, match="a sinusoid has no AR2 process"):
+    with pytest.raises(lbt.errors.ProblemError, match="a sinusoid has no AR2 process"):
         drifting().ar_process(np.arange(3) / 800, 800)
     falls = drifting(start_hz=23, end_hz=10, duration_s=0.5, damping=1e-4)
-    with pytest.raises(lbt.ProblemError, match="must move slowly beside its decay"):
+    with pytest.raises(lbt.errors.ProblemError, match="must move slowly beside its decay"):
         drawn(falls, frames=800)
-    with pytest.raises(lbt.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"
+    ):
         fitted_direction(drifting(end_hz=500), PATH)
-    with pytest.raises(lbt.DimensionError, match="must have 1 components"):
+    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
         fitted_direction(drifting(direction=(1, 0)), PATH)
 
 
@@ -196,7 +203,7 @@ def drift_file(tmp_path, keys="kind: drift\n      end_hz: 23\n      duration_s: 
 
 def test_a_configuration_may_have_one(tmp_path):
     (found,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
-    expected = lbt.DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    expected = lbt.models.DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
     assert found == expected
     damped = "kind: drift\n      end_hz: 16\n      duration_s: 9\n      damping: 0.01"
     (found,) = lbt.load_config(drift_file(tmp_path, damped)).truth.vibrations
@@ -212,12 +219,14 @@ def test_a_configuration_may_have_one(tmp_path):
         ("kind: sinusoid\n      damping: 0.1", "damping goes with kind: resonance"),
         ("kind: drift\n      end_hz: 500\n      duration_s: 60", r"\[0\].end_hz: must lie below"),
         ("kind: drift\n      end_hz: -3\n      duration_s: 60", "greater than 0"),
-        ("kind: drift\n      end_hz: 2\n      duration_s: 60\n      damping: 0.5",
-         r"truth.vibrations\[0\]: .* frequency above that"),
+        (
+            "kind: drift\n      end_hz: 2\n      duration_s: 60\n      damping: 0.5",
+            r"truth.vibrations\[0\]: .* frequency above that",
+        ),
     ],
-)  # fmt: skip
+)
 def test_wrong_keys_are_refused(tmp_path, keys, words):
-    with pytest.raises(lbt.ConfigError, match=words):
+    with pytest.raises(lbt.errors.ConfigError, match=words):
         lbt.load_config(drift_file(tmp_path, keys))
 
 

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.cli import end_to_end_commands
+from lbt_synth.cli import end_to_end as end_to_end_commands
 from lbt_synth.cli.main import main
-from lbt_synth.endtoend.cases import case_of
 from lbt_synth.errors import ConfigError, MissingExtraError, OutputError, ProblemError
-from lbt_synth.paper.end_to_end import all_cases, entries, modal_distance, plan_tables
-from lbt_synth.paper.end_to_end_figure import table_figure
-from lbt_synth.paper.published import TABLE_III
+from lbt_synth.interop.specula.cases import case_of
+from lbt_synth.report.figures.paper import table_figure
+from lbt_synth.studies.paper.end_to_end import all_cases, entries, modal_distance, plan_tables
+from lbt_synth.studies.paper.published import TABLE_III
 
 CONFIG = "examples/lbt.yaml"
 
@@ -35,7 +35,7 @@ def made_run(system, *, gain=0.5, noise_nm=10.0, frames=4000, seed=0):
     measured = np.zeros_like(residual)
     measured[1:] = gain * residual[:-1]
     measured += noise_nm * rng.standard_normal(measured.shape)
-    return lbt.EndToEndRun(
+    return lbt.interop.EndToEndRun(
         system=system,
         strehl_series=0.8 + 0.01 * rng.standard_normal(frames),
         other_modes_series=np.full(frames, 0.85),
@@ -192,12 +192,14 @@ def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path,
         assert main(arguments) == 2
         assert 'pip install "lbt-synth[e2e]"' in capsys.readouterr().err
     with pytest.raises(MissingExtraError) as caught:
-        lbt.calibrate(lbt.load_config(CONFIG).end_to_end.system, cache=tmp_path)
+        lbt.interop.calibrate(lbt.load_config(CONFIG).end_to_end.system, cache=tmp_path)
     assert caught.value.extra == "e2e"
 
 
 def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
-    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5, bandwidth_hz=150)
+    shell = lbt.models.PositionLoop.of_bandwidth(
+        natural_frequency_hz=20, damping=0.5, bandwidth_hz=150
+    )
     slow = replace(setup.system.hardware, mirror=shell)
     run = made_run(replace(setup.system, modes=3, hardware=slow), frames=20)
     design = lbt.integrator(slow, gain=0.1)
@@ -206,14 +208,14 @@ def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
     seen = end_to_end_commands._telemetry(
         run, design, SimpleNamespace(key="k"), SimpleNamespace(gain=str(gain))
     )
-    seen = lbt.load_telemetry(lbt.save_telemetry(tmp_path / "t.fits", seen))
+    seen = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.fits", seen))
     assert np.array_equal(seen.hardware.mirror_taps, slow.mirror_taps)
     assert "with the mirror taps c" in seen.convention
 
 
 def test_a_case_holds_all_that_decides_and_fits_into_json(setup):
     design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
-    shake = lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100)
+    shake = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100)
     case = case_of(setup, design.controller, vibrations=[shake], seed=3)
     assert json.loads(json.dumps(case)) is not None
     for other in (
@@ -223,9 +225,11 @@ def test_a_case_holds_all_that_decides_and_fits_into_json(setup):
         case_of(replace(setup, gain=0.4), design.controller, vibrations=[shake], seed=3),
         case_of(
             replace(setup, system=replace(setup.system, photons=51.0)),
-            design.controller, vibrations=[shake], seed=3,
+            design.controller,
+            vibrations=[shake],
+            seed=3,
         ),
-    ):  # fmt: skip
+    ):
         assert json.dumps(other) != json.dumps(case)
 
 
@@ -248,11 +252,17 @@ def test_the_tables_as_planned(rows):
     cases = all_cases(rows)
     # the 20 Hz row of Table III is the row with vibration of Table II
     assert len(cases) == 8 * 2 + 3 * 14
-    moved = [c["vibrations"][0]["frequency_hz"] for n, c in cases.items() if n.startswith("slow-v")
-             and "none" not in n]  # fmt: skip
+    moved = [
+        c["vibrations"][0]["frequency_hz"]
+        for n, c in cases.items()
+        if n.startswith("slow-v") and "none" not in n
+    ]
     assert sorted(set(moved)) == sorted(40 - row.model_hz for row in TABLE_III)
-    still = {c["vibrations"][0]["frequency_hz"] for n, c in cases.items() if n.startswith("kal")
-             and "none" not in n}  # fmt: skip
+    still = {
+        c["vibrations"][0]["frequency_hz"]
+        for n, c in cases.items()
+        if n.startswith("kal") and "none" not in n
+    }
     assert still == {20.0}
 
 
@@ -349,11 +359,11 @@ def test_bad_input_at_the_command_line(tmp_path, capsys, arguments):
 
 def test_a_run_needs_a_controller_with_steps(setup):
     with pytest.raises(ProblemError, match="step"):
-        lbt.run_end_to_end(setup.system, object())
+        lbt.interop.run_end_to_end(setup.system, object())
 
 
 def test_the_cache_must_be_a_directory(tmp_path):
-    from lbt_synth.endtoend import cache_directory
+    from lbt_synth.interop.specula.calibration import cache_directory
 
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cache directory"):

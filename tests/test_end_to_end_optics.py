@@ -14,16 +14,16 @@ import pytest
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.endtoend.cases import case_of, run_case
-from lbt_synth.endtoend.optics import Optics, make_modes
 from lbt_synth.errors import ProblemError
+from lbt_synth.interop.specula.cases import case_of, run_case
+from lbt_synth.interop.specula.optics import Optics, make_modes
 
 pytestmark = [
     pytest.mark.e2e,
     pytest.mark.filterwarnings("ignore::DeprecationWarning:specula"),
 ]
 PATH = lbt.LoopHardware(frame_rate_hz=800)
-BRIGHT = lbt.EndToEndSystem(
+BRIGHT = lbt.interop.EndToEndSystem(
     hardware=PATH,
     diameter_m=1.5,
     obstruction=0.2,
@@ -39,7 +39,7 @@ BRIGHT = lbt.EndToEndSystem(
     actuators_across=7,
     pixels=24,
 )
-SETUP = lbt.EndToEndSetup(
+SETUP = lbt.interop.EndToEndSetup(
     system=BRIGHT, frames=400, settle_frames=200, gain=0.5, leak=1.0, leak_from_mode=2
 )
 
@@ -51,7 +51,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def calibration(cache):
-    return lbt.calibrate(BRIGHT, cache=cache)
+    return lbt.interop.calibrate(BRIGHT, cache=cache)
 
 
 def test_the_modes_are_orthonormal_and_the_first_are_tip_and_tilt(calibration):
@@ -87,28 +87,28 @@ def test_a_small_phase_is_reconstructed_whatever_its_mode(calibration):
 
 
 def test_a_calibration_is_kept_by_its_content(cache, calibration):
-    again = lbt.calibrate(BRIGHT, cache=cache)
+    again = lbt.interop.calibrate(BRIGHT, cache=cache)
     assert again.cached
     assert again.key == calibration.key
     assert np.array_equal(again.reconstructor.matrix, calibration.reconstructor.matrix)
     assert np.array_equal(again.modes.shapes, calibration.modes.shapes)
     # the flux plays no part, the modulation does
-    assert lbt.calibrate(replace(BRIGHT, photons=10.0), cache=cache).cached
-    other = lbt.calibrate(replace(BRIGHT, modulation_lambda_over_d=3.0), cache=cache)
+    assert lbt.interop.calibrate(replace(BRIGHT, photons=10.0), cache=cache).cached
+    other = lbt.interop.calibrate(replace(BRIGHT, modulation_lambda_over_d=3.0), cache=cache)
     assert not other.cached
     assert other.key != calibration.key
 
 
 def test_a_damaged_calibration_is_measured_anew(tmp_path, calibration):
-    first = lbt.calibrate(BRIGHT, cache=tmp_path)
+    first = lbt.interop.calibrate(BRIGHT, cache=tmp_path)
     (file,) = tmp_path.glob("calibration-*.npz")
     whole = file.read_bytes()
     for damage in (whole[: len(whole) // 2], b"", whole[:-2000] + b"x" * 2000):
         file.write_bytes(damage)
-        found = lbt.calibrate(BRIGHT, cache=tmp_path)
+        found = lbt.interop.calibrate(BRIGHT, cache=tmp_path)
         assert not found.cached
         assert np.array_equal(found.reconstructor.matrix, first.reconstructor.matrix)
-        assert lbt.calibrate(BRIGHT, cache=tmp_path).cached
+        assert lbt.interop.calibrate(BRIGHT, cache=tmp_path).cached
 
 
 def test_too_many_modes_for_the_mirror():
@@ -117,10 +117,10 @@ def test_too_many_modes_for_the_mirror():
 
 
 # a filter for 40 Hz leaves much of a line at 44 Hz
-SHAKE = lbt.SinusoidalVibration(frequency_hz=44, rms_nm=60.0, direction=(0.8, 0.6))
+SHAKE = lbt.models.SinusoidalVibration(frequency_hz=44, rms_nm=60.0, direction=(0.8, 0.6))
 PLANT = lbt.tip_tilt_plant(
     frame_rate_hz=800,
-    turbulence=lbt.ARModel(coefficients=[0.99], driving_rms_nm=0.5, frame_rate_hz=800),
+    turbulence=lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=0.5, frame_rate_hz=800),
     noise_nm=0.3,
     vibrations=[
         lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=20, direction=d)
@@ -140,9 +140,12 @@ def test_in_the_linear_range_it_is_the_modal_loop(cache, method, delay):
         design = lbt.integrator(path, gain=0.3)
     else:
         plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, delay_frames=delay, turbulence=PLANT.turbulence[0], noise_nm=0.3,
+            frame_rate_hz=800,
+            delay_frames=delay,
+            turbulence=PLANT.turbulence[0],
+            noise_nm=0.3,
             vibrations=PLANT.vibrations,
-        )  # fmt: skip
+        )
         design = lbt.kalman(plant)
     run = setup.run(design, cache=cache)
     assert run.tip_tilt_gain == pytest.approx(1.0, abs=0.05)
@@ -199,7 +202,7 @@ def test_a_controller_that_returns_something_else(cache, returned, match):
             pass
 
     with pytest.raises(ProblemError, match=match):
-        lbt.run_end_to_end(BRIGHT, Odd(), frames=2, settle_frames=200, cache=cache)
+        lbt.interop.run_end_to_end(BRIGHT, Odd(), frames=2, settle_frames=200, cache=cache)
 
 
 def test_a_case_is_its_run(cache):
@@ -227,7 +230,7 @@ def small_config(folder):
         ("pixels: 60", "pixels: 24\n  actuators_across: 7"),
         ("frames: 1600", "frames: 40"),
         ("settle_frames: 400", "settle_frames: 200"),
-    ):  # fmt: skip
+    ):
         assert old in text
         text = text.replace(old, new, 1)
     file = folder / "small.yaml"
@@ -244,7 +247,7 @@ def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
     data = json.loads(capsys.readouterr().out)
     assert sorted(p.name for p in out.iterdir()) == ["run.png", "summary.json", "telemetry.fits"]
     assert json.loads((out / "summary.json").read_text())["strehl"] == data["strehl"]
-    telemetry = lbt.load_telemetry(out / "telemetry.fits")
+    telemetry = lbt.files.load_telemetry(out / "telemetry.fits")
     assert telemetry.strehl == data["strehl"]
     assert telemetry.commands.shape == (40, 20)
     assert np.std(telemetry.residual_nm[:, 0]) <= data["tip_rms_nm"] * (1 + 1e-12)
@@ -257,9 +260,24 @@ def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
 
 def test_a_table_that_was_killed_goes_on(tmp_path, cache):
     config, out = small_config(tmp_path), tmp_path / "table"
-    arguments = [sys.executable, "-m", "lbt_synth.cli.main", "e2e-table", str(config), "-o",
-                 str(out), "--cache", str(cache), "--seeds", "1", "--tables", "II", "--jobs", "2",
-                 "--json"]  # fmt: skip
+    arguments = [
+        sys.executable,
+        "-m",
+        "lbt_synth.cli.main",
+        "e2e-table",
+        str(config),
+        "-o",
+        str(out),
+        "--cache",
+        str(cache),
+        "--seeds",
+        "1",
+        "--tables",
+        "II",
+        "--jobs",
+        "2",
+        "--json",
+    ]
     first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
     end = time.monotonic() + 120
     while len(list(out.glob("cases/*.json"))) < 2:
@@ -297,11 +315,11 @@ def test_phase_screens_are_kept_by_their_content_and_drawn_anew_if_damaged(tmp_p
         assert file.read_bytes() == whole
     # 1.5 and 1.5001 m have the same pixel to three decimals, which is how SPECULA names a screen
     other = replace(BRIGHT, diameter_m=1.5001)
-    lbt.run_end_to_end(other, setup.controller(None), frames=2, settle_frames=200, **known)
+    lbt.interop.run_end_to_end(other, setup.controller(None), frames=2, settle_frames=200, **known)
     assert len(list(tmp_path.glob("screens/*/*.fits"))) == 2
 
 
 def test_a_cache_that_takes_no_screens(tmp_path, calibration):
     (tmp_path / "screens").write_text("not a directory")
-    with pytest.raises(lbt.OutputError, match="phase screen"):
+    with pytest.raises(lbt.errors.OutputError, match="phase screen"):
         replace(SETUP, frames=2).run(None, cache=tmp_path, calibration=calibration)

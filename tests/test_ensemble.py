@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.ensemble.panels import graded_edges
-from lbt_synth.ensemble.parts import independent_parts
-from lbt_synth.ensemble.responses import stacked_response
+from lbt_synth.linear.quadrature import adaptive_integral
+from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.loop.budget import distinct_edges, pole_edges
-from lbt_synth.models.flows import _octave_splines
-from lbt_synth.quadrature import adaptive_integral
-from lbt_synth.statespace import pointwise_response
+from lbt_synth.loop.ensemble.independent_parts import independent_parts
+from lbt_synth.loop.ensemble.panels import graded_edges
+from lbt_synth.loop.ensemble.responses import stacked_response
+from lbt_synth.models.frozen_flows import _octave_splines
 
 RATE = 800
-SLOW = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
+SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
 AIR = lbt.Atmosphere(
     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22, obstruction=0.11
 )
@@ -61,16 +61,16 @@ def weather(count, seed=0):
 
 
 def ensemble_of(w, *, turbulence, direction=(1, 0.5)):
-    return lbt.LoopEnsemble(
+    return lbt.loop.LoopEnsemble(
         sensor_gain=w["gains"],
         delay_frames=w["delays"],
         noise_nm=w["noise"],
         turbulence=turbulence,
         vibrations=[
-            lbt.EnsembleVibration(
+            lbt.loop.EnsembleVibration(
                 frequency_hz=w["frequency"], rms_nm=w["rms"], direction=direction
             ),
-            lbt.EnsembleVibration(
+            lbt.loop.EnsembleVibration(
                 frequency_hz=w["frequency"] + 10,
                 rms_nm=w["rms"],
                 damping=w["damping"],
@@ -87,7 +87,7 @@ def truth_of(w, i, turbulence, direction=(1, 0.5)):
         noise_nm=float(w["noise"][i]),
         sensor_gain=float(w["gains"][i]),
         vibrations=(
-            lbt.SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=direction),
+            lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=direction),
             lbt.Vibration(
                 frequency_hz=f + 10, rms_nm=rms, damping=float(w["damping"][i]), direction=direction
             ),
@@ -126,12 +126,14 @@ def agree(found, design, w, turbulence_of, *, rel=5e-7):
 @pytest.mark.parametrize("which", ["kalman", "coupled"])
 def test_each_loop_on_its_own_under_frozen_flow(which, request):
     design, w = request.getfixturevalue(which), weather(14)
-    flows = lbt.FrozenFlows(atmosphere=AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"])
+    flows = lbt.models.FrozenFlows(
+        atmosphere=AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"]
+    )
 
     def air(i):
         return replace(AIR, seeing_arcsec=w["seeing"][i], wind_speed_m_s=w["wind"][i])
 
-    found = lbt.ensemble_residuals(
+    found = lbt.loop.ensemble_residuals(
         design.controller, design.hardware, ensemble_of(w, turbulence=flows)
     )
     agree(found, design, w, air)
@@ -143,12 +145,14 @@ def test_each_loop_on_its_own_under_processes(which, request):
     design, w = request.getfixturevalue(which), weather(10, seed=1)
     rng = np.random.default_rng(2)
     poles, drive = rng.uniform(0.97, 0.995, 10), rng.uniform(20, 90, 10)
-    each = lbt.ModalTurbulence(
+    each = lbt.models.ModalTurbulence(
         coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE
     )
 
     def own(i):
-        return lbt.ARModel(coefficients=[poles[i]], driving_rms_nm=drive[i], frame_rate_hz=RATE)
+        return lbt.models.ARModel(
+            coefficients=[poles[i]], driving_rms_nm=drive[i], frame_rate_hz=RATE
+        )
 
     for turbulence, single in (
         (SLOW, lambda i: SLOW),
@@ -157,25 +161,27 @@ def test_each_loop_on_its_own_under_processes(which, request):
         ((AIR, each), lambda i: (AIR, own(i))),
     ):
         ensemble = ensemble_of(w, turbulence=turbulence)
-        found = lbt.ensemble_residuals(design.controller, design.hardware, ensemble)
+        found = lbt.loop.ensemble_residuals(design.controller, design.hardware, ensemble)
         agree(found, design, w, single)
 
 
 def test_unstable_loops_are_told(kalman):
     w = weather(20, seed=3)
     w["gains"] = np.linspace(0.2, 4, 20)
-    found = lbt.ensemble_residuals(
+    found = lbt.loop.ensemble_residuals(
         kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR)
     )
     assert agree(found, kalman, w, lambda i: AIR) > 3
 
 
 def test_a_mirror_with_dynamics(kalman):
-    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
+    shell = lbt.models.PositionLoop.of_bandwidth(
+        natural_frequency_hz=50, damping=0.5, bandwidth_hz=300
+    )
     design = lbt.kalman(plant(mirror=shell))
     w = weather(6, seed=4)
     w["gains"] = np.linspace(0.5, 1, 6)
-    found = lbt.ensemble_residuals(
+    found = lbt.loop.ensemble_residuals(
         design.controller, design.hardware, ensemble_of(w, turbulence=AIR)
     )
     agree(found, design, w, lambda i: AIR)
@@ -192,15 +198,15 @@ class Peak:
     "parts",
     [
         [AIR, lbt.Vibration(frequency_hz=133.3, damping=1e-5, rms_nm=500).ar_model(RATE)],
-        [AIR, lbt.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])],
+        [AIR, lbt.models.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])],
         [Peak(), AIR, SLOW],
     ],
 )
 def test_sums_of_spectra(kalman, parts):
     """A peak that no pole of the loop is near."""
-    spectrum = lbt.SumSpectrum(parts=parts)
-    found = lbt.ensemble_residuals(
-        kalman.controller, kalman.hardware, lbt.LoopEnsemble(turbulence=spectrum)
+    spectrum = lbt.models.SumSpectrum(parts=parts)
+    found = lbt.loop.ensemble_residuals(
+        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(turbulence=spectrum)
     )
     loop = lbt.close_loop(kalman.hardware, kalman.controller)
     single = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum))
@@ -217,8 +223,8 @@ def test_slow_and_fast_winds_together(wind, leak, outer):
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     controller = lbt.Controller(A=leak, B=0.3, C=1.0, D=0.0, dt_s=1 / RATE)
     air = replace(AIR, outer_scale_m=outer)
-    flows = lbt.FrozenFlows(atmosphere=air, wind_speed_m_s=wind)
-    found = lbt.ensemble_residuals(controller, path, lbt.LoopEnsemble(turbulence=flows))
+    flows = lbt.models.FrozenFlows(atmosphere=air, wind_speed_m_s=wind)
+    found = lbt.loop.ensemble_residuals(controller, path, lbt.loop.LoopEnsemble(turbulence=flows))
     loop = lbt.close_loop(path, controller)
     for speed, residual in zip(wind, found.turbulence_nm, strict=True):
         truth = lbt.Truth(turbulence=replace(air, wind_speed_m_s=speed))
@@ -239,10 +245,12 @@ def test_next_to_instability(delay, distance):
     controller = replace(controller, B=np.array([[low * (1 - distance)]]))
     loop = lbt.close_loop(path, controller)
     exact = lbt.residual_budget(loop, lbt.Truth(turbulence=SLOW)).turbulence_nm
-    spectrum = lbt.SumSpectrum(parts=[SLOW])
+    spectrum = lbt.models.SumSpectrum(parts=[SLOW])
     single = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum)).turbulence_nm
     assert single == pytest.approx(exact, rel=5e-7)
-    found = lbt.ensemble_residuals(controller, path, lbt.LoopEnsemble(turbulence=spectrum))
+    found = lbt.loop.ensemble_residuals(
+        controller, path, lbt.loop.LoopEnsemble(turbulence=spectrum)
+    )
     assert found.turbulence_nm[0] == pytest.approx(exact, rel=5e-7)
 
 
@@ -267,7 +275,9 @@ def test_a_peak_upon_much_that_is_flat(distance):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_states_in_any_units_leave_the_same(seed):
-    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=600)
+    shell = lbt.models.PositionLoop.of_bandwidth(
+        natural_frequency_hz=50, damping=0.5, bandwidth_hz=600
+    )
     design = lbt.kalman(plant(mirror=shell, delay_frames=3))
     k = design.controller
     units = 10 ** np.random.default_rng(seed).uniform(-6, 6, k.n_states)
@@ -287,14 +297,14 @@ def test_a_controller_for_each_loop():
         lbt.kalman(plant(vibrations=[replace(LINE, frequency_hz=f)]))
         for f in (18, 19, 20, 21, 22, 23)
     ]
-    found = lbt.ensemble_residuals(
+    found = lbt.loop.ensemble_residuals(
         [design.controller for design in designs],
         designs[0].hardware,
         ensemble_of(w, turbulence=AIR),
     )
     for i, design in enumerate(designs):
         own = {name: values[i : i + 1] for name, values in w.items()}
-        alone = lbt.ensemble_residuals(
+        alone = lbt.loop.ensemble_residuals(
             design.controller, design.hardware, ensemble_of(own, turbulence=AIR)
         )
         assert alone.stable[0] == found.stable[i]
@@ -305,15 +315,15 @@ def test_a_controller_for_each_loop():
 def test_loops_that_differ_by_their_lines_only_are_the_same_as_apart(kalman):
     """Rows that share a loop are closed once; each has its own answer all the same."""
     f = np.repeat([18.0, 20.0, 22.0], 5)
-    lines = [lbt.EnsembleVibration(frequency_hz=f, rms_nm=500, damping=0.01)]
+    lines = [lbt.loop.EnsembleVibration(frequency_hz=f, rms_nm=500, damping=0.01)]
     given = {"noise_nm": 15.5, "turbulence": AIR, "vibrations": lines}
     gains = np.tile(np.linspace(0.5, 1, 5), 3)
-    together = lbt.ensemble_residuals(
-        kalman.controller, kalman.hardware, lbt.LoopEnsemble(sensor_gain=gains, **given)
+    together = lbt.loop.ensemble_residuals(
+        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(sensor_gain=gains, **given)
     )
     jitter = gains * (1 + 1e-13 * np.arange(15))  # no two rows alike
-    apart = lbt.ensemble_residuals(
-        kalman.controller, kalman.hardware, lbt.LoopEnsemble(sensor_gain=jitter, **given)
+    apart = lbt.loop.ensemble_residuals(
+        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(sensor_gain=jitter, **given)
     )
     assert together.rms_nm == pytest.approx(apart.rms_nm, rel=1e-9)
     assert len(np.unique(together.rms_nm)) == 15
@@ -327,15 +337,17 @@ def test_order_and_scale_do_not_matter(kalman, order, scale):
     other = {name: values[list(order)] for name, values in w.items()}
     other["rms"], other["noise"] = scale * other["rms"], scale * other["noise"]
     strength = scale ** (6 / 5)  # seeing^(5/3) is a variance
-    found = lbt.ensemble_residuals(
+    found = lbt.loop.ensemble_residuals(
         kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR)
     )
-    again = lbt.ensemble_residuals(
+    again = lbt.loop.ensemble_residuals(
         kalman.controller,
         kalman.hardware,
         ensemble_of(
             other,
-            turbulence=lbt.FrozenFlows(atmosphere=AIR, seeing_arcsec=np.full(12, 0.8 * strength)),
+            turbulence=lbt.models.FrozenFlows(
+                atmosphere=AIR, seeing_arcsec=np.full(12, 0.8 * strength)
+            ),
         ),
     )
     assert again.rms_nm == pytest.approx(scale * found.rms_nm[list(order)], rel=1e-7, nan_ok=True)
@@ -344,7 +356,7 @@ def test_order_and_scale_do_not_matter(kalman, order, scale):
 def test_flows_are_those_of_single_atmospheres():
     w = weather(8, seed=7)
     f = np.geomspace(1e-5, 399, 300)
-    flows = lbt.FrozenFlows(
+    flows = lbt.models.FrozenFlows(
         atmosphere=AIR,
         seeing_arcsec=w["seeing"],
         wind_speed_m_s=w["wind"],
@@ -365,7 +377,7 @@ def test_flows_of_many_outer_scales():
     """More scales than have tables of their own: a polynomial over each octave."""
     scales = np.geomspace(16.5, 31.5, 20)
     f = np.geomspace(1e-4, 399, 100)
-    found = lbt.FrozenFlows(atmosphere=AIR, outer_scale_m=scales).psd(f)
+    found = lbt.models.FrozenFlows(atmosphere=AIR, outer_scale_m=scales).psd(f)
     for i in (0, 7, 19):
         single = replace(AIR, outer_scale_m=float(scales[i])).psd(f)
         assert found[i] == pytest.approx(single, rel=1e-9)
@@ -374,7 +386,7 @@ def test_flows_of_many_outer_scales():
 
 def test_kolmogorov_flows():
     air = replace(AIR, outer_scale_m=None)
-    flows = lbt.FrozenFlows(atmosphere=air, wind_speed_m_s=[10.0, 20.0])
+    flows = lbt.models.FrozenFlows(atmosphere=air, wind_speed_m_s=[10.0, 20.0])
     assert flows.psd([3.0])[1, 0] == pytest.approx(air.psd(3.0), rel=1e-12)
     assert flows.taken(np.array([0])).psd([3.0])[0, 0] == pytest.approx(
         replace(air, wind_speed_m_s=10).psd(3.0), rel=1e-12
@@ -389,7 +401,7 @@ def test_partial_fractions_and_what_has_none():
     z = np.exp(1j * np.linspace(0.01, 3, 50))
     found = stacked_response(A, B, C, D, z)
     for k in range(3):
-        system = lbt.StateSpace(A=A[k], B=B[k], C=C[k], D=D[k])
+        system = lbt.linear.StateSpace(A=A[k], B=B[k], C=C[k], D=D[k])
         assert found[k] == pytest.approx(pointwise_response(system, z), rel=1e-9, abs=1e-9)
 
 
@@ -416,8 +428,8 @@ def test_states_in_odd_units_stay_coupled(coupled):
     odd = lbt.Controller(
         A=k.A * units / units[:, None], B=k.B / units[:, None], C=k.C * units, D=k.D, dt_s=k.dt_s
     )
-    ensemble = lbt.LoopEnsemble(sensor_gain=[0.5, 1.0], noise_nm=15.5, turbulence=AIR)
-    one, other = (lbt.ensemble_residuals(c, coupled.hardware, ensemble) for c in (k, odd))
+    ensemble = lbt.loop.LoopEnsemble(sensor_gain=[0.5, 1.0], noise_nm=15.5, turbulence=AIR)
+    one, other = (lbt.loop.ensemble_residuals(c, coupled.hardware, ensemble) for c in (k, odd))
     assert other.rms_nm == pytest.approx(one.rms_nm, rel=1e-8)
 
 
@@ -427,7 +439,9 @@ def test_a_state_that_no_mode_sees_counts_for_stability():
         hidden = lbt.Controller(
             A=np.diag([1.0, pole]), B=[[0.3], [0.0]], C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE
         )
-        found = lbt.ensemble_residuals(hidden, path, lbt.LoopEnsemble(noise_nm=[1.0, 2.0]))
+        found = lbt.loop.ensemble_residuals(
+            hidden, path, lbt.loop.LoopEnsemble(noise_nm=[1.0, 2.0])
+        )
         assert found.stable.tolist() == [stable] * 2
 
 
@@ -436,7 +450,9 @@ def test_noise_through_an_integrator():
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=1, modes=1)
     lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / RATE)
     g = np.array([0.2, 0.5, 1.0, 1.9])
-    found = lbt.ensemble_residuals(lazy, path, lbt.LoopEnsemble(sensor_gain=g / 0.5, noise_nm=3.0))
+    found = lbt.loop.ensemble_residuals(
+        lazy, path, lbt.loop.LoopEnsemble(sensor_gain=g / 0.5, noise_nm=3.0)
+    )
     # the noise enters as (0.5 / g) of what the closed form has
     assert found.noise_nm**2 == pytest.approx(9 * (0.5 / g) ** 2 * g / (2 - g), rel=1e-9)
 
@@ -449,44 +465,52 @@ def test_panels_reach_the_narrowest_poles():
 
 
 def test_nothing_to_meet(kalman):
-    found = lbt.ensemble_residuals(kalman.controller, kalman.hardware, lbt.LoopEnsemble(loops=3))
+    found = lbt.loop.ensemble_residuals(
+        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(loops=3)
+    )
     assert found.rms_nm.tolist() == [0.0] * 3
     assert found.strehl(CAMERA) == pytest.approx([1.0] * 3)
 
 
 WRONG = [
-    ({"sensor_gain": 0.0}, lbt.ProblemError, "sensor_gain must be above 0"),
-    ({"sensor_gain": [np.nan, 1]}, lbt.ProblemError, "finite"),
-    ({"noise_nm": -1.0}, lbt.ProblemError, "noise_nm must be at least 0"),
-    ({"delay_frames": [0.5, 2]}, lbt.ProblemError, "delay_frames must be at least 1"),
-    ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, lbt.DimensionError, "one entry a loop"),
-    ({"sensor_gain": []}, lbt.DimensionError, "at least one loop"),
-    ({"turbulence": "von Karman"}, lbt.ProblemError, "turbulence must be"),
-    ({"vibrations": [LINE]}, lbt.ProblemError, "EnsembleVibration"),
-    ({"turbulence": (AIR, AIR, AIR)}, lbt.DimensionError, "one entry a mode"),
-    ({"noise_nm": np.ones((2, 3))}, lbt.DimensionError, "one column a measurement"),
+    ({"sensor_gain": 0.0}, lbt.errors.ProblemError, "sensor_gain must be above 0"),
+    ({"sensor_gain": [np.nan, 1]}, lbt.errors.ProblemError, "finite"),
+    ({"noise_nm": -1.0}, lbt.errors.ProblemError, "noise_nm must be at least 0"),
+    ({"delay_frames": [0.5, 2]}, lbt.errors.ProblemError, "delay_frames must be at least 1"),
+    ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, lbt.errors.DimensionError, "one entry a loop"),
+    ({"sensor_gain": []}, lbt.errors.DimensionError, "at least one loop"),
+    ({"turbulence": "von Karman"}, lbt.errors.ProblemError, "turbulence must be"),
+    ({"vibrations": [LINE]}, lbt.errors.ProblemError, "EnsembleVibration"),
+    ({"turbulence": (AIR, AIR, AIR)}, lbt.errors.DimensionError, "one entry a mode"),
+    ({"noise_nm": np.ones((2, 3))}, lbt.errors.DimensionError, "one column a measurement"),
     (
-        {"turbulence": lbt.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
-        lbt.ProblemError,
+        {"turbulence": lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
+        lbt.errors.ProblemError,
         "sampled at the loop's 800 Hz; got 500 Hz",
     ),
     (
-        {"vibrations": [lbt.EnsembleVibration(frequency_hz=[20, 400], rms_nm=1)]},
-        lbt.ProblemError,
+        {"vibrations": [lbt.loop.EnsembleVibration(frequency_hz=[20, 400], rms_nm=1)]},
+        lbt.errors.ProblemError,
         "Nyquist frequency 400 Hz; got 400 Hz",
     ),
     (
-        {"vibrations": [lbt.EnsembleVibration(frequency_hz=20, rms_nm=1, direction=[1, 0, 0])]},
-        lbt.DimensionError,
+        {
+            "vibrations": [
+                lbt.loop.EnsembleVibration(frequency_hz=20, rms_nm=1, direction=[1, 0, 0])
+            ]
+        },
+        lbt.errors.DimensionError,
         "must have 2 components",
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("given", "kind", "message"), WRONG)
 def test_what_loops_cannot_meet(kalman, given, kind, message):
     with pytest.raises(kind, match=message):
-        lbt.ensemble_residuals(kalman.controller, kalman.hardware, lbt.LoopEnsemble(**given))
+        lbt.loop.ensemble_residuals(
+            kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(**given)
+        )
 
 
 @pytest.mark.parametrize(
@@ -499,39 +523,39 @@ def test_what_loops_cannot_meet(kalman, given, kind, message):
     ],
 )
 def test_what_is_no_vibration(given, message):
-    with pytest.raises(lbt.ProblemError, match=message):
-        lbt.EnsembleVibration(**({"frequency_hz": 20.0, "rms_nm": 1.0} | given))
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        lbt.loop.EnsembleVibration(**({"frequency_hz": 20.0, "rms_nm": 1.0} | given))
 
 
 @pytest.mark.parametrize(
     ("given", "kind", "message"),
     [
-        ({"seeing_arcsec": [0.5, 0.0]}, lbt.ProblemError, "seeing_arcsec must be above 0"),
+        ({"seeing_arcsec": [0.5, 0.0]}, lbt.errors.ProblemError, "seeing_arcsec must be above 0"),
         (
             {"seeing_arcsec": [0.5, 0.6], "wind_speed_m_s": [1, 2, 3]},
-            lbt.DimensionError,
+            lbt.errors.DimensionError,
             "same length",
         ),
-        ({"wind_speed_m_s": [[1.0]]}, lbt.DimensionError, "lists, one number a loop"),
+        ({"wind_speed_m_s": [[1.0]]}, lbt.errors.DimensionError, "lists, one number a loop"),
     ],
 )
 def test_what_is_no_flow(given, kind, message):
     with pytest.raises(kind, match=message):
-        lbt.FrozenFlows(atmosphere=AIR, **given)
+        lbt.models.FrozenFlows(atmosphere=AIR, **given)
 
 
 def test_frequencies_of_flows():
-    with pytest.raises(lbt.ProblemError, match="above 0 Hz"):
-        lbt.FrozenFlows(atmosphere=AIR).psd([0.0])
+    with pytest.raises(lbt.errors.ProblemError, match="above 0 Hz"):
+        lbt.models.FrozenFlows(atmosphere=AIR).psd([0.0])
 
 
 def test_controllers_that_do_not_fit(kalman):
-    ensemble = lbt.LoopEnsemble(loops=3)
-    with pytest.raises(lbt.DimensionError, match=r"one a loop \(3\)"):
-        lbt.ensemble_residuals([kalman.controller] * 2, kalman.hardware, ensemble)
+    ensemble = lbt.loop.LoopEnsemble(loops=3)
+    with pytest.raises(lbt.errors.DimensionError, match=r"one a loop \(3\)"):
+        lbt.loop.ensemble_residuals([kalman.controller] * 2, kalman.hardware, ensemble)
     small = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    with pytest.raises(lbt.DimensionError, match="map 1 measurements"):
-        lbt.ensemble_residuals(kalman.controller, small, ensemble)
+    with pytest.raises(lbt.errors.DimensionError, match="map 1 measurements"):
+        lbt.loop.ensemble_residuals(kalman.controller, small, ensemble)
     slow = lbt.LoopHardware(frame_rate_hz=500)
-    with pytest.raises(lbt.ProblemError, match="must run at the loop's 500 Hz"):
-        lbt.ensemble_residuals(kalman.controller, slow, ensemble)
+    with pytest.raises(lbt.errors.ProblemError, match="must run at the loop's 500 Hz"):
+        lbt.loop.ensemble_residuals(kalman.controller, slow, ensemble)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.plotting.identification import _apart
+from lbt_synth.report.figures.identification import _apart
 
 FILE = ROOT / "examples" / "data" / "eris_vibrations_psd.fits"
 
@@ -30,12 +30,12 @@ def example() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def seen(example) -> lbt.SpectrumRecord:
+def seen(example) -> lbt.identification.SpectrumRecord:
     return example.record()
 
 
 @pytest.fixture(scope="module")
-def model(seen) -> lbt.IdentifiedModel:
+def model(seen) -> lbt.identification.IdentifiedModel:
     return lbt.identify(seen, frame_rate_hz=1000, delay_frames=2)
 
 
@@ -53,9 +53,9 @@ def test_file_without_names_is_read_as_a_spectrum():
     assert found.rms_nm == pytest.approx([94.6, 101.5], abs=0.05)
     by_number = lbt.load_record(FILE, unit="nm^2/Hz", columns={"frequency": 0, "density": (1, 2)})
     assert np.array_equal(by_number.density_nm2_hz, found.density_nm2_hz)
-    with pytest.raises(lbt.ProblemError, match=r"unit of the density; give unit \(nm\^2/Hz"):
+    with pytest.raises(lbt.errors.ProblemError, match=r"unit of the density; give unit \(nm\^2/Hz"):
         lbt.load_record(FILE, kind="spectrum")
-    with pytest.raises(lbt.ProblemError, match="say what kind"):
+    with pytest.raises(lbt.errors.ProblemError, match="say what kind"):
         lbt.load_record(FILE)
 
 
@@ -109,7 +109,7 @@ def test_parts_of_the_disturbance_are_the_file(seen, example):
     met = example.disturbance(seen)
     f = np.concatenate([seen.frequency_hz, seen.frequency_hz[:-1] + 0.009])
     for i, column in enumerate(seen.spectra):
-        whole = lbt.SumSpectrum(parts=[met.background[i], met.lines[i]])
+        whole = lbt.models.SumSpectrum(parts=[met.background[i], met.lines[i]])
         assert whole.psd(f) == pytest.approx(column.psd(f), rel=1e-12)
         moved = example.disturbance(seen, shift_hz=0.5).lines[i]
         assert moved.psd(f + 0.5) == pytest.approx(met.lines[i].psd(f), rel=1e-9, abs=1e-9)
@@ -119,8 +119,9 @@ def test_kalman_removes_what_the_integrator_leaves_of_the_lines(model, seen, exa
     met, plant = example.disturbance(seen), example.composed(model)
     lines = {}
     for name, design in {
-        "integrator": lbt.model_integrator(plant), "Kalman": lbt.kalman(plant),
-    }.items():  # fmt: skip
+        "integrator": lbt.design.model_integrator(plant),
+        "Kalman": lbt.kalman(plant),
+    }.items():
         assert design.certificate.passed
         loop = lbt.close_loop(plant.hardware, design.controller)
         parts = example.residual(loop, met)
@@ -133,21 +134,21 @@ def test_kalman_removes_what_the_integrator_leaves_of_the_lines(model, seen, exa
         assert example.rms(parts["total"]) ** 2 == pytest.approx(
             sum(example.rms(parts[key]) ** 2 for key in parts if key != "total")
         )
-        limit = lbt.least_residual(plant.hardware, met.whole)
+        limit = lbt.loop.least_residual(plant.hardware, met.whole)
         assert limit.rms_nm < example.rms(parts["total"])
     assert lines["Kalman"] < 0.3 * lines["integrator"]
 
 
 def test_turbulence_of_the_plant_is_the_atmospheres(model, example):
     plant = example.composed(model)
-    air = lbt.ar2_turbulence(example.AIR, frame_rate_hz=1000, noise_nm=example.NOISE_NM)
+    air = lbt.models.ar2_turbulence(example.AIR, frame_rate_hz=1000, noise_nm=example.NOISE_NM)
     made = plant.vibrations[0].ar_model(1000)
     assert made.coefficients == pytest.approx(air.coefficients, rel=1e-9)
     assert made.rms_nm == pytest.approx(air.rms_nm, rel=1e-9)
 
 
 def test_figure_of_a_short_spectrum(model):
-    figure = lbt.identification_figure(model)
+    figure = lbt.report.figures.identification_figure(model)
     figure.canvas.draw()
     labels = [text.get_text() for text in figure.axes[4].get_xticklabels() if text.get_text()]
     assert {"10", "20", "50"} <= set(labels)
@@ -158,8 +159,9 @@ def test_figure_of_a_short_spectrum(model):
         places = [blended.transform(text.get_position())[0] for text in plot.texts]
         # 6.5 points of type, and a little more
         assert np.all(np.diff(places) > 1.1 * 6.5 / 72 * figure.dpi)
-        highest = np.max(np.interp([x.frequency_hz for x in axis.lines],
-                                   axis.frequency_hz, axis.fitted_nm2_hz))  # fmt: skip
+        highest = np.max(
+            np.interp([x.frequency_hz for x in axis.lines], axis.frequency_hz, axis.fitted_nm2_hz)
+        )
         top = plot.transData.transform((10, highest))[1]
         for text in plot.texts:
             x, y = blended.transform(text.get_position())
@@ -180,15 +182,15 @@ def test_labels_do_not_overlap(wanted):
 
 
 def test_sum_of_spectra():
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=2.0, frame_rate_hz=500)
-    table = lbt.TabulatedSpectrum(frequency_hz=[10, 20, 40], density_nm2_hz=[1, 5, 2])
-    other = lbt.TabulatedSpectrum(frequency_hz=[20, 30], density_nm2_hz=[7, 7])
-    whole = lbt.SumSpectrum(parts=[slow, lbt.SumSpectrum(parts=[table, other])])
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=2.0, frame_rate_hz=500)
+    table = lbt.models.TabulatedSpectrum(frequency_hz=[10, 20, 40], density_nm2_hz=[1, 5, 2])
+    other = lbt.models.TabulatedSpectrum(frequency_hz=[20, 30], density_nm2_hz=[7, 7])
+    whole = lbt.models.SumSpectrum(parts=[slow, lbt.models.SumSpectrum(parts=[table, other])])
     f = np.array([5.0, 15.0, 25.0, 100.0])
     assert whole.psd(f) == pytest.approx(slow.psd(f) + np.array([0, 3, 4.25 + 7, 0]))
     assert whole.parts == (slow, table, other)
     assert whole.breakpoints_hz.tolist() == [10, 20, 30, 40]
-    assert isinstance(whole, lbt.Spectrum)
+    assert isinstance(whole, lbt.models.Spectrum)
     path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
     loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
     left = [
@@ -202,5 +204,5 @@ def test_sum_of_spectra():
     ("parts", "text"), [([], "at least one"), ([3.0], "psd"), (3.0, "must be a list")]
 )
 def test_sums_of_no_spectra_are_refused(parts, text):
-    with pytest.raises(lbt.ProblemError, match=text):
-        lbt.SumSpectrum(parts=parts)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.models.SumSpectrum(parts=parts)

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.export.rehearsal import WrittenTerms, rehearsed_error
+from lbt_synth.interop.rehearsal import WrittenTerms, rehearsed_error
 
 FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
@@ -36,7 +36,7 @@ def designs():
 def test_the_compiled_controller_closes_the_loop(tmp_path, loaded, designs, name, precision):
     """Same disturbance and noise for thousands of frames, in a loop: some are unstable alone."""
     single = precision == "single"
-    written = lbt.export_c(tmp_path / "ctl.c", designs[name], precision=precision)
+    written = lbt.interop.export_c(tmp_path / "ctl.c", designs[name], precision=precision)
     theirs = Compiled(written.files[0], single=single)
     commands = [
         lbt.simulate(
@@ -56,7 +56,7 @@ def test_the_compiled_controller_closes_the_loop(tmp_path, loaded, designs, name
 def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, precision):
     """Bit for bit in the loop, and the error that is told is that of the compiled source."""
     design, single = designs[name], precision == "single"
-    written = lbt.export_c(tmp_path / "ctl.c", design, precision=precision)
+    written = lbt.interop.export_c(tmp_path / "ctl.c", design, precision=precision)
     theirs = Compiled(written.files[0], single=single)
     assert rehearsed_error(design, theirs) == written.error
     assert 0 < written.error < LIMITS[precision]
@@ -72,7 +72,7 @@ def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, 
 
 @pytest.mark.parametrize("precision", LIMITS)
 def test_the_compiled_integrator_on_given_measurements(tmp_path, designs, precision):
-    written = lbt.export_c(tmp_path / "slow.c", designs["integrator"], precision=precision)
+    written = lbt.interop.export_c(tmp_path / "slow.c", designs["integrator"], precision=precision)
     theirs = Compiled(written.files[0], single=precision == "single")
     ours = designs["integrator"].controller.start()
     series = np.random.default_rng(1).standard_normal((FRAMES, 2))
@@ -103,7 +103,7 @@ def controllers(draw):
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(controller=controllers(), precision=st.sampled_from(list(LIMITS)))
 def test_any_stable_controller(tmp_path, controller, precision):
-    written = lbt.export_c(tmp_path / "any.c", bare_design(controller), precision=precision)
+    written = lbt.interop.export_c(tmp_path / "any.c", bare_design(controller), precision=precision)
     theirs = Compiled(written.files[0], single=precision == "single")
     ours = controller.start()
     series = np.random.default_rng(2).standard_normal((200, controller.B.shape[1]))
@@ -116,13 +116,13 @@ def test_any_stable_controller(tmp_path, controller, precision):
 
 def test_both_forms_are_met(designs):
     for name in ("kalman", "hinf", "integrator", "prior"):
-        assert lbt.frame_cost(designs[name]).form == "straight line"
-    assert lbt.frame_cost(designs["turned"]).form == "loops"
+        assert lbt.interop.frame_cost(designs[name]).form == "straight line"
+    assert lbt.interop.frame_cost(designs["turned"]).form == "loops"
 
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
 def test_two_loops_at_once_do_not_meet(tmp_path, designs, name):
-    one = Compiled(lbt.export_c(tmp_path / "ctl.c", designs[name]).files[0])
+    one = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs[name]).files[0])
     two = Compiled(tmp_path / "ctl.c", library=one.library)
     alone = [designs[name].controller.start() for _ in range(2)]
     series = np.random.default_rng(3).standard_normal((60, 2, 2))
@@ -133,7 +133,7 @@ def test_two_loops_at_once_do_not_meet(tmp_path, designs, name):
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
 def test_reset_forgets_even_what_is_not_a_number(tmp_path, designs, name):
-    theirs = Compiled(lbt.export_c(tmp_path / "ctl.c", designs[name]).files[0])
+    theirs = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs[name]).files[0])
     series = np.random.default_rng(4).standard_normal((20, 2))
     first = [theirs.step(y) for y in series]
     assert not np.all(np.isfinite(theirs.step([np.nan, 1.0])))
@@ -144,7 +144,7 @@ def test_reset_forgets_even_what_is_not_a_number(tmp_path, designs, name):
 
 def test_measurements_and_commands_in_one_array(tmp_path, designs):
     for name in ("kalman", "turned"):
-        theirs = Compiled(lbt.export_c(tmp_path / "ctl.c", designs[name]).files[0])
+        theirs = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs[name]).files[0])
         ours = designs[name].controller.start()
         for y in np.random.default_rng(5).standard_normal((5, 2)):
             both = y.copy()
@@ -153,7 +153,7 @@ def test_measurements_and_commands_in_one_array(tmp_path, designs):
 
 
 def test_the_header_is_fit_for_cpp(tmp_path, designs):
-    written = lbt.export_c(tmp_path / "ctl.c", designs["kalman"], precision="single")
+    written = lbt.interop.export_c(tmp_path / "ctl.c", designs["kalman"], precision="single")
     user = tmp_path / "user.cpp"
     user.write_text(
         '#include "ctl.h"\n#include "ctl.h"\n'
@@ -173,9 +173,9 @@ def test_the_header_is_fit_for_cpp(tmp_path, designs):
 
 def test_coefficients_are_exact_and_explained(tmp_path, designs):
     controller = designs["kalman"].controller
-    text = lbt.export_c(tmp_path / "k.c", designs["kalman"]).files[0].read_text()
+    text = lbt.interop.export_c(tmp_path / "k.c", designs["kalman"]).files[0].read_text()
     found = re.findall(r"(-?0x\S+p[+-]\d+), /\* ([ABCD])\[(\d+)\]\[(\d+)\] = (\S+) \*/", text)
-    assert len(found) == lbt.frame_cost(controller).coefficients
+    assert len(found) == lbt.interop.frame_cost(controller).coefficients
     for code, name, i, j, decimal in found:
         value = getattr(controller, name)[int(i), int(j)]
         assert float.fromhex(code) == value == float(decimal)
@@ -183,7 +183,7 @@ def test_coefficients_are_exact_and_explained(tmp_path, designs):
 
 def test_the_comment_says_where_it_comes_from(tmp_path, designs):
     sha = "ab" * 32
-    written = lbt.export_c(tmp_path / "k.c", designs["kalman"], gain_digest=sha)
+    written = lbt.interop.export_c(tmp_path / "k.c", designs["kalman"], gain_digest=sha)
     for file in written.files:
         text = file.read_text()
         for part in (lbt.__version__, "kalman (riccati)", sha, "800.0 Hz", "2.0 frames", "nm rms"):
@@ -196,14 +196,16 @@ def test_the_comment_says_where_it_comes_from(tmp_path, designs):
     "evil", ["*/ int main(void) {} /*", "x\\\n*/", "??/", "*\n/ #error", "\u202e*/", 'a"b', "\x00"]
 )
 def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
-    check = lbt.Check(name=evil, value=0.0, limit=1.0, method=evil)
+    check = lbt.design.Check(name=evil, value=0.0, limit=1.0, method=evil)
     design = replace(
         designs["integrator"],
         method=evil,
-        solver=lbt.SolverReport(route=evil, status=evil, iterations=0),
-        certificate=lbt.Certificate(checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0)),
+        solver=lbt.design.SolverReport(route=evil, status=evil, iterations=0),
+        certificate=lbt.design.Certificate(
+            checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0)
+        ),
     )
-    written = lbt.export_c(tmp_path / "k.c", design)
+    written = lbt.interop.export_c(tmp_path / "k.c", design)
     Compiled(written.files[0])
     code = written.files[0].read_text()
     assert code.isascii()
@@ -216,15 +218,17 @@ def test_the_same_design_is_the_same_source(tmp_path, designs, precision):
     texts = []
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
-        files = lbt.export_c(
+        files = lbt.interop.export_c(
             tmp_path / folder / "k.c", designs["hinf"], precision=precision
-        ).files  # fmt: skip
+        ).files
         texts.append([file.read_bytes() for file in files])
     assert texts[0] == texts[1]
 
 
 def test_a_name_of_its_own(tmp_path, designs):
-    written = lbt.export_c(tmp_path / "tip-tilt.v2.c", designs["integrator"], name="Tip_tilt2")
+    written = lbt.interop.export_c(
+        tmp_path / "tip-tilt.v2.c", designs["integrator"], name="Tip_tilt2"
+    )
     assert '#include "tip-tilt.v2.h"' in written.files[0].read_text()
     assert Compiled(written.files[0], name="Tip_tilt2").step([1.0, 0.0])[1] == 0
 
@@ -233,52 +237,53 @@ def test_a_name_of_its_own(tmp_path, designs):
     "name", ["", "2fast", "kal-man", "a b", "_x", "x_", "a__b", "ä", "x;y", "x" * 26, 3, "a\n"]
 )
 def test_names_that_are_no_identifiers(tmp_path, designs, name):
-    with pytest.raises(lbt.ProblemError, match="prefix of the C names must"):
-        lbt.export_c(tmp_path / "k.c", designs["integrator"], name=name)
+    with pytest.raises(lbt.errors.ProblemError, match="prefix of the C names must"):
+        lbt.interop.export_c(tmp_path / "k.c", designs["integrator"], name=name)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("file", ["k.h", "k", "k.C", 'k".c', "k\\.c", "k\n.c", ".."])
 def test_files_that_are_no_source(tmp_path, designs, file):
-    with pytest.raises(lbt.OutputError, match=r"must end in \.c"):
-        lbt.export_c(tmp_path / file, designs["integrator"], name="k")
+    with pytest.raises(lbt.errors.OutputError, match=r"must end in \.c"):
+        lbt.interop.export_c(tmp_path / file, designs["integrator"], name="k")
 
 
 def test_single_precision_has_a_largest_number(tmp_path):
     huge = lbt.Controller(A=[[0.5]], B=[[1e39]], C=[[1e-39]], D=[[0.0]])
-    lbt.export_c(tmp_path / "k.c", bare_design(huge))
+    lbt.interop.export_c(tmp_path / "k.c", bare_design(huge))
     with pytest.raises(
-        lbt.ProblemError, match=r"below 3.4e\+38 in single precision; got 1e\+39 in B"
+        lbt.errors.ProblemError, match=r"below 3.4e\+38 in single precision; got 1e\+39 in B"
     ):
-        lbt.export_c(tmp_path / "single.c", bare_design(huge), precision="single")
+        lbt.interop.export_c(tmp_path / "single.c", bare_design(huge), precision="single")
     assert not list(tmp_path.glob("single*"))
 
 
 def test_arithmetic_that_overflows_is_refused(tmp_path):
     """Coefficients that fit, products that do not."""
     steep = lbt.Controller(A=[[0.5]], B=[[1e30]], C=[[1e30]], D=[[0.0]])
-    lbt.export_c(tmp_path / "k.c", bare_design(steep))
-    with pytest.raises(lbt.NumericalError, match="must stay finite in single precision"):
-        lbt.export_c(tmp_path / "single.c", bare_design(steep), precision="single")
+    lbt.interop.export_c(tmp_path / "k.c", bare_design(steep))
+    with pytest.raises(lbt.errors.NumericalError, match="must stay finite in single precision"):
+        lbt.interop.export_c(tmp_path / "single.c", bare_design(steep), precision="single")
     assert not list(tmp_path.glob("single*"))
 
 
 def test_a_loop_that_rounding_would_break_is_refused(tmp_path, loaded):
     brink = lbt.integrator(loaded.hardware, gain=1 - 1e-8)  # stable below 1; rounds to 1
-    lbt.export_c(tmp_path / "k.c", brink)
-    with pytest.raises(lbt.NumericalError, match="as they would be written is unstable"):
-        lbt.export_c(tmp_path / "single.c", brink, precision="single")
+    lbt.interop.export_c(tmp_path / "k.c", brink)
+    with pytest.raises(lbt.errors.NumericalError, match="as they would be written is unstable"):
+        lbt.interop.export_c(tmp_path / "single.c", brink, precision="single")
     assert not list(tmp_path.glob("single*"))
 
 
 def test_precision_is_one_of_two(tmp_path, designs):
-    with pytest.raises(lbt.ProblemError, match="precision must be one of double, single"):
-        lbt.export_c(tmp_path / "k.c", designs["integrator"], precision="half")
+    with pytest.raises(lbt.errors.ProblemError, match="precision must be one of double, single"):
+        lbt.interop.export_c(tmp_path / "k.c", designs["integrator"], precision="half")
 
 
 def test_source_and_header_are_both_written_or_none(tmp_path, designs, monkeypatch):
     before = {
-        file: file.read_bytes() for file in lbt.export_c(tmp_path / "k.c", designs["kalman"]).files
+        file: file.read_bytes()
+        for file in lbt.interop.export_c(tmp_path / "k.c", designs["kalman"]).files
     }
     real = Path.replace
 
@@ -289,12 +294,12 @@ def test_source_and_header_are_both_written_or_none(tmp_path, designs, monkeypat
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "replace", stubborn)
-        with pytest.raises(lbt.OutputError, match=r"cannot write .*k\.h: No space left"):
-            lbt.export_c(tmp_path / "k.c", designs["hinf"])
-        with pytest.raises(lbt.OutputError):
-            lbt.export_c(tmp_path / "new.c", designs["hinf"])
+        with pytest.raises(lbt.errors.OutputError, match=r"cannot write .*k\.h: No space left"):
+            lbt.interop.export_c(tmp_path / "k.c", designs["hinf"])
+        with pytest.raises(lbt.errors.OutputError):
+            lbt.interop.export_c(tmp_path / "new.c", designs["hinf"])
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
     (tmp_path / "taken.h").mkdir()
-    with pytest.raises(lbt.OutputError, match=r"taken\.h is a directory"):
-        lbt.export_c(tmp_path / "taken.c", designs["hinf"])
+    with pytest.raises(lbt.errors.OutputError, match=r"taken\.h is a directory"):
+        lbt.interop.export_c(tmp_path / "taken.c", designs["hinf"])
     assert not (tmp_path / "taken.c").exists()

@@ -82,7 +82,7 @@ def test_export_mat_and_iir_at_the_terminal(tmp_path, capsys, designs, gains):
 def test_a_transfer_function_that_single_precision_breaks_gets_a_note(
     tmp_path, capsys, loaded, half_width_hz, effect
 ):
-    prior = lbt.kalman(lbt.spread_plant(loaded.plant, half_width_hz=half_width_hz, lines=3))
+    prior = lbt.kalman(lbt.models.spread_plant(loaded.plant, half_width_hz=half_width_hz, lines=3))
     gain = lbt.save_gain(tmp_path / "g.fits", prior)
     arguments = ("export", gain, "--format", "iir", "-o", tmp_path / "k.fits")
     status, text, _ = run(capsys, *arguments)
@@ -97,9 +97,12 @@ def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys):
     """An integrator beside large states that the command subtracts again."""
     slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
     large = lbt.Controller(
-        A=[[1, 0, 0], [0, 0.3, 0], [0, 0, 0.3]], B=[[0.4], [1e5], [1e5]], C=[[1, 1, -1]], D=[[0]],
+        A=[[1, 0, 0], [0, 0.3, 0], [0, 0, 0.3]],
+        B=[[0.4], [1e5], [1e5]],
+        C=[[1, 1, -1]],
+        D=[[0]],
         dt_s=1 / 800,
-    )  # fmt: skip
+    )
     gain = lbt.save_gain(tmp_path / "g.fits", dataclasses.replace(slow, controller=large))
     arguments = ("export", gain, "--format", "c", "-o", tmp_path / "k.c")
     status, text, _ = run(capsys, *arguments, "--precision", "single")
@@ -110,7 +113,7 @@ def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
 def test_show_prints_the_cost(capsys, designs, gains, name):
-    cost = lbt.frame_cost(designs[name])
+    cost = lbt.interop.frame_cost(designs[name])
     status, text, _ = run(capsys, "show", gains[name])
     assert status == 0
     assert re.search(rf"multiplications a frame +{cost.multiplications} +\({cost.form}\)", text)
@@ -122,7 +125,11 @@ def test_show_prints_the_cost(capsys, designs, gains, name):
 
 BAD = [
     (("KALMAN", "--format", "mat", "-o", "k.mat", "--name", "x"), 2, "--name goes with --format c"),
-    (("KALMAN", "--format", "iir", "-o", "k.fits", "--precision", "single"), 2, "--precision goes with"),
+    (
+        ("KALMAN", "--format", "iir", "-o", "k.fits", "--precision", "single"),
+        2,
+        "--precision goes with",
+    ),
     (("KALMAN", "--format", "c", "-o", "k.c", "--precision", "half"), 2, "invalid choice"),
     (("KALMAN", "--format", "c", "-o", "k.c", "--name", "2x"), 2, "prefix of the C names"),
     (("KALMAN", "--format", "c", "-o", "kal man.c"), 2, "must end in .c"),
@@ -136,7 +143,7 @@ BAD = [
     (("none.fits", "--format", "c", "-o", "k.c"), 2, "cannot read none.fits"),
     (("DAMAGED.fits", "--format", "c", "-o", "k.c"), 2, "damaged"),
     (("PRIOR", "--format", "iir", "-o", "k.fits"), 1, "do not hold the poles"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("arguments", "expected", "text"), BAD)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 import lbt_synth as lbt
-from lbt_synth.export.polynomials import axis_polynomials
+from lbt_synth.interop.iir.polynomials import axis_polynomials
 
 
 @pytest.fixture
@@ -27,32 +27,36 @@ def designs():
     return lbt_designs()
 
 
-EXPORTS = {"k.c": lbt.export_c, "k.mat": lbt.export_mat, "k.fits": lbt.export_iir}
+EXPORTS = {
+    "k.c": lbt.interop.export_c,
+    "k.mat": lbt.interop.export_mat,
+    "k.fits": lbt.interop.export_iir,
+}
 
 
 @pytest.mark.parametrize("file", EXPORTS)
 def test_what_no_format_takes(tmp_path, designs, file):
     export, target = EXPORTS[file], tmp_path / file
-    with pytest.raises(lbt.ProblemError, match="expected a Design; got int"):
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got int"):
         export(target, 3)
-    failed = lbt.Check(name="rms", value=2.0, limit=1.0, method="guess")
-    with pytest.raises(lbt.CertificateError, match="this one failed: rms") as caught:
+    failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, method="guess")
+    with pytest.raises(lbt.errors.CertificateError, match="this one failed: rms") as caught:
         export(
             target,
             replace(
                 designs["integrator"],
-                certificate=lbt.Certificate(
+                certificate=lbt.design.Certificate(
                     checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0)
                 ),
             ),
         )
     assert caught.value.failed == ("rms",)
     for digest in ("abc", "AB" * 32, 3, "ab" * 32 + "\n"):
-        with pytest.raises(lbt.ProblemError, match="64 hexadecimal digits"):
+        with pytest.raises(lbt.errors.ProblemError, match="64 hexadecimal digits"):
             export(target, designs["integrator"], gain_digest=digest)
-    with pytest.raises(lbt.OutputError, match="must end in"):
+    with pytest.raises(lbt.errors.OutputError, match="must end in"):
         export(tmp_path / "k.txt", designs["integrator"])
-    with pytest.raises(lbt.OutputError, match="cannot write"):
+    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
         export(tmp_path / "nowhere" / file, designs["integrator"])
     assert not list(tmp_path.iterdir())
 
@@ -61,7 +65,7 @@ def test_costs_by_hand():
     controller = lbt.Controller(
         A=[[1.0, 0.5], [0.0, -1.0]], B=[[2.0], [0.0]], C=[[1.0, 1.0], [0.0, 0.0]], D=[[0.0], [3.0]]
     )
-    cost = lbt.frame_cost(controller)
+    cost = lbt.interop.frame_cost(controller)
     # x0 + .5 x1 + 2 y; -x1; n0 + n1; 3 y
     assert (cost.multiplications, cost.additions, cost.coefficients, cost.states) == (3, 3, 3, 2)
     assert (cost.dense_multiplications, cost.dense_additions, cost.dense_coefficients) == (
@@ -75,30 +79,30 @@ def test_costs_by_hand():
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
 def test_costs_are_those_of_the_source(tmp_path, designs, name):
-    text = lbt.export_c(tmp_path / "k.c", designs[name]).files[0].read_text()
+    text = lbt.interop.export_c(tmp_path / "k.c", designs[name]).files[0].read_text()
     body = text.split("k_step(k_state", 1)[1].split("{", 1)[1]
-    cost = lbt.frame_cost(designs[name])
+    cost = lbt.interop.frame_cost(designs[name])
     assert body.count(" * ") == cost.multiplications
     assert body.count(" + ") + body.count(" - ") == cost.additions
 
 
 def test_costs_of_whole_matrices(tmp_path, designs):
-    cost = lbt.frame_cost(designs["turned"])
+    cost = lbt.interop.frame_cost(designs["turned"])
     n = designs["turned"].controller.n_states
     assert cost.multiplications == cost.dense_multiplications == (n + 2) ** 2
-    text = lbt.export_c(tmp_path / "k.c", designs["turned"]).files[0].read_text()
+    text = lbt.interop.export_c(tmp_path / "k.c", designs["turned"]).files[0].read_text()
     assert len(re.findall(r"/\* \[\d+\]\[\d+\] = ", text)) == cost.coefficients
 
 
 def test_costs_need_a_controller():
-    with pytest.raises(lbt.ProblemError, match="expected a Design or a Controller; got int"):
-        lbt.frame_cost(3)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Design or a Controller; got int"):
+        lbt.interop.frame_cost(3)
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
 def test_matlab_round_trip(tmp_path, designs, name):
     design = designs[name]
-    written = lbt.export_mat(tmp_path / "k.mat", design, gain_digest="cd" * 32)
+    written = lbt.interop.export_mat(tmp_path / "k.mat", design, gain_digest="cd" * 32)
     data = loadmat(written.files[0], simplify_cells=True)
     for key in "ABCD":
         assert np.array_equal(data["new_state"][key], getattr(design.controller, key))
@@ -122,14 +126,16 @@ def test_matlab_round_trip(tmp_path, designs, name):
 
 
 def test_the_same_design_is_the_same_matlab_file(tmp_path, designs):
-    files = [lbt.export_mat(tmp_path / n, designs["kalman"]).files[0] for n in ("a.mat", "b.mat")]
+    files = [
+        lbt.interop.export_mat(tmp_path / n, designs["kalman"]).files[0] for n in ("a.mat", "b.mat")
+    ]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert files[0].read_bytes().startswith(b"MATLAB 5.0 MAT-file")
 
 
 def test_matlab_file_of_a_bare_problem(tmp_path):
     odd = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0, 3.0]], C=[[1.0], [4.0]], D=np.zeros((2, 3)))
-    data = loadmat(lbt.export_mat(tmp_path / "k.mat", bare_design(odd)).files[0])
+    data = loadmat(lbt.interop.export_mat(tmp_path / "k.mat", bare_design(odd)).files[0])
     assert data["textbook"]["D"][0, 0].tolist() == [[1, 2, 3], [4, 8, 12]]
     assert "frame_rate_hz" not in data
 
@@ -137,7 +143,7 @@ def test_matlab_file_of_a_bare_problem(tmp_path):
 @pytest.mark.parametrize(("name", "limit"), [("kalman", 1e-12), ("hinf", 1e-9), ("integrator", 0)])
 def test_transfer_functions_are_those_of_the_controller(tmp_path, designs, name, limit):
     design = designs[name]
-    written = lbt.export_iir(tmp_path / "k.fits", design)
+    written = lbt.interop.export_iir(tmp_path / "k.fits", design)
     num, den = transfer_functions(written.files[0])
     assert written.error <= max(limit, 1e-15)
     frequency = np.linspace(0.5, 399, 200)
@@ -150,13 +156,15 @@ def test_transfer_functions_are_those_of_the_controller(tmp_path, designs, name,
 
 def test_an_integrator_is_the_textbook_one(tmp_path, loaded):
     slow = lbt.integrator(loaded.hardware, gain=0.25)
-    num, den = transfer_functions(lbt.export_iir(tmp_path / "k.fits", slow).files[0])
+    num, den = transfer_functions(lbt.interop.export_iir(tmp_path / "k.fits", slow).files[0])
     assert num.tolist() == [[0, 0.25]] * 2  # 0.25 z / (z - 1)
     assert den.tolist() == [[-1, 1]] * 2
 
 
 def test_states_of_the_other_axis_and_delays_in_both_are_left_out(tmp_path, designs):
-    num, den = transfer_functions(lbt.export_iir(tmp_path / "k.fits", designs["kalman"]).files[0])
+    num, den = transfer_functions(
+        lbt.interop.export_iir(tmp_path / "k.fits", designs["kalman"]).files[0]
+    )
     assert num.shape == (2, 5)  # of ten states, five are the other axis', one a factor z
     poles = np.sort_complex(np.roots(den[0, ::-1]))
     own = np.linalg.eigvals(designs["kalman"].controller.A)
@@ -181,7 +189,7 @@ def test_axes_of_any_order(tmp_path, seed, orders):
         D[axis, axis] = rng.standard_normal() * rng.choice([0, 1])
     turn = rng.permutation(n)
     controller = lbt.Controller(A=A[np.ix_(turn, turn)], B=B[turn], C=C[:, turn], D=D)
-    written = lbt.export_iir(tmp_path / "k.fits", bare_design(controller))
+    written = lbt.interop.export_iir(tmp_path / "k.fits", bare_design(controller))
     num, den = transfer_functions(written.files[0])
     series = rng.standard_normal((100, m))
     run = controller.start()
@@ -210,18 +218,18 @@ def test_exact_coefficients_of_close_poles():
 
 def test_transfer_functions_that_do_not_hold(tmp_path, loaded, designs):
     """Fifteen lines within a few hertz: no double precision coefficients hold these poles."""
-    with pytest.raises(lbt.NumericalError, match="do not hold the poles") as caught:
-        lbt.export_iir(tmp_path / "k.fits", designs["prior"])
+    with pytest.raises(lbt.errors.NumericalError, match="do not hold the poles") as caught:
+        lbt.interop.export_iir(tmp_path / "k.fits", designs["prior"])
     assert caught.value.residual > 1e-6
-    with pytest.raises(lbt.NumericalError, match="to 1e-30 of the largest one"):
-        lbt.export_iir(tmp_path / "k.fits", designs["kalman"], tolerance=1e-30)
+    with pytest.raises(lbt.errors.NumericalError, match="to 1e-30 of the largest one"):
+        lbt.interop.export_iir(tmp_path / "k.fits", designs["kalman"], tolerance=1e-30)
     assert not list(tmp_path.iterdir())
 
 
 def test_single_precision_may_break_a_loop(tmp_path, loaded):
     """Three lines: fine in double precision, unstable in single, and it is said."""
-    prior = lbt.kalman(lbt.spread_plant(loaded.plant, half_width_hz=3.5, lines=3))
-    written = lbt.export_iir(tmp_path / "k.fits", prior)
+    prior = lbt.kalman(lbt.models.spread_plant(loaded.plant, half_width_hz=3.5, lines=3))
+    written = lbt.interop.export_iir(tmp_path / "k.fits", prior)
     assert written.error < 1e-6
     assert written.error_single > 1e-2
 
@@ -229,23 +237,27 @@ def test_single_precision_may_break_a_loop(tmp_path, loaded):
 def test_axes_that_do_not_decouple(tmp_path, loaded):
     slanted = replace(loaded.plant.vibrations[0], direction=(0.6, 0.8))
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=loaded.plant.turbulence, vibrations=[slanted],
+        frame_rate_hz=800,
+        turbulence=loaded.plant.turbulence,
+        vibrations=[slanted],
         noise_nm=loaded.noise_nm,
-    )  # fmt: skip
-    with pytest.raises(lbt.ProblemError, match="here measurement 2 moves command 1"):
-        lbt.export_iir(tmp_path / "k.fits", lbt.kalman(plant))
+    )
+    with pytest.raises(lbt.errors.ProblemError, match="here measurement 2 moves command 1"):
+        lbt.interop.export_iir(tmp_path / "k.fits", lbt.kalman(plant))
     direct = lbt.Controller(A=[[0.0]], B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[1.0, 0.0], [0.5, 1.0]])
-    with pytest.raises(lbt.ProblemError, match="here measurement 1 moves command 2"):
-        lbt.export_iir(tmp_path / "k.fits", bare_design(direct))
+    with pytest.raises(lbt.errors.ProblemError, match="here measurement 1 moves command 2"):
+        lbt.interop.export_iir(tmp_path / "k.fits", bare_design(direct))
     wide = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0]], C=[[1.0]], D=[[0.0, 0.0]])
-    with pytest.raises(lbt.ProblemError, match="got 1 commands and 2 measurements"):
-        lbt.export_iir(tmp_path / "k.fits", bare_design(wide))
+    with pytest.raises(lbt.errors.ProblemError, match="got 1 commands and 2 measurements"):
+        lbt.interop.export_iir(tmp_path / "k.fits", bare_design(wide))
     long = lbt.Controller(A=np.eye(41, k=1), B=np.eye(41)[:, -1:], C=np.eye(41)[:1], D=[[0.0]])
-    with pytest.raises(lbt.ProblemError, match="at most 40 states for a transfer function; got 41"):
-        lbt.export_iir(tmp_path / "k.fits", bare_design(long))
+    with pytest.raises(
+        lbt.errors.ProblemError, match="at most 40 states for a transfer function; got 41"
+    ):
+        lbt.interop.export_iir(tmp_path / "k.fits", bare_design(long))
     big = lbt.Controller(A=1e150 * np.eye(2, k=1), B=[[0.0], [1e150]], C=[[1e150, 0.0]], D=[[0.0]])
-    with pytest.raises(lbt.NumericalError, match="too large for double precision"):
-        lbt.export_iir(tmp_path / "k.fits", bare_design(big))
-    with pytest.raises(lbt.ProblemError, match="tolerance must be above 0"):
-        lbt.export_iir(tmp_path / "k.fits", bare_design(long), tolerance=0)
+    with pytest.raises(lbt.errors.NumericalError, match="too large for double precision"):
+        lbt.interop.export_iir(tmp_path / "k.fits", bare_design(big))
+    with pytest.raises(lbt.errors.ProblemError, match="tolerance must be above 0"):
+        lbt.interop.export_iir(tmp_path / "k.fits", bare_design(long), tolerance=0)
     assert not list(tmp_path.iterdir())

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.gainfile import store
+from lbt_synth.files.gain_file import store
 
 ENDINGS = ("fits", "npz", "json")
 
@@ -45,7 +45,7 @@ def test_round_trip_keeps_every_bit(tmp_path, name, ending):
     assert back.solver == design.solver
     assert back.certificate.checks == design.certificate.checks
     assert back.recertified().passed
-    if isinstance(design, lbt.FilterDesign):
+    if isinstance(design, lbt.design.FilterDesign):
         assert type(back.problem) is type(design.problem)
         for field in ("gain_predictor", "gain_filter"):
             assert np.array_equal(getattr(back, field), getattr(design, field))
@@ -122,7 +122,7 @@ def test_truncated_files_are_refused(tmp_path, ending):
         len(content) - 40,
     ):
         path.write_bytes(content[:length])
-        with pytest.raises(lbt.GainFileError) as caught:
+        with pytest.raises(lbt.errors.GainFileError) as caught:
             lbt.load_gain(path)
         assert "\n" not in str(caught.value)
 
@@ -138,7 +138,7 @@ def test_a_flipped_bit_is_found_or_harmless(tmp_path, ending, place, bit):
     path.write_bytes(bytes(content))
     try:
         back = lbt.load_gain(path)
-    except lbt.GainFileError:
+    except lbt.errors.GainFileError:
         return
     assert np.array_equal(back.controller.A, DESIGNS["kalman"].controller.A)
     assert np.array_equal(back.gain_predictor, DESIGNS["kalman"].gain_predictor)
@@ -156,7 +156,7 @@ def test_foreign_files_are_refused(tmp_path):
     pickled = tmp_path / "pickled.npz"
     np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
     for path in (picture, other, notes, prose, pickled):
-        with pytest.raises(lbt.GainFileError, match=f"{path.name} is "):
+        with pytest.raises(lbt.errors.GainFileError, match=f"{path.name} is "):
             lbt.load_gain(path)
 
 
@@ -175,12 +175,14 @@ def test_an_edited_gain_does_not_match_its_digest(tmp_path):
     def change(document):
         document["arrays"]["GAIN_PREDICTOR"][0][0] *= 1.0001
 
-    with pytest.raises(lbt.GainFileError, match="does not match its digest"):
+    with pytest.raises(lbt.errors.GainFileError, match="does not match its digest"):
         lbt.load_gain(edited(tmp_path, change, resign=False))
 
 
 def test_a_later_layout_is_refused_by_its_number(tmp_path):
-    with pytest.raises(lbt.SchemaVersionError, match="layout version 99; this lbt_synth reads 1"):
+    with pytest.raises(
+        lbt.errors.SchemaVersionError, match="layout version 99; this lbt_synth reads 1"
+    ):
         lbt.load_gain(edited(tmp_path, lambda d: d["meta"].update(schema_version=99)))
 
 
@@ -197,7 +199,7 @@ def test_a_later_layout_is_refused_by_its_number(tmp_path):
     ],
 )
 def test_signed_nonsense_is_inconsistent(tmp_path, change, text):
-    with pytest.raises(lbt.GainFileError, match=text):
+    with pytest.raises(lbt.errors.GainFileError, match=text):
         lbt.load_gain(edited(tmp_path, change))
 
 
@@ -212,14 +214,14 @@ def test_a_file_that_was_tampered_with_is_not_verified(tmp_path):
 
 
 def test_endings_and_missing_files(tmp_path):
-    with pytest.raises(lbt.OutputError, match="must end in .fits, .npz, .json; got 'g.txt'"):
+    with pytest.raises(lbt.errors.OutputError, match="must end in .fits, .npz, .json; got 'g.txt'"):
         lbt.save_gain(tmp_path / "g.txt", DESIGNS["kalman"])
-    with pytest.raises(lbt.GainFileError, match="must end in"):
+    with pytest.raises(lbt.errors.GainFileError, match="must end in"):
         lbt.load_gain(tmp_path / "g.txt")
-    with pytest.raises(lbt.GainFileError, match="cannot read .*No such file"):
+    with pytest.raises(lbt.errors.GainFileError, match="cannot read .*No such file"):
         lbt.load_gain(tmp_path / "none.fits")
     (tmp_path / "folder.fits").mkdir()
-    with pytest.raises(lbt.GainFileError, match="cannot read"):
+    with pytest.raises(lbt.errors.GainFileError, match="cannot read"):
         lbt.load_gain(tmp_path / "folder.fits")
 
 
@@ -231,21 +233,21 @@ def test_nothing_half_written_stays(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(lbt.OutputError, match="cannot write .*No space left on device"):
+    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No space left on device"):
         lbt.save_gain(path, DESIGNS["hinf"])
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["g.fits"]
 
 
 def test_directories_that_cannot_be_written(tmp_path):
-    with pytest.raises(lbt.OutputError, match="cannot write .*No such file or directory"):
+    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No such file or directory"):
         lbt.save_gain(tmp_path / "nowhere" / "g.fits", DESIGNS["kalman"])
     (tmp_path / "taken.fits").mkdir()
-    with pytest.raises(lbt.OutputError, match="is a directory"):
+    with pytest.raises(lbt.errors.OutputError, match="is a directory"):
         lbt.save_gain(tmp_path / "taken.fits", DESIGNS["kalman"])
     file = tmp_path / "file"
     file.write_text("")
-    with pytest.raises(lbt.OutputError, match="Not a directory"):
+    with pytest.raises(lbt.errors.OutputError, match="Not a directory"):
         lbt.save_gain(file / "g.fits", DESIGNS["kalman"])
 
 
@@ -264,7 +266,7 @@ def test_directories_that_cannot_be_written(tmp_path):
 def test_hostile_json(tmp_path, text):
     path = tmp_path / "h.json"
     path.write_text(text)
-    with pytest.raises(lbt.GainFileError):
+    with pytest.raises(lbt.errors.GainFileError):
         lbt.load_gain(path)
 
 
@@ -277,14 +279,14 @@ def test_hostile_archives(tmp_path):
         path.write_bytes(bytes(damaged))
         try:
             assert np.array_equal(lbt.load_gain(path).controller.A, DESIGNS["bare"].controller.A)
-        except lbt.GainFileError:
+        except lbt.errors.GainFileError:
             continue
 
 
 def test_impossible_names():
-    with pytest.raises(lbt.GainFileError, match="null"):
+    with pytest.raises(lbt.errors.GainFileError, match="null"):
         lbt.load_gain("x\0y.json")
-    with pytest.raises(lbt.OutputError, match="null"):
+    with pytest.raises(lbt.errors.OutputError, match="null"):
         lbt.save_gain("x\0y.json", DESIGNS["bare"])
 
 
@@ -307,10 +309,10 @@ def test_an_edited_header_card_is_found(tmp_path, old, new):
     content = path.read_bytes()
     assert old in content
     path.write_bytes(content.replace(old, new))
-    with pytest.raises(lbt.GainFileError, match="a checksum is broken"):
+    with pytest.raises(lbt.errors.GainFileError, match="a checksum is broken"):
         lbt.load_gain(path)
 
 
 def test_only_designs_are_saved(tmp_path):
-    with pytest.raises(lbt.OutputError, match="holds a Design; got int"):
+    with pytest.raises(lbt.errors.OutputError, match="holds a Design; got int"):
         lbt.save_gain(tmp_path / "g.fits", 3)

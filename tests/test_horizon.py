@@ -18,9 +18,12 @@ def uncorrelated(problem):
     n, p = problem.B.shape
     q = problem.C.shape[0]
     return lbt.EstimationProblem(
-        A=problem.A, B=np.hstack([problem.B, np.zeros((n, q))]), C=problem.C,
-        D=np.hstack([np.zeros((q, p)), problem.D[:, :q] + 2 * np.eye(q)]), L=problem.L,
-    )  # fmt: skip
+        A=problem.A,
+        B=np.hstack([problem.B, np.zeros((n, q))]),
+        C=problem.C,
+        D=np.hstack([np.zeros((q, p)), problem.D[:, :q] + 2 * np.eye(q)]),
+        L=problem.L,
+    )
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 4), q=st.integers(1, 2), l=st.integers(1, 2))
@@ -76,7 +79,7 @@ def test_hinf_filter_form_against_its_own_riccati_condition(seed, n):
         weight = np.diag(np.r_[np.diag(p.R), -(gamma**2) * np.ones(len(p.L))])
         try:
             P = lbt.solve_dare(p.A.T, outputs.T, p.Q, weight).X
-        except (lbt.SynthesisError, lbt.DetectabilityError):
+        except (lbt.errors.SynthesisError, lbt.errors.DetectabilityError):
             return False
         P = P + 1e-12 * np.trace(P) * np.eye(n)
         information = np.linalg.inv(P) + p.C.T @ np.linalg.solve(p.R, p.C) - p.L.T @ p.L / gamma**2
@@ -89,14 +92,16 @@ def test_hinf_filter_form_against_its_own_riccati_condition(seed, n):
 def test_correlated_noise_is_refused_beyond_one_frame():
     p = random_problem(np.random.default_rng(0), 3)
     assert lbt.kalman(p, horizon=0).certificate.passed
-    with pytest.raises(lbt.ProblemError, match="prediction of 2 frames needs .* uncorrelated"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="prediction of 2 frames needs .* uncorrelated"
+    ):
         lbt.kalman(p, horizon=2)
 
 
 @pytest.mark.parametrize("horizon", [1.0, "1", None, True, 101, -101])
 def test_wrong_horizons(horizon):
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.ProblemError, match="horizon must be"):
+    with pytest.raises(lbt.errors.ProblemError, match="horizon must be"):
         lbt.kalman(walk, horizon=horizon)
 
 
@@ -117,9 +122,9 @@ def test_a_horizon_is_a_delay_of_the_loop(method):
         p = lbt_axis_plant()
         bare = lbt.EstimationProblem(A=p.A, B=p.B, C=p.C, D=p.D, L=p.L, dt_s=p.dt_s)
         assert make(bare, horizon=horizon).rms == pytest.approx(direct.rms, rel=1e-9)
-    with pytest.raises(lbt.ProblemError, match="delay of 1 to 100 frames; got -1"):
+    with pytest.raises(lbt.errors.ProblemError, match="delay of 1 to 100 frames; got -1"):
         make(lbt_axis_plant(), horizon=-1)
-    with pytest.raises(lbt.ProblemError, match="horizon of 1; got 2"):
+    with pytest.raises(lbt.errors.ProblemError, match="horizon of 1; got 2"):
         make(lbt_axis_plant().full(), horizon=2)
 
 

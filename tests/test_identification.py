@@ -12,9 +12,9 @@ from scipy.optimize import approx_fprime
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.identification.periodogram import loop_periodogram
-from lbt_synth.identification.search import candidates
-from lbt_synth.identification.whittle import GAIN, Likelihood
+from lbt_synth.identification.fit.line_candidates import candidates
+from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.fit.whittle import GAIN, Likelihood
 from lbt_synth.models.resonance import coefficients, log_density, log_roll_off
 
 RATE = 1000.0
@@ -29,7 +29,7 @@ def loop_of(
     gain: float = 0.4,
     frames: int = FRAMES,
     seed: int = 0,
-    turbulence: lbt.ARModel | None = None,
+    turbulence: lbt.models.ARModel | None = None,
     axes: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Measurements and corrections of an integrator's loop, (frames, axes) each."""
@@ -49,10 +49,10 @@ def loop_of(
     return run.measurements[0][2:], run.commands[0][:-2]
 
 
-def slow() -> lbt.ARModel:
+def slow() -> lbt.models.ARModel:
     """Turbulence of 300 nm around 1 Hz."""
     a1, a2, drive = coefficients(2 * np.pi * 1.0 / RATE, 0.6)
-    return lbt.ARModel(
+    return lbt.models.ARModel(
         coefficients=[a1, a2], driving_rms_nm=300 * np.sqrt(drive), frame_rate_hz=RATE
     )
 
@@ -149,11 +149,17 @@ def likelihood() -> tuple[Likelihood, np.ndarray]:
     w = 2 * np.pi / RATE
     theta = np.array(
         [
-            np.log(0.7), np.log(30), np.log(20 * w),
-            np.log(1.1 * w), np.log(0.5), np.log(200.0**2),
-            np.log(39 * w), np.log(0.02 / 0.98), np.log(15.0**2),
+            np.log(0.7),
+            np.log(30),
+            np.log(20 * w),
+            np.log(1.1 * w),
+            np.log(0.5),
+            np.log(200.0**2),
+            np.log(39 * w),
+            np.log(0.02 / 0.98),
+            np.log(15.0**2),
         ]
-    )  # fmt: skip
+    )
     return Likelihood(data), theta
 
 
@@ -207,7 +213,7 @@ def test_scan_finds_a_line_and_nothing_in_noise() -> None:
 
 def test_closed_loop_gives_lines_noise_and_sensor_gain() -> None:
     y, c = loop_of(lines=((17.0, 0.006, 40), (63.0, 0.004, 12)), frames=40_000)
-    found = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     assert [line.kind for line in found.lines] == ["line", "line"]
     for line, (f, z, r) in zip(found.lines, ((17.0, 0.006, 40), (63.0, 0.004, 12)), strict=True):
         assert line.frequency_hz == pytest.approx(f, abs=5 * line.frequency_error_hz)
@@ -233,7 +239,7 @@ def test_standard_errors_are_honest() -> None:
     deviations: dict[str, list[float]] = {"f": [], "z": [], "rms": [], "noise": [], "gain": []}
     for seed in range(12):
         y, c = loop_of(lines=((45.0, 0.02, 25),), seed=seed, frames=12_000)
-        found = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+        found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
         (line,) = found.lines
         assert found.sensor_gain_error is not None
         deviations["f"].append((line.frequency_hz - 45) / line.frequency_error_hz)
@@ -250,8 +256,8 @@ def test_standard_errors_are_honest() -> None:
 @settings(max_examples=3, deadline=None)
 def test_units_do_not_matter(scale: float) -> None:
     y, c = loop_of(lines=((40, 0.01, 30),), frames=8192)
-    one = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    other = lbt.identify_axis(scale * y[:, 0], scale * c[:, 0], frame_rate_hz=RATE)
+    one = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    other = lbt.identification.identify_axis(scale * y[:, 0], scale * c[:, 0], frame_rate_hz=RATE)
     assert other.sensor_gain == pytest.approx(one.sensor_gain, rel=1e-3)
     assert other.noise_nm == pytest.approx(scale * one.noise_nm, rel=1e-3)
     for a, b in zip(one.lines, other.lines, strict=True):
@@ -262,21 +268,25 @@ def test_units_do_not_matter(scale: float) -> None:
 def test_the_model_designs_a_filter_as_good_as_the_truth() -> None:
     lines = ((17.0, 0.006, 40), (63.0, 0.004, 12))
     y, c = loop_of(lines=lines, frames=40_000)
-    axis = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    model = lbt.IdentifiedModel(axes=(axis,), frame_rate_hz=RATE, delay_frames=2.0)
+    axis = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    model = lbt.identification.IdentifiedModel(axes=(axis,), frame_rate_hz=RATE, delay_frames=2.0)
     vibrations = [
         lbt.Vibration(frequency_hz=f, damping=z, rms_nm=r, direction=(1.0,)) for f, z, r in lines
     ]
     exact = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=slow(), vibrations=vibrations, noise_nm=6.0,
-        sensor_gain=0.6, modes=1,
-    )  # fmt: skip
+        frame_rate_hz=RATE,
+        turbulence=slow(),
+        vibrations=vibrations,
+        noise_nm=6.0,
+        sensor_gain=0.6,
+        modes=1,
+    )
     truth = lbt.Truth(
         turbulence=slow(), vibrations=tuple(vibrations), noise_nm=6.0, sensor_gain=0.6
     )
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
 
-    def left(plant: lbt.TipTiltPlant) -> float:
+    def left(plant: lbt.models.TipTiltPlant) -> float:
         loop = lbt.close_loop(path, lbt.kalman(plant).controller, sensor_gain=0.6)
         return lbt.residual_budget(loop, truth).rms_nm ** 2
 
@@ -285,14 +295,16 @@ def test_the_model_designs_a_filter_as_good_as_the_truth() -> None:
 
 def test_what_the_loop_does_not_show_is_said() -> None:
     y, c = loop_of(gain=0.002, frames=8192, noise=20.0)
-    found = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, assumed_gain=0.7)
+    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, assumed_gain=0.7)
     assert found.sensor_gain == pytest.approx(0.7, rel=1e-12)
     assert found.sensor_gain_error is None
     assert "assumed to be 0.7, not found" in found.sensor_gain_note
-    open_loop = lbt.identify_axis(y[:, 0] + 0.6 * c[:, 0], frame_rate_hz=RATE)
+    open_loop = lbt.identification.identify_axis(y[:, 0] + 0.6 * c[:, 0], frame_rate_hz=RATE)
     assert open_loop.sensor_gain == 1
     assert "open loop" in open_loop.sensor_gain_note
-    given_gain = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6)
+    given_gain = lbt.identification.identify_axis(
+        y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6
+    )
     assert given_gain.sensor_gain == pytest.approx(0.6, rel=1e-12)
     assert given_gain.sensor_gain_note == "given"
 
@@ -301,9 +313,9 @@ def test_an_announced_line_is_found_where_a_search_would_not_dare() -> None:
     rng = np.random.default_rng(5)
     n = 16_384
     y = rng.standard_normal(n) + 0.05 * np.sin(2 * np.pi * 90.0 * np.arange(n) / RATE)
-    plain = lbt.identify_axis(10 * y, frame_rate_hz=RATE)
-    told = lbt.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
-    wrong = lbt.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(140.0, 0.05)])
+    plain = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE)
+    told = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
+    wrong = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(140.0, 0.05)])
     assert not plain.lines
     assert not wrong.lines
     (line,) = told.lines
@@ -313,8 +325,8 @@ def test_an_announced_line_is_found_where_a_search_would_not_dare() -> None:
 
 def test_a_start_leads_to_the_same_place() -> None:
     y, c = loop_of(lines=((40, 0.01, 30),))
-    once = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    again = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, start=once)
+    once = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    again = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, start=once)
     assert again.sensor_gain == pytest.approx(once.sensor_gain, rel=1e-3)
     assert [line.frequency_hz for line in again.lines] == pytest.approx(
         [line.frequency_hz for line in once.lines], abs=0.005
@@ -323,7 +335,9 @@ def test_a_start_leads_to_the_same_place() -> None:
 
 def test_what_is_left_out_is_not_white() -> None:
     y, c = loop_of(lines=((40, 0.01, 30),))
-    found = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6, most_lines=0)
+    found = lbt.identification.identify_axis(
+        y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6, most_lines=0
+    )
     assert not found.lines
     assert not found.whiteness.white
     assert found.whiteness.p_value < 1e-6
@@ -331,7 +345,7 @@ def test_what_is_left_out_is_not_white() -> None:
 
 def test_two_close_lines_are_told_apart() -> None:
     y, c = loop_of(lines=((60.0, 0.002, 40), (61.2, 0.002, 25)), frames=40_000)
-    found = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     assert [line.frequency_hz for line in found.lines] == pytest.approx([60.0, 61.2], abs=0.1)
 
 
@@ -341,21 +355,25 @@ def test_spectrum_of_known_averages() -> None:
     density = line.psd(f) + slow().psd(f) + 0.05
     chance = np.random.default_rng(0).gamma(20.0, 1 / 20.0, f.size)
     for averages in (20.0, None):
-        found = lbt.identify_spectrum(f, density * chance, frame_rate_hz=RATE, averages=averages)
+        found = lbt.identification.identify_spectrum(
+            f, density * chance, frame_rate_hz=RATE, averages=averages
+        )
         (peak,) = found.lines
         assert peak.frequency_hz == pytest.approx(52, abs=5 * peak.frequency_error_hz)
         assert peak.rms_nm == pytest.approx(30, abs=5 * peak.rms_error_nm)
         assert found.data.count[0] == pytest.approx(20, rel=0.25)
 
 
-def joint(gains: tuple[float, float], loop_gains: tuple[float, float]) -> lbt.IdentifiedModel:
+def joint(
+    gains: tuple[float, float], loop_gains: tuple[float, float]
+) -> lbt.identification.IdentifiedModel:
     parts = [
         loop_of(sensor_gain=g, gain=k, seed=i, frames=20_000, noise=10.0)
         for i, (g, k) in enumerate(zip(gains, loop_gains, strict=True))
     ]
     y, c = (np.hstack([part[i] for part in parts]) for i in range(2))
     u = np.vstack([c, np.zeros((2, 2))])
-    record = lbt.loop_record(
+    record = lbt.identification.loop_record(
         np.vstack([np.zeros((2, 2)), y]), u, frame_rate_hz=RATE, delay_frames=2.0, unit="nm"
     )
     return lbt.identify(record)
@@ -376,13 +394,15 @@ def test_axes_share_a_sensor_gain_where_they_agree() -> None:
 
 def test_identify_needs_what_it_needs() -> None:
     y = np.random.default_rng(0).standard_normal((6000, 1))
-    without = lbt.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
+    without = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
     with pytest.raises(ProblemError, match="with_delay"):
         lbt.identify(without)
     with pytest.raises(ProblemError, match="one number, or 1"):
-        lbt.identify(lbt.loop_record(y, frame_rate_hz=RATE, unit="nm"), sensor_gain=[1.0, 2.0])
+        lbt.identify(
+            lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm"), sensor_gain=[1.0, 2.0]
+        )
     with pytest.raises(ProblemError, match="expected an IdentifiedModel"):
-        lbt.identification_figure("model")
+        lbt.report.figures.identification_figure("model")
 
 
 @pytest.mark.parametrize(
@@ -402,10 +422,13 @@ def test_identify_needs_what_it_needs() -> None:
         ({"lowest_line_hz": 501}, ProblemError, "lowest_line_hz"),
         ({"most_lines": -1}, ProblemError, "most_lines"),
         ({"measurement": np.zeros(2000)}, ProblemError, "constant"),
-        ({"measurement": 1e200 * np.random.default_rng(0).standard_normal(2000)}, ProblemError,
-         "units"),
+        (
+            {"measurement": 1e200 * np.random.default_rng(0).standard_normal(2000)},
+            ProblemError,
+            "units",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_series_are_refused(
     change: dict[str, object], error: type[Exception], words: str
 ) -> None:
@@ -414,7 +437,7 @@ def test_bad_series_are_refused(
         "frame_rate_hz": RATE,
     }
     with pytest.raises(error, match=words):
-        lbt.identify_axis(**(good | change))  # type: ignore[arg-type]
+        lbt.identification.identify_axis(**(good | change))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -430,4 +453,4 @@ def test_bad_series_are_refused(
 )
 def test_bad_spectra_are_refused(f: np.ndarray, density: np.ndarray, words: str) -> None:
     with pytest.raises(ProblemError, match=words):
-        lbt.identify_spectrum(f, density, frame_rate_hz=RATE)
+        lbt.identification.identify_spectrum(f, density, frame_rate_hz=RATE)

@@ -11,12 +11,14 @@ from test_identification import RATE, loop_of
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.checks import cut
-from lbt_synth.identification.periodogram import loop_periodogram
-from lbt_synth.identification.whiteness import whiteness
+from lbt_synth.identification.fit.checks import cut
+from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.fit.whiteness import whiteness
 
 
-def record_of(seeds: tuple[int, ...] = (0,), *, delay: float = 2.0, **options) -> lbt.LoopRecord:
+def record_of(
+    seeds: tuple[int, ...] = (0,), *, delay: float = 2.0, **options
+) -> lbt.identification.LoopRecord:
     """Records of one axis, end to end."""
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     series = []
@@ -26,7 +28,7 @@ def record_of(seeds: tuple[int, ...] = (0,), *, delay: float = 2.0, **options) -
         series.append((y[:-2], u[:-2]))
     y, u = (np.vstack([one[i] for one in series]) for i in range(2))
     assert path.delay_frames == 2
-    return lbt.loop_record(y, u, frame_rate_hz=RATE, delay_frames=delay, unit="nm")
+    return lbt.identification.loop_record(y, u, frame_rate_hz=RATE, delay_frames=delay, unit="nm")
 
 
 LINE = ((31.0, 0.004, 60.0),)
@@ -52,7 +54,7 @@ def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> No
         np.vstack([series[: lost[0]], series[lost[1] :]])
         for series in (whole.measurements, whole.commands)
     )
-    spliced = lbt.loop_record(y, u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    spliced = lbt.identification.loop_record(y, u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     found = lbt.identify(spliced)
     axis = found.axes[0]
     assert axis.sensor_gain_error is not None
@@ -64,10 +66,13 @@ def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> No
 @pytest.mark.parametrize("factor", [1 / 500, 100.0])
 def test_commands_in_other_units_are_doubted(factor: float) -> None:
     record = record_of((0,), lines=LINE, frames=20_000)
-    wrong = lbt.loop_record(
-        record.measurements, factor * record.commands, frame_rate_hz=RATE, delay_frames=2,
+    wrong = lbt.identification.loop_record(
+        record.measurements,
+        factor * record.commands,
+        frame_rate_hz=RATE,
+        delay_frames=2,
         unit="nm",
-    )  # fmt: skip
+    )
     found = lbt.identify(wrong)
     told = any("units, signs and axes of the commands" in note for note in found.notes)
     assert told or found.axes[0].sensor_gain_error is None
@@ -114,11 +119,11 @@ def test_standard_errors_hold_the_error_of_the_gain() -> None:
             for i in range(2)
         ]
         y, c = (np.hstack([part[i] for part in parts]) for i in range(2))
-        record = lbt.loop_record(
+        record = lbt.identification.loop_record(
             y[:-2], np.vstack([c[2:], c[-2:]])[:-2], frame_rate_hz=RATE, delay_frames=2, unit="nm"
         )
         model = lbt.identify(record)
-        alone = lbt.identify_axis(
+        alone = lbt.identification.identify_axis(
             y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=model.sensor_gains[0]
         )
         deviations += [
@@ -160,9 +165,19 @@ def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys) -> None:
     np.save(tmp_path / "s.npy", series)
     begin = time.process_time()
     status, _, error = run(
-        capsys, "identify", tmp_path / "s.npy", "--kind", "open-loop", "--unit", "nm",
-        "--frame-rate-hz", 1000, "-o", tmp_path / "s.yaml", "--no-figure",
-    )  # fmt: skip
+        capsys,
+        "identify",
+        tmp_path / "s.npy",
+        "--kind",
+        "open-loop",
+        "--unit",
+        "nm",
+        "--frame-rate-hz",
+        1000,
+        "-o",
+        tmp_path / "s.yaml",
+        "--no-figure",
+    )
     assert status in (0, 2)
     assert "Traceback" not in error
     assert time.process_time() - begin < 60
@@ -173,9 +188,19 @@ def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
     file = tmp_path / "a\x01.npz"
     np.savez(file, measurements=record.measurements, commands=record.commands)
     status, _, error = run(
-        capsys, "auto", file, "-o", tmp_path / "q.fits", "--frame-rate-hz", 1000,
-        "--delay-frames", 2, "--unit", "nm", "--no-figure",
-    )  # fmt: skip
+        capsys,
+        "auto",
+        file,
+        "-o",
+        tmp_path / "q.fits",
+        "--frame-rate-hz",
+        1000,
+        "--delay-frames",
+        2,
+        "--unit",
+        "nm",
+        "--no-figure",
+    )
     assert (status, error) == (0, "")
     assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()
 
@@ -201,11 +226,11 @@ def test_bad_requests(options: dict[str, object], words: str) -> None:
 def test_a_dead_axis_is_named() -> None:
     y = np.random.default_rng(0).standard_normal((6000, 2))
     y[:, 1] = 0
-    record = lbt.LoopRecord(
+    record = lbt.identification.LoopRecord(
         frame_rate_hz=RATE,
         measurements=y,
         usable=np.ones(6000, dtype=bool),
-        health=lbt.RecordHealth(frames=6000, usable=6000),
+        health=lbt.identification.RecordHealth(frames=6000, usable=6000),
     )
     with pytest.raises(ProblemError, match="axis 1 of the record is constant"):
         lbt.identify(record)
@@ -214,14 +239,16 @@ def test_a_dead_axis_is_named() -> None:
 def test_a_design_is_doubted_where_the_gains_disagree() -> None:
     first = record_of((0,), lines=LINE, frames=20_000, sensor_gain=0.9)
     second = record_of((1,), lines=LINE, frames=20_000, sensor_gain=0.4)
-    both = lbt.loop_record(
+    both = lbt.identification.loop_record(
         np.vstack([first.measurements, second.measurements]),
         np.vstack([first.commands, second.commands]),
-        frame_rate_hz=RATE, delay_frames=2, unit="nm",
-    )  # fmt: skip
+        frame_rate_hz=RATE,
+        delay_frames=2,
+        unit="nm",
+    )
     try:
         notes = lbt.design_from_record(both).notes
-    except lbt.CertificateError as error:
+    except lbt.errors.CertificateError as error:
         notes = (str(error),)
     assert any("sensor gain" in note for note in notes)
     assert lbt.design_from_record(first).notes == ()

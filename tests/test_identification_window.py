@@ -15,8 +15,8 @@ from scipy.signal import lfilter
 from test_identification import RATE, loop_of
 
 import lbt_synth as lbt
-from lbt_synth.identification.periodogram import loop_periodogram
-from lbt_synth.identification.window import TAPER, WIDE, log_smearing
+from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.fit.window import TAPER, WIDE, log_smearing
 
 
 def correlation(t: float) -> float:
@@ -85,7 +85,9 @@ def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:
     k = np.arange(40_000)
     wave = 300 * np.sqrt(2) * np.cos(2 * np.pi * 20.0037 * k / RATE)
     slow = np.cumsum(rng.standard_normal(k.size))
-    found = lbt.identify_axis(wave + slow + 5 * rng.standard_normal(k.size), frame_rate_hz=RATE)
+    found = lbt.identification.identify_axis(
+        wave + slow + 5 * rng.standard_normal(k.size), frame_rate_hz=RATE
+    )
     (line,) = found.lines
     assert not line.resolved
     assert line.damping * line.frequency_hz * 40 == pytest.approx(0.01, rel=1e-2)
@@ -97,7 +99,7 @@ def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:
 
 def test_a_line_that_is_resolved_says_so() -> None:
     y, c = loop_of(lines=((40, 0.01, 30),), frames=20_000)
-    (line,) = lbt.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE).lines
+    (line,) = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE).lines
     assert line.resolved
     assert line.damping == pytest.approx(0.01, abs=5 * line.damping_error)
 
@@ -131,7 +133,7 @@ def test_short_stretches_do_not_lead_to_a_sidelobe(frequency: float, stretch: in
     z = slow + 5 * rng.standard_normal(k.size)
     z += 50 * np.sqrt(2) * np.cos(2 * np.pi * frequency * k / RATE + 1)
     pieces = [(j, j + stretch) for j in range(0, k.size - stretch, stretch + 5)]
-    found = lbt.identify_axis(z, frame_rate_hz=RATE, stretches=pieces)
+    found = lbt.identification.identify_axis(z, frame_rate_hz=RATE, stretches=pieces)
     (line,) = found.lines
     assert line.frequency_hz == pytest.approx(frequency, abs=0.1)
     assert line.rms_nm == pytest.approx(50, rel=0.15)

@@ -32,7 +32,7 @@ class Line:
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    turbulence: lbt.ARModel
+    turbulence: lbt.models.ARModel
     parts: tuple = ()
     noise_nm: float = 15.5
     noise_error_nm: float = 0.12
@@ -45,11 +45,11 @@ class Model:
     axes: tuple
     frame_rate_hz: float = RATE
     delay_frames: float = 2.0
-    mirror: lbt.PositionLoop | None = None
+    mirror: lbt.models.PositionLoop | None = None
 
 
 def ar(*coefficients, driving):
-    return lbt.ARModel(coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=RATE)
+    return lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=RATE)
 
 
 TIP = Axis(
@@ -70,12 +70,12 @@ TILT = Axis(
 )
 TWO = Model(axes=(TIP, TILT))
 ONE_AXIS = Model(axes=(replace(TIP, sensor_gain=1.0),))
-SHELL = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=500)
+SHELL = lbt.models.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=500)
 
 
 def saved(tmp_path, model, name="model.yaml", **options):
-    settings, comments = lbt.identified_config(model, **options)
-    return lbt.save_config(tmp_path / name, settings, comments=comments)
+    settings, comments = lbt.config.identified_config(model, **options)
+    return lbt.config.save_config(tmp_path / name, settings, comments=comments)
 
 
 @pytest.mark.parametrize(
@@ -104,8 +104,10 @@ def test_what_was_identified_is_what_is_read(tmp_path, model):
     for made, (i, line) in zip(plant.vibrations, lines, strict=True):
         assert made.direction == tuple(np.eye(len(model.axes))[i])
         assert (made.frequency_hz, made.damping, made.rms_nm) == (
-            line.frequency_hz, line.damping, line.rms_nm
-        )  # fmt: skip
+            line.frequency_hz,
+            line.damping,
+            line.rms_nm,
+        )
     truth = config.truth
     assert truth.turbulence_of(len(model.axes)) == plant.turbulence
     assert truth.vibrations == plant.vibrations
@@ -119,7 +121,7 @@ def test_the_residual_of_the_kalman_filter_is_the_estimation_error(tmp_path):
     design = lbt.kalman(config.plant)
     loop = lbt.close_loop(config.hardware, design.controller)
     assert lbt.residual_budget(loop, config.truth).rms_nm == pytest.approx(design.rms, rel=1e-8)
-    assert lbt.least_residual(config.hardware, config.truth).rms_nm == pytest.approx(
+    assert lbt.loop.least_residual(config.hardware, config.truth).rms_nm == pytest.approx(
         design.rms, rel=1e-6
     )
 
@@ -177,8 +179,8 @@ def test_quiet_axes_have_no_vibrations(tmp_path):
     ],
 )
 def test_models_that_no_configuration_can_hold(model, options, text):
-    with pytest.raises(lbt.ProblemError, match=text):
-        lbt.identified_config(model, **options)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.config.identified_config(model, **options)
 
 
 def test_the_smallest_file_of_the_documentation(tmp_path):
@@ -197,7 +199,7 @@ def test_the_smallest_file_of_the_documentation(tmp_path):
 @pytest.mark.parametrize("name", ["lbt.yaml", "lbt_robust.yaml", "lbt_slow_mirror.yaml"])
 def test_the_examples_are_written_as_they_are(tmp_path, name):
     before = lbt.load_config(ROOT / "examples" / name)
-    after = lbt.load_config(lbt.save_config(tmp_path / name, before.settings))
+    after = lbt.load_config(lbt.config.save_config(tmp_path / name, before.settings))
     assert after.settings == before.settings
     assert after.settings.model_fields_set == before.settings.model_fields_set
     np.testing.assert_array_equal(after.plant.A, before.plant.A)
@@ -223,21 +225,27 @@ def test_whatever_is_set_is_read_again(noise, a, angle, frequency, frames, scale
         {
             "version": 1,
             "atmosphere": {
-                "seeing_arcsec": frequency, "outer_scale_m": scale, "wind_speed_m_s": frequency
+                "seeing_arcsec": frequency,
+                "outer_scale_m": scale,
+                "wind_speed_m_s": frequency,
             },
             "sensor": {"noise_nm": noise, "matrix": [a, a]},
             "loop": {"frame_rate_hz": frequency},
             "model": {
                 "turbulence": [ar_section, {"kind": "ar1"}] if many else ar_section,
                 "vibrations": [
-                    {"direction_deg": angle, "frequency_hz": frequency, "damping": 0.1,
-                     "rms_nm": frequency},
+                    {
+                        "direction_deg": angle,
+                        "frequency_hz": frequency,
+                        "damping": 0.1,
+                        "rms_nm": frequency,
+                    },
                 ],
             },
             "truth": {"vibrations": "model"} if many else {"vibrations": []},
             "simulation": {"frames": frames},
         }
-    )  # fmt: skip
+    )
     text = config_text(settings, {"loop.frame_rate_hz": "a # comment: [odd] ' \" é"})
     assert "odd" in text  # config_text reads it again, and refuses what has changed
 
@@ -251,18 +259,18 @@ def test_whatever_is_set_is_read_again(noise, a, angle, frequency, frames, scale
     ],
 )
 def test_comments_that_have_no_place(tmp_path, comments, text):
-    settings, _ = lbt.identified_config(ONE_AXIS)
-    with pytest.raises(lbt.ProblemError, match=text):
-        lbt.save_config(tmp_path / "a.yaml", settings, comments=comments)
+    settings, _ = lbt.config.identified_config(ONE_AXIS)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.config.save_config(tmp_path / "a.yaml", settings, comments=comments)
     assert not list(tmp_path.iterdir())
 
 
 def test_only_configurations_are_written(tmp_path):
-    with pytest.raises(lbt.ProblemError, match="FileSection"):
-        lbt.save_config(tmp_path / "a.yaml", {"version": 1})
-    settings, _ = lbt.identified_config(ONE_AXIS)
-    with pytest.raises(lbt.OutputError, match="cannot write"):
-        lbt.save_config(tmp_path / "none" / "a.yaml", settings)
+    with pytest.raises(lbt.errors.ProblemError, match="FileSection"):
+        lbt.config.save_config(tmp_path / "a.yaml", {"version": 1})
+    settings, _ = lbt.config.identified_config(ONE_AXIS)
+    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
+        lbt.config.save_config(tmp_path / "none" / "a.yaml", settings)
 
 
 # --- every command on such a configuration
@@ -309,15 +317,25 @@ def test_every_command_runs(tmp_path, capsys, model):
     sigma = answer(capsys, "sigma", gain, integrator, "-o", tmp_path / "s.png")
     assert all(design["stable"] for design in sigma["designs"].values())
     simulated = answer(
-        capsys, "simulate", config, gain, "--frames", "4000", "--cases", "2",
-        "--telemetry", tmp_path / "t.fits", "-o", tmp_path / "sim.png",
-    )  # fmt: skip
+        capsys,
+        "simulate",
+        config,
+        gain,
+        "--frames",
+        "4000",
+        "--cases",
+        "2",
+        "--telemetry",
+        tmp_path / "t.fits",
+        "-o",
+        tmp_path / "sim.png",
+    )
     assert simulated["residual_exact_nm"] == pytest.approx(made["rms"], rel=1e-6)
     assert np.sqrt(np.mean(np.square(simulated["residual_nm"]))) == pytest.approx(
         made["rms"], rel=0.1
     )
     assert simulated["sensor_gain"] == pytest.approx(np.mean([a.sensor_gain for a in model.axes]))
-    seen = lbt.load_telemetry(tmp_path / "t.fits")
+    seen = lbt.files.load_telemetry(tmp_path / "t.fits")
     assert seen.diameter_m is None
     assert 0 < seen.strehl < 1
     assert "telescope" not in run(capsys, "telemetry", tmp_path / "t.fits")
@@ -328,9 +346,21 @@ def test_every_command_runs(tmp_path, capsys, model):
     best = {row["method"]: row for row in anew["rows"] if row["error_hz"] == 0}
     assert best["kalman"]["residual_nm"] == pytest.approx(made["rms"], rel=1e-6)
     mapped = answer(
-        capsys, "robustness", config, gain, "--errors-hz", "-1", "1", "3",
-        "--sensor-gains", "0.7", "0.9", "3", "-o", tmp_path / "m.png",
-    )  # fmt: skip
+        capsys,
+        "robustness",
+        config,
+        gain,
+        "--errors-hz",
+        "-1",
+        "1",
+        "3",
+        "--sensor-gains",
+        "0.7",
+        "0.9",
+        "3",
+        "-o",
+        tmp_path / "m.png",
+    )
     assert np.array(mapped["maps"]["k"]["strehl"]).shape == (1, 3, 3)
     front = answer(
         capsys, "tradeoff", config, "--points", "2", "--taps", "2", "-o", tmp_path / "f.png"
@@ -349,7 +379,7 @@ def test_commands_that_need_more_say_so(tmp_path, capsys):
     assert "the key atmosphere is missing" in error
     uneven = lbt.load_config(ROOT / "examples" / "lbt.yaml").settings.model_dump(exclude_unset=True)
     uneven["sensor"] = {"noise_nm": [15.5, 9.0]}
-    lbt.save_config(tmp_path / "u.yaml", FileSection.model_validate(uneven))
+    lbt.config.save_config(tmp_path / "u.yaml", FileSection.model_validate(uneven))
     error = run(capsys, "modal", tmp_path / "u.yaml", "-o", tmp_path / "m.png", expect=2)
     assert "sensor.noise_nm must be one number for hundreds of modes" in error
     error = run(capsys, "mirror", config, "-o", tmp_path / "m.png", expect=2)
@@ -357,7 +387,7 @@ def test_commands_that_need_more_say_so(tmp_path, capsys):
     error = run(capsys, "design", config, "--method", "robust", "-o", tmp_path / "m.fits", expect=2)
     assert "design.robust is missing" in error
     with pytest.raises(
-        lbt.ConfigError, match="the key telescope is missing: an end-to-end"
+        lbt.errors.ConfigError, match="the key telescope is missing: an end-to-end"
     ) as caught:
         _ = lbt.load_config(config).end_to_end
     assert caught.value.path == "telescope"

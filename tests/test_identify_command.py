@@ -27,8 +27,8 @@ def loop():
 @pytest.fixture(scope="module")
 def night(loop, tmp_path_factory):
     run_, path, ran = loop
-    seen = lbt.telemetry_of(run_, path, sensor_gain=GAIN, design=ran)
-    return lbt.save_telemetry(tmp_path_factory.mktemp("night") / "night.fits", seen)
+    seen = lbt.files.telemetry_of(run_, path, sensor_gain=GAIN, design=ran)
+    return lbt.files.save_telemetry(tmp_path_factory.mktemp("night") / "night.fits", seen)
 
 
 def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, night):
@@ -68,9 +68,12 @@ def test_auto_tests_its_design_on_unseen_data(made, loop):
     out, data = made
     rows = {row["name"]: row for row in data["held_out"]}
     assert list(rows) == [
-        "what ran", "best integrator", "Kalman filter", "least-squares predictor",
+        "what ran",
+        "best integrator",
+        "Kalman filter",
+        "least-squares predictor",
         "limit of performance",
-    ]  # fmt: skip
+    ]
     kalman = rows["Kalman filter"]
     assert kalman["data_nm"] < 0.5 * rows["what ran"]["data_nm"]
     assert kalman["data_nm"] < 1.02 * rows["least-squares predictor"]["data_nm"]
@@ -91,9 +94,21 @@ def test_auto_tests_its_design_on_unseen_data(made, loop):
 def test_auto_says_what_it_found(capsys, night, tmp_path):
     out = tmp_path / "h.npz"
     status, text, error = run(
-        capsys, "auto", night, "-o", out, "--method", "hinf", "--gamma-ratio", 1.3, "--no-figure",
-        "--model", tmp_path / "m.yml", "--sensor-gain", GAIN,
-    )  # fmt: skip
+        capsys,
+        "auto",
+        night,
+        "-o",
+        out,
+        "--method",
+        "hinf",
+        "--gamma-ratio",
+        1.3,
+        "--no-figure",
+        "--model",
+        tmp_path / "m.yml",
+        "--sensor-gain",
+        GAIN,
+    )
     assert (status, error) == (0, "")
     assert "gain over what ran, on unseen data: residual" in text
     assert "sensor gain given." in text
@@ -115,9 +130,12 @@ def test_series_of_any_format(tmp_path, capsys, loop, ending):
         np.savez(file, measurements=y, commands=u)
     elif ending == "csv":
         np.savetxt(
-            file, np.hstack([y, u]), delimiter=",", comments="",
+            file,
+            np.hstack([y, u]),
+            delimiter=",",
+            comments="",
             header="tip_nm,tilt_nm,command_tip_nm,command_tilt_nm",
-        )  # fmt: skip
+        )
     else:
         from astropy.io import fits
 
@@ -137,9 +155,21 @@ def test_an_open_loop_series_and_one_axis(tmp_path, capsys, loop):
     noise = np.random.default_rng(0).standard_normal(len(run_.total_nm[0]))
     np.save(file, run_.total_nm[0][:, 0] + NOISE * noise)
     status, text, error = run(
-        capsys, "auto", file, "-o", tmp_path / "t.fits", "--kind", "open-loop",
-        "--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm", "--no-figure",
-    )  # fmt: skip
+        capsys,
+        "auto",
+        file,
+        "-o",
+        tmp_path / "t.fits",
+        "--kind",
+        "open-loop",
+        "--frame-rate-hz",
+        1000,
+        "--delay-frames",
+        2,
+        "--unit",
+        "nm",
+        "--no-figure",
+    )
     assert (status, error) == (0, "")
     assert "what ran" not in text
     assert "Kalman filter" in text
@@ -152,9 +182,12 @@ def test_a_spectrum(tmp_path, capsys):
     chance = np.random.default_rng(0).gamma(20.0, 1 / 20.0, f.size)
     file = tmp_path / "psd.csv"
     np.savetxt(
-        file, np.column_stack([f, (line.psd(f) + 0.5) * chance]), delimiter=",", comments="",
+        file,
+        np.column_stack([f, (line.psd(f) + 0.5) * chance]),
+        delimiter=",",
+        comments="",
         header="frequency_hz,psd_nm2/Hz",
-    )  # fmt: skip
+    )
     options = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm^2/Hz")
     status, _, error = run(
         capsys, "identify", file, "-o", tmp_path / "m.yaml", *options, "--kind", "spectrum"
@@ -240,9 +273,20 @@ def test_a_short_record_is_refused_with_the_length_it_needs(tmp_path, capsys):
     np.save(tmp_path / "y.npy", np.random.default_rng(0).standard_normal(900))
     for command, output in (("identify", "m.yaml"), ("auto", "t.fits")):
         status, _, error = run(
-            capsys, command, tmp_path / "y.npy", "-o", tmp_path / output, "--kind", "open-loop",
-            "--frame-rate-hz", 500, "--delay-frames", 2, "--unit", "nm",
-        )  # fmt: skip
+            capsys,
+            command,
+            tmp_path / "y.npy",
+            "-o",
+            tmp_path / output,
+            "--kind",
+            "open-loop",
+            "--frame-rate-hz",
+            500,
+            "--delay-frames",
+            2,
+            "--unit",
+            "nm",
+        )
         assert status == 2
         assert "needs 4096 usable frames" in error
 
@@ -262,12 +306,16 @@ def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, night):
 
 def test_design_from_record_needs_a_delay_and_data():
     noise = np.random.default_rng(0).standard_normal((9000, 1))
-    with pytest.raises(lbt.ProblemError, match="needs the delay"):
-        lbt.design_from_record(lbt.loop_record(noise, noise, frame_rate_hz=RATE, unit="nm"))
-    with pytest.raises(lbt.ProblemError, match="LoopRecord"):
+    with pytest.raises(lbt.errors.ProblemError, match="needs the delay"):
+        lbt.design_from_record(
+            lbt.identification.loop_record(noise, noise, frame_rate_hz=RATE, unit="nm")
+        )
+    with pytest.raises(lbt.errors.ProblemError, match="LoopRecord"):
         lbt.design_from_record(noise)
-    short = lbt.loop_record(noise[:900], frame_rate_hz=RATE, delay_frames=2, unit="nm")
-    with pytest.raises(lbt.ProblemError, match="4096"):
+    short = lbt.identification.loop_record(
+        noise[:900], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+    )
+    with pytest.raises(lbt.errors.ProblemError, match="4096"):
         lbt.design_from_record(short)
-    with pytest.raises(lbt.ProblemError, match="method"):
+    with pytest.raises(lbt.errors.ProblemError, match="method"):
         lbt.design_from_record(short, method="magic")

@@ -10,12 +10,12 @@ import lbt_synth as lbt
 
 @pytest.mark.parametrize(("delay", "limit"), [(1, 2.0), (2, 1.0), (3, 0.618034), (4, 0.445042)])
 def test_limits_of_whole_delays(delay, limit):
-    assert lbt.integrator_gain_limit(delay) == pytest.approx(limit, abs=1e-6)
+    assert lbt.design.integrator_gain_limit(delay) == pytest.approx(limit, abs=1e-6)
 
 
 @given(delay=st.floats(1, 4.5))
 def test_the_limit_is_where_the_loop_turns_unstable(delay):
-    limit = lbt.integrator_gain_limit(delay)
+    limit = lbt.design.integrator_gain_limit(delay)
     path = lbt.LoopHardware(frame_rate_hz=1, delay_frames=delay, modes=1)
 
     def radius(gain):
@@ -28,18 +28,18 @@ def test_the_limit_is_where_the_loop_turns_unstable(delay):
 
 def test_a_gain_beyond_the_limit_does_not_leave_the_library():
     path = lbt.LoopHardware(frame_rate_hz=800)
-    with pytest.raises(lbt.CertificateError, match="spectral radius of the closed loop"):
+    with pytest.raises(lbt.errors.CertificateError, match="spectral radius of the closed loop"):
         lbt.integrator(path, gain=1.01)
-    with pytest.raises(lbt.CertificateError):  # marginal
+    with pytest.raises(lbt.errors.CertificateError):  # marginal
         lbt.integrator(path, gain=1.0)
-    with pytest.raises(lbt.ProblemError, match="gain must be above 0"):
+    with pytest.raises(lbt.errors.ProblemError, match="gain must be above 0"):
         lbt.integrator(path, gain=0.0)
 
 
 def test_the_best_gain_beats_a_fine_search(air):
     path = lbt.LoopHardware(frame_rate_hz=800)
     truth = lbt.Truth(turbulence=air, noise_nm=15.5, sensor_gain=0.6)
-    best = lbt.optimal_integrator(path, truth)
+    best = lbt.design.optimal_integrator(path, truth)
 
     def residual(gain):
         controller = lbt.integrator(path, gain=gain).controller
@@ -52,9 +52,10 @@ def test_the_best_gain_beats_a_fine_search(air):
 def test_reconstructor_inverts_any_sensor():
     rng = np.random.default_rng(0)
     path = lbt.LoopHardware(
-        frame_rate_hz=800, sensor_matrix=rng.standard_normal((5, 2)),
+        frame_rate_hz=800,
+        sensor_matrix=rng.standard_normal((5, 2)),
         influence_matrix=rng.standard_normal((2, 2)),
-    )  # fmt: skip
+    )
     design = lbt.integrator(path, gain=0.4)
     plain = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
     f = [0.5, 10, 100]
@@ -64,5 +65,7 @@ def test_reconstructor_inverts_any_sensor():
 
 
 def test_an_undisturbed_loop_has_no_best_gain():
-    with pytest.raises(lbt.ProblemError, match="must disturb the loop"):
-        lbt.optimal_integrator(lbt.LoopHardware(frame_rate_hz=800), lbt.Truth(turbulence=None))
+    with pytest.raises(lbt.errors.ProblemError, match="must disturb the loop"):
+        lbt.design.optimal_integrator(
+            lbt.LoopHardware(frame_rate_hz=800), lbt.Truth(turbulence=None)
+        )

@@ -15,9 +15,7 @@ import lbt_synth as lbt
 
 
 def scalar(a, q, r):
-    return lbt.EstimationProblem(
-        A=a, B=[[np.sqrt(q), 0.0]], C=1.0, D=[[0.0, np.sqrt(r)]], L=1.0
-    )  # fmt: skip
+    return lbt.EstimationProblem(A=a, B=[[np.sqrt(q), 0.0]], C=1.0, D=[[0.0, np.sqrt(r)]], L=1.0)
 
 
 def closed_form(a, q, r, horizon):
@@ -137,9 +135,9 @@ def test_no_witness_proves_too_much(seed, n, r):
     covariance = lbt.solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R, problem.S).X
     states = rng.standard_normal((n, r)) * rng.choice([0.0, 1e-3, 1.0])
     disturbances = rng.standard_normal((problem.B.shape[1], r))
-    witness = lbt.Witness(states=states, disturbances=disturbances)
+    witness = lbt.linear.Witness(states=states, disturbances=disturbances)
     least = lbt.hinf(problem, method="riccati").gamma_least
-    assert lbt.infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
+    assert lbt.linear.infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
     assert least <= kalman.gamma * (1 + 1e-9)
 
 
@@ -149,9 +147,11 @@ def test_a_forged_claim_is_found_out(axis_plant):
     forged = dataclasses.replace(design, gamma_infeasible=1.001 * design.gamma_infeasible)
     failed = [check.name for check in forged.recertified().checks if not check.passed]
     assert failed == ["infeasible level over the level proved, less 1"]
-    with pytest.raises(lbt.DimensionError, match="a witness must have 4 rows of states"):
-        lbt.certify_infeasible(
-            axis_plant, 1.0, lbt.Witness(states=np.ones((3, 1)), disturbances=np.ones((3, 1)))
+    with pytest.raises(lbt.errors.DimensionError, match="a witness must have 4 rows of states"):
+        lbt.design.certify_infeasible(
+            axis_plant,
+            1.0,
+            lbt.linear.Witness(states=np.ones((3, 1)), disturbances=np.ones((3, 1))),
         )
 
 
@@ -169,14 +169,16 @@ def test_states_without_error_prove_nothing():
     p = lbt.EstimationProblem(
         A=np.diag([0.9, 0.5]), B=[[1, 0], [0, 0]], C=[[1, 0]], D=[[0, 1]], L=[[1, 1]]
     )
-    free = lbt.Witness(states=[[0.0], [1.0]], disturbances=[[1e-6], [0.0]])
-    assert not lbt.certify_infeasible(p, 1e5, free).passed
+    free = lbt.linear.Witness(states=[[0.0], [1.0]], disturbances=[[1e-6], [0.0]])
+    assert not lbt.design.certify_infeasible(p, 1e5, free).passed
     least = lbt.hinf(p, method="riccati").gamma_least
     assert least == pytest.approx(1.34536, abs=1e-5)
     extended = lbt.mixed(p, gamma_ratio=1.01, taps=3).problem
     memory = np.eye(extended.n_states)[:, -2:]
-    assert not lbt.certify_infeasible(
-        extended, 1.1 * least, lbt.Witness(states=memory, disturbances=1e-6 * np.ones((2, 2)))
+    assert not lbt.design.certify_infeasible(
+        extended,
+        1.1 * least,
+        lbt.linear.Witness(states=memory, disturbances=1e-6 * np.ones((2, 2))),
     ).passed
 
 
@@ -184,14 +186,14 @@ def test_claims_need_a_proof_and_must_fit_the_filter(axis_plant):
     design = lbt.hinf(axis_plant, gamma_ratio=1.2, method="riccati")
     bare = dataclasses.replace(design, witness=None)
     assert not bare.recertified().passed
-    with pytest.raises(lbt.DimensionError, match="states must be a matrix"):
-        lbt.Witness(states=np.zeros(2), disturbances=np.zeros(2))
-    with pytest.raises(lbt.DimensionError, match="disturbances must have 3 columns"):
-        lbt.Witness(states=np.zeros((2, 3)), disturbances=np.zeros((2, 2)))
-    with pytest.raises(lbt.NonFiniteError):
-        lbt.Witness(states=[[np.nan]], disturbances=[[1.0]])
-    with pytest.raises(lbt.ProblemError, match="level must be above 0"):
-        lbt.certify_infeasible(axis_plant, -5.0, design.witness)
+    with pytest.raises(lbt.errors.DimensionError, match="states must be a matrix"):
+        lbt.linear.Witness(states=np.zeros(2), disturbances=np.zeros(2))
+    with pytest.raises(lbt.errors.DimensionError, match="disturbances must have 3 columns"):
+        lbt.linear.Witness(states=np.zeros((2, 3)), disturbances=np.zeros((2, 2)))
+    with pytest.raises(lbt.errors.NonFiniteError):
+        lbt.linear.Witness(states=[[np.nan]], disturbances=[[1.0]])
+    with pytest.raises(lbt.errors.ProblemError, match="level must be above 0"):
+        lbt.design.certify_infeasible(axis_plant, -5.0, design.witness)
 
 
 @settings(max_examples=20)
@@ -201,9 +203,12 @@ def test_the_bracket_does_not_depend_on_the_units_of_states(seed):
     problem = random_problem(rng, 4)
     units = 10.0 ** rng.uniform(-5, 5, 4)
     scaled = lbt.EstimationProblem(
-        A=problem.A * units[:, None] / units, B=problem.B * units[:, None], C=problem.C / units,
-        D=problem.D, L=problem.L / units,
-    )  # fmt: skip
+        A=problem.A * units[:, None] / units,
+        B=problem.B * units[:, None],
+        C=problem.C / units,
+        D=problem.D,
+        L=problem.L / units,
+    )
     one, other = (lbt.hinf(p, method="riccati") for p in (problem, scaled))
     assert other.gamma_least == pytest.approx(one.gamma_least, rel=1e-8)
     assert other.gamma_infeasible == pytest.approx(one.gamma_infeasible, rel=1e-8)

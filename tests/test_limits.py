@@ -14,11 +14,11 @@ from plants import LBT_YAML, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.distance import model_distance
-from lbt_synth.limits import band as band_module
-from lbt_synth.limits import least_model_residual
-from lbt_synth.limits.prediction import Reach
-from lbt_synth.quadrature import settled_panels
+from lbt_synth.linear.quadrature import settled_panels
+from lbt_synth.loop.least_residuals import band as band_module
+from lbt_synth.loop.least_residuals.prediction import Reach
+from lbt_synth.loop.least_residuals.residual import least_model_residual
+from lbt_synth.studies.limits import model_distance
 
 RATE = 800.0
 CONFIG = str(LBT_YAML)
@@ -36,11 +36,13 @@ def path(delay=2.0, modes=1, **extra):
 
 
 def ar(*coefficients, driving=1.0):
-    return lbt.ARModel(coefficients=list(coefficients), driving_rms_nm=driving, frame_rate_hz=RATE)
+    return lbt.models.ARModel(
+        coefficients=list(coefficients), driving_rms_nm=driving, frame_rate_hz=RATE
+    )
 
 
 def variance(hardware, **truth):
-    return float(lbt.least_residual(hardware, lbt.Truth(**truth)).variance_nm2.sum())
+    return float(lbt.loop.least_residual(hardware, lbt.Truth(**truth)).variance_nm2.sum())
 
 
 def budget(design, truth, hardware=None):
@@ -89,7 +91,7 @@ def test_nothing_to_correct():
 
 
 def test_a_band_limited_process_without_noise_is_known_for_ever():
-    table = lbt.TabulatedSpectrum(frequency_hz=[1, 50], density_nm2_hz=[3, 3])
+    table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 50], density_nm2_hz=[3, 3])
     assert variance(path(), turbulence=table) == 0.0
     assert variance(path(), turbulence=table, noise_nm=1.0) > 0.1
 
@@ -144,7 +146,7 @@ def test_fractions_meet_the_whole_delays():
 
 @pytest.mark.parametrize("delay", [2.75, 6.8])
 def test_both_ways_to_the_value_at_the_zero(delay, monkeypatch):
-    from lbt_synth.limits import prediction
+    from lbt_synth.loop.least_residuals import prediction
 
     truth = {"turbulence": ar(1.5, -0.8), "noise_nm": 0.4}
     values = []
@@ -164,15 +166,21 @@ def test_kalman_filters_reach_the_limit(delay, seed):
     a = -np.poly(np.concatenate([roots, roots.conj()])).real[1:]
     lines = [
         lbt.Vibration(
-            frequency_hz=rng.uniform(5, 390), damping=10 ** rng.uniform(-5, -1),
-            rms_nm=10 ** rng.uniform(0, 3), direction=(1,),
+            frequency_hz=rng.uniform(5, 390),
+            damping=10 ** rng.uniform(-5, -1),
+            rms_nm=10 ** rng.uniform(0, 3),
+            direction=(1,),
         )
         for _ in range(2)
-    ]  # fmt: skip
+    ]
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=ar(*a, driving=10 ** rng.uniform(-1, 2)), vibrations=lines,
-        noise_nm=10 ** rng.uniform(-2, 2), delay_frames=delay, modes=1,
-    )  # fmt: skip
+        frame_rate_hz=RATE,
+        turbulence=ar(*a, driving=10 ** rng.uniform(-1, 2)),
+        vibrations=lines,
+        noise_nm=10 ** rng.uniform(-2, 2),
+        delay_frames=delay,
+        modes=1,
+    )
     limit = least_model_residual(plant)
     assert lbt.kalman(plant).rms == pytest.approx(limit.rms_nm, rel=1e-8)
     assert limit.change < 1e-6
@@ -183,7 +191,7 @@ def test_kalman_filters_of_fractional_delays_stay_above(delay):
     plant = lbt_axis_plant(delay_frames=delay)
     design = lbt.kalman(plant)
     truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
-    limit = lbt.least_residual(plant.hardware, truth).rms_nm
+    limit = lbt.loop.least_residual(plant.hardware, truth).rms_nm
     assert limit < budget(design, truth).rms_nm < 1.08 * limit
     found, above = model_distance(design)
     assert found == pytest.approx(limit)
@@ -196,15 +204,16 @@ def test_kalman_of_the_example(config):
     assert limit_nm == pytest.approx(192.619, abs=1e-3)
     assert abs(above) < 1e-8
     as_truth = lbt.Truth(
-        turbulence=config.plant.turbulence[0], vibrations=config.plant.vibrations,
+        turbulence=config.plant.turbulence[0],
+        vibrations=config.plant.vibrations,
         noise_nm=config.noise_nm,
-    )  # fmt: skip
-    assert lbt.least_residual(config.hardware, as_truth).rms_nm == pytest.approx(limit_nm)
+    )
+    assert lbt.loop.least_residual(config.hardware, as_truth).rms_nm == pytest.approx(limit_nm)
 
 
 def test_limit_of_the_example_and_a_filter_that_comes_close(config):
     """A Kalman filter with a long AR model of the true spectrum, against 10.84 nm."""
-    limit = lbt.least_residual(config.hardware, config.truth).rms_nm
+    limit = lbt.loop.least_residual(config.hardware, config.truth).rms_nm
     assert limit == pytest.approx(10.8414, abs=1e-4)
     still = replace(config.truth, vibrations=())
     f = (np.arange(1 << 17) + 0.5) / (1 << 17) * RATE / 2
@@ -232,20 +241,25 @@ def test_no_design_passes_the_limit(gain, delay, noise, seed):
     rng = np.random.default_rng(seed)
     line = lbt.Vibration(frequency_hz=rng.uniform(2, 380), damping=0.01, rms_nm=5.0, direction=(1,))
     truth = lbt.Truth(
-        turbulence=ar(rng.uniform(-0.9, 0.99)), vibrations=(line,), noise_nm=noise,
+        turbulence=ar(rng.uniform(-0.9, 0.99)),
+        vibrations=(line,),
+        noise_nm=noise,
         sensor_gain=rng.uniform(0.5, 1.0),
-    )  # fmt: skip
+    )
     hardware = path(delay)
-    limit = lbt.least_residual(hardware, truth).rms_nm
-    by_hand = lbt.integrator(hardware, gain=gain * lbt.integrator_gain_limit(delay))
+    limit = lbt.loop.least_residual(hardware, truth).rms_nm
+    by_hand = lbt.integrator(hardware, gain=gain * lbt.design.integrator_gain_limit(delay))
     assert budget(by_hand, truth).rms_nm >= limit * (1 - 1e-9)
     poles = np.diag(rng.uniform(-0.9, 0.9, 3))
     parameter = lbt.Controller(
-        A=poles, B=rng.standard_normal((3, 1)), C=rng.standard_normal((1, 3)),
-        D=rng.standard_normal((1, 1)), dt_s=1 / RATE,
-    )  # fmt: skip
+        A=poles,
+        B=rng.standard_normal((3, 1)),
+        C=rng.standard_normal((1, 3)),
+        D=rng.standard_normal((1, 1)),
+        dt_s=1 / RATE,
+    )
     loop = lbt.close_loop(
-        hardware, lbt.youla_controller(hardware, parameter), sensor_gain=truth.sensor_gain
+        hardware, lbt.loop.youla_controller(hardware, parameter), sensor_gain=truth.sensor_gain
     )
     assume(loop.is_stable)
     assert lbt.residual_budget(loop, truth).rms_nm >= limit * (1 - 1e-9)
@@ -278,7 +292,7 @@ def test_directions_can_be_turned(angle):
             )
         ]
         truth = lbt.Truth(turbulence=ar(0.99), vibrations=lines, noise_nm=2.0)
-        return lbt.least_residual(path(modes=2), truth)
+        return lbt.loop.least_residual(path(modes=2), truth)
 
     limit = turned(angle)
     assert np.sort(limit.variance_nm2) == pytest.approx(np.sort(turned(0.0).variance_nm2))
@@ -299,16 +313,18 @@ def test_more_measurements_than_modes():
 
 
 def test_a_sinusoid_of_known_frequency_costs_nothing():
-    line = lbt.SinusoidalVibration(frequency_hz=20, rms_nm=797, direction=(1,))
+    line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797, direction=(1,))
     with_line = variance(path(), turbulence=ar(0.99), noise_nm=3.0, vibrations=(line,))
     assert with_line == variance(path(), turbulence=ar(0.99), noise_nm=3.0)
     narrow = [
         variance(
-            path(), turbulence=ar(0.99), noise_nm=3.0,
+            path(),
+            turbulence=ar(0.99),
+            noise_nm=3.0,
             vibrations=(lbt.Vibration(frequency_hz=20, damping=k, rms_nm=797, direction=(1,)),),
         )
         for k in (1e-2, 1e-6, 1e-10)
-    ]  # fmt: skip
+    ]
     assert narrow[0] > narrow[1] > narrow[2] > with_line
     assert narrow[2] == pytest.approx(with_line, rel=1e-2)
 
@@ -317,7 +333,7 @@ def test_kolmogorov_turbulence(air):
     endless = replace(air, outer_scale_m=None)
     hardware = path(modes=2)
     one, other = (
-        lbt.least_residual(hardware, lbt.Truth(turbulence=a, noise_nm=15.5)).rms_nm
+        lbt.loop.least_residual(hardware, lbt.Truth(turbulence=a, noise_nm=15.5)).rms_nm
         for a in (air, endless)
     )
     assert one < other < 1.2 * one
@@ -326,7 +342,7 @@ def test_kolmogorov_turbulence(air):
 # -------------------------------------------------------------------------- band
 def test_band_of_the_example(config):
     line = config.truth.vibrations[0]
-    limit = lbt.least_worst_residual(
+    limit = lbt.loop.least_worst_residual(
         config.hardware, config.truth, band_hz=(16.5, 23.5), rms_nm=line.rms_nm
     )
     assert limit.rms_nm == pytest.approx(15.1088, abs=1e-4)
@@ -339,7 +355,7 @@ def test_band_of_the_example(config):
 def test_the_density_found_is_the_hardest(config):
     """Its Wiener limit, as a table of its own, is the band limit; the flat one is below."""
     hardware, still = config.hardware, replace(config.truth, vibrations=())
-    limit = lbt.least_worst_residual(hardware, still, band_hz=(10.0, 40.0), rms_nm=5.0)
+    limit = lbt.loop.least_worst_residual(hardware, still, band_hz=(10.0, 40.0), rms_nm=5.0)
     edges = np.linspace(10, 40, 61)
     share = np.histogram(limit.frequency_hz, edges, weights=limit.weight)[0]
     assert not np.allclose(share, 1 / 60, rtol=0.01)
@@ -353,7 +369,7 @@ def test_the_density_found_is_the_hardest(config):
         spectrum = Anonymous(psd)
         spectrum.breakpoints_hz = edges
         one = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-        own = lbt.least_residual(one, replace(still, turbulence=spectrum)).variance_nm2[0]
+        own = lbt.loop.least_residual(one, replace(still, turbulence=spectrum)).variance_nm2[0]
         return np.sqrt(own + limit.variance_nm2[1])
 
     hardest, flat = of_density(share), of_density(np.full(60, 1 / 60))
@@ -365,7 +381,7 @@ def test_the_density_found_is_the_hardest(config):
 def test_designs_stay_above_the_band_limit(delay):
     plant = lbt_axis_plant(delay_frames=delay, damping=0.05)
     still = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    limit = lbt.least_worst_residual(
+    limit = lbt.loop.least_worst_residual(
         plant.hardware, still, band_hz=(17, 23), rms_nm=500, direction=(1,)
     )
     assert limit.achieved_nm < limit.rms_nm * (1 + 1e-7)
@@ -376,7 +392,7 @@ def test_designs_stay_above_the_band_limit(delay):
                 replace(
                     still,
                     vibrations=(
-                        lbt.SinusoidalVibration(frequency_hz=f, rms_nm=500, direction=(1,)),
+                        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=500, direction=(1,)),
                     ),
                 ),
             ).rms_nm
@@ -387,9 +403,9 @@ def test_designs_stay_above_the_band_limit(delay):
 
 def test_narrow_bands_tend_to_the_known_frequency():
     still = lbt.Truth(turbulence=ar(0.99), noise_nm=3.0)
-    known = lbt.least_residual(path(), still).rms_nm
+    known = lbt.loop.least_residual(path(), still).rms_nm
     found = [
-        lbt.least_worst_residual(
+        lbt.loop.least_worst_residual(
             path(), still, band_hz=(20, 20 + width), rms_nm=100, direction=(1,)
         ).rms_nm
         for width in (10, 1, 1e-2, 1e-5)
@@ -400,9 +416,11 @@ def test_narrow_bands_tend_to_the_known_frequency():
 
 def test_band_without_noise():
     still = lbt.Truth(turbulence=ar(0.99))
-    limit = lbt.least_worst_residual(path(), still, band_hz=(15, 25), rms_nm=100, direction=(1,))
-    assert lbt.least_residual(path(), still).rms_nm < limit.rms_nm <= limit.achieved_nm
-    silent = lbt.least_worst_residual(
+    limit = lbt.loop.least_worst_residual(
+        path(), still, band_hz=(15, 25), rms_nm=100, direction=(1,)
+    )
+    assert lbt.loop.least_residual(path(), still).rms_nm < limit.rms_nm <= limit.achieved_nm
+    silent = lbt.loop.least_worst_residual(
         path(), lbt.Truth(turbulence=None), band_hz=(15, 25), rms_nm=100, direction=(1,)
     )
     assert silent.rms_nm == 0.0
@@ -414,7 +432,7 @@ def test_study(config):
         "kalman": lbt.kalman(config.plant),
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, method="riccati"),
     }
-    study = lbt.limit_study(
+    study = lbt.studies.limit_study(
         designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5]
     )
     assert study.band_hz == (16.5, 23.5)
@@ -426,7 +444,7 @@ def test_study(config):
         assert row.worst_nm == pytest.approx(
             study.band.rms_nm * (1 + row.above_band_limit_percent / 100)
         )
-    (axis,) = lbt.limits_figure(study).axes
+    (axis,) = lbt.report.figures.limits_figure(study).axes
     assert axis.get_xlabel() == "frequency of the true vibration [Hz]"
     assert axis.get_ylabel() == "residual [nm rms]"
     assert len({str(line.get_linestyle()) for line in axis.get_lines()[:2]}) == 2
@@ -435,43 +453,49 @@ def test_study(config):
 def test_study_of_an_unstable_design(config):
     designs = {"low": lbt.hinf(config.plant, gamma_ratio=1.05, method="riccati")}
     truth = replace(config.truth, sensor_gain=0.3)
-    study = lbt.limit_study(designs, config.hardware, truth, config.imaging, errors_hz=[-1, 1])
+    study = lbt.studies.limit_study(
+        designs, config.hardware, truth, config.imaging, errors_hz=[-1, 1]
+    )
     (row,) = study.rows
     assert not row.stable
     assert np.isnan([row.residual_nm, row.strehl, row.worst_nm, row.above_limit_percent]).all()
-    lbt.limits_figure(study)
+    lbt.report.figures.limits_figure(study)
 
 
 # ------------------------------------------------------------------------ errors
 def test_bad_loops():
     calm = {"turbulence": ar(0.9), "noise_nm": 1.0}
-    with pytest.raises(lbt.ProblemError, match="the sensor must see every mode.*got rank 1 for 2"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="the sensor must see every mode.*got rank 1 for 2"
+    ):
         variance(path(sensor_matrix=[[1.0, 1.0]]), **calm)
-    with pytest.raises(lbt.ProblemError, match="the mirror must reach every mode.*got rank 1"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="the mirror must reach every mode.*got rank 1"
+    ):
         variance(path(influence_matrix=[[1.0], [1.0]]), **calm)
     slanted = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=5, direction=(1, 1))
     upright = lbt.Vibration(frequency_hz=30, damping=0.01, rms_nm=5, direction=(1, 0))
-    with pytest.raises(lbt.ProblemError, match="modes that decouple.*Turn the directions"):
+    with pytest.raises(lbt.errors.ProblemError, match="modes that decouple.*Turn the directions"):
         variance(path(modes=2), **calm, vibrations=(slanted, upright))
-    with pytest.raises(lbt.ProblemError, match="along principal axes of the sensor's noise"):
+    with pytest.raises(lbt.errors.ProblemError, match="along principal axes of the sensor's noise"):
         variance(path(sensor_matrix=np.diag([1.0, 2.0])), **calm, vibrations=(slanted,))
-    with pytest.raises(lbt.DimensionError, match="must have 1 components"):
+    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
         variance(path(), **calm, vibrations=(upright,))
-    slow = lbt.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)
-    with pytest.raises(lbt.ProblemError, match="sampled at the loop's 800 Hz; got 500"):
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)
+    with pytest.raises(lbt.errors.ProblemError, match="sampled at the loop's 800 Hz; got 500"):
         variance(path(), turbulence=slow)
 
 
 def test_bad_spectra():
     for psd in (lambda f: -np.ones(f.shape), lambda f: f * np.nan, lambda f: np.ones(3)):
-        with pytest.raises(lbt.ProblemError, match=r"Anonymous.psd does not"):
+        with pytest.raises(lbt.errors.ProblemError, match=r"Anonymous.psd does not"):
             variance(path(), turbulence=Anonymous(psd), noise_nm=1.0)
-    with pytest.raises(lbt.ProblemError, match="set noise_nm to 0"):
+    with pytest.raises(lbt.errors.ProblemError, match="set noise_nm to 0"):
         variance(path(), turbulence=ar(0.9, driving=1e10), noise_nm=1e-155)
 
 
 def test_integrals_that_do_not_settle():
-    with pytest.raises(lbt.NumericalError, match="did not settle"):
+    with pytest.raises(lbt.errors.NumericalError, match="did not settle"):
         settled_panels(lambda x: (1 / x)[:, None], np.array([0.0, 1.0]))
 
 
@@ -493,34 +517,37 @@ def test_integrals_that_do_not_settle():
 def test_bad_bands(arguments, text):
     good = {"band_hz": (15, 25), "rms_nm": 10, "direction": (1,)}
     still = lbt.Truth(turbulence=ar(0.9), noise_nm=1.0)
-    with pytest.raises(lbt.ProblemError, match=text):
-        lbt.least_worst_residual(path(), still, **(good | arguments))
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.loop.least_worst_residual(path(), still, **(good | arguments))
 
 
 def test_a_search_that_does_not_settle(monkeypatch):
     monkeypatch.setattr(band_module, "_ROUNDS", 1)
     monkeypatch.setattr(band_module, "_LARGEST_GAP", 1e-6)
-    with pytest.raises(lbt.NumericalError, match="a gap of .* is left") as caught:
-        lbt.least_worst_residual(
-            path(3), lbt.Truth(turbulence=ar(0.9), noise_nm=1.0), band_hz=(1, 399), rms_nm=50,
+    with pytest.raises(lbt.errors.NumericalError, match="a gap of .* is left") as caught:
+        lbt.loop.least_worst_residual(
+            path(3),
+            lbt.Truth(turbulence=ar(0.9), noise_nm=1.0),
+            band_hz=(1, 399),
+            rms_nm=50,
             direction=(1,),
-        )  # fmt: skip
+        )
     assert caught.value.residual > 0
 
 
 def test_bad_studies(config):
     good = (config.hardware, config.truth, config.imaging)
-    with pytest.raises(lbt.ProblemError, match="at least one design"):
-        lbt.limit_study({}, *good)
+    with pytest.raises(lbt.errors.ProblemError, match="at least one design"):
+        lbt.studies.limit_study({}, *good)
     designs = {"kalman": lbt.kalman(config.plant)}
-    with pytest.raises(lbt.ProblemError, match="at least one error"):
-        lbt.limit_study(designs, *good, errors_hz=[])
-    with pytest.raises(lbt.ProblemError, match="must be above 0"):
-        lbt.limit_study(designs, *good, errors_hz=[25.0])
-    still = lbt.limit_study(designs, *good)
+    with pytest.raises(lbt.errors.ProblemError, match="at least one error"):
+        lbt.studies.limit_study(designs, *good, errors_hz=[])
+    with pytest.raises(lbt.errors.ProblemError, match="must be above 0"):
+        lbt.studies.limit_study(designs, *good, errors_hz=[25.0])
+    still = lbt.studies.limit_study(designs, *good)
     assert still.band is None
-    with pytest.raises(lbt.ProblemError, match="a vibration that moves"):
-        lbt.limits_figure(still)
+    with pytest.raises(lbt.errors.ProblemError, match="a vibration that moves"):
+        lbt.report.figures.limits_figure(still)
 
 
 # ------------------------------------------------------------------- command line
@@ -636,25 +663,27 @@ def test_full_plants_that_do_not_decouple():
     ]
     parts = {"frame_rate_hz": RATE, "turbulence": ar(0.99, driving=10), "noise_nm": 5.0}
     full = lbt.tip_tilt_plant(**parts, vibrations=lines).full()
-    with pytest.raises(lbt.ProblemError, match="the disturbance across them"):
+    with pytest.raises(lbt.errors.ProblemError, match="the disturbance across them"):
         least_model_residual(full)
     assert np.isnan(model_distance(lbt.kalman(full))).all()
     plain = lbt.tip_tilt_plant(**parts, vibrations=lines[1:]).full()
     entry = plain.D.copy()
     entry[:, 0] = 1.0
-    with pytest.raises(lbt.ProblemError, match="independent of the disturbance"):
+    with pytest.raises(lbt.errors.ProblemError, match="independent of the disturbance"):
         least_model_residual(replace(plain, D=entry))
-    assert np.isnan(model_distance(lbt.kalman(lbt.EstimationProblem(
-        A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0
-    )))).all()  # fmt: skip
+    assert np.isnan(
+        model_distance(
+            lbt.kalman(lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0))
+        )
+    ).all()
 
 
 def test_a_band_may_be_very_narrow():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
     truth = lbt.Truth(turbulence=slow, noise_nm=10.0)
-    known = lbt.least_residual(path, truth).rms_nm
-    narrow = lbt.least_worst_residual(
+    known = lbt.loop.least_residual(path, truth).rms_nm
+    narrow = lbt.loop.least_worst_residual(
         path, truth, band_hz=(20, 20 + 1e-9), rms_nm=100, direction=(1,)
     )
     assert known <= narrow.rms_nm < known * 1.01

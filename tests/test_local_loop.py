@@ -14,14 +14,14 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import lbt_synth as lbt
-from lbt_synth.models.lifting import lifted_mirror, settled_mirror
+from lbt_synth.models.lifted_mirror import lifted_mirror, settled_mirror
 
 QUICK = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 500}
 SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_samples": 2}
 
 
 def shell(**changes):
-    return lbt.PositionLoop.of_bandwidth(**{**QUICK, **changes})
+    return lbt.models.PositionLoop.of_bandwidth(**{**QUICK, **changes})
 
 
 def test_the_step_is_that_of_a_second_order_system_when_sampled_fast():
@@ -67,10 +67,13 @@ def test_a_step_response_in_blocks_is_that_sample_by_sample(changes):
 def test_two_lags_without_feedback_have_taps_in_closed_form(damping):
     """A held force on an overdamped mode: steps of ``1 - (p2 e^-p1 t - p1 e^-p2 t)/(p2 - p1)``."""
     w, T = 2 * np.pi * 200, 1 / 800
-    mirror = lbt.PositionLoop(
-        natural_frequency_hz=200, damping=damping, proportional_per_s2=0, derivative_per_s=0,
+    mirror = lbt.models.PositionLoop(
+        natural_frequency_hz=200,
+        damping=damping,
+        proportional_per_s2=0,
+        derivative_per_s=0,
         delay_samples=0,
-    )  # fmt: skip
+    )
     p1, p2 = w * (damping - np.sqrt(damping**2 - 1)), w * (damping + np.sqrt(damping**2 - 1))
 
     def travelled(t):
@@ -86,10 +89,14 @@ def test_two_lags_without_feedback_have_taps_in_closed_form(damping):
 
 
 def test_the_motion_within_a_sample_is_that_of_python_control():
-    mirror = lbt.PositionLoop(
-        natural_frequency_hz=300, damping=0.2, proportional_per_s2=0, derivative_per_s=0,
-        sampling_hz=9000, delay_samples=0,
-    )  # fmt: skip
+    mirror = lbt.models.PositionLoop(
+        natural_frequency_hz=300,
+        damping=0.2,
+        proportional_per_s2=0,
+        derivative_per_s=0,
+        sampling_hz=9000,
+        delay_samples=0,
+    )
     w = 2 * np.pi * 300
     plant = control.tf([w**2], [1, 2 * 0.2 * w, w**2])
     peer = control.sample_system(plant, 1 / 9000, method="zoh")
@@ -125,8 +132,9 @@ def brute_taps(mirror, frame_rate_hz, delay_frames, frames):
         t = i * dt
         for n, stop in enumerate(stops):
             if stop - t > 1e-15:
-                run = solve_ivp(motion, (t, stop), state, args=(a,), rtol=1e-12, atol=1e-15,
-                                method="DOP853")  # fmt: skip
+                run = solve_ivp(
+                    motion, (t, stop), state, args=(a,), rtol=1e-12, atol=1e-15, method="DOP853"
+                )
                 state, t = run.y[:, -1], stop
             if n < inside.size:
                 averages.append(state[2])
@@ -163,11 +171,15 @@ def test_the_lifted_mirror_is_the_brute_force_one(mirror, rate, delay):
 )
 def test_taps_are_an_impulse_response_of_unit_gain(natural, damping, ratio, delay, late, ramp):
     try:
-        mirror = lbt.PositionLoop.of_bandwidth(
-            natural_frequency_hz=natural, damping=damping, bandwidth_hz=natural * ratio,
-            bandwidth_damping=0.8, delay_samples=late, ramp_samples=ramp,
-        )  # fmt: skip
-    except lbt.ProblemError as error:
+        mirror = lbt.models.PositionLoop.of_bandwidth(
+            natural_frequency_hz=natural,
+            damping=damping,
+            bandwidth_hz=natural * ratio,
+            bandwidth_damping=0.8,
+            delay_samples=late,
+            ramp_samples=ramp,
+        )
+    except lbt.errors.ProblemError as error:
         if "must be stable" not in str(error):
             raise
         return
@@ -223,10 +235,13 @@ def test_the_loop_with_a_moving_mirror_is_affine_in_the_filter(delay, feedthroug
         frame_rate_hz=800, delay_frames=delay, influence_matrix=influence, mirror=shell(**SLOW)
     )
     parameter = lbt.Controller(
-        A=np.diag([0.9, 0.4, -0.5]), B=rng.normal(size=(3, 2)), C=rng.normal(size=(2, 3)),
-        D=rng.normal(size=(2, 2)) * feedthrough, dt_s=1 / 800,
-    )  # fmt: skip
-    loop = lbt.close_loop(path, lbt.youla_controller(path, parameter))
+        A=np.diag([0.9, 0.4, -0.5]),
+        B=rng.normal(size=(3, 2)),
+        C=rng.normal(size=(2, 3)),
+        D=rng.normal(size=(2, 2)) * feedthrough,
+        dt_s=1 / 800,
+    )
+    loop = lbt.close_loop(path, lbt.loop.youla_controller(path, parameter))
     assert loop.is_stable
     f = np.array([0.0, 3.0, 20.0, 150.0, 400.0])
     z = np.exp(2j * np.pi * f / 800)[:, None, None]
@@ -275,35 +290,40 @@ def test_any_delay_of_a_moving_mirror_is_exact(frames):
     ],
 )
 def test_impossible_local_loops_are_refused(changes, message):
-    with pytest.raises(lbt.ProblemError, match=message):
+    with pytest.raises(lbt.errors.ProblemError, match=message):
         shell(**changes)
 
 
 def test_a_mirror_without_any_force_is_refused():
-    with pytest.raises(lbt.ProblemError, match="must follow its command"):
-        lbt.PositionLoop(
-            natural_frequency_hz=10, damping=1, proportional_per_s2=0, derivative_per_s=0,
+    with pytest.raises(lbt.errors.ProblemError, match="must follow its command"):
+        lbt.models.PositionLoop(
+            natural_frequency_hz=10,
+            damping=1,
+            proportional_per_s2=0,
+            derivative_per_s=0,
             feed_forward=0,
-        )  # fmt: skip
+        )
 
 
 def test_rates_that_do_not_fit_are_refused():
-    with pytest.raises(lbt.ProblemError, match=r"that fit are 986\.30137 and 1000 Hz"):
+    with pytest.raises(lbt.errors.ProblemError, match=r"that fit are 986\.30137 and 1000 Hz"):
         lbt.LoopHardware(frame_rate_hz=990, mirror=shell())
-    with pytest.raises(lbt.ProblemError, match=r"that fit are 72000 Hz"):
+    with pytest.raises(lbt.errors.ProblemError, match=r"that fit are 72000 Hz"):
         lbt.LoopHardware(frame_rate_hz=1e5, mirror=shell())
-    with pytest.raises(lbt.ProblemError, match="ramp_samples must be at most 90"):
+    with pytest.raises(lbt.errors.ProblemError, match="ramp_samples must be at most 90"):
         lbt.LoopHardware(frame_rate_hz=800, mirror=shell(ramp_samples=91))
-    with pytest.raises(lbt.ProblemError, match="expected a PositionLoop"):
+    with pytest.raises(lbt.errors.ProblemError, match="expected a PositionLoop"):
         lbt.LoopHardware(frame_rate_hz=800, mirror=0.7)
 
 
 def test_a_local_loop_has_so_many_samples_a_frame():
     quick = shell(sampling_hz=8e7)
     lbt.LoopHardware(frame_rate_hz=8e2 * 10, mirror=quick)
-    with pytest.raises(lbt.ProblemError, match=r"at most 100000 samples .* Lower sampling_hz to"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"at most 100000 samples .* Lower sampling_hz to"
+    ):
         lbt.LoopHardware(frame_rate_hz=799, mirror=quick)
-    with pytest.raises(lbt.ProblemError, match="= inf"):
+    with pytest.raises(lbt.errors.ProblemError, match="= inf"):
         lbt.LoopHardware(frame_rate_hz=1e-308, mirror=quick)
 
 
@@ -319,15 +339,15 @@ def test_the_page_says_where_the_settled_design_becomes_unstable(config):
 
 
 def test_a_mirror_that_rings_for_ever_is_refused():
-    ringing = lbt.PositionLoop(
+    ringing = lbt.models.PositionLoop(
         natural_frequency_hz=10, damping=1e-5, proportional_per_s2=0, derivative_per_s=0
     )
-    with pytest.raises(lbt.ProblemError, match="must settle within 4000 frames"):
+    with pytest.raises(lbt.errors.ProblemError, match="must settle within 4000 frames"):
         lbt.LoopHardware(frame_rate_hz=800, mirror=ringing)
-    with pytest.raises(lbt.ProblemError, match="must settle within"):
+    with pytest.raises(lbt.errors.ProblemError, match="must settle within"):
         ringing.step_response()
 
 
 def test_a_tolerance_out_of_range_is_refused():
-    with pytest.raises(lbt.ProblemError, match="tolerance must be below 1"):
+    with pytest.raises(lbt.errors.ProblemError, match="tolerance must be below 1"):
         shell().step_response(1.0)

@@ -44,7 +44,7 @@ def test_error_transfer_of_the_lbt(gain):
 
 @given(gain=st.floats(0.01, 0.99), delay=st.integers(1, 4))
 def test_integrator_loop_is_its_textbook_transfer_function(gain, delay):
-    g = gain * lbt.integrator_gain_limit(delay)
+    g = gain * lbt.design.integrator_gain_limit(delay)
     path = lbt.LoopHardware(frame_rate_hz=500, delay_frames=delay, modes=1)
     loop = lbt.close_loop(path, lbt.integrator(path, gain=g).controller)
     z = np.exp(2j * np.pi * np.array([1.0, 40, 200]) / 500)
@@ -65,8 +65,10 @@ def test_noise_of_an_integrator_has_a_closed_form():
 @pytest.mark.parametrize(
     "model",
     [
-        lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89, frame_rate_hz=800),
-        lbt.ARModel(coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800),
+        lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89, frame_rate_hz=800),
+        lbt.models.ARModel(
+            coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
+        ),
         lbt.Vibration(frequency_hz=17, damping=0.005, rms_nm=300).ar_model(800),
     ],
 )
@@ -83,7 +85,7 @@ def test_quadrature_agrees_with_the_lyapunov_equation(gain, model):
 @pytest.mark.parametrize("half_width", [0.3, 0.03, 0.003])
 def test_narrow_lines_of_a_table_are_not_missed(half_width):
     """A triangle of unit area: its residual is the rejection at its place."""
-    table = lbt.TabulatedSpectrum(
+    table = lbt.models.TabulatedSpectrum(
         frequency_hz=[37.3 - half_width, 37.3, 37.3 + half_width],
         density_nm2_hz=[0, 100 / half_width, 0],
     )
@@ -98,7 +100,7 @@ def test_a_measured_spectrum_against_brute_force():
     rng = np.random.default_rng(0)
     f = np.linspace(5, 100, 3393)
     lines = sum(40 / (1 + ((f - c) / w) ** 2) for c, w in ((10, 0.1), (48.3, 0.03), (72.5, 0.05)))
-    table = lbt.TabulatedSpectrum(
+    table = lbt.models.TabulatedSpectrum(
         frequency_hz=f, density_nm2_hz=lines * rng.uniform(0.2, 1, f.size)
     )
     plant = lbt_axis_plant()
@@ -114,7 +116,7 @@ def test_a_narrow_resonance_tends_to_the_sinusoid():
     plant = lbt_axis_plant(modes=2)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
     along = {"frequency_hz": 18.0, "rms_nm": 100.0, "direction": (0.6, 0.8)}
-    line = lbt.Truth(turbulence=None, vibrations=(lbt.SinusoidalVibration(**along),))
+    line = lbt.Truth(turbulence=None, vibrations=(lbt.models.SinusoidalVibration(**along),))
     narrow = lbt.Truth(turbulence=None, vibrations=(lbt.Vibration(**along, damping=1e-6),))
     exact, limit = (lbt.residual_budget(loop, t).vibration_nm2 for t in (line, narrow))
     assert np.allclose(limit, exact, rtol=1e-3)
@@ -124,12 +126,13 @@ def test_parts_of_the_budget_add_up():
     plant = lbt_axis_plant(modes=2)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
     truth = lbt.Truth(
-        turbulence=plant.turbulence[0], noise_nm=15.5,
+        turbulence=plant.turbulence[0],
+        noise_nm=15.5,
         vibrations=(
-            lbt.SinusoidalVibration(frequency_hz=19, rms_nm=50),
+            lbt.models.SinusoidalVibration(frequency_hz=19, rms_nm=50),
             lbt.Vibration(frequency_hz=31, damping=0.01, rms_nm=20, direction=(0, 1)),
         ),
-    )  # fmt: skip
+    )
     b = lbt.residual_budget(loop, truth)
     assert b.rms_nm**2 == pytest.approx(b.turbulence_nm**2 + b.vibration_nm**2 + b.noise_nm**2)
     assert np.allclose(b.total_nm2, b.turbulence_nm2 + b.vibration_nm2 + b.noise_nm2)
@@ -139,11 +142,11 @@ def test_parts_of_the_budget_add_up():
 def test_a_decoupled_loop_treats_all_directions_alike(angle):
     plant = lbt_axis_plant(modes=2)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    line = lbt.SinusoidalVibration(
+    line = lbt.models.SinusoidalVibration(
         frequency_hz=18, rms_nm=100, direction=(np.cos(angle), np.sin(angle))
     )
     budget = lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(line,)))
-    other = lbt.SinusoidalVibration(frequency_hz=18, rms_nm=100)
+    other = lbt.models.SinusoidalVibration(frequency_hz=18, rms_nm=100)
     same = lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(other,)))
     assert budget.rms_nm == pytest.approx(same.rms_nm, rel=1e-6)
 
@@ -158,33 +161,35 @@ def test_marginal_and_unstable_loops_have_no_residual():
             lambda loop=loop: lbt.residual_budget(loop, truth),
             lambda loop=loop: lbt.loop_margins(loop),
         ):
-            with pytest.raises(lbt.UnstableLoopError, match=word) as caught:
+            with pytest.raises(lbt.errors.UnstableLoopError, match=word) as caught:
                 ask()
             assert caught.value.spectral_radius >= 1 - 1e-6
-        with pytest.raises(lbt.UnstableLoopError):
+        with pytest.raises(lbt.errors.UnstableLoopError):
             lbt.simulate(controller, truth, hardware=path, frames=10)
 
 
 def test_loops_refuse_what_does_not_fit():
     path = lbt.LoopHardware(frame_rate_hz=800)
     lazy = lbt.integrator(path, gain=0.3).controller
-    with pytest.raises(lbt.DimensionError, match="map 1 measurements to 1 commands; got 2 to 2"):
+    with pytest.raises(
+        lbt.errors.DimensionError, match="map 1 measurements to 1 commands; got 2 to 2"
+    ):
         lbt.close_loop(lbt.LoopHardware(frame_rate_hz=800, modes=1), lazy)
     with pytest.raises(
-        lbt.ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"
+        lbt.errors.ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"
     ):
         lbt.close_loop(lbt.LoopHardware(frame_rate_hz=500), lazy)
     loop = lbt.close_loop(path, lazy)
-    with pytest.raises(lbt.ProblemError, match="truth's sensor gain 0.5; got 1"):
+    with pytest.raises(lbt.errors.ProblemError, match="truth's sensor gain 0.5; got 1"):
         lbt.residual_budget(loop, lbt.Truth(turbulence=None, sensor_gain=0.5))
-    line = lbt.SinusoidalVibration(frequency_hz=10, rms_nm=1, direction=(1, 0, 0))
-    with pytest.raises(lbt.DimensionError, match="must have 2 components"):
+    line = lbt.models.SinusoidalVibration(frequency_hz=10, rms_nm=1, direction=(1, 0, 0))
+    with pytest.raises(lbt.errors.DimensionError, match="must have 2 components"):
         lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(line,)))
-    fast = lbt.SinusoidalVibration(frequency_hz=600, rms_nm=1)
-    with pytest.raises(lbt.ProblemError, match="below the Nyquist"):
+    fast = lbt.models.SinusoidalVibration(frequency_hz=600, rms_nm=1)
+    with pytest.raises(lbt.errors.ProblemError, match="below the Nyquist"):
         lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(fast,)))
-    other_rate = lbt.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
-    with pytest.raises(lbt.ProblemError, match="must be sampled at the loop's 800 Hz"):
+    other_rate = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
+    with pytest.raises(lbt.errors.ProblemError, match="must be sampled at the loop's 800 Hz"):
         lbt.residual_budget(loop, lbt.Truth(turbulence=other_rate))
 
 
@@ -210,7 +215,7 @@ def test_margins_of_an_integrator_against_hand_computation():
 def test_the_ends_of_the_gain_interval_are_where_it_turns_unstable(design):
     plant = lbt_axis_plant(modes=2)
     controller = design(plant).controller
-    low, high = lbt.stable_sensor_gains(plant.hardware, controller)
+    low, high = lbt.loop.stable_sensor_gains(plant.hardware, controller)
 
     def stable(gain):
         return lbt.close_loop(plant.hardware, controller, sensor_gain=gain).is_stable
@@ -240,4 +245,4 @@ def test_the_delay_margin_is_where_a_longer_delay_destabilises():
 def test_an_unstable_nominal_has_no_interval():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     wild = lbt.Controller(A=1.0, B=3.0, C=1.0, D=0.0, dt_s=1 / 800)
-    assert np.all(np.isnan(lbt.stable_sensor_gains(path, wild)))
+    assert np.all(np.isnan(lbt.loop.stable_sensor_gains(path, wild)))

@@ -13,14 +13,14 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.design.lqg_result import estimation_plant, loop_powers
-from lbt_synth.limits import least_model_residual
+from lbt_synth.design.lqg_design import estimation_plant, loop_powers
+from lbt_synth.loop.least_residuals.residual import least_model_residual
 
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
 
 
 def shell(bandwidth_hz=100.0, **changes):
-    return lbt.PositionLoop.of_bandwidth(
+    return lbt.models.PositionLoop.of_bandwidth(
         **{"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": bandwidth_hz, **changes}
     )
 
@@ -29,11 +29,16 @@ def slow_plant(delay=2.0, mirror=None, modes=1, **changes):
     base = lbt_axis_plant(modes=modes)
     return lbt.tip_tilt_plant(
         **{
-            "frame_rate_hz": 800, "delay_frames": delay, "turbulence": base.turbulence,
-            "vibrations": base.vibrations, "noise_nm": 15.5, "modes": modes, "mirror": mirror,
+            "frame_rate_hz": 800,
+            "delay_frames": delay,
+            "turbulence": base.turbulence,
+            "vibrations": base.vibrations,
+            "noise_nm": 15.5,
+            "modes": modes,
+            "mirror": mirror,
             **changes,
         }
-    )  # fmt: skip
+    )
 
 
 def model_rms(plant, controller):
@@ -70,7 +75,7 @@ def test_it_reaches_the_limit_of_any_linear_controller(delay, bandwidth):
 
 def test_a_zero_on_the_circle_is_approached_with_a_small_weight():
     plant = slow_plant(2.5)
-    with pytest.raises(lbt.InfeasibleError, match="no zero on the unit circle"):
+    with pytest.raises(lbt.errors.InfeasibleError, match="no zero on the unit circle"):
         lbt.lqg(plant)
     limit = least_model_residual(plant).rms_nm
     excess = [lbt.lqg(plant, command_weight=w).rms / limit - 1 for w in (1e-2, 1e-3, 1e-4)]
@@ -107,7 +112,7 @@ def test_no_other_gain_costs_less():
     """Perturbed gains of the regulator, in the real loop."""
     plant = slow_plant(2.25, shell())
     design = lbt.lqg(plant, command_weight=0.01)
-    from lbt_synth.design.lqg_result import lqg_controller
+    from lbt_synth.design.lqg_design import lqg_controller
 
     def cost(x):
         changed = lqg_controller(
@@ -137,7 +142,9 @@ def test_the_exact_residual_is_that_of_a_simulation():
     assert np.sqrt(np.mean(run.rms_nm**2)) == pytest.approx(design.rms, rel=0.01)
     exact = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
     assert exact.rms_nm == pytest.approx(design.rms, rel=1e-9)
-    assert lbt.least_residual(plant.hardware, truth).rms_nm == pytest.approx(design.rms, rel=1e-9)
+    assert lbt.loop.least_residual(plant.hardware, truth).rms_nm == pytest.approx(
+        design.rms, rel=1e-9
+    )
 
 
 def test_coupled_matrices_and_redundant_commands():
@@ -153,18 +160,18 @@ def test_coupled_matrices_and_redundant_commands():
 def test_other_disturbances_meet_the_same_loop():
     plant = slow_plant(2.25, shell())
     design = lbt.lqg(plant)
-    moved = lbt.retuned_plant(plant, 2.0)
+    moved = lbt.models.retuned_plant(plant, 2.0)
     assert astuple(moved.hardware.mirror) == astuple(plant.hardware.mirror)
     error = design.error_system(moved)
-    from lbt_synth.lyapunov import stationary_covariance
+    from lbt_synth.linear.lyapunov import stationary_covariance
 
     X = stationary_covariance(error.A, error.B @ error.B.T)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5, vibrations=moved.vibrations)
     budget = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
     assert np.sqrt(error.C @ X @ error.C.T)[0, 0] == pytest.approx(budget.rms_nm, rel=1e-8)
-    with pytest.raises(lbt.ProblemError, match="must come in a TipTiltPlant"):
+    with pytest.raises(lbt.errors.ProblemError, match="must come in a TipTiltPlant"):
         design.error_system(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
-    with pytest.raises(lbt.ProblemError, match="must have 4 states"):
+    with pytest.raises(lbt.errors.ProblemError, match="must have 4 states"):
         design.error_system(slow_plant(2.25, shell(), vibrations=None))
 
 
@@ -174,7 +181,7 @@ def test_what_is_left_of_the_settled_mirror():
     design = lbt.lqg(plant)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
     loop = lbt.close_loop(plant.hardware, design.controller)
-    left = lbt.settling_error(loop, truth)
+    left = lbt.loop.settling_error(loop, truth)
     run = lbt.simulate(
         design.controller, truth, hardware=plant.hardware, frames=60_000, seed=1, cases=2
     )
@@ -185,12 +192,15 @@ def test_what_is_left_of_the_settled_mirror():
         missed.append((np.concatenate([[0], u[:-1]]) - real)[taps.size :])
     assert np.std(missed) == pytest.approx(left.rms_nm, rel=0.01)
     # a sinusoid by hand
-    shake = lbt.Truth(turbulence=None, noise_nm=0.0, vibrations=(
-        lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),))  # fmt: skip
+    shake = lbt.Truth(
+        turbulence=None,
+        noise_nm=0.0,
+        vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),),
+    )
     z = np.exp(2j * np.pi * 20 / 800)
     change = z**-1 - np.sum(taps * z ** -np.arange(taps.size))
     command = loop.system.frequency_response([20.0])[0, 1, 0] * 100 * np.sqrt(2)
-    assert abs(lbt.settling_error(loop, shake).line_amplitudes_nm[0, 0]) == pytest.approx(
+    assert abs(lbt.loop.settling_error(loop, shake).line_amplitudes_nm[0, 0]) == pytest.approx(
         abs(change * command), rel=1e-9
     )
 
@@ -199,7 +209,7 @@ def test_a_settled_mirror_leaves_nothing():
     plant = slow_plant(2.25)
     loop = lbt.close_loop(plant.hardware, lbt.lqg(plant).controller)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    assert lbt.settling_error(loop, truth).rms_nm == 0
+    assert lbt.loop.settling_error(loop, truth).rms_nm == 0
 
 
 @pytest.mark.parametrize("ending", ["fits", "npz", "json"])
@@ -208,7 +218,7 @@ def test_gain_files(tmp_path, ending, mirror):
     plant = slow_plant(2.0, shell() if mirror else None, modes=2)
     design = lbt.lqg(plant, command_weight=0.01)
     loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"x.{ending}", design))
-    assert isinstance(loaded, lbt.LqgDesign)
+    assert isinstance(loaded, lbt.design.LqgDesign)
     assert loaded.recertified().passed
     np.testing.assert_array_equal(loaded.controller.A, design.controller.A)
     np.testing.assert_array_equal(loaded.gain_mirror, design.gain_mirror)
@@ -227,7 +237,7 @@ def test_a_gain_file_that_does_not_fit_its_mirror_is_refused(tmp_path):
     design = lbt.lqg(slow_plant(2.0, shell()))
     broken = replace(design, gain_mirror=design.gain_mirror[:-1])
     path = lbt.save_gain(tmp_path / "x.json", broken)
-    with pytest.raises(lbt.GainFileError, match="GAIN_MIRROR must be"):
+    with pytest.raises(lbt.errors.GainFileError, match="GAIN_MIRROR must be"):
         lbt.load_gain(path)
 
 
@@ -239,7 +249,7 @@ def test_changed_gains_fail_the_certificate(field):
     changed = replace(design, **{field: value * (1 + 1e-4)})
     certificate = changed.recertified()
     assert not certificate.passed
-    with pytest.raises(lbt.CertificateError):
+    with pytest.raises(lbt.errors.CertificateError):
         certificate.require()
 
 
@@ -247,8 +257,9 @@ def test_a_changed_controller_fails_the_certificate():
     design = lbt.lqg(slow_plant(2.0, shell()))
     K = design.controller
     changed = lbt.Controller(A=K.A, B=K.B * 1.0001, C=K.C, D=K.D, dt_s=K.dt_s)
-    failed = [c.name for c in replace(design, controller=changed).recertified().checks
-              if not c.passed]  # fmt: skip
+    failed = [
+        c.name for c in replace(design, controller=changed).recertified().checks if not c.passed
+    ]
     assert "controller against its gains" in failed
 
 
@@ -258,19 +269,23 @@ def test_the_other_designs_and_analyses_take_a_moving_mirror():
     made = {
         "kalman": lbt.kalman(plant),
         "hinf": lbt.hinf(plant, gamma_ratio=1.3, method="riccati"),
-        "integrator": lbt.optimal_integrator(plant.hardware, truth),
+        "integrator": lbt.design.optimal_integrator(plant.hardware, truth),
         "lqg": lbt.lqg(plant),
     }
-    limit = lbt.least_residual(plant.hardware, truth).rms_nm
+    limit = lbt.loop.least_residual(plant.hardware, truth).rms_nm
     for design in made.values():
         loop = lbt.close_loop(plant.hardware, design.controller)
         assert loop.is_stable
         assert lbt.residual_budget(loop, truth).rms_nm >= limit * (1 - 1e-9)
-    assert lbt.stable_sensor_gains(plant.hardware, made["integrator"].controller)[1] > 1
-    found = lbt.strehl_map(
-        made["lqg"], truth, lbt.Imaging(diameter_m=8.22), errors_hz=[0.0], sensor_gains=[1.0],
+    assert lbt.loop.stable_sensor_gains(plant.hardware, made["integrator"].controller)[1] > 1
+    found = lbt.studies.strehl_map(
+        made["lqg"],
+        truth,
+        lbt.Imaging(diameter_m=8.22),
+        errors_hz=[0.0],
+        sensor_gains=[1.0],
         delay_errors_frames=[0.0, 0.1],
-    )  # fmt: skip
+    )
     assert found.stable.all()
     late = replace(plant.hardware, delay_frames=2.35)
     exact = lbt.residual_budget(lbt.close_loop(late, made["lqg"].controller), truth)
@@ -279,33 +294,42 @@ def test_the_other_designs_and_analyses_take_a_moving_mirror():
 
 def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell(300.0))
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    objective = lbt.ResidualVariance(turbulence=slow, noise_nm=20.0)
-    demands = [lbt.ModulusMargin(at_least=0.5)]
-    spec = lbt.Specification(objective=objective, demands=demands)
-    design = lbt.shape(path, spec, functions=25, states=None)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    objective = lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0)
+    demands = [lbt.design.shaping.ModulusMargin(at_least=0.5)]
+    spec = lbt.design.shaping.Specification(objective=objective, demands=demands)
+    design = lbt.design.shape(path, spec, functions=25, states=None)
     assert lbt.loop_margins(lbt.close_loop(path, design.controller)).modulus > 0.5
-    free = lbt.lqg(lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0, modes=1,
-                                      mirror=path.mirror))  # fmt: skip
+    free = lbt.lqg(
+        lbt.tip_tilt_plant(
+            frame_rate_hz=800, turbulence=slow, noise_nm=20.0, modes=1, mirror=path.mirror
+        )
+    )
     assert design.objective_nm[0] >= free.rms
-    with pytest.raises(lbt.ProblemError, match="mirror that settles at once"):
-        lbt.shape(path, lbt.Specification(objective=objective,
-                                          demands=[lbt.DelayError(frames=0.2)]))  # fmt: skip
+    with pytest.raises(lbt.errors.ProblemError, match="mirror that settles at once"):
+        lbt.design.shape(
+            path,
+            lbt.design.shaping.Specification(
+                objective=objective, demands=[lbt.design.shaping.DelayError(frames=0.2)]
+            ),
+        )
 
 
 def test_wrong_arguments_are_refused():
     plant = slow_plant(2.0, shell())
-    with pytest.raises(lbt.ProblemError, match="lqg needs a TipTiltPlant"):
+    with pytest.raises(lbt.errors.ProblemError, match="lqg needs a TipTiltPlant"):
         lbt.lqg(plant.full())
-    with pytest.raises(lbt.ProblemError, match="command_weight must be at least 0"):
+    with pytest.raises(lbt.errors.ProblemError, match="command_weight must be at least 0"):
         lbt.lqg(plant, command_weight=-1.0)
     flat = slow_plant(2.0, shell(), modes=2, influence_matrix=[[1.0], [0.5]])
-    with pytest.raises(lbt.DimensionError, match="must have rank 2"):
+    with pytest.raises(lbt.errors.DimensionError, match="must have rank 2"):
         lbt.lqg(flat)
-    with pytest.raises(lbt.ProblemError, match="needs a TipTiltPlant"):
-        lbt.mirror_study(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
-    with pytest.raises(lbt.ProblemError, match="settles at once"):
-        lbt.mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
+    with pytest.raises(lbt.errors.ProblemError, match="needs a TipTiltPlant"):
+        lbt.studies.mirror_study(
+            plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8)
+        )
+    with pytest.raises(lbt.errors.ProblemError, match="settles at once"):
+        lbt.report.figures.mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
 
 
 def test_complex_zeros_outside_the_circle_have_no_limit():
@@ -313,10 +337,12 @@ def test_complex_zeros_outside_the_circle_have_no_limit():
     truth = lbt.Truth(turbulence=lbt_axis_plant().turbulence[0], noise_nm=15.5)
     rng, refused = np.random.default_rng(0), 0
     for _ in range(200):
-        mirror = lbt.PositionLoop(
-            natural_frequency_hz=rng.uniform(50, 2000), damping=rng.uniform(0.01, 0.1),
-            proportional_per_s2=0.0, derivative_per_s=0.0,
-        )  # fmt: skip
+        mirror = lbt.models.PositionLoop(
+            natural_frequency_hz=rng.uniform(50, 2000),
+            damping=rng.uniform(0.01, 0.1),
+            proportional_per_s2=0.0,
+            derivative_per_s=0.0,
+        )
         path = lbt.LoopHardware(
             frame_rate_hz=800, delay_frames=rng.uniform(2, 3), modes=1, mirror=mirror
         )
@@ -324,8 +350,8 @@ def test_complex_zeros_outside_the_circle_have_no_limit():
         late = zeros[np.abs(zeros) > 1]
         if np.any(np.abs(late.imag) > 1e-6):
             refused += 1
-            with pytest.raises(lbt.ProblemError, match="real zeros outside the unit circle"):
-                lbt.least_residual(path, truth)
+            with pytest.raises(lbt.errors.ProblemError, match="real zeros outside the unit circle"):
+                lbt.loop.least_residual(path, truth)
     assert refused > 0
 
 
@@ -337,7 +363,7 @@ def test_the_example_has_a_mirror_for_design_and_loop():
     assert config.hardware.mirror is config.plant.hardware.mirror
     step = config.hardware.mirror.step_response()
     assert 3e-3 < step.settling_s < 6e-3
-    rows = lbt.mirror_study(config.plant, config.truth, config.imaging)
+    rows = lbt.studies.mirror_study(config.plant, config.truth, config.imaging)
     by_name = {row.design: row for row in rows}
     assert not by_name["kalman, settled mirror"].stable
     assert by_name["lqg"].strehl > 0.8
@@ -349,19 +375,22 @@ def test_the_example_has_a_mirror_for_design_and_loop():
     [
         ("bandwidth_hz: 100.0", "bandwith_hz: 100.0", "did you mean bandwidth_hz"),
         ("bandwidth_hz: 100.0", "proportional_per_s2: 4.0e5", "expected either bandwidth_hz"),
-        ("    bandwidth_hz: 100.0", "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0",
-         "bandwidth_damping goes with bandwidth_hz"),
+        (
+            "    bandwidth_hz: 100.0",
+            "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0",
+            "bandwidth_damping goes with bandwidth_hz",
+        ),
         ("bandwidth_hz: 100.0", "bandwidth_hz: 10.0", "mirror.local_loop: bandwidth_hz must be"),
         ("frame_rate_hz: 800.0", "frame_rate_hz: 990.0", "986.30137 and 1000 Hz"),
         ("delay_samples: 1", "delay_samples: 1.5", "mirror.local_loop.delay_samples"),
     ],
-)  # fmt: skip
+)
 def test_wrong_sections_are_refused(tmp_path, old, new, message):
     text = SLOW_YAML.read_text()
     assert old in text
     path = tmp_path / "a.yaml"
     path.write_text(text.replace(old, new))
-    with pytest.raises(lbt.ConfigError, match=message):
+    with pytest.raises(lbt.errors.ConfigError, match=message):
         lbt.load_config(path)
 
 
@@ -428,8 +457,11 @@ def test_wrong_commands(tmp_path, capsys):
     status, _, err = run(capsys, "mirror", SLOW_YAML, "--tolerance", "2")
     assert status == 2
     assert "tolerance" in err
-    for extra, text in ((("--horizon", "2"), "takes no horizon"), (("--gain", "1"), "--gain goes"),
-                        (("--route", "sdp"), "takes no --route")):  # fmt: skip
+    for extra, text in (
+        (("--horizon", "2"), "takes no horizon"),
+        (("--gain", "1"), "--gain goes"),
+        (("--route", "sdp"), "takes no --route"),
+    ):
         status, _, err = run(capsys, "design", SLOW_YAML, "--method", "lqg", *extra, "-o", gain)
         assert status == 2
         assert text in err

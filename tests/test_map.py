@@ -10,18 +10,20 @@ from plants import LBT_YAML
 from scipy.special import j0
 
 import lbt_synth as lbt
-from lbt_synth.ensemble.panels import graded_edges
-from lbt_synth.loop.budget import residual_budget
+from lbt_synth.linear.quadrature import adaptive_integral, gauss_panels
+from lbt_synth.loop import residual_budget
+from lbt_synth.loop.ensemble.panels import graded_edges
 from lbt_synth.loop.strehl import annular_otf, jitter_strehls
-from lbt_synth.quadrature import adaptive_integral, gauss_panels
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
-SLOW = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
 DIAGONAL = (0.8, 0.6)
 
 
 def sinusoid(frequency_hz=20.0, rms_nm=797.0, direction=(1.0, 0.0)):
-    return lbt.SinusoidalVibration(frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction)
+    return lbt.models.SinusoidalVibration(
+        frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction
+    )
 
 
 def random_line(frequency_hz=20.0, rms_nm=500.0, damping=0.01, direction=(1.0, 0.0)):
@@ -56,7 +58,7 @@ def single(design, truth, imaging, error_hz, gain, delay_error=0.0):
 
 
 def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
-    found = lbt.strehl_map(
+    found = lbt.studies.strehl_map(
         design, truth, imaging, errors_hz=errors, sensor_gains=gains, delay_errors_frames=delays
     )
     assert found.stable.any()
@@ -64,7 +66,7 @@ def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
         for j, gain in enumerate(gains):
             for k, error in enumerate(errors):
                 if not found.stable[i, j]:
-                    with pytest.raises(lbt.UnstableLoopError):
+                    with pytest.raises(lbt.errors.UnstableLoopError):
                         single(design, truth, imaging, error, gain, delay)
                     continue
                 here = found.strehl[i, j, k], found.residual_nm[i, j, k]
@@ -86,14 +88,16 @@ TRUTHS = {
 @pytest.mark.parametrize("name", TRUTHS)
 def test_each_point_is_that_of_the_single_evaluator(kalman, air, name):
     vibrations, turbulence = TRUTHS[name]
-    table = lbt.TabulatedSpectrum(frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1])
+    table = lbt.models.TabulatedSpectrum(
+        frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1]
+    )
     spectra = {"air": air, "ar": SLOW, "none": None, "table": table}
     truth = lbt.Truth(turbulence=spectra[turbulence], vibrations=vibrations, noise_nm=15.5)
     assert_as_single(kalman, truth, CAMERA, [-2.5, 0.0, 1.0], [0.07, 0.6, 1.0, 1.9])
 
 
 def test_points_next_to_instability(robust, settings):
-    low, high = lbt.stable_sensor_gains(robust.hardware, robust.controller)
+    low, high = lbt.loop.stable_sensor_gains(robust.hardware, robust.controller)
     gains = [low * 1.01, low * 1.0001, 1.0, high * 0.99, high * (1 - 1e-6)]
     assert_as_single(robust, settings.truth, settings.imaging, [1.0], gains)
 
@@ -124,22 +128,22 @@ def test_axes_that_the_sensor_mixes(air):
 
 
 def test_unstable_points_are_nan(robust, settings):
-    found = lbt.strehl_map(
+    found = lbt.studies.strehl_map(
         robust, settings.truth, settings.imaging, errors_hz=[-1, 0], sensor_gains=[0.3, 1.0, 3.0]
     )
     assert found.stable[0].tolist() == [False, True, False]
     assert np.isnan(found.strehl[0, [0, 2]]).all()
     assert np.isnan(found.residual_nm[0, [0, 2]]).all()
     assert np.isfinite(found.strehl[0, 1]).all()
-    none = lbt.strehl_map(
+    none = lbt.studies.strehl_map(
         robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[0.1]
     )
     assert np.isnan(none.strehl).all()
 
 
 def test_an_image_that_is_gone_has_no_strehl(robust, settings):
-    _, high = lbt.stable_sensor_gains(robust.hardware, robust.controller)
-    found = lbt.strehl_map(
+    _, high = lbt.loop.stable_sensor_gains(robust.hardware, robust.controller)
+    found = lbt.studies.strehl_map(
         robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[high * (1 - 1e-8)]
     )
     assert found.stable.all()
@@ -151,7 +155,7 @@ def test_order_and_neighbours_change_nothing(kalman, settings):
     """A point is the same alone, among others, in any order, and more of them than fit at once."""
 
     def mapped(errors, gains):
-        return lbt.strehl_map(
+        return lbt.studies.strehl_map(
             kalman, settings.truth, settings.imaging, errors_hz=errors, sensor_gains=gains
         )
 
@@ -171,7 +175,9 @@ def test_turning_the_vibration_changes_nothing(kalman, air):
         truth = lbt.Truth(
             turbulence=air, vibrations=(sinusoid(direction=direction),), noise_nm=15.5
         )
-        return lbt.strehl_map(kalman, truth, CAMERA, errors_hz=[0, 2], sensor_gains=[0.5, 1]).strehl
+        return lbt.studies.strehl_map(
+            kalman, truth, CAMERA, errors_hz=[0, 2], sensor_gains=[0.5, 1]
+        ).strehl
 
     assert mapped((1.0, 0.0)) == pytest.approx(mapped((0.0, 1.0)), rel=1e-9)
     assert mapped((1.0, 0.0)) == pytest.approx(mapped(DIAGONAL), rel=1e-6)
@@ -182,8 +188,8 @@ def test_the_sign_of_the_error_is_that_of_the_sweep(kalman, settings):
     moved = replace(
         settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
     )
-    below = lbt.strehl_map(kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1])
-    above = lbt.strehl_map(
+    below = lbt.studies.strehl_map(kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1])
+    above = lbt.studies.strehl_map(
         kalman, settings.truth, settings.imaging, errors_hz=[1.5], sensor_gains=[1]
     )
     assert below.strehl == pytest.approx(above.strehl, rel=1e-12)
@@ -191,10 +197,15 @@ def test_the_sign_of_the_error_is_that_of_the_sweep(kalman, settings):
 
 def test_counts_points_as_they_are_done(kalman, settings):
     counts = []
-    lbt.strehl_map(
-        kalman, settings.truth, settings.imaging, errors_hz=[0, 1],
-        sensor_gains=np.linspace(0.5, 1, 70), delay_errors_frames=[0, 0.1], advance=counts.append,
-    )  # fmt: skip
+    lbt.studies.strehl_map(
+        kalman,
+        settings.truth,
+        settings.imaging,
+        errors_hz=[0, 1],
+        sensor_gains=np.linspace(0.5, 1, 70),
+        delay_errors_frames=[0, 0.1],
+        advance=counts.append,
+    )
     assert sum(counts) == 2 * 70 * 2
 
 
@@ -230,15 +241,17 @@ def test_fewer_directions_lose_nothing():
     found = jitter_strehls(covariances, imaging=CAMERA, line_amplitudes_nm=lines)
     for i in range(len(found)):
         assert found[i] == pytest.approx(dense_strehl(covariances[i], lines[i], CAMERA), abs=1e-13)
-        alone = lbt.jitter_strehl(covariances[i], imaging=CAMERA, line_amplitudes_nm=lines[i])
+        alone = lbt.loop.jitter_strehl(covariances[i], imaging=CAMERA, line_amplitudes_nm=lines[i])
         assert alone == pytest.approx(found[i], abs=1e-14)
 
 
 def test_many_jitters_of_wrong_sizes():
-    with pytest.raises(lbt.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"):
+    with pytest.raises(
+        lbt.errors.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"
+    ):
         jitter_strehls(np.zeros((3, 2, 2)), imaging=CAMERA, line_amplitudes_nm=np.zeros((2, 1, 2)))
     indefinite = np.stack([np.eye(2), np.diag([1, -1])])
-    with pytest.raises(lbt.DefinitenessError, match="least eigenvalue of -1"):
+    with pytest.raises(lbt.errors.DefinitenessError, match="least eigenvalue of -1"):
         jitter_strehls(indefinite, imaging=CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2)))
 
 
@@ -277,28 +290,28 @@ WRONG = [
     ({"sensor_gains": "wide"}, "sensor_gains must be an array of numbers"),
     ({"delay_errors_frames": [-1.5]}, "delay_errors_frames must be at least -1"),
     ({"delay_errors_frames": [99]}, "together must lie between 1 and 100"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("wrong", "text"), WRONG)
 def test_wrong_axes_are_refused(kalman, settings, wrong, text):
     axes = {"errors_hz": [0], "sensor_gains": [1]} | wrong
-    with pytest.raises(lbt.ProblemError, match=text):
-        lbt.strehl_map(kalman, settings.truth, settings.imaging, **axes)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.studies.strehl_map(kalman, settings.truth, settings.imaging, **axes)
 
 
 def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
     axes = {"errors_hz": [0, 1], "sensor_gains": [1]}
     walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.ProblemError, match="needs a design for a loop"):
-        lbt.strehl_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
-    with pytest.raises(lbt.ProblemError, match="needs a vibration in the truth"):
-        lbt.strehl_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)
-    with pytest.raises(lbt.DimensionError, match="must have 1 components"):
-        lbt.strehl_map(lbt.kalman(axis_plant), settings.truth, settings.imaging, **axes)
+    with pytest.raises(lbt.errors.ProblemError, match="needs a design for a loop"):
+        lbt.studies.strehl_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
+    with pytest.raises(lbt.errors.ProblemError, match="needs a vibration in the truth"):
+        lbt.studies.strehl_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)
+    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
+        lbt.studies.strehl_map(lbt.kalman(axis_plant), settings.truth, settings.imaging, **axes)
     three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
-    with pytest.raises(lbt.DimensionError, match="got a loop of 3 modes"):
-        lbt.strehl_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
+    with pytest.raises(lbt.errors.DimensionError, match="got a loop of 3 modes"):
+        lbt.studies.strehl_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
 
 
 # --------------------------------------------------------------------------
@@ -308,13 +321,13 @@ def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
 def maps(kalman, robust, settings):
     axes = {"errors_hz": [2, 0, -2, 1], "sensor_gains": [1.5, 0.3, 0.8, 3.0]}
     return {
-        name: lbt.strehl_map(design, settings.truth, settings.imaging, **axes)
+        name: lbt.studies.strehl_map(design, settings.truth, settings.imaging, **axes)
         for name, design in (("Kalman", kalman), ("H-infinity", robust))
     }
 
 
 def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
-    figure = lbt.map_figure(maps)
+    figure = lbt.report.figures.map_figure(maps)
     left, right, bar = figure.axes
     assert [left.get_title(), right.get_title()] == ["Kalman", "H-infinity"]
     assert bar.get_ylabel() == "Strehl ratio [%]"
@@ -328,27 +341,37 @@ def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
 
 def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
     def mapped(design, gains, delays):
-        return lbt.strehl_map(
-            design, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=gains,
+        return lbt.studies.strehl_map(
+            design,
+            settings.truth,
+            settings.imaging,
+            errors_hz=[0],
+            sensor_gains=gains,
             delay_errors_frames=delays,
-        )  # fmt: skip
+        )
 
-    figure = lbt.map_figure(
+    figure = lbt.report.figures.map_figure(
         {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
     )
     assert len(figure.axes) == 5
     assert figure.axes[2].get_ylabel() == "delay error +0.1 frames\nsensor gain [-]"
     figure.savefig(tmp_path / "a.png")
-    nowhere = lbt.map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
+    nowhere = lbt.report.figures.map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
     nowhere.savefig(tmp_path / "b.pdf")
 
 
 def test_map_figures_that_are_refused(maps, kalman, settings):
-    with pytest.raises(lbt.ProblemError, match="at least one map"):
-        lbt.map_figure({})
-    late = lbt.strehl_map(
-        kalman, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[1],
+    with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
+        lbt.report.figures.map_figure({})
+    late = lbt.studies.strehl_map(
+        kalman,
+        settings.truth,
+        settings.imaging,
+        errors_hz=[0],
+        sensor_gains=[1],
         delay_errors_frames=[0.1],
-    )  # fmt: skip
-    with pytest.raises(lbt.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"):
-        lbt.map_figure({**maps, "late": late})
+    )
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"
+    ):
+        lbt.report.figures.map_figure({**maps, "late": late})

@@ -44,9 +44,26 @@ def files(tmp_path_factory, kalman, robust):
 def test_command_with_gain_files(tmp_path, capsys, files, kalman, settings):
     table, figure = tmp_path / "m.csv", tmp_path / "m.png"
     status, text, error = run(
-        capsys, "robustness", CONFIG, *files.values(), "--errors-hz", -2, 2, 5,
-        "--sensor-gains", 0.5, 1, 3, "--delay-errors", 0, 0.1, "-o", table, "-o", figure,
-    )  # fmt: skip
+        capsys,
+        "robustness",
+        CONFIG,
+        *files.values(),
+        "--errors-hz",
+        -2,
+        2,
+        5,
+        "--sensor-gains",
+        0.5,
+        1,
+        3,
+        "--delay-errors",
+        0,
+        0.1,
+        "-o",
+        table,
+        "-o",
+        figure,
+    )
     assert (status, error) == (0, "")
     assert "kalman: Strehl ratio over frequency errors of -2 to +2 Hz" in text
     assert "hinf: stable sensor gains: 0.5484 to" in text
@@ -54,8 +71,14 @@ def test_command_with_gain_files(tmp_path, capsys, files, kalman, settings):
     assert figure.read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert list(rows[0]) == [
-        "file", "delay_error_frames", "sensor_gain", "error_hz", "strehl", "residual_nm", "stable",
-    ]  # fmt: skip
+        "file",
+        "delay_error_frames",
+        "sensor_gain",
+        "error_hz",
+        "strehl",
+        "residual_nm",
+        "stable",
+    ]
     assert len(rows) == 2 * 2 * 3 * 5
     row = rows[1 * 5 + 3]
     assert (row["file"], row["sensor_gain"], row["error_hz"]) == ("kalman", "0.75", "1.0")
@@ -119,10 +142,13 @@ def test_command_without_gain_files_is_as_before(tmp_path, capsys, settings):
         capsys, "robustness", tmp_path / "few.yaml", "--sensor-gain", 0.8, "--json"
     )
     assert status == 0
-    rows = lbt.frequency_robustness(
-        settings.plant, replace(settings.truth, sensor_gain=0.8), settings.imaging,
-        errors_hz=[-1, 2], gamma_ratio=1.2,
-    )  # fmt: skip
+    rows = lbt.studies.frequency_robustness(
+        settings.plant,
+        replace(settings.truth, sensor_gain=0.8),
+        settings.imaging,
+        errors_hz=[-1, 2],
+        gamma_ratio=1.2,
+    )
     assert json.loads(text)["rows"] == [asdict(row) for row in rows]
 
 
@@ -150,7 +176,7 @@ BAD = [
     ((CONFIG, "KALMAN", "-o", "m.xls"), "must end in .csv"),
     ((CONFIG, "KALMAN", "-o", "none/m.png"), "no directory none"),
     (("ZERO", "KALMAN"), "robustness.sensor_gains[0]: input should be greater than 0; got 0"),
-]  # fmt: skip
+]
 
 
 @pytest.fixture(scope="module")

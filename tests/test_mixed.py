@@ -13,7 +13,7 @@ from plants import LBT_YAML, lbt_axis_plant, random_problem
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.lyapunov import stationary_covariance
+from lbt_synth.linear.lyapunov import stationary_covariance
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def ends(plant):
 @pytest.mark.parametrize("ratio", [1.01, 1.05, 1.1, 1.2])
 def test_less_variance_than_the_central_filter_of_the_same_norm(plant, ends, ratio):
     bound = ratio * ends[0].gamma_least
-    best, central = lbt.mixed(plant, gamma=bound), lbt.central(plant, gamma=bound)
+    best, central = lbt.mixed(plant, gamma=bound), lbt.design.central(plant, gamma=bound)
     assert best.gamma == pytest.approx(bound, rel=1e-6)
     assert central.gamma == pytest.approx(bound, rel=1e-6)
     assert ends[1].rms < best.rms < central.rms
@@ -41,7 +41,9 @@ def test_the_ends_of_the_front(plant, ends):
     least, kalman = ends
     assert lbt.mixed(plant, gamma=2 * kalman.gamma).rms == pytest.approx(kalman.rms, rel=1e-9)
     assert lbt.mixed(plant, gamma_ratio=1).gamma == pytest.approx(least.gamma, rel=1e-9)
-    assert lbt.central(plant, gamma=2 * kalman.gamma).rms == pytest.approx(kalman.rms, rel=1e-9)
+    assert lbt.design.central(plant, gamma=2 * kalman.gamma).rms == pytest.approx(
+        kalman.rms, rel=1e-9
+    )
     assert lbt.mixed(plant, rms=2 * least.rms).gamma == pytest.approx(least.gamma, rel=1e-5)
 
 
@@ -64,7 +66,7 @@ def test_no_gain_of_the_plants_own_order_does_better(plant, ends):
     """An independent search over all predictor gains, not convex: it ends above."""
     bound = 1.05 * ends[0].gamma_least
     best = lbt.mixed(plant, gamma=bound)
-    start = lbt.central(plant, gamma=bound).gain_predictor
+    start = lbt.design.central(plant, gamma=bound).gain_predictor
 
     def variance(gain):
         error = plant.error_system(gain.reshape(start.shape))
@@ -79,9 +81,12 @@ def test_no_gain_of_the_plants_own_order_does_better(plant, ends):
 
     unit = np.abs(start.ravel())
     found = minimize(
-        lambda g: variance(g * unit) / 1e4, start.ravel() / unit, method="SLSQP",
-        constraints=[{"type": "ineq", "fun": lambda g: room(g * unit) / 100}], options={"maxiter": 200, "ftol": 1e-9},
-    )  # fmt: skip
+        lambda g: variance(g * unit) / 1e4,
+        start.ravel() / unit,
+        method="SLSQP",
+        constraints=[{"type": "ineq", "fun": lambda g: room(g * unit) / 100}],
+        options={"maxiter": 200, "ftol": 1e-9},
+    )
     assert room(found.x * unit) > -1e-6 * bound
     searched = np.sqrt(variance(found.x * unit))
     assert searched < np.sqrt(variance(start.ravel()))  # the search did something
@@ -97,7 +102,9 @@ def test_bounds_hold_on_any_problem(seed, n, q, l):
     design = lbt.mixed(problem, gamma=bound, taps=6)
     assert design.gamma <= bound * (1 + 1e-6)
     assert (
-        kalman.rms * (1 - 1e-9) <= design.rms <= lbt.central(problem, gamma=bound).rms * (1 + 1e-6)
+        kalman.rms * (1 - 1e-9)
+        <= design.rms
+        <= lbt.design.central(problem, gamma=bound).rms * (1 + 1e-6)
     )
     assert design.recertified().passed
 
@@ -117,14 +124,14 @@ def test_a_mixed_filter_is_a_design_like_any_other(tmp_path, plant):
 @pytest.mark.parametrize(
     ("arguments", "error", "text"),
     [
-        ({}, lbt.ProblemError, "give one of gamma, gamma_ratio and rms"),
-        ({"gamma": 200.0, "rms": 140.0}, lbt.ProblemError, "give one of"),
-        ({"gamma": 100.0}, lbt.InfeasibleError, "gamma must be at least 155.5"),
-        ({"gamma_ratio": 0.9}, lbt.ProblemError, "gamma_ratio must be at least 1"),
-        ({"rms": 100.0}, lbt.InfeasibleError, "rms must be at least 135.9"),
-        ({"rms": np.nan}, lbt.ProblemError, "rms must be finite"),
-        ({"rms": 140.0, "taps": 0}, lbt.ProblemError, "taps must be at least 1"),
-        ({"rms": 140.0, "taps": 65}, lbt.ProblemError, "taps must be at most 64"),
+        ({}, lbt.errors.ProblemError, "give one of gamma, gamma_ratio and rms"),
+        ({"gamma": 200.0, "rms": 140.0}, lbt.errors.ProblemError, "give one of"),
+        ({"gamma": 100.0}, lbt.errors.InfeasibleError, "gamma must be at least 155.5"),
+        ({"gamma_ratio": 0.9}, lbt.errors.ProblemError, "gamma_ratio must be at least 1"),
+        ({"rms": 100.0}, lbt.errors.InfeasibleError, "rms must be at least 135.9"),
+        ({"rms": np.nan}, lbt.errors.ProblemError, "rms must be finite"),
+        ({"rms": 140.0, "taps": 0}, lbt.errors.ProblemError, "taps must be at least 1"),
+        ({"rms": 140.0, "taps": 65}, lbt.errors.ProblemError, "taps must be at most 64"),
     ],
 )
 def test_wrong_demands(plant, arguments, error, text):
@@ -133,15 +140,15 @@ def test_wrong_demands(plant, arguments, error, text):
 
 
 def test_memory_that_does_not_fit(plant):
-    with pytest.raises(lbt.DimensionError, match="taps must have 1 row to match L"):
+    with pytest.raises(lbt.errors.DimensionError, match="taps must have 1 row to match L"):
         plant.with_memory(np.ones((2, 3)))
-    with pytest.raises(lbt.DimensionError, match="multiple of 2 columns"):
+    with pytest.raises(lbt.errors.DimensionError, match="multiple of 2 columns"):
         lbt_axis_plant(modes=2).with_memory(np.ones((2, 3)))
 
 
 def test_the_front_of_the_lbt(plant):
     """A norm close to its least costs sensor-gain robustness, whichever filter has it."""
-    points = list(lbt.tradeoff(plant, points=5, taps=8))
+    points = list(lbt.studies.tradeoff(plant, points=5, taps=8))
     for family in ("mixed", "central"):
         own = [point for point in points if point.family == family]
         gamma, rms, low = ([getattr(p, key) for p in own] for key in ("gamma", "rms", "gain_low"))
@@ -152,7 +159,7 @@ def test_the_front_of_the_lbt(plant):
     for mixed, central in zip(points[2:-2:2], points[3:-2:2], strict=True):
         assert mixed.rms < central.rms
         assert mixed.gain_low < central.gain_low  # it tolerates more, too
-    figure = lbt.tradeoff_figure(points)
+    figure = lbt.report.figures.tradeoff_figure(points)
     assert len(figure.axes) == 2
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert labels[0] == "least variance at this norm"
@@ -161,15 +168,15 @@ def test_the_front_of_the_lbt(plant):
 
 def test_a_front_without_a_loop():
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    points = list(lbt.tradeoff(walk, points=2, families=["central"]))
+    points = list(lbt.studies.tradeoff(walk, points=2, families=["central"]))
     assert np.isnan(points[0].gain_low)
-    assert len(lbt.tradeoff_figure(points).axes) == 1
-    with pytest.raises(lbt.ProblemError, match="families must be"):
-        next(lbt.tradeoff(walk, families=["best"]))
-    with pytest.raises(lbt.ProblemError, match="points must be at least 2"):
-        next(lbt.tradeoff(walk, points=1))
-    with pytest.raises(lbt.ProblemError, match="at least one point"):
-        lbt.tradeoff_figure([])
+    assert len(lbt.report.figures.tradeoff_figure(points).axes) == 1
+    with pytest.raises(lbt.errors.ProblemError, match="families must be"):
+        next(lbt.studies.tradeoff(walk, families=["best"]))
+    with pytest.raises(lbt.errors.ProblemError, match="points must be at least 2"):
+        next(lbt.studies.tradeoff(walk, points=1))
+    with pytest.raises(lbt.errors.ProblemError, match="at least one point"):
+        lbt.report.figures.tradeoff_figure([])
 
 
 def test_two_axes_on_the_command_line(tmp_path, capsys):
@@ -200,10 +207,46 @@ def test_two_axes_on_the_command_line(tmp_path, capsys):
         (["tradeoff", str(LBT_YAML), "-o", "f.txt"], "must end in .csv"),
         (["tradeoff", str(LBT_YAML), "--points", "1"], "--points must be at least 2"),
         (["tradeoff", "nowhere.yaml"], "nowhere.yaml"),
-        (["design", str(LBT_YAML), "--method", "kalman", "--rms", "200", "-o", str(tmp_path / "k.fits")], "--rms goes with --method mixed"),
-        (["design", str(LBT_YAML), "--method", "integrator", "--horizon", "2", "-o", str(tmp_path / "k.fits")], "no horizon"),
-        (["design", str(LBT_YAML), "--method", "kalman", "--horizon", "-3", "-o", str(tmp_path / "k.fits")], "horizon must leave the loop a delay"),
-    ):  # fmt: skip
+        (
+            [
+                "design",
+                str(LBT_YAML),
+                "--method",
+                "kalman",
+                "--rms",
+                "200",
+                "-o",
+                str(tmp_path / "k.fits"),
+            ],
+            "--rms goes with --method mixed",
+        ),
+        (
+            [
+                "design",
+                str(LBT_YAML),
+                "--method",
+                "integrator",
+                "--horizon",
+                "2",
+                "-o",
+                str(tmp_path / "k.fits"),
+            ],
+            "no horizon",
+        ),
+        (
+            [
+                "design",
+                str(LBT_YAML),
+                "--method",
+                "kalman",
+                "--horizon",
+                "-3",
+                "-o",
+                str(tmp_path / "k.fits"),
+            ],
+            "horizon must leave the loop a delay",
+        ),
+    ):
         assert main(wrong) == 2
         assert text in capsys.readouterr().err
     target = str(tmp_path / "m.fits")
@@ -225,8 +268,11 @@ def test_a_plant_with_its_commands_as_states(plant):
 
 def test_a_plant_with_memory_is_not_assembled_anew(plant):
     design = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
-    for again in (lambda: design.problem.ahead(2), lambda: lbt.retuned_plant(design.problem, 1.0)):
-        with pytest.raises(lbt.ProblemError, match="holds the memory of a mixed filter"):
+    for again in (
+        lambda: design.problem.ahead(2),
+        lambda: lbt.models.retuned_plant(design.problem, 1.0),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match="holds the memory of a mixed filter"):
             again()
 
 
@@ -254,7 +300,7 @@ def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
 
     monkeypatch.setattr(cvxpy.Problem, "solve", panic)
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.NumericalError, match="numbers out of its range"):
+    with pytest.raises(lbt.errors.NumericalError, match="numbers out of its range"):
         lbt.hinf(walk)
 
 

@@ -22,7 +22,7 @@ def interaction(q: int, n: int, seed: int = 0) -> np.ndarray:
 def test_inverse_is_that_of_numpy(q, n, seed):
     D = interaction(q, n, seed)
     kept = min(q, n)
-    made = lbt.reconstructor(D, kept=kept)
+    made = lbt.design.modal.reconstructor(D, kept=kept)
     assert np.allclose(made.matrix, np.linalg.pinv(D, rcond=1e-14), rtol=1e-6, atol=1e-9)
     if n <= q:
         assert np.allclose(made.matrix @ D, np.eye(n), atol=1e-7)
@@ -36,9 +36,12 @@ def test_truncation_leaves_out_the_weakest():
     right, _ = np.linalg.qr(interaction(4, 4, 1))
     values = np.array([8.0, 4.0, 1.0, 0.01])
     D = left * values @ right.T
-    full = lbt.reconstructor(D)
+    full = lbt.design.modal.reconstructor(D)
     assert full.condition_number == pytest.approx(800)
-    for cut in (lbt.reconstructor(D, condition=10), lbt.reconstructor(D, kept=3)):
+    for cut in (
+        lbt.design.modal.reconstructor(D, condition=10),
+        lbt.design.modal.reconstructor(D, kept=3),
+    ):
         assert cut.kept == 3
         assert cut.condition_number == pytest.approx(8)
         assert cut.condition_number_full == pytest.approx(800)
@@ -55,76 +58,78 @@ def test_bad_interaction_matrices_are_refused():
     D = interaction(6, 4)
     blind = D.copy()
     blind[:, [1, 3]] = 0
-    with pytest.raises(lbt.ProblemError, match="none from modes 1 and 3 of 4"):
-        lbt.reconstructor(blind)
-    with pytest.raises(lbt.DimensionError, match="at least as many slopes as modes, 6"):
-        lbt.reconstructor(D.T)
-    with pytest.raises(lbt.NonFiniteError):
-        lbt.reconstructor(np.where(D == D[0, 0], np.nan, D))
+    with pytest.raises(lbt.errors.ProblemError, match="none from modes 1 and 3 of 4"):
+        lbt.design.modal.reconstructor(blind)
+    with pytest.raises(lbt.errors.DimensionError, match="at least as many slopes as modes, 6"):
+        lbt.design.modal.reconstructor(D.T)
+    with pytest.raises(lbt.errors.NonFiniteError):
+        lbt.design.modal.reconstructor(np.where(D == D[0, 0], np.nan, D))
     twin = np.hstack([D, D[:, :1]])
-    with pytest.raises(lbt.ProblemError, match="give the same slopes"):
-        lbt.reconstructor(twin)
-    assert lbt.reconstructor(twin, kept=4).kept == 4
-    with pytest.raises(lbt.ProblemError, match="not both"):
-        lbt.reconstructor(D, kept=2, condition=3)
-    with pytest.raises(lbt.ProblemError, match="condition must be at least 1"):
-        lbt.reconstructor(D, condition=0.5)
-    with pytest.raises(lbt.ProblemError, match="kept must be at least 1"):
-        lbt.reconstructor(D, kept=0)
-    with pytest.raises(lbt.ProblemError, match="must not vanish"):
-        lbt.reconstructor(D, kept=5)
-    with pytest.raises(lbt.DimensionError):
-        lbt.reconstructor(np.zeros((0, 3)))
+    with pytest.raises(lbt.errors.ProblemError, match="give the same slopes"):
+        lbt.design.modal.reconstructor(twin)
+    assert lbt.design.modal.reconstructor(twin, kept=4).kept == 4
+    with pytest.raises(lbt.errors.ProblemError, match="not both"):
+        lbt.design.modal.reconstructor(D, kept=2, condition=3)
+    with pytest.raises(lbt.errors.ProblemError, match="condition must be at least 1"):
+        lbt.design.modal.reconstructor(D, condition=0.5)
+    with pytest.raises(lbt.errors.ProblemError, match="kept must be at least 1"):
+        lbt.design.modal.reconstructor(D, kept=0)
+    with pytest.raises(lbt.errors.ProblemError, match="must not vanish"):
+        lbt.design.modal.reconstructor(D, kept=5)
+    with pytest.raises(lbt.errors.DimensionError):
+        lbt.design.modal.reconstructor(np.zeros((0, 3)))
     blind_many = np.zeros((12, 9))
     blind_many[:, 0] = 1
-    with pytest.raises(lbt.ProblemError, match="1, 2, 3, 4, 5 and 3 more"):
-        lbt.reconstructor(blind_many)
+    with pytest.raises(lbt.errors.ProblemError, match="1, 2, 3, 4, 5 and 3 more"):
+        lbt.design.modal.reconstructor(blind_many)
 
 
 # ---------------------------------------------------------------- projection
 def test_projection_by_gram_schmidt():
     rng = np.random.default_rng(0)
     modes, w = rng.standard_normal((40, 6)), rng.uniform(0, 1, 40)
-    clean = lbt.project_out(modes, weights=w)
+    clean = lbt.design.modal.project_out(modes, weights=w)
     assert np.array_equal(clean[:, :2], modes[:, :2])
     base = np.linalg.qr(np.sqrt(w)[:, None] * modes[:, :2])[0]
     expected = np.sqrt(w)[:, None] * modes[:, 2:]
     expected -= base @ (base.T @ expected)
     assert np.allclose(np.sqrt(w)[:, None] * clean[:, 2:], expected, atol=1e-12)
-    assert np.allclose(lbt.project_out(clean, weights=w), clean, atol=1e-12)
+    assert np.allclose(lbt.design.modal.project_out(clean, weights=w), clean, atol=1e-12)
 
 
 def test_projection_through_the_mirror_is_that_of_its_phase():
     rng = np.random.default_rng(1)
     influence, commands = rng.standard_normal((50, 8)), rng.standard_normal((8, 5))
-    clean = lbt.project_out(commands, [4, 0], influence_matrix=influence)
-    assert np.allclose(influence @ clean, lbt.project_out(influence @ commands, [4, 0]), atol=1e-10)
+    clean = lbt.design.modal.project_out(commands, [4, 0], influence_matrix=influence)
+    assert np.allclose(
+        influence @ clean, lbt.design.modal.project_out(influence @ commands, [4, 0]), atol=1e-10
+    )
 
 
 def test_bad_projections_are_refused():
     modes = interaction(20, 4)
-    with pytest.raises(lbt.ProblemError, match="different mode numbers from 0 to 3"):
-        lbt.project_out(modes, [0, 4])
-    with pytest.raises(lbt.ProblemError, match="different mode numbers"):
-        lbt.project_out(modes, [1, 1])
-    with pytest.raises(lbt.ProblemError, match="at least one mode"):
-        lbt.project_out(modes, [])
-    with pytest.raises(lbt.ProblemError, match="list of mode numbers"):
-        lbt.project_out(modes, 1)
-    with pytest.raises(lbt.DimensionError, match="weights must have shape"):
-        lbt.project_out(modes, weights=np.ones(4))
-    with pytest.raises(lbt.ProblemError, match="weights must be at least 0"):
-        lbt.project_out(modes, weights=-np.ones(20))
-    with pytest.raises(lbt.DimensionError, match="influence_matrix must have 20 columns"):
-        lbt.project_out(modes, influence_matrix=np.ones((30, 3)))
+    with pytest.raises(lbt.errors.ProblemError, match="different mode numbers from 0 to 3"):
+        lbt.design.modal.project_out(modes, [0, 4])
+    with pytest.raises(lbt.errors.ProblemError, match="different mode numbers"):
+        lbt.design.modal.project_out(modes, [1, 1])
+    with pytest.raises(lbt.errors.ProblemError, match="at least one mode"):
+        lbt.design.modal.project_out(modes, [])
+    with pytest.raises(lbt.errors.ProblemError, match="list of mode numbers"):
+        lbt.design.modal.project_out(modes, 1)
+    with pytest.raises(lbt.errors.DimensionError, match="weights must have shape"):
+        lbt.design.modal.project_out(modes, weights=np.ones(4))
+    with pytest.raises(lbt.errors.ProblemError, match="weights must be at least 0"):
+        lbt.design.modal.project_out(modes, weights=-np.ones(20))
+    with pytest.raises(lbt.errors.DimensionError, match="influence_matrix must have 20 columns"):
+        lbt.design.modal.project_out(modes, influence_matrix=np.ones((30, 3)))
     twins = modes.copy()
     twins[:, 1] = 2 * twins[:, 0]
-    with pytest.raises(lbt.ProblemError, match="independent"):
-        lbt.project_out(twins)
+    with pytest.raises(lbt.errors.ProblemError, match="independent"):
+        lbt.design.modal.project_out(twins)
     spanned = modes.copy()
     spanned[:, 3] = spanned[:, 0] - spanned[:, 1]
-    with pytest.raises(lbt.ProblemError, match="nothing is left of mode 3"):
-        lbt.project_out(spanned)
+    with pytest.raises(lbt.errors.ProblemError, match="nothing is left of mode 3"):
+        lbt.design.modal.project_out(spanned)
 
 
 # ---------------------------------------------------------------- mixed controller
@@ -147,15 +152,15 @@ def written_out(filter_controller, gains, leak, filtered, slopes, inverse):
 def test_step_is_the_recursion_written_out():
     rng = np.random.default_rng(3)
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    inverse = lbt.reconstructor(interaction(9, 5))
+    inverse = lbt.design.modal.reconstructor(interaction(9, 5))
     gains, leak = rng.uniform(0, 1, 5), rng.uniform(0.9, 1, 5)
-    mixed = lbt.MixedController(
+    mixed = lbt.design.modal.MixedController(
         filter=kalman, gains=gains, filtered=(3, 1), leak=leak, reconstructor=inverse
     )
     slopes = 30 * rng.standard_normal((60, 9))
     expected = written_out(kalman.controller, gains, leak, (3, 1), slopes, inverse.matrix)
     for filters in (kalman, kalman.controller, kalman.controller.start()):
-        other = lbt.MixedController(
+        other = lbt.design.modal.MixedController(
             filter=filters, gains=gains, filtered=(3, 1), leak=leak, reconstructor=inverse
         )
         assert np.allclose([other.step(y) for y in slopes], expected, atol=1e-9)
@@ -168,7 +173,7 @@ def test_step_is_the_recursion_written_out():
 
 
 def test_commands_are_the_callers():
-    mixed = lbt.MixedController.integrators([1.0, 1.0])
+    mixed = lbt.design.modal.MixedController.integrators([1.0, 1.0])
     mixed.step([1.0, 2.0])[:] = 1e9
     assert mixed.step([0.0, 0.0]).tolist() == [1.0, 2.0]
 
@@ -179,8 +184,8 @@ def test_two_modes_in_the_loop_agree_with_the_exact_budget():
         turbulence=plant.turbulence[0], vibrations=plant.vibrations[:1], noise_nm=15.5
     )
     for mixed, gain in (
-        (lbt.MixedController(filter=lbt.kalman(plant), gains=[0, 0]), None),
-        (lbt.MixedController.integrators([0.4, 0.4]), 0.4),
+        (lbt.design.modal.MixedController(filter=lbt.kalman(plant), gains=[0, 0]), None),
+        (lbt.design.modal.MixedController.integrators([0.4, 0.4]), 0.4),
     ):
         controller = (
             lbt.kalman(plant).controller
@@ -201,10 +206,12 @@ def test_fifty_modes_in_the_loop_agree_with_the_linear_loop():
     n, q = 50, 90
     plant = lbt_axis_plant(modes=2)
     D = interaction(q, n)
-    inverse = lbt.reconstructor(D)
+    inverse = lbt.design.modal.reconstructor(D)
     hardware = lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=D)
     gains = np.linspace(0.2, 0.6, n)
-    mixed = lbt.MixedController(filter=lbt.kalman(plant), gains=gains, reconstructor=inverse)
+    mixed = lbt.design.modal.MixedController(
+        filter=lbt.kalman(plant), gains=gains, reconstructor=inverse
+    )
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
     kept = {"frames": 200, "seed": 1, "settle_frames": 50}
     stepped = lbt.simulate(mixed, truth, hardware=hardware, **kept)
@@ -219,9 +226,9 @@ def test_modes_count_for_themselves_only():
     rng = np.random.default_rng(0)
     gains, order = rng.uniform(0, 1, 7), rng.permutation(7)
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    one = lbt.MixedController(filter=kalman, gains=gains, filtered=(0, 1))
+    one = lbt.design.modal.MixedController(filter=kalman, gains=gains, filtered=(0, 1))
     at = [int(np.flatnonzero(order == i)[0]) for i in (0, 1)]
-    other = lbt.MixedController(filter=kalman, gains=gains[order], filtered=at)
+    other = lbt.design.modal.MixedController(filter=kalman, gains=gains[order], filtered=at)
     for _ in range(20):
         y = rng.standard_normal(7)
         assert np.array_equal(one.step(y)[order], other.step(y[order]))
@@ -229,7 +236,7 @@ def test_modes_count_for_themselves_only():
 
 def test_a_step_of_672_modes_takes_microseconds():
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    mixed = lbt.MixedController(filter=kalman, gains=np.full(672, 0.4))
+    mixed = lbt.design.modal.MixedController(filter=kalman, gains=np.full(672, 0.4))
     y = np.ones(672)
 
     def took() -> float:
@@ -243,32 +250,64 @@ def test_a_step_of_672_modes_takes_microseconds():
 
 def test_bad_mixed_controllers_are_refused():
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    inverse = lbt.reconstructor(interaction(9, 5))
+    inverse = lbt.design.modal.reconstructor(interaction(9, 5))
     gains = np.full(5, 0.4)
     cases = [
-        ({"filter": kalman, "gains": 0.4}, lbt.DimensionError, "gains must be a list"),
-        ({"filter": kalman, "gains": [0.4, np.nan]}, lbt.NonFiniteError, "gains must be finite"),
-        ({"filter": None, "gains": [-0.1]}, lbt.ProblemError, "gains must be at least 0"),
-        ({"filter": None, "gains": gains, "leak": 1.1}, lbt.ProblemError, "leak must be from 0 to 1"),
-        ({"filter": None, "gains": gains, "leak": [1, 1]}, lbt.DimensionError, "leak must be one"),
-        ({"filter": kalman, "gains": gains, "filtered": (0,)}, lbt.DimensionError, "1 filtered"),
-        ({"filter": kalman, "gains": gains, "filtered": (0, 5)}, lbt.ProblemError, "from 0 to 4"),
-        ({"filter": kalman, "gains": gains, "filtered": ()}, lbt.ProblemError, "at least one mode"),
-        ({"filter": 3, "gains": gains}, lbt.ProblemError, "filter must be a design"),
-        ({"filter": None, "gains": [1, 1], "reconstructor": inverse}, lbt.DimensionError, "a mode of"),
-        ({"filter": None, "gains": gains, "reconstructor": 1}, lbt.ProblemError, "Reconstructor"),
-    ]  # fmt: skip
+        ({"filter": kalman, "gains": 0.4}, lbt.errors.DimensionError, "gains must be a list"),
+        (
+            {"filter": kalman, "gains": [0.4, np.nan]},
+            lbt.errors.NonFiniteError,
+            "gains must be finite",
+        ),
+        ({"filter": None, "gains": [-0.1]}, lbt.errors.ProblemError, "gains must be at least 0"),
+        (
+            {"filter": None, "gains": gains, "leak": 1.1},
+            lbt.errors.ProblemError,
+            "leak must be from 0 to 1",
+        ),
+        (
+            {"filter": None, "gains": gains, "leak": [1, 1]},
+            lbt.errors.DimensionError,
+            "leak must be one",
+        ),
+        (
+            {"filter": kalman, "gains": gains, "filtered": (0,)},
+            lbt.errors.DimensionError,
+            "1 filtered",
+        ),
+        (
+            {"filter": kalman, "gains": gains, "filtered": (0, 5)},
+            lbt.errors.ProblemError,
+            "from 0 to 4",
+        ),
+        (
+            {"filter": kalman, "gains": gains, "filtered": ()},
+            lbt.errors.ProblemError,
+            "at least one mode",
+        ),
+        ({"filter": 3, "gains": gains}, lbt.errors.ProblemError, "filter must be a design"),
+        (
+            {"filter": None, "gains": [1, 1], "reconstructor": inverse},
+            lbt.errors.DimensionError,
+            "a mode of",
+        ),
+        (
+            {"filter": None, "gains": gains, "reconstructor": 1},
+            lbt.errors.ProblemError,
+            "Reconstructor",
+        ),
+    ]
     for arguments, error, words in cases:
         with pytest.raises(error, match=words):
-            lbt.MixedController(**arguments)
+            lbt.design.modal.MixedController(**arguments)
 
 
 def test_bad_measurements_leave_the_state_alone():
-    mixed = lbt.MixedController.integrators([1.0, 1.0])
+    mixed = lbt.design.modal.MixedController.integrators([1.0, 1.0])
     mixed.step([1.0, 2.0])
-    with pytest.raises(lbt.DimensionError, match=r"y must have shape \(2,\)"):
+    with pytest.raises(lbt.errors.DimensionError, match=r"y must have shape \(2,\)"):
         mixed.step([1.0])
-    with pytest.raises(lbt.NonFiniteError, match="The state is as before"):
+    with pytest.raises(lbt.errors.NonFiniteError, match="The state is as before"):
         mixed.step([np.nan, 1.0])
     assert mixed.step([0.0, 0.0]).tolist() == [1.0, 2.0]
 
@@ -281,9 +320,9 @@ def test_a_filter_without_matrices_is_stepped_but_not_linear():
         def reset(self):
             pass
 
-    mixed = lbt.MixedController(filter=Echo(), gains=[0.5, 0.5, 0.5], filtered=(2,))
+    mixed = lbt.design.modal.MixedController(filter=Echo(), gains=[0.5, 0.5, 0.5], filtered=(2,))
     assert mixed.step([1.0, 1.0, 3.0]).tolist() == [0.5, 0.5, -3.0]
-    with pytest.raises(lbt.ProblemError, match="only a filter with matrices"):
+    with pytest.raises(lbt.errors.ProblemError, match="only a filter with matrices"):
         mixed.as_controller()
 
 
@@ -302,13 +341,13 @@ class Own:
 
 def test_what_a_filter_returns_is_checked():
     for out, error, words in (
-        (5.0, lbt.DimensionError, r"commands must have shape \(2,\).*got \(\)"),
-        (np.zeros(3), lbt.DimensionError, r"got \(3,\)"),
-        (np.array([1.0, np.nan]), lbt.NonFiniteError, "commands must be finite"),
-        (["a", "b"], lbt.ProblemError, "commands must be an array of numbers"),
+        (5.0, lbt.errors.DimensionError, r"commands must have shape \(2,\).*got \(\)"),
+        (np.zeros(3), lbt.errors.DimensionError, r"got \(3,\)"),
+        (np.array([1.0, np.nan]), lbt.errors.NonFiniteError, "commands must be finite"),
+        (["a", "b"], lbt.errors.ProblemError, "commands must be an array of numbers"),
     ):
         own = Own(np.zeros(2))
-        control = lbt.MixedController(filter=own, gains=[0.0, 0.0, 0.5])
+        control = lbt.design.modal.MixedController(filter=own, gains=[0.0, 0.0, 0.5])
         assert control.step([1.0, 1.0, 1.0]).tolist() == [0.0, 0.0, 0.5]
         own.out = out
         with pytest.raises(error, match=words):
@@ -318,8 +357,8 @@ def test_what_a_filter_returns_is_checked():
 
 
 def test_measurements_that_are_no_numbers_are_refused():
-    control = lbt.MixedController.integrators([0.5])
+    control = lbt.design.modal.MixedController.integrators([0.5])
     for y, words in (("a", "array of numbers"), (["1.0"], "array of numbers"), ([1j], "real")):
-        with pytest.raises(lbt.ProblemError, match=words):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
             control.step(y)
     assert control.step([1]).tolist() == [0.5]

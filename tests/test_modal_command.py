@@ -30,12 +30,14 @@ def test_modal_as_json_agrees_with_the_library(capsys):
     data = json.loads(text)
     assert status == 0
     config = lbt.load_config(LBT_YAML)
-    air = lbt.modal_turbulence(config.atmosphere, modes=20, frame_rate_hz=800)
-    noise = lbt.pyramid_modal_noise_nm(config.noise_nm, modes=20, modulation_lambda_over_d=4)
+    air = lbt.models.modal_turbulence(config.atmosphere, modes=20, frame_rate_hz=800)
+    noise = lbt.models.pyramid_modal_noise_nm(config.noise_nm, modes=20, modulation_lambda_over_d=4)
     line = config.plant.vibrations[0]
-    filters = lbt.modal_filters(air, noise_nm=noise, vibrations={0: line, 1: line})
+    filters = lbt.design.modal.modal_filters(air, noise_nm=noise, vibrations={0: line, 1: line})
     assert data["residual_nm"]["Kalman filters"] == pytest.approx((filters.rms_nm**2).sum() ** 0.5)
-    gains = lbt.modal_gains(air, noise_nm=noise, frame_rate_hz=800, vibrations={0: line, 1: line})
+    gains = lbt.design.modal.modal_gains(
+        air, noise_nm=noise, frame_rate_hz=800, vibrations={0: line, 1: line}
+    )
     assert data["rows"][0]["gain"] == pytest.approx(gains.gains[0])
     ordered = list(data["residual_nm"].values())
     assert ordered == sorted(ordered, reverse=True)
@@ -64,16 +66,16 @@ def test_modal_knows_the_local_loop(capsys):
     data, config = json.loads(text), lbt.load_config(slow)
     shell = config.hardware.mirror
     assert shell is not None
-    air = lbt.modal_turbulence(config.atmosphere, modes=5, frame_rate_hz=800)
-    noise = lbt.pyramid_modal_noise_nm(config.noise_nm, modes=5, modulation_lambda_over_d=4)
+    air = lbt.models.modal_turbulence(config.atmosphere, modes=5, frame_rate_hz=800)
+    noise = lbt.models.pyramid_modal_noise_nm(config.noise_nm, modes=5, modulation_lambda_over_d=4)
     line = config.plant.vibrations[0]
     known = {"noise_nm": noise, "vibrations": {0: line, 1: line}}
-    gains = lbt.modal_gains(air, frame_rate_hz=800, mirror=shell, **known)
-    filters = lbt.modal_filters(air, mirror=shell, **known)
+    gains = lbt.design.modal.modal_gains(air, frame_rate_hz=800, mirror=shell, **known)
+    filters = lbt.design.modal.modal_filters(air, mirror=shell, **known)
     assert data["rows"][0]["gain"] == pytest.approx(gains.gains[0])
     assert data["residual_nm"]["Kalman filters"] == pytest.approx((filters.rms_nm**2).sum() ** 0.5)
-    loop = lbt.modal_loop(
-        lbt.MixedController.integrators(gains.gains), mirror=shell, frame_rate_hz=800
+    loop = lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController.integrators(gains.gains), mirror=shell, frame_rate_hz=800
     )
     assert np.allclose(loop.residual_rms_nm(air, **known), gains.rms_nm, rtol=1e-6)
     status, text, _ = run(capsys, "modal", slow, "--modes", 5)
@@ -96,7 +98,7 @@ def test_bad_input(capsys, arguments, words):
 
 
 def test_bad_noise_is_refused():
-    with pytest.raises(lbt.ProblemError, match="tilt_noise_nm"):
-        lbt.pyramid_modal_noise_nm(0, modes=3, modulation_lambda_over_d=4)
-    with pytest.raises(lbt.ProblemError, match="modulation"):
-        lbt.pyramid_modal_noise_nm(1, modes=3, modulation_lambda_over_d=0)
+    with pytest.raises(lbt.errors.ProblemError, match="tilt_noise_nm"):
+        lbt.models.pyramid_modal_noise_nm(0, modes=3, modulation_lambda_over_d=4)
+    with pytest.raises(lbt.errors.ProblemError, match="modulation"):
+        lbt.models.pyramid_modal_noise_nm(1, modes=3, modulation_lambda_over_d=0)

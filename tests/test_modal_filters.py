@@ -10,44 +10,49 @@ from plants import lbt_axis_plant
 from scipy.linalg import solve_discrete_lyapunov
 
 import lbt_synth as lbt
+from lbt_synth.design.modal import certificate as certificates
+from lbt_synth.design.modal.plants import lines_per_mode, plant_stacks
+from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.loop.budget import ar_covariance
-from lbt_synth.lyapunov import stationary_covariances
-from lbt_synth.modal import certificate as certificates
-from lbt_synth.modal.plants import lines_per_mode, plant_stacks
-from lbt_synth.simulation.linear import SystemStack
-from lbt_synth.simulation.run import step_loop
+from lbt_synth.loop.simulation.long_series import SystemStack
+from lbt_synth.loop.simulation.run import step_loop
 
 RATE = 800.0
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
 HUM = lbt.Vibration(frequency_hz=55, damping=0.02, rms_nm=40.0, direction=(1,))
 
 
-def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.ModalTurbulence:
+def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ModalTurbulence:
     rng = np.random.default_rng(seed)
     if order == 1:
         coefficients = rng.uniform(0.9, 0.995, (n, 1))
     else:
         decay, turn = rng.uniform(0.9, 0.99, n), rng.uniform(0.005, 0.1, n)
         coefficients = np.stack([2 * decay * np.cos(turn), -(decay**2)], axis=1)
-    return lbt.ModalTurbulence(
+    return lbt.models.ModalTurbulence(
         coefficients=coefficients, driving_rms_nm=10 ** rng.uniform(0, 2, n), frame_rate_hz=RATE
     )
 
 
 def single_plant(air, mode, lines, noise, gain, delay):
     return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=air.model(mode), vibrations=list(lines) or None,
-        noise_nm=float(noise), delay_frames=delay, sensor_gain=float(gain), modes=1,
-    )  # fmt: skip
+        frame_rate_hz=RATE,
+        turbulence=air.model(mode),
+        vibrations=list(lines) or None,
+        noise_nm=float(noise),
+        delay_frames=delay,
+        sensor_gain=float(gain),
+        modes=1,
+    )
 
 
 # ---------------------------------------------------------------- turbulence as arrays
 def test_arrays_are_the_single_models():
     models = [
-        lbt.ARModel(coefficients=[0.99], driving_rms_nm=3.0, frame_rate_hz=RATE),
-        lbt.ARModel(coefficients=[1.9, -0.92], driving_rms_nm=1.0, frame_rate_hz=RATE),
+        lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=3.0, frame_rate_hz=RATE),
+        lbt.models.ARModel(coefficients=[1.9, -0.92], driving_rms_nm=1.0, frame_rate_hz=RATE),
     ]
-    air = lbt.ModalTurbulence.of(models)
+    air = lbt.models.ModalTurbulence.of(models)
     assert (air.n_modes, air.order) == (2, 2)
     assert np.allclose(air.rms_nm, [m.rms_nm for m in models], rtol=1e-13)
     f = np.geomspace(0.1, 400, 7)
@@ -58,22 +63,22 @@ def test_arrays_are_the_single_models():
 def test_bad_arrays_are_refused():
     ok = {"coefficients": [[0.9], [0.8]], "driving_rms_nm": [1, 1], "frame_rate_hz": 800}
     for change, error, words in (
-        ({"coefficients": [[0.9], [1.0]]}, lbt.ProblemError, "modulus 1 in mode 1"),
-        ({"coefficients": np.zeros((0, 1))}, lbt.DimensionError, "at least one of each"),
-        ({"driving_rms_nm": [1]}, lbt.DimensionError, r"shape \(2,\)"),
-        ({"driving_rms_nm": [1, 0]}, lbt.ProblemError, "above 0"),
-        ({"frame_rate_hz": 0}, lbt.ProblemError, "frame_rate_hz"),
+        ({"coefficients": [[0.9], [1.0]]}, lbt.errors.ProblemError, "modulus 1 in mode 1"),
+        ({"coefficients": np.zeros((0, 1))}, lbt.errors.DimensionError, "at least one of each"),
+        ({"driving_rms_nm": [1]}, lbt.errors.DimensionError, r"shape \(2,\)"),
+        ({"driving_rms_nm": [1, 0]}, lbt.errors.ProblemError, "above 0"),
+        ({"frame_rate_hz": 0}, lbt.errors.ProblemError, "frame_rate_hz"),
     ):
         with pytest.raises(error, match=words):
-            lbt.ModalTurbulence(**(ok | change))
-    air = lbt.ModalTurbulence(**ok)
-    with pytest.raises(lbt.ProblemError, match="from 0 to 1"):
+            lbt.models.ModalTurbulence(**(ok | change))
+    air = lbt.models.ModalTurbulence(**ok)
+    with pytest.raises(lbt.errors.ProblemError, match="from 0 to 1"):
         air.model(2)
-    with pytest.raises(lbt.ProblemError, match="one ARModel a mode"):
-        lbt.ModalTurbulence.of([])
-    slow = lbt.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=500)
-    with pytest.raises(lbt.ProblemError, match="same frame rate"):
-        lbt.ModalTurbulence.of([air.model(0), slow])
+    with pytest.raises(lbt.errors.ProblemError, match="one ARModel a mode"):
+        lbt.models.ModalTurbulence.of([])
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=500)
+    with pytest.raises(lbt.errors.ProblemError, match="same frame rate"):
+        lbt.models.ModalTurbulence.of([air.model(0), slow])
 
 
 # ---------------------------------------------------------------- filters
@@ -84,7 +89,7 @@ def test_each_filter_is_that_of_kalman(delay, order):
     air = some_air(n, order)
     noise, gain = np.linspace(5, 30, n), np.linspace(0.5, 1.1, n)
     lines = {1: [LINE], 4: [LINE, HUM], 5: HUM}
-    filters = lbt.modal_filters(
+    filters = lbt.design.modal.modal_filters(
         air, noise_nm=noise, vibrations=lines, delay_frames=delay, sensor_gain=gain
     )
     for i in range(n):
@@ -114,22 +119,29 @@ def test_each_filter_is_that_of_kalman(delay, order):
 @pytest.mark.parametrize("delay", [1, 2, 2.6])
 @pytest.mark.parametrize("bandwidth", [60.0, 500.0])
 def test_filters_know_the_mirror_as_kalman_does(delay, bandwidth):
-    shell = lbt.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.of_bandwidth(
         natural_frequency_hz=20, damping=0.5, bandwidth_hz=bandwidth
     )
     air, lines = some_air(4), {1: [LINE], 3: [LINE, HUM]}
     noise, gain = np.linspace(5, 20, 4), np.linspace(0.6, 1.1, 4)
     known = {"delay_frames": delay, "mirror": shell}
-    filters = lbt.modal_filters(air, noise_nm=noise, vibrations=lines, sensor_gain=gain, **known)
-    loop = lbt.modal_loop(filters, sensor_gain=gain)
+    filters = lbt.design.modal.modal_filters(
+        air, noise_nm=noise, vibrations=lines, sensor_gain=gain, **known
+    )
+    loop = lbt.design.modal.modal_loop(filters, sensor_gain=gain)
     assert (loop.mirror, loop.frame_rate_hz, loop.delay_frames) == (shell, RATE, delay)
     exact = loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
     assert np.allclose(exact, filters.rms_nm, rtol=1e-9)
     for i in range(4):
         plant = lbt.tip_tilt_plant(
-            frame_rate_hz=RATE, turbulence=air.model(i), vibrations=lines.get(i),
-            noise_nm=float(noise[i]), sensor_gain=float(gain[i]), modes=1, **known,
-        )  # fmt: skip
+            frame_rate_hz=RATE,
+            turbulence=air.model(i),
+            vibrations=lines.get(i),
+            noise_nm=float(noise[i]),
+            sensor_gain=float(gain[i]),
+            modes=1,
+            **known,
+        )
         one = lbt.kalman(plant)
         mine = filters.controller(i)
         assert mine.n_states == one.controller.n_states
@@ -158,11 +170,14 @@ def test_stacked_plants_are_tip_tilt_plants(delay):
 
 def test_a_failing_mode_is_named():
     air = some_air(4)
-    filters = lbt.modal_filters(air, noise_nm=10.0)
+    filters = lbt.design.modal.modal_filters(air, noise_nm=10.0)
     (stack,) = plant_stacks(
-        air, filters.vibrations, noise_nm=filters.noise_nm, delay_frames=2.0,
+        air,
+        filters.vibrations,
+        noise_nm=filters.noise_nm,
+        delay_frames=2.0,
         sensor_gain=filters.sensor_gain,
-    )  # fmt: skip
+    )
     solution = lbt.solve_dare(
         np.swapaxes(stack.A, 1, 2), np.swapaxes(stack.C, 1, 2), stack.Q, stack.R
     )
@@ -174,11 +189,11 @@ def test_a_failing_mode_is_named():
     examined.loops(stack.modes, np.full(4, 0.5), filters.rms_nm[:, None] ** 2, zero, zero)
     checks = examined.certificate(applied=False)
     assert not checks.passed
-    with pytest.raises(lbt.CertificateError, match="least-variance gain .mode 2."):
+    with pytest.raises(lbt.errors.CertificateError, match="least-variance gain .mode 2."):
         checks.require()
     gains[:] = 5.0
     examined.filters(stack, gains, solution)
-    with pytest.raises(lbt.CertificateError, match="modes 0, 1, 2 and 3"):
+    with pytest.raises(lbt.errors.CertificateError, match="modes 0, 1, 2 and 3"):
         examined.certificate(applied=False).require()
 
 
@@ -199,33 +214,41 @@ def test_stacked_lyapunov_is_scipys():
 def test_bad_filters_are_refused():
     air = some_air(3)
     for arguments, error, words in (
-        ({"noise_nm": 0.0}, lbt.ProblemError, "noise_nm must be above 0"),
-        ({"noise_nm": [1.0, 2.0]}, lbt.DimensionError, "one a mode .3."),
-        ({"noise_nm": np.nan}, lbt.NonFiniteError, "noise_nm"),
-        ({"noise_nm": 1, "delay_frames": 0.5}, lbt.ProblemError, "delay_frames"),
-        ({"noise_nm": 1, "sensor_gain": -1}, lbt.ProblemError, "sensor_gain must be above 0"),
-        ({"noise_nm": 1, "vibrations": [LINE]}, lbt.ProblemError, "must be a mapping"),
-        ({"noise_nm": 1, "vibrations": {3: LINE}}, lbt.ProblemError, "from 0 to 2"),
-        ({"noise_nm": 1, "vibrations": {0: 3}}, lbt.ProblemError, "list of Vibration"),
-        ({"noise_nm": 1, "mirror": 3}, lbt.ProblemError, "PositionLoop"),
-        ({"noise_nm": 1, "vibrations": {0: [1]}}, lbt.ProblemError, "list of Vibration"),
+        ({"noise_nm": 0.0}, lbt.errors.ProblemError, "noise_nm must be above 0"),
+        ({"noise_nm": [1.0, 2.0]}, lbt.errors.DimensionError, "one a mode .3."),
+        ({"noise_nm": np.nan}, lbt.errors.NonFiniteError, "noise_nm"),
+        ({"noise_nm": 1, "delay_frames": 0.5}, lbt.errors.ProblemError, "delay_frames"),
+        (
+            {"noise_nm": 1, "sensor_gain": -1},
+            lbt.errors.ProblemError,
+            "sensor_gain must be above 0",
+        ),
+        ({"noise_nm": 1, "vibrations": [LINE]}, lbt.errors.ProblemError, "must be a mapping"),
+        ({"noise_nm": 1, "vibrations": {3: LINE}}, lbt.errors.ProblemError, "from 0 to 2"),
+        ({"noise_nm": 1, "vibrations": {0: 3}}, lbt.errors.ProblemError, "list of Vibration"),
+        ({"noise_nm": 1, "mirror": 3}, lbt.errors.ProblemError, "PositionLoop"),
+        ({"noise_nm": 1, "vibrations": {0: [1]}}, lbt.errors.ProblemError, "list of Vibration"),
     ):
         with pytest.raises(error, match=words):
-            lbt.modal_filters(air, **arguments)
-    filters = lbt.modal_filters([air.model(0)], noise_nm=1.0)
-    with pytest.raises(lbt.ProblemError, match="from 0 to 0"):
+            lbt.design.modal.modal_filters(air, **arguments)
+    filters = lbt.design.modal.modal_filters([air.model(0)], noise_nm=1.0)
+    with pytest.raises(lbt.errors.ProblemError, match="from 0 to 0"):
         filters.controller(1)
-    with pytest.raises(lbt.DimensionError, match=r"\(1,\)"):
+    with pytest.raises(lbt.errors.DimensionError, match=r"\(1,\)"):
         filters.start().step([1.0, 2.0])
-    with pytest.raises(lbt.ProblemError, match="y must be an array of numbers"):
+    with pytest.raises(lbt.errors.ProblemError, match="y must be an array of numbers"):
         filters.start().step(["a"])
 
 
 # ---------------------------------------------------------------- the loop of all modes
 @given(
-    count=st.integers(1, 4), n=st.integers(1, 5), m=st.integers(1, 2), p=st.integers(1, 3),
-    frames=st.integers(1, 200), seed=st.integers(0, 100),
-)  # fmt: skip
+    count=st.integers(1, 4),
+    n=st.integers(1, 5),
+    m=st.integers(1, 2),
+    p=st.integers(1, 3),
+    frames=st.integers(1, 200),
+    seed=st.integers(0, 100),
+)
 def test_stacked_series_are_the_recursion(count, n, m, p, frames, seed):
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((count, n, n))
@@ -234,8 +257,8 @@ def test_stacked_series_are_the_recursion(count, n, m, p, frames, seed):
     D, u = rng.standard_normal((count, p, m)), rng.standard_normal((count, frames, m))
     out = SystemStack(A, B, C, D).filtered(u)
     for i in range(count):
-        system = lbt.StateSpace(A=A[i], B=B[i], C=C[i], D=D[i])
-        expected = lbt.filter_series(system, u[i])
+        system = lbt.linear.StateSpace(A=A[i], B=B[i], C=C[i], D=D[i])
+        expected = lbt.loop.filter_series(system, u[i])
         assert np.allclose(out[i], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     if m == p:
         again = u.copy()
@@ -245,18 +268,25 @@ def test_stacked_series_are_the_recursion(count, n, m, p, frames, seed):
 
 def controllers(n, delay):
     air = some_air(n)
-    filters = lbt.modal_filters(air, noise_nm=8.0, vibrations={0: [LINE]}, delay_frames=delay)
+    filters = lbt.design.modal.modal_filters(
+        air, noise_nm=8.0, vibrations={0: [LINE]}, delay_frames=delay
+    )
     gains = np.linspace(0.1, 0.3, n)
     tip_tilt = lbt.kalman(lbt_axis_plant(modes=2, delay_frames=delay))
     return {
-        "integrators": lbt.MixedController.integrators(gains, leak=np.linspace(0.98, 1, n)),
-        "filters": filters,
-        "mixed": lbt.MixedController(filter=tip_tilt, gains=gains, filtered=(3, 1)),
-        "both": lbt.MixedController(
-            filter=lbt.modal_filters([air.model(0)] * 2, noise_nm=8.0, delay_frames=delay),
-            gains=gains, filtered=(2, 0),
+        "integrators": lbt.design.modal.MixedController.integrators(
+            gains, leak=np.linspace(0.98, 1, n)
         ),
-    }  # fmt: skip
+        "filters": filters,
+        "mixed": lbt.design.modal.MixedController(filter=tip_tilt, gains=gains, filtered=(3, 1)),
+        "both": lbt.design.modal.MixedController(
+            filter=lbt.design.modal.modal_filters(
+                [air.model(0)] * 2, noise_nm=8.0, delay_frames=delay
+            ),
+            gains=gains,
+            filtered=(2, 0),
+        ),
+    }
 
 
 @pytest.mark.parametrize("delay", [1, 1.4, 2, 2.7, 3])
@@ -268,9 +298,11 @@ def test_series_are_those_of_the_loop_as_written(kind, delay):
     total, noise = 100 * rng.standard_normal((n, frames)), 8 * rng.standard_normal((n, frames))
     gain = np.linspace(0.6, 1.1, n)
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, sensor_matrix=np.diag(gain))
-    running = controller.start() if isinstance(controller, lbt.ModalFilters) else controller
+    running = (
+        controller.start() if isinstance(controller, lbt.design.modal.ModalFilters) else controller
+    )
     expected = step_loop(running, 1.0, path, total.T[None], noise.T[None])[0].T
-    loop = lbt.modal_loop(controller, delay_frames=delay, sensor_gain=gain)
+    loop = lbt.design.modal.modal_loop(controller, delay_frames=delay, sensor_gain=gain)
     run = loop.run(total, noise, all_series=True)
     got = np.concatenate([run.residual_nm, run.commands, run.measurements])
     assert np.allclose(got, expected, atol=1e-10 * np.abs(expected).max())
@@ -286,10 +318,10 @@ def test_exact_residuals_are_those_of_the_budget(kind):
     n, delay = 5, 2.4
     controller = controllers(n, delay)[kind]
     air, noise, gain = some_air(n, 2), np.linspace(1, 9, n), np.linspace(0.6, 1.1, n)
-    loop = lbt.modal_loop(controller, delay_frames=delay, sensor_gain=gain)
+    loop = lbt.design.modal.modal_loop(controller, delay_frames=delay, sensor_gain=gain)
     got = loop.residual_rms_nm(air, noise_nm=noise, vibrations={2: [HUM], 3: [LINE, HUM]})
     whole = (
-        lbt.MixedController(filter=controller, gains=np.zeros(n), filtered=range(n))
+        lbt.design.modal.MixedController(filter=controller, gains=np.zeros(n), filtered=range(n))
         if kind == "filters"
         else controller
     ).as_controller(1 / RATE)
@@ -315,11 +347,11 @@ def test_exact_residuals_are_those_of_the_budget(kind):
 
 def test_filters_run_in_simulate():
     air = some_air(3)
-    filters = lbt.modal_filters(air, noise_nm=8.0)
+    filters = lbt.design.modal.modal_filters(air, noise_nm=8.0)
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=3)
     truth = lbt.Truth(turbulence=air.model(0), noise_nm=8.0)
     run = lbt.simulate(filters.start(), truth, hardware=path, frames=300)
-    again = lbt.modal_loop(filters)
+    again = lbt.design.modal.modal_loop(filters)
     # the same residual but for the frames before, whose total phase is not kept
     assert run.residual_nm.shape == (1, 300, 3)
     exact = again.residual_rms_nm([air.model(0)] * 3, noise_nm=8.0)
@@ -327,85 +359,98 @@ def test_filters_run_in_simulate():
 
 
 def test_bad_loops_are_refused():
-    classical = lbt.MixedController.integrators([0.5, 0.5, 1.2])
-    loop = lbt.modal_loop(classical)
+    classical = lbt.design.modal.MixedController.integrators([0.5, 0.5, 1.2])
+    loop = lbt.design.modal.modal_loop(classical)
     series = np.zeros((3, 10))
-    with pytest.raises(lbt.UnstableLoopError, match="mode 2"):
+    with pytest.raises(lbt.errors.UnstableLoopError, match="mode 2"):
         loop.run(series, series)
-    with pytest.raises(lbt.UnstableLoopError, match="mode 2"):
+    with pytest.raises(lbt.errors.UnstableLoopError, match="mode 2"):
         loop.residual_rms_nm(some_air(3), noise_nm=1.0)
-    calm = lbt.modal_loop(classical, sensor_gain=0.5)
+    calm = lbt.design.modal.modal_loop(classical, sensor_gain=0.5)
     assert calm.is_stable
-    with pytest.raises(lbt.DimensionError, match=r"must both be \(3, frames\)"):
+    with pytest.raises(lbt.errors.DimensionError, match=r"must both be \(3, frames\)"):
         calm.run(series[:2], series)
-    with pytest.raises(lbt.ProblemError, match="more frames than settle_frames"):
+    with pytest.raises(lbt.errors.ProblemError, match="more frames than settle_frames"):
         calm.run(series, series, settle_frames=10)
     for bad in (np.nan, np.inf):
         broken = series.copy()
         broken[1, 4] = bad
-        with pytest.raises(lbt.NonFiniteError, match="total_nm"):
+        with pytest.raises(lbt.errors.NonFiniteError, match="total_nm"):
             calm.run(broken, series)
-        with pytest.raises(lbt.NonFiniteError, match="noise_nm"):
+        with pytest.raises(lbt.errors.NonFiniteError, match="noise_nm"):
             calm.run(series, broken)
         ending = series.copy()
         ending[1, -1] = bad
-        with pytest.raises(lbt.NonFiniteError, match="noise_nm"):
+        with pytest.raises(lbt.errors.NonFiniteError, match="noise_nm"):
             calm.run(series, ending, all_series=True)
-    with pytest.raises(lbt.DimensionError, match="must have 3 modes; got 2"):
+    with pytest.raises(lbt.errors.DimensionError, match="must have 3 modes; got 2"):
         calm.residual_rms_nm(some_air(2), noise_nm=1.0)
-    with pytest.raises(lbt.ProblemError, match="MixedController or ModalFilters"):
-        lbt.modal_loop([0.5])
-    with pytest.raises(lbt.ProblemError, match="reconstructor"):
-        lbt.modal_loop(
-            lbt.MixedController.integrators([0.5], reconstructor=lbt.reconstructor([[2.0]]))
+    with pytest.raises(lbt.errors.ProblemError, match="MixedController or ModalFilters"):
+        lbt.design.modal.modal_loop([0.5])
+    with pytest.raises(lbt.errors.ProblemError, match="reconstructor"):
+        lbt.design.modal.modal_loop(
+            lbt.design.modal.MixedController.integrators(
+                [0.5], reconstructor=lbt.design.modal.reconstructor([[2.0]])
+            )
         )
-    two = lbt.modal_filters(some_air(2), noise_nm=1.0)
-    with pytest.raises(lbt.DimensionError, match="for the 1 filtered modes; got 2"):
-        lbt.MixedController(filter=two, gains=[0.1, 0.1], filtered=(0,))
+    two = lbt.design.modal.modal_filters(some_air(2), noise_nm=1.0)
+    with pytest.raises(lbt.errors.DimensionError, match="for the 1 filtered modes; got 2"):
+        lbt.design.modal.MixedController(filter=two, gains=[0.1, 0.1], filtered=(0,))
 
 
 # ---------------------------------------------------------------- rates, delays, digits
 def test_loops_have_the_rate_of_their_filters():
-    air, slow = some_air(2), lbt.ARModel(coefficients=[0.9], driving_rms_nm=5, frame_rate_hz=400)
-    filters = lbt.modal_filters(air, noise_nm=10.0, delay_frames=3)
-    mixed = lbt.MixedController(filter=filters, gains=[0.0, 0.0])
+    air, slow = (
+        some_air(2),
+        lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=5, frame_rate_hz=400),
+    )
+    filters = lbt.design.modal.modal_filters(air, noise_nm=10.0, delay_frames=3)
+    mixed = lbt.design.modal.MixedController(filter=filters, gains=[0.0, 0.0])
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=RATE, turbulence=air.model(0), noise_nm=10.0, delay_frames=3
     )
-    both = lbt.MixedController(filter=lbt.kalman(plant), gains=[0.0, 0.0, 0.2])
+    both = lbt.design.modal.MixedController(filter=lbt.kalman(plant), gains=[0.0, 0.0, 0.2])
     for controller in (filters, mixed, both):
-        loop = lbt.modal_loop(controller)
+        loop = lbt.design.modal.modal_loop(controller)
         assert (loop.delay_frames, loop.frame_rate_hz, loop.is_stable) == (3.0, RATE, True)
-        assert lbt.modal_loop(controller, delay_frames=2.8).delay_frames == 2.8
+        assert lbt.design.modal.modal_loop(controller, delay_frames=2.8).delay_frames == 2.8
         n = controller.n_modes
-        with pytest.raises(lbt.ProblemError, match="loop's frame rate, 800 Hz; got 400 Hz"):
+        with pytest.raises(lbt.errors.ProblemError, match="loop's frame rate, 800 Hz; got 400 Hz"):
             loop.residual_rms_nm([slow] * n, noise_nm=10.0)
-        with pytest.raises(lbt.ProblemError, match="frame_rate_hz must be that of the filters"):
-            lbt.modal_loop(controller, frame_rate_hz=400)
+        with pytest.raises(
+            lbt.errors.ProblemError, match="frame_rate_hz must be that of the filters"
+        ):
+            lbt.design.modal.modal_loop(controller, frame_rate_hz=400)
         if controller is not filters:
             assert controller.as_controller().dt_s == 1 / RATE
             assert controller.as_controller(1 / RATE).dt_s == 1 / RATE
-            with pytest.raises(lbt.ProblemError, match="dt_s must be that of the filter"):
+            with pytest.raises(lbt.errors.ProblemError, match="dt_s must be that of the filter"):
                 controller.as_controller(1 / 400)
     assert np.allclose(
-        lbt.modal_loop(mixed).residual_rms_nm(air, noise_nm=10.0), filters.rms_nm, rtol=1e-9
+        lbt.design.modal.modal_loop(mixed).residual_rms_nm(air, noise_nm=10.0),
+        filters.rms_nm,
+        rtol=1e-9,
     )
-    plain = lbt.MixedController.integrators([0.1, 0.1])
-    free = lbt.modal_loop(plain)
+    plain = lbt.design.modal.MixedController.integrators([0.1, 0.1])
+    free = lbt.design.modal.modal_loop(plain)
     assert (free.frame_rate_hz, free.delay_frames) == (None, 2.0)
     assert free.residual_rms_nm([slow] * 2, noise_nm=1.0).shape == (2,)
-    with pytest.raises(lbt.ProblemError, match="loop's frame rate, 800 Hz"):
-        lbt.modal_loop(plain, frame_rate_hz=RATE).residual_rms_nm([slow] * 2, noise_nm=1.0)
-    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5, bandwidth_hz=300)
-    with pytest.raises(lbt.ProblemError, match="needs frame_rate_hz"):
-        lbt.modal_loop(plain, mirror=shell)
+    with pytest.raises(lbt.errors.ProblemError, match="loop's frame rate, 800 Hz"):
+        lbt.design.modal.modal_loop(plain, frame_rate_hz=RATE).residual_rms_nm(
+            [slow] * 2, noise_nm=1.0
+        )
+    shell = lbt.models.PositionLoop.of_bandwidth(
+        natural_frequency_hz=20, damping=0.5, bandwidth_hz=300
+    )
+    with pytest.raises(lbt.errors.ProblemError, match="needs frame_rate_hz"):
+        lbt.design.modal.modal_loop(plain, mirror=shell)
 
 
 def test_a_process_that_is_all_but_a_walk_is_refused():
-    loop = lbt.modal_loop(lbt.MixedController.integrators([0.5, 0.5]))
+    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators([0.5, 0.5]))
 
     def residual(distance):
-        air = lbt.ModalTurbulence(
+        air = lbt.models.ModalTurbulence(
             coefficients=[[0.9], [1 - distance]], driving_rms_nm=[1.0, 10.0], frame_rate_hz=RATE
         )
         return loop.residual_rms_nm(air, noise_nm=5.0)[1]
@@ -416,14 +461,14 @@ def test_a_process_that_is_all_but_a_walk_is_refused():
     for distance in (1e-7, 1e-8, 1e-9):
         assert residual(distance) == pytest.approx(walk, rel=1e-6)
     for distance in (1e-12, 1e-15):
-        with pytest.raises(lbt.NumericalError, match="rounding of the variance.*mode 1"):
+        with pytest.raises(lbt.errors.NumericalError, match="rounding of the variance.*mode 1"):
             residual(distance)
 
 
 def test_series_that_are_no_numbers_are_refused():
-    loop = lbt.modal_loop(lbt.MixedController.integrators([0.5]))
+    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators([0.5]))
     for total, noise in (("a", "b"), ([["1", "2"]], [[0, 0]]), ([[1j, 0]], [[0, 0]])):
-        with pytest.raises(lbt.ProblemError, match="total_nm must be"):
+        with pytest.raises(lbt.errors.ProblemError, match="total_nm must be"):
             loop.run(total, noise)
-    with pytest.raises(lbt.DimensionError, match="rows of unequal length"):
+    with pytest.raises(lbt.errors.DimensionError, match="rows of unequal length"):
         loop.run([[1.0], [1.0, 2.0]], [[1.0]])

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.modal.gains import _minimised
+from lbt_synth.design.modal.gains import _minimised
 
 RATE = 800.0
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,))
@@ -21,23 +21,27 @@ LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,)
 )
 def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_gain):
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
-    ar1 = lbt.ar1_turbulence(air, frame_rate_hz=RATE)
-    table = lbt.TabulatedSpectrum(
+    ar1 = lbt.models.ar1_turbulence(air, frame_rate_hz=RATE)
+    table = lbt.models.TabulatedSpectrum(
         frequency_hz=[0, 1, 5, 30, 31, 32, 400], density_nm2_hz=[4e4, 4e4, 50, 1, 90, 0.5, 0.01]
     )
-    found = lbt.modal_gains(
-        [air, ar1, table, ar1], noise_nm=noise, frame_rate_hz=RATE, delay_frames=delay,
-        sensor_gain=sensor_gain, vibrations={3: LINE},
-    )  # fmt: skip
+    found = lbt.design.modal.modal_gains(
+        [air, ar1, table, ar1],
+        noise_nm=noise,
+        frame_rate_hz=RATE,
+        delay_frames=delay,
+        sensor_gain=sensor_gain,
+        vibrations={3: LINE},
+    )
     for i, (spectrum, lines) in enumerate([(air, ()), (ar1, ()), (table, ()), (ar1, (LINE,))]):
         truth = lbt.Truth(
             turbulence=spectrum, noise_nm=noise, sensor_gain=sensor_gain, vibrations=lines
         )
-        best = lbt.optimal_integrator(path, truth)
+        best = lbt.design.optimal_integrator(path, truth)
         loop = lbt.close_loop(path, best.controller, sensor_gain=sensor_gain)
         assert found.rms_nm[i] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-6)
         assert found.gains[i] == pytest.approx(best.gain, rel=1e-4)
-        if isinstance(spectrum, lbt.ARModel):  # where the answer is exact, so is this
+        if isinstance(spectrum, lbt.models.ARModel):  # where the answer is exact, so is this
             assert found.gains[i] == pytest.approx(best.gain, rel=1e-6)
     assert not found.limited.any()
 
@@ -45,42 +49,53 @@ def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_g
 def test_residuals_are_those_of_the_loop():
     rng = np.random.default_rng(0)
     n = 200
-    air = lbt.ModalTurbulence(
-        coefficients=rng.uniform(0.5, 0.999, (n, 1)), driving_rms_nm=10 ** rng.uniform(-1, 2, n),
+    air = lbt.models.ModalTurbulence(
+        coefficients=rng.uniform(0.5, 0.999, (n, 1)),
+        driving_rms_nm=10 ** rng.uniform(-1, 2, n),
         frame_rate_hz=RATE,
-    )  # fmt: skip
+    )
     noise, gain = 10 ** rng.uniform(0, 2, n), rng.uniform(0.3, 1.2, n)
     lines = {5: [LINE], 77: [LINE, LINE]}
-    found = lbt.modal_gains(
-        air, noise_nm=noise, frame_rate_hz=RATE, sensor_gain=gain, vibrations=lines,
+    found = lbt.design.modal.modal_gains(
+        air,
+        noise_nm=noise,
+        frame_rate_hz=RATE,
+        sensor_gain=gain,
+        vibrations=lines,
         delay_frames=2.3,
-    )  # fmt: skip
+    )
 
     def exact(gains):
-        loop = lbt.modal_loop(
-            lbt.MixedController.integrators(gains), delay_frames=2.3, sensor_gain=gain
+        loop = lbt.design.modal.modal_loop(
+            lbt.design.modal.MixedController.integrators(gains), delay_frames=2.3, sensor_gain=gain
         )
         return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
 
     least = exact(found.gains)
     assert np.allclose(least, found.rms_nm, rtol=1e-6)
-    smallest = 1e-4 * lbt.integrator_gain_limit(2.3) / gain
+    smallest = 1e-4 * lbt.design.integrator_gain_limit(2.3) / gain
     for factor in (0.9, 0.99, 1.01, 1.1):
         other = np.clip(factor * found.gains, smallest, found.limit)
         assert np.all(exact(other) >= least * (1 - 1e-6))
 
 
 def test_a_quiet_sensor_is_limited_by_stability():
-    fast = lbt.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=RATE)
-    slow = lbt.ARModel(coefficients=[1.999, -0.99900025], driving_rms_nm=1.0, frame_rate_hz=RATE)
-    found = lbt.modal_gains([slow, fast], noise_nm=[0.0, 0.5], frame_rate_hz=RATE, margin=0.5)
+    fast = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=RATE)
+    slow = lbt.models.ARModel(
+        coefficients=[1.999, -0.99900025], driving_rms_nm=1.0, frame_rate_hz=RATE
+    )
+    found = lbt.design.modal.modal_gains(
+        [slow, fast], noise_nm=[0.0, 0.5], frame_rate_hz=RATE, margin=0.5
+    )
     assert found.limited.tolist() == [True, False]
     assert found.gains[0] == pytest.approx(0.5)
     assert np.allclose(found.limit, 0.5)
-    weak = lbt.modal_gains([slow], noise_nm=0.0, frame_rate_hz=RATE, margin=0.5, sensor_gain=1.25)
+    weak = lbt.design.modal.modal_gains(
+        [slow], noise_nm=0.0, frame_rate_hz=RATE, margin=0.5, sensor_gain=1.25
+    )
     assert weak.gains[0] == pytest.approx(0.4)
-    loop = lbt.modal_loop(lbt.MixedController.integrators(found.gains))
-    air = lbt.ModalTurbulence.of([slow, fast])
+    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators(found.gains))
+    air = lbt.models.ModalTurbulence.of([slow, fast])
     assert np.allclose(found.rms_nm, loop.residual_rms_nm(air, noise_nm=[0.0, 0.5]), rtol=1e-6)
 
 
@@ -95,9 +110,11 @@ def test_minimum_between_the_points(a, b, delta):
     highest = 0.999
     place, value = _minimised(h, function(h)[None], 1.0, np.array([highest]))
     best = minimize_scalar(
-        lambda log: function(np.exp(log)), bounds=(np.log(1e-4), np.log(highest)), method="bounded",
+        lambda log: function(np.exp(log)),
+        bounds=(np.log(1e-4), np.log(highest)),
+        method="bounded",
         options={"xatol": 1e-10},
-    )  # fmt: skip
+    )
     assert value[0] == pytest.approx(best.fun, rel=1e-9)
     assert place[0] == pytest.approx(np.exp(best.x), rel=1e-4)
 
@@ -106,7 +123,7 @@ def test_telemetry_finds_what_the_models_say():
     rng = np.random.default_rng(1)
     n, frames, noise = 40, 60_000, 20.0
     poles = np.linspace(0.9, 0.995, n)
-    air = lbt.ModalTurbulence(
+    air = lbt.models.ModalTurbulence(
         coefficients=poles[:, None], driving_rms_nm=np.geomspace(3, 30, n), frame_rate_hz=RATE
     )
     gain = np.linspace(0.5, 1.0, n)
@@ -116,33 +133,37 @@ def test_telemetry_finds_what_the_models_say():
     for k in range(frames):
         state = poles * state + white[:, k]
         total[:, k] = state
-    loop = lbt.modal_loop(
-        lbt.MixedController.integrators(np.full(n, 0.2)), delay_frames=2.5, sensor_gain=gain
+    loop = lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController.integrators(np.full(n, 0.2)),
+        delay_frames=2.5,
+        sensor_gain=gain,
     )
     run = loop.run(total, noise * rng.standard_normal((n, frames)), all_series=True)
     known = {"frame_rate_hz": RATE, "delay_frames": 2.5, "sensor_gain": gain}
-    exact = lbt.modal_gains(air, noise_nm=noise, **known)
-    found = lbt.modal_gains_from_telemetry(
+    exact = lbt.design.modal.modal_gains(air, noise_nm=noise, **known)
+    found = lbt.design.modal.modal_gains_from_telemetry(
         run.measurements.T, run.commands.T, noise_nm=noise, **known
     )
 
     def cost(gains):
-        closed = lbt.modal_loop(
-            lbt.MixedController.integrators(gains), delay_frames=2.5, sensor_gain=gain
+        closed = lbt.design.modal.modal_loop(
+            lbt.design.modal.MixedController.integrators(gains), delay_frames=2.5, sensor_gain=gain
         )
         return closed.residual_rms_nm(air, noise_nm=noise)
 
     # what is lost by gains from telemetry, in residual; less where the segments are longer,
     # which tell the modes that are best left alone from those that wander
     assert np.max(cost(found.gains) / exact.rms_nm - 1) < 0.02
-    longer = lbt.modal_gains_from_telemetry(
+    longer = lbt.design.modal.modal_gains_from_telemetry(
         run.measurements.T, run.commands.T, noise_nm=noise, segment_frames=4096, **known
     )
     assert np.max(cost(longer.gains) / exact.rms_nm - 1) < 0.01
     assert np.median(np.abs(found.gains / exact.gains - 1)) < 0.1
     # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high, and
     # nothing is lost by that
-    guessed = lbt.modal_gains_from_telemetry(run.measurements.T, run.commands.T, **known)
+    guessed = lbt.design.modal.modal_gains_from_telemetry(
+        run.measurements.T, run.commands.T, **known
+    )
     assert np.all(guessed.noise_nm > 0.97 * noise)
     assert np.max(cost(guessed.gains) / exact.rms_nm - 1) < 0.02
 
@@ -160,16 +181,20 @@ def ar_series(coefficients, driving, modes, frames, rng):
 def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
     """Weak turbulence behind noise: neither gains nor residuals are pushed to one side."""
     rng = np.random.default_rng(frames)
-    air = lbt.ModalTurbulence(coefficients=[[pole]], driving_rms_nm=[driving], frame_rate_hz=RATE)
-    exact = lbt.modal_gains(air, noise_nm=noise, frame_rate_hz=RATE)
-    loop = lbt.modal_loop(lbt.MixedController.integrators(np.full(modes, 0.1)))
+    air = lbt.models.ModalTurbulence(
+        coefficients=[[pole]], driving_rms_nm=[driving], frame_rate_hz=RATE
+    )
+    exact = lbt.design.modal.modal_gains(air, noise_nm=noise, frame_rate_hz=RATE)
+    loop = lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController.integrators(np.full(modes, 0.1))
+    )
     run = loop.run(
         ar_series([pole], driving, modes, frames, rng),
         noise * rng.standard_normal((modes, frames)),
         all_series=True,
     )
     series = run.measurements.T, run.commands.T
-    found = lbt.modal_gains_from_telemetry(*series, frame_rate_hz=RATE, noise_nm=noise)
+    found = lbt.design.modal.modal_gains_from_telemetry(*series, frame_rate_hz=RATE, noise_nm=noise)
     variances, truth = found.rms_nm**2, exact.rms_nm[0] ** 2
     error = max(np.std(variances) / np.sqrt(modes), 2e-3 * truth)
     assert abs(np.mean(variances) - truth) < 4 * error
@@ -178,7 +203,7 @@ def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
     # the scatter that the documentation states
     assert np.std(variances) < 4 * noise**2 * np.sqrt(2 / frames)
     # where the noise is put plays no part in the choice of the gain
-    guessed = lbt.modal_gains_from_telemetry(*series, frame_rate_hz=RATE)
+    guessed = lbt.design.modal.modal_gains_from_telemetry(*series, frame_rate_hz=RATE)
     assert np.quantile(np.abs(guessed.gains / found.gains - 1), 0.9) < 5e-3
 
 
@@ -186,15 +211,22 @@ def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
 def test_a_steep_spectrum_does_not_leak(segment_frames):
     """Most of the turbulence lies below the periodogram's first frequency, 3 Hz."""
     rng = np.random.default_rng(3)
-    air = lbt.ModalTurbulence(coefficients=[[0.9999]], driving_rms_nm=[1.0], frame_rate_hz=RATE)
-    exact = lbt.modal_gains(air, noise_nm=2.0, frame_rate_hz=RATE)
+    air = lbt.models.ModalTurbulence(
+        coefficients=[[0.9999]], driving_rms_nm=[1.0], frame_rate_hz=RATE
+    )
+    exact = lbt.design.modal.modal_gains(air, noise_nm=2.0, frame_rate_hz=RATE)
     total = ar_series([0.9999], 1.0, 6, 40_000, rng)
-    loop = lbt.modal_loop(lbt.MixedController.integrators(np.full(6, 0.2)))
+    loop = lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController.integrators(np.full(6, 0.2))
+    )
     run = loop.run(total, 2.0 * rng.standard_normal(total.shape), all_series=True)
-    found = lbt.modal_gains_from_telemetry(
-        run.measurements.T, run.commands.T, frame_rate_hz=RATE, noise_nm=2.0,
+    found = lbt.design.modal.modal_gains_from_telemetry(
+        run.measurements.T,
+        run.commands.T,
+        frame_rate_hz=RATE,
+        noise_nm=2.0,
         segment_frames=segment_frames,
-    )  # fmt: skip
+    )
     assert np.mean(found.gains) == pytest.approx(exact.gains[0], rel=0.02)
     assert np.mean(found.rms_nm) == pytest.approx(exact.rms_nm[0], rel=0.02)
 
@@ -203,9 +235,9 @@ def test_residuals_are_at_least_the_propagated_noise():
     """Pure noise, and more of it claimed than there is."""
     rng = np.random.default_rng(4)
     y = 5.0 * rng.standard_normal((5000, 3))
-    found = lbt.modal_gains_from_telemetry(y, 0 * y, frame_rate_hz=RATE, noise_nm=6.0)
-    loop = lbt.modal_loop(lbt.MixedController.integrators(found.gains))
-    nothing = lbt.ModalTurbulence(
+    found = lbt.design.modal.modal_gains_from_telemetry(y, 0 * y, frame_rate_hz=RATE, noise_nm=6.0)
+    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators(found.gains))
+    nothing = lbt.models.ModalTurbulence(
         coefficients=np.zeros((3, 1)), driving_rms_nm=np.full(3, 1e-9), frame_rate_hz=RATE
     )
     assert np.allclose(found.rms_nm, loop.residual_rms_nm(nothing, noise_nm=6.0), rtol=1e-3)
@@ -216,13 +248,13 @@ def test_sharp_peaks_of_arrays_are_those_of_models(damping):
     line = lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=200.0, direction=(1,))
     model = line.ar_model(RATE)
     known = {"noise_nm": 15.5, "frame_rate_hz": RATE}
-    single = lbt.modal_gains([model], **known)
-    stacked = lbt.modal_gains(lbt.ModalTurbulence.of([model]), **known)
+    single = lbt.design.modal.modal_gains([model], **known)
+    stacked = lbt.design.modal.modal_gains(lbt.models.ModalTurbulence.of([model]), **known)
     assert stacked.rms_nm[0] == pytest.approx(single.rms_nm[0], rel=1e-6)
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     truth = lbt.Truth(turbulence=model, noise_nm=15.5)
     best = lbt.residual_budget(
-        lbt.close_loop(path, lbt.optimal_integrator(path, truth).controller), truth
+        lbt.close_loop(path, lbt.design.optimal_integrator(path, truth).controller), truth
     )
     assert stacked.rms_nm[0] == pytest.approx(best.rms_nm, rel=1e-6)
 
@@ -231,33 +263,39 @@ def test_sharp_peaks_of_arrays_are_those_of_models(damping):
 @pytest.mark.parametrize("bandwidth", [60.0, 250.0])
 @pytest.mark.parametrize("delay", [2, 2.4])
 def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
-    shell = lbt.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.of_bandwidth(
         natural_frequency_hz=20, damping=0.5, bandwidth_hz=bandwidth
     )
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1, mirror=shell)
     truth = lbt.Truth(turbulence=slow, noise_nm=5.0, sensor_gain=0.8)
-    best = lbt.optimal_integrator(path, truth)
+    best = lbt.design.optimal_integrator(path, truth)
     loop = lbt.close_loop(path, best.controller, sensor_gain=0.8)
     known = {"delay_frames": delay, "sensor_gain": 0.8, "mirror": shell, "frame_rate_hz": RATE}
-    found = lbt.modal_gains([slow], noise_nm=5.0, **known)
+    found = lbt.design.modal.modal_gains([slow], noise_nm=5.0, **known)
     assert found.mirror is shell
     assert found.gains[0] == pytest.approx(best.gain, rel=1e-5)
     assert found.rms_nm[0] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-6)
-    integrators = lbt.MixedController.integrators(found.gains)
-    closed = lbt.modal_loop(integrators, **known)
-    air = lbt.ModalTurbulence.of([slow])
+    integrators = lbt.design.modal.MixedController.integrators(found.gains)
+    closed = lbt.design.modal.modal_loop(integrators, **known)
+    air = lbt.models.ModalTurbulence.of([slow])
     assert closed.residual_rms_nm(air, noise_nm=5.0)[0] == pytest.approx(found.rms_nm[0], rel=1e-6)
     limit = found.limit[0] / (1 - 0.001)
     for part, stable in ((0.999, True), (1.001, False)):
-        unit = lbt.MixedController.integrators([part * limit])
-        assert lbt.modal_loop(unit, **(known | {"sensor_gain": 1.0})).is_stable is stable
+        unit = lbt.design.modal.MixedController.integrators([part * limit])
+        assert (
+            lbt.design.modal.modal_loop(unit, **(known | {"sensor_gain": 1.0})).is_stable is stable
+        )
     # and from its telemetry
     rng = np.random.default_rng(6)
-    many = lbt.modal_loop(lbt.MixedController.integrators(np.full(8, found.gains[0] / 2)), **known)
+    many = lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController.integrators(np.full(8, found.gains[0] / 2)), **known
+    )
     total = ar_series([0.99], 10.0, 8, 20_000, rng)
     run = many.run(total, 5.0 * rng.standard_normal(total.shape), all_series=True)
-    seen = lbt.modal_gains_from_telemetry(run.measurements.T, run.commands.T, noise_nm=5.0, **known)
+    seen = lbt.design.modal.modal_gains_from_telemetry(
+        run.measurements.T, run.commands.T, noise_nm=5.0, **known
+    )
     assert np.mean(seen.gains) == pytest.approx(found.gains[0], rel=0.05)
     assert np.mean(seen.rms_nm) == pytest.approx(found.rms_nm[0], rel=0.02)
 
@@ -267,18 +305,20 @@ def test_noise_from_a_quiet_band():
     frames, noise = 40_000, np.array([[3.0], [30.0]])
     k = np.arange(frames)
     slow = 300 * np.sin(2 * np.pi * 0.5 * k / RATE) + 100 * np.sin(2 * np.pi * 3.1 * k / RATE)
-    loop = lbt.modal_loop(lbt.MixedController.integrators([0.3, 0.3]))
+    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators([0.3, 0.3]))
     run = loop.run(
         np.stack([slow, slow]), noise * rng.standard_normal((2, frames)), all_series=True
     )
-    found = lbt.modal_gains_from_telemetry(run.measurements.T, run.commands.T, frame_rate_hz=RATE)
+    found = lbt.design.modal.modal_gains_from_telemetry(
+        run.measurements.T, run.commands.T, frame_rate_hz=RATE
+    )
     assert np.allclose(found.noise_nm, noise[:, 0], rtol=0.02)
     assert found.gains[0] > found.gains[1]
 
 
 def test_bad_input_is_refused(air):
     known = {"frame_rate_hz": RATE}
-    ar1 = lbt.ar1_turbulence(air, frame_rate_hz=RATE)
+    ar1 = lbt.models.ar1_turbulence(air, frame_rate_hz=RATE)
 
     class Odd:
         def psd(self, frequency_hz):
@@ -291,38 +331,57 @@ def test_bad_input_is_refused(air):
             return np.sin(1e9 * frequency_hz) ** 200
 
     for spectra, arguments, error, words in (
-        ([ar1], {"noise_nm": -1}, lbt.ProblemError, "noise_nm must be at least 0"),
-        ([ar1], {"noise_nm": [1, 2]}, lbt.DimensionError, "one a mode"),
-        ([ar1], {"noise_nm": 1, "margin": 0}, lbt.ProblemError, "margin must be at least"),
-        ([ar1], {"noise_nm": 1, "margin": 0.9999}, lbt.ProblemError, "leave room"),
-        ([ar1], {"noise_nm": 1, "sensor_gain": 1e-6}, lbt.ProblemError, "leave room"),
-        ([ar1], {"noise_nm": 1, "delay_frames": 0}, lbt.ProblemError, "delay_frames"),
-        ([], {"noise_nm": 1}, lbt.ProblemError, "one spectrum a mode"),
-        (ar1, {"noise_nm": 1}, lbt.ProblemError, "one spectrum a mode"),
-        ([ar1, 3], {"noise_nm": 1}, lbt.ProblemError, "one spectrum a mode"),
-        ([ar1, Odd()], {"noise_nm": 1}, lbt.ProblemError, "that of mode 1 is not"),
-        ([Lines()], {"noise_nm": 0}, lbt.NumericalError, "did not settle"),
-        ([ar1], {"noise_nm": 1, "vibrations": {0: 3}}, lbt.ProblemError, "list of Vibration"),
-        ([ar1], {"noise_nm": 1, "vibrations": {0: None}}, lbt.ProblemError, "list of Vibration"),
-        ([ar1], {"noise_nm": 1, "mirror": 3}, lbt.ProblemError, "PositionLoop"),
-        ([ar1], {"noise_nm": 1, "frame_rate_hz": 500}, lbt.ProblemError, "sampled at the frame"),
-        (lbt.ModalTurbulence.of([ar1]), {"noise_nm": 1, "frame_rate_hz": 500}, lbt.ProblemError,
-         "sampled at the frame"),
-    ):  # fmt: skip
+        ([ar1], {"noise_nm": -1}, lbt.errors.ProblemError, "noise_nm must be at least 0"),
+        ([ar1], {"noise_nm": [1, 2]}, lbt.errors.DimensionError, "one a mode"),
+        ([ar1], {"noise_nm": 1, "margin": 0}, lbt.errors.ProblemError, "margin must be at least"),
+        ([ar1], {"noise_nm": 1, "margin": 0.9999}, lbt.errors.ProblemError, "leave room"),
+        ([ar1], {"noise_nm": 1, "sensor_gain": 1e-6}, lbt.errors.ProblemError, "leave room"),
+        ([ar1], {"noise_nm": 1, "delay_frames": 0}, lbt.errors.ProblemError, "delay_frames"),
+        ([], {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum a mode"),
+        (ar1, {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum a mode"),
+        ([ar1, 3], {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum a mode"),
+        ([ar1, Odd()], {"noise_nm": 1}, lbt.errors.ProblemError, "that of mode 1 is not"),
+        ([Lines()], {"noise_nm": 0}, lbt.errors.NumericalError, "did not settle"),
+        (
+            [ar1],
+            {"noise_nm": 1, "vibrations": {0: 3}},
+            lbt.errors.ProblemError,
+            "list of Vibration",
+        ),
+        (
+            [ar1],
+            {"noise_nm": 1, "vibrations": {0: None}},
+            lbt.errors.ProblemError,
+            "list of Vibration",
+        ),
+        ([ar1], {"noise_nm": 1, "mirror": 3}, lbt.errors.ProblemError, "PositionLoop"),
+        (
+            [ar1],
+            {"noise_nm": 1, "frame_rate_hz": 500},
+            lbt.errors.ProblemError,
+            "sampled at the frame",
+        ),
+        (
+            lbt.models.ModalTurbulence.of([ar1]),
+            {"noise_nm": 1, "frame_rate_hz": 500},
+            lbt.errors.ProblemError,
+            "sampled at the frame",
+        ),
+    ):
         with pytest.raises(error, match=words):
-            lbt.modal_gains(spectra, **(known | arguments))
+            lbt.design.modal.modal_gains(spectra, **(known | arguments))
 
-    nothing = lbt.TabulatedSpectrum(frequency_hz=[0, 1], density_nm2_hz=[0, 0])
-    with pytest.raises(lbt.ProblemError, match="got none in mode 0"):
-        lbt.modal_gains([nothing], noise_nm=0, **known)
+    nothing = lbt.models.TabulatedSpectrum(frequency_hz=[0, 1], density_nm2_hz=[0, 0])
+    with pytest.raises(lbt.errors.ProblemError, match="got none in mode 0"):
+        lbt.design.modal.modal_gains([nothing], noise_nm=0, **known)
 
     series = np.zeros((3000, 2))
     for y, u, arguments, error, words in (
-        (series, series[1:], {}, lbt.DimensionError, "must both be"),
-        (series[:900], series[:900], {}, lbt.ProblemError, "longer than a segment"),
-        (series + np.nan, series, {}, lbt.NonFiniteError, "measurements"),
-        (series, series, {"segment_frames": 8}, lbt.ProblemError, "segment_frames"),
-        (series, series, {}, lbt.ProblemError, "got none in mode 0"),
+        (series, series[1:], {}, lbt.errors.DimensionError, "must both be"),
+        (series[:900], series[:900], {}, lbt.errors.ProblemError, "longer than a segment"),
+        (series + np.nan, series, {}, lbt.errors.NonFiniteError, "measurements"),
+        (series, series, {"segment_frames": 8}, lbt.errors.ProblemError, "segment_frames"),
+        (series, series, {}, lbt.errors.ProblemError, "got none in mode 0"),
     ):
         with pytest.raises(error, match=words):
-            lbt.modal_gains_from_telemetry(y, u, **(known | arguments))
+            lbt.design.modal.modal_gains_from_telemetry(y, u, **(known | arguments))

@@ -56,28 +56,28 @@ def kolmogorov_integral(air, n, outer):
 
 
 def test_nolls_order():
-    radial, azimuthal = lbt.noll_orders(20)
+    radial, azimuthal = lbt.models.noll_orders(20)
     # Noll's table I, j = 2 to 21
     assert radial.tolist() == [1] * 2 + [2] * 3 + [3] * 4 + [4] * 5 + [5] * 6
     assert azimuthal.tolist() == [1, 1, 0, 2, 2, 1, 1, 3, 3, 0, 2, 2, 4, 4, 1, 1, 3, 3, 5, 5]
-    with pytest.raises(lbt.ProblemError, match="modes must be at least 1"):
-        lbt.noll_orders(0)
+    with pytest.raises(lbt.errors.ProblemError, match="modes must be at least 1"):
+        lbt.models.noll_orders(0)
 
 
 def test_modes_of_a_telescope():
     air = lbt.Atmosphere(outer_scale_m=22, **SITE)
-    modes = lbt.modal_turbulence(air, modes=30, frame_rate_hz=800)
-    tilt = lbt.ar1_turbulence(air, frame_rate_hz=800)
+    modes = lbt.models.modal_turbulence(air, modes=30, frame_rate_hz=800)
+    tilt = lbt.models.ar1_turbulence(air, frame_rate_hz=800)
     assert modes.coefficients[0, 0] == tilt.coefficients[0]
     assert modes.rms_nm[1] == pytest.approx(tilt.rms_nm, rel=1e-7)
-    radial, _ = lbt.noll_orders(30)
+    radial, _ = lbt.models.noll_orders(30)
     assert np.allclose(
         np.log(modes.coefficients[:, 0]) / np.log(tilt.coefficients[0]), (radial + 1) / 2
     )
     # the spectra hold the variances
     f = np.linspace(0, 400, 200_001)
     assert np.allclose(np.trapezoid(modes.psd(f), f, axis=1), modes.rms_nm**2, rtol=1e-3)
-    with pytest.raises(lbt.ProblemError, match="expected an Atmosphere"):
-        lbt.modal_turbulence(800, modes=3, frame_rate_hz=800)
-    with pytest.raises(lbt.ProblemError, match="frame_rate_hz"):
-        lbt.modal_turbulence(air, modes=3, frame_rate_hz=-1)
+    with pytest.raises(lbt.errors.ProblemError, match="expected an Atmosphere"):
+        lbt.models.modal_turbulence(800, modes=3, frame_rate_hz=800)
+    with pytest.raises(lbt.errors.ProblemError, match="frame_rate_hz"):
+        lbt.models.modal_turbulence(air, modes=3, frame_rate_hz=-1)

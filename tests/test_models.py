@@ -98,24 +98,24 @@ def test_taylor_wind_only_stretches_time(factor):
 
 
 def test_le_roux_pole():
-    pole = lbt.le_roux_pole(wind_speed_m_s=20, diameter_m=8.22, frame_rate_hz=800)
+    pole = lbt.models.le_roux_pole(wind_speed_m_s=20, diameter_m=8.22, frame_rate_hz=800)
     assert pole == pytest.approx(0.98860, abs=5e-6)
 
 
 def test_ar1_is_stationary_with_the_von_karman_variance(air):
-    model = lbt.ar1_turbulence(air, frame_rate_hz=800)
+    model = lbt.models.ar1_turbulence(air, frame_rate_hz=800)
     assert model.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-12)
 
 
 def test_ar2_fit_of_the_lbt(air):
-    model = lbt.ar2_turbulence(air, frame_rate_hz=800, noise_nm=15.5)
+    model = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=15.5)
     assert model.coefficients == pytest.approx([1.997477, -0.997555], abs=2e-5)
 
 
 def test_ar2_fit_returns_the_model_that_made_the_spectrum(monkeypatch, air):
-    made = lbt.ARModel(coefficients=[1.99, -0.992], driving_rms_nm=0.8, frame_rate_hz=800)
+    made = lbt.models.ARModel(coefficients=[1.99, -0.992], driving_rms_nm=0.8, frame_rate_hz=800)
     monkeypatch.setattr(type(air), "psd", lambda _self, f: made.psd(f))
-    found = lbt.ar2_turbulence(air, frame_rate_hz=800, noise_nm=1.0)
+    found = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=1.0)
     assert found.coefficients == pytest.approx(made.coefficients, abs=1e-5)
     assert found.driving_rms_nm == pytest.approx(0.8, rel=1e-3)
 
@@ -135,7 +135,7 @@ def test_vibration_keeps_its_rms(frequency, damping, rms):
 @given(poles=st.lists(st.floats(-0.95, 0.95), min_size=1, max_size=5))
 def test_variance_against_a_lyapunov_equation(poles):
     coefficients = -np.poly(poles)[1:]
-    model = lbt.ARModel(coefficients=coefficients, driving_rms_nm=3.0, frame_rate_hz=1)
+    model = lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=3.0, frame_rate_hz=1)
     drive = np.zeros((len(poles), len(poles)))
     drive[0, 0] = 9.0
     expected = solve_discrete_lyapunov(model.companion, drive)[0, 0]
@@ -162,15 +162,19 @@ def test_direction_becomes_a_unit_vector():
 
 
 def test_pyramid_noise_of_the_lbt():
-    noise = lbt.pyramid_tilt_noise_nm(
-        photons=50, read_noise_electrons=8, modulation_lambda_over_d=4, subapertures=704,
-        wavelength_um=0.75, diameter_m=8.22,
-    )  # fmt: skip
+    noise = lbt.models.pyramid_tilt_noise_nm(
+        photons=50,
+        read_noise_electrons=8,
+        modulation_lambda_over_d=4,
+        subapertures=704,
+        wavelength_um=0.75,
+        diameter_m=8.22,
+    )
     assert noise == pytest.approx(15.5, abs=0.05)
 
 
 def test_one_mas_is_a_quarter_of_the_diameter():
-    assert lbt.nm_per_mas(8.22) == pytest.approx(9.963, abs=5e-4)
+    assert lbt.models.nm_per_mas(8.22) == pytest.approx(9.963, abs=5e-4)
 
 
 @pytest.mark.parametrize(
@@ -179,43 +183,45 @@ def test_one_mas_is_a_quarter_of_the_diameter():
         lambda v: lbt.Vibration(frequency_hz=v, damping=0.1, rms_nm=1),
         lambda v: lbt.Vibration(frequency_hz=1, damping=v, rms_nm=1),
         lambda v: lbt.Vibration(frequency_hz=1, damping=0.1, rms_nm=v),
-        lambda v: lbt.SinusoidalVibration(frequency_hz=1, rms_nm=v),
-        lambda v: lbt.ARModel(coefficients=[v], driving_rms_nm=1, frame_rate_hz=1),
-        lambda v: lbt.ARModel(coefficients=[0.5], driving_rms_nm=v, frame_rate_hz=1),
+        lambda v: lbt.models.SinusoidalVibration(frequency_hz=1, rms_nm=v),
+        lambda v: lbt.models.ARModel(coefficients=[v], driving_rms_nm=1, frame_rate_hz=1),
+        lambda v: lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=v, frame_rate_hz=1),
         lambda v: lbt.Truth(turbulence=None, noise_nm=v),
         lambda v: lbt.Truth(turbulence=None, sensor_gain=v),
         lambda v: lbt.Imaging(diameter_m=v),
         lambda v: lbt.LoopHardware(frame_rate_hz=v),
         lambda v: lbt.LoopHardware(frame_rate_hz=1, delay_frames=v),
-        lambda v: lbt.nm_per_mas(v),
-        lambda v: lbt.TabulatedSpectrum(frequency_hz=[0, v], density_nm2_hz=[1, 1]),
+        lambda v: lbt.models.nm_per_mas(v),
+        lambda v: lbt.models.TabulatedSpectrum(frequency_hz=[0, v], density_nm2_hz=[1, 1]),
     ],
 )
 @pytest.mark.parametrize("value", [np.nan, np.inf, -2.0])
 def test_impossible_values_are_refused(make, value):
-    with pytest.raises(lbt.ProblemError):
+    with pytest.raises(lbt.errors.ProblemError):
         make(value)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1.0, 1.5])
 def test_damping_lies_in_the_open_interval(damping):
-    with pytest.raises(lbt.ProblemError, match="damping must be"):
+    with pytest.raises(lbt.errors.ProblemError, match="damping must be"):
         lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=1)
 
 
 def test_a_vibration_above_nyquist_is_refused():
-    with pytest.raises(lbt.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"
+    ):
         lbt.Vibration(frequency_hz=500, damping=0.1, rms_nm=1).ar_model(800)
 
 
 def test_the_papers_literal_sign_is_refused():
     a1, a2 = 1.972279, 0.996863  # erratum 1: + A2
-    with pytest.raises(lbt.ProblemError, match="Check the signs"):
-        lbt.ARModel(coefficients=[a1, a2], driving_rms_nm=1, frame_rate_hz=800)
+    with pytest.raises(lbt.errors.ProblemError, match="Check the signs"):
+        lbt.models.ARModel(coefficients=[a1, a2], driving_rms_nm=1, frame_rate_hz=800)
 
 
 def test_a_truth_needs_a_spectrum():
-    with pytest.raises(lbt.ProblemError, match="psd"):
+    with pytest.raises(lbt.errors.ProblemError, match="psd"):
         lbt.Truth(turbulence=3.0)
 
 
@@ -228,5 +234,5 @@ def test_a_truth_needs_a_spectrum():
     ],
 )
 def test_spectrum_tables_are_checked(frequency, density, text):
-    with pytest.raises(lbt.ProblemError, match=text):
-        lbt.TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=density)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.models.TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=density)

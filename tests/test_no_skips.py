@@ -12,10 +12,12 @@ from plants import ROOT
 CASES = {
     "a test that passes": ("def test_it(): pass", 0),
     "a test that is skipped": (
-        "import pytest\ndef test_good(): pass\ndef test_it(): pytest.skip('not here')", 1),
+        "import pytest\ndef test_good(): pass\ndef test_it(): pytest.skip('not here')",
+        1,
+    ),
     "a module that is skipped": ("import pytest\npytest.importorskip('no_such_package')", None),
     "no test at all": ("", 5),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -18,9 +18,12 @@ def random_system(seed, n, m, p, radius):
 
 
 @given(
-    seed=st.integers(0, 100_000), n=st.integers(1, 8), m=st.integers(1, 3), p=st.integers(1, 3),
+    seed=st.integers(0, 100_000),
+    n=st.integers(1, 8),
+    m=st.integers(1, 3),
+    p=st.integers(1, 3),
     radius=st.sampled_from([0.3, 0.9, 0.999, 1 - 1e-6]),
-)  # fmt: skip
+)
 def test_against_slycot(seed, n, m, p, radius):
     A, B, C, D = random_system(seed, n, m, p, radius)
     expected, _ = slycot.ab13dd("D", "I", "N", "D", n, m, p, A, np.eye(n), B, C, D, 1e-12)
@@ -48,7 +51,9 @@ def test_poles_at_zero_and_wide_systems():
 def test_a_narrow_peak_is_found_and_placed():
     line = lbt.Vibration(frequency_hz=133.7, damping=1e-7, rms_nm=1).ar_model(800)
     a1, a2 = line.coefficients
-    system = lbt.StateSpace(A=[[a1, a2], [1, 0]], B=[[1], [0]], C=[[1, 0]], D=[[0]], dt_s=1 / 800)
+    system = lbt.linear.StateSpace(
+        A=[[a1, a2], [1, 0]], B=[[1], [0]], C=[[1, 0]], D=[[0]], dt_s=1 / 800
+    )
     norm = lbt.hinf_norm(system)
     assert norm.peak_frequency_hz == pytest.approx(133.7, rel=1e-6)
     pole = np.exp(2j * np.pi * 133.7 / 800)
@@ -77,22 +82,22 @@ def test_the_norm_is_homogeneous(seed, scale):
 def test_takes_python_control_systems():
     system = control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
     assert float(lbt.hinf_norm(system)) == pytest.approx(2, rel=1e-9)
-    with pytest.raises(lbt.ProblemError, match="must be in discrete time"):
+    with pytest.raises(lbt.errors.ProblemError, match="must be in discrete time"):
         lbt.hinf_norm(control.ss([[-0.5]], [[1.0]], [[1.0]], [[0.0]]))
-    with pytest.raises(lbt.ProblemError, match="got str"):
+    with pytest.raises(lbt.errors.ProblemError, match="got str"):
         lbt.hinf_norm("system")
 
 
 def test_unstable_systems_have_no_norm():
-    with pytest.raises(lbt.UnstableLoopError, match="got a pole of modulus 1.5") as caught:
+    with pytest.raises(lbt.errors.UnstableLoopError, match="got a pole of modulus 1.5") as caught:
         lbt.hinf_norm(([[1.5]], [[1.0]], [[1.0]], [[0.0]]))
     assert caught.value.spectral_radius == 1.5
 
 
 def test_round_trip_through_python_control():
     A, B, C, D = random_system(4, 5, 2, 3, 0.9)
-    system = lbt.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
-    back = lbt.StateSpace.of(system.to_control())
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
+    back = lbt.linear.StateSpace.of(system.to_control())
     for name in "ABCD":
         assert np.array_equal(getattr(back, name), getattr(system, name))
     assert back.dt_s == 0.002
@@ -100,7 +105,7 @@ def test_round_trip_through_python_control():
 
 def test_frequency_response_against_python_control():
     A, B, C, D = random_system(7, 5, 2, 3, 0.9)
-    system = lbt.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
     f = np.linspace(0.0, 250, 40)
     expected = np.moveaxis(system.to_control()(np.exp(2j * np.pi * f * 0.002)), 2, 0)
     assert np.allclose(system.frequency_response(f), expected, rtol=1e-10)
@@ -124,7 +129,7 @@ def test_frequency_responses_of_defective_matrices(n):
     """A Jordan block at 0.9, turned at random: no basis of eigenvectors, a closed form."""
     turn = np.linalg.qr(np.random.default_rng(n).standard_normal((n, n)))[0]
     block = 0.9 * np.eye(n) + np.eye(n, k=1)
-    system = lbt.StateSpace(
+    system = lbt.linear.StateSpace(
         A=turn @ block @ turn.T, B=turn[:, -1:], C=turn[:, :1].T, D=[[0.0]], dt_s=1.0
     )
     frequency = np.linspace(0.1, 0.5, 5000)
@@ -136,19 +141,19 @@ def test_frequency_responses_of_defective_matrices(n):
 @given(seed=st.integers(0, 100_000), n=st.integers(1, 9), m=st.integers(1, 4), p=st.integers(1, 4))
 def test_many_points_and_few_points_agree(seed, n, m, p):
     A, B, C, D = random_system(seed, n, m, p, 0.95)
-    system = lbt.StateSpace(A=A, B=B, C=C, D=D)
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D)
     frequency = np.linspace(0, 0.5, 101)
     many = system.frequency_response(frequency)
     few = np.concatenate([system.frequency_response(frequency[i : i + 1]) for i in range(101)])
     assert np.allclose(many, few, rtol=1e-10, atol=1e-10 * np.abs(few).max())
     sigma = np.linalg.svd(few, compute_uv=False)[:, 0]
-    assert np.allclose(lbt.largest_singular_values(system, frequency), sigma, rtol=1e-10)
+    assert np.allclose(lbt.linear.largest_singular_values(system, frequency), sigma, rtol=1e-10)
 
 
 def test_a_pole_on_the_unit_circle_has_no_response():
-    integrator = lbt.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.1)
+    integrator = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.1)
     for frequency in ([0.0], np.linspace(0, 5, 50)):
-        with pytest.raises(lbt.ProblemError, match="pole at 0 Hz, on the unit circle"):
+        with pytest.raises(lbt.errors.ProblemError, match="pole at 0 Hz, on the unit circle"):
             integrator.frequency_response(frequency)
     assert np.isfinite(integrator.frequency_response(np.linspace(0.1, 5, 50))).all()
 
@@ -170,8 +175,8 @@ def test_the_bracket_is_narrow_and_holds():
     A, B, C, D = random_system(3, 6, 2, 2, 0.99)
     norm = lbt.hinf_norm((A, B, C, D))
     assert norm.lower <= norm.value <= norm.upper <= norm.lower * (1 + 1e-10)
-    dense = lbt.largest_singular_values(
-        lbt.StateSpace(A=A, B=B, C=C, D=D), np.linspace(0, 0.5, 20_001)
+    dense = lbt.linear.largest_singular_values(
+        lbt.linear.StateSpace(A=A, B=B, C=C, D=D), np.linspace(0, 0.5, 20_001)
     )
     assert dense.max() <= norm.upper
 
@@ -188,8 +193,8 @@ def test_units_of_states_change_nothing(seed, n, scale):
     turned = (A * units[:, None] / units, B * units[:, None], C / units, D)
     assert float(lbt.hinf_norm(turned)) == pytest.approx(expected, rel=1e-9)
     frequency = np.linspace(0, 0.5, 201)
-    plain = lbt.StateSpace(A=A, B=B, C=C, D=D).frequency_response(frequency)
-    scaled = lbt.StateSpace(A=turned[0], B=turned[1], C=turned[2], D=D).frequency_response(
+    plain = lbt.linear.StateSpace(A=A, B=B, C=C, D=D).frequency_response(frequency)
+    scaled = lbt.linear.StateSpace(A=turned[0], B=turned[1], C=turned[2], D=D).frequency_response(
         frequency
     )
     assert np.allclose(scaled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())

@@ -11,9 +11,9 @@ from plants import LBT_YAML
 from test_cli import run
 
 import lbt_synth as lbt
-from lbt_synth.cli.commands import COMMANDS
+from lbt_synth.cli.command_table import COMMANDS
 from lbt_synth.errors import OutputError
-from lbt_synth.files import refuse_replacing, require_writable
+from lbt_synth.storage.atomic_files import refuse_replacing, require_writable
 
 READ_ONLY = {"show", "verify"}  # they write nothing
 WITHOUT_INPUTS = {"paper"}
@@ -71,8 +71,10 @@ def originals(tmp_path_factory):
     )
     design = lbt.integrator(lbt.load_config(LBT_YAML).hardware, gain=0.4)
     lbt.save_gain(folder / "gain.fits", design)
-    series = lbt.Telemetry(frame_rate_hz=800, commands=[[0.0, 1.0]], measurements=[[3.0, 2.0]])
-    lbt.save_telemetry(folder / "series.fits", series)
+    series = lbt.files.Telemetry(
+        frame_rate_hz=800, commands=[[0.0, 1.0]], measurements=[[3.0, 2.0]]
+    )
+    lbt.files.save_telemetry(folder / "series.fits", series)
     return folder
 
 

@@ -12,30 +12,16 @@ from matplotlib.figure import Figure
 from pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
-from lbt_synth.pages import (
-    Area,
-    Axis,
-    Bars,
-    Cell,
-    Chart,
-    Curve,
-    Listing,
-    Map,
-    Page,
-    Panel,
-    Paragraph,
-    Section,
-    Table,
-    page_html,
-    page_pdf,
-)
-from lbt_synth.pages.charts import legend_of
-from lbt_synth.pages.interactive import interactive
-from lbt_synth.pages.looks import colour, dashes, marker_name
-from lbt_synth.pages.pdf import HEIGHT, by_sheets, height_of_block
-from lbt_synth.pages.scales import ends_of, log_tick_texts, log_ticks, shortened
-from lbt_synth.pages.static import chart_svg, draw_chart, drawing, height_of
-from lbt_synth.pages.typeset import BODY, MONO, mono_lines, width_of, wrapped
+from lbt_synth.report.page.blocks import Listing, Page, Paragraph, Section
+from lbt_synth.report.page.bokeh_charts import interactive
+from lbt_synth.report.page.charts import Area, Axis, Bars, Chart, Curve, Map, Panel, legend_of
+from lbt_synth.report.page.html import page_html
+from lbt_synth.report.page.line_styles import colour, dashes, marker_name
+from lbt_synth.report.page.matplotlib_charts import chart_svg, draw_chart, drawing, height_of
+from lbt_synth.report.page.pdf import HEIGHT, by_sheets, height_of_block, page_pdf
+from lbt_synth.report.page.scales import ends_of, log_tick_texts, log_ticks, shortened
+from lbt_synth.report.page.typeset import BODY, MONO, mono_lines, width_of, wrapped
+from lbt_synth.storage.tables import Cell, Table
 
 
 @pytest.fixture(scope="module")
@@ -293,12 +279,14 @@ def test_charts_that_are_too_high_go_on_on_the_next_sheet(count):
     assert all(height_of_block(part) <= HEIGHT - 1.25 - 0.5 for part in parts)
     assert [part.title for part in parts[:2]] == ["Many", "Many (continued)"][: len(parts)]
     page = Page(
-        title="t", subtitle="s", creator="c",
+        title="t",
+        subtitle="s",
+        creator="c",
         sections=(
             Section(key="a", title="A", blocks=(Paragraph(text="a"),)),
             Section(key="b", title="B", blocks=(chart,)),
         ),
-    )  # fmt: skip
+    )
     assert pages_of(page_pdf(page)) == len(parts) + (count >= 6)
 
 
@@ -356,10 +344,17 @@ def test_contrast_of_texts(plain):
     assert contrast("#000000", "#ffffff") == pytest.approx(21)
     named = dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6});", plain))
     for ink, paper in (
-        ("ink", "paper"), ("soft", "paper"), ("link", "paper"), ("ink", "tint"),
-        ("bad", "bad-tint"), ("good", "paper"), ("note", "paper"), ("ink", "note-tint"),
-        ("ink", "good-tint"), ("bad", "paper"),
-    ):  # fmt: skip
+        ("ink", "paper"),
+        ("soft", "paper"),
+        ("link", "paper"),
+        ("ink", "tint"),
+        ("bad", "bad-tint"),
+        ("good", "paper"),
+        ("note", "paper"),
+        ("ink", "note-tint"),
+        ("ink", "good-tint"),
+        ("bad", "paper"),
+    ):
         assert contrast(named[ink], named[paper]) >= 4.5, (ink, paper)
 
 
@@ -400,5 +395,5 @@ DOT = Curve(name="a", x=[1.0], y=[1.0])
     ],
 )
 def test_mistakes_are_refused(make, text):
-    with pytest.raises(lbt.ProblemError, match=re.escape(text)):
+    with pytest.raises(lbt.errors.ProblemError, match=re.escape(text)):
         make()

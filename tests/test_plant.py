@@ -10,7 +10,7 @@ import lbt_synth as lbt
 
 
 def slow(pole=0.98, drive=50.0):
-    return lbt.ARModel(coefficients=[pole], driving_rms_nm=drive, frame_rate_hz=800)
+    return lbt.models.ARModel(coefficients=[pole], driving_rms_nm=drive, frame_rate_hz=800)
 
 
 def test_full_form_is_the_papers():
@@ -22,9 +22,13 @@ def test_full_form_is_the_papers():
     rng = np.random.default_rng(1)
     sensor, influence = rng.standard_normal((3, 2)), rng.standard_normal((2, 2))
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=slow(), vibrations=lines, noise_nm=2.0,
-        sensor_matrix=sensor, influence_matrix=influence,
-    )  # fmt: skip
+        frame_rate_hz=800,
+        turbulence=slow(),
+        vibrations=lines,
+        noise_nm=2.0,
+        sensor_matrix=sensor,
+        influence_matrix=influence,
+    )
     full = plant.full()
     a = np.array([line.ar_model(800).coefficients for line in lines])
     A1, minus_A2 = np.diag(a[:, 0]), np.diag(a[:, 1])
@@ -78,14 +82,18 @@ def test_full_and_reduced_form_give_the_same_controller(delay, design):
 def test_predicted_error_is_the_closed_loops_residual(delay, order):
     """Where truth is the model, the filter's rms is the residual of the loop, exactly."""
     coefficients = [0.99] if order == 1 else [1.95, -0.955]
-    turbulence = lbt.ARModel(coefficients=coefficients, driving_rms_nm=20, frame_rate_hz=800)
+    turbulence = lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=20, frame_rate_hz=800)
     line = lbt.Vibration(frequency_hz=23, damping=0.02, rms_nm=120, direction=(0.6, 0.8))
     rng = np.random.default_rng(3)
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, delay_frames=delay, turbulence=turbulence, vibrations=[line],
-        noise_nm=9.0, sensor_matrix=rng.standard_normal((3, 2)),
+        frame_rate_hz=800,
+        delay_frames=delay,
+        turbulence=turbulence,
+        vibrations=[line],
+        noise_nm=9.0,
+        sensor_matrix=rng.standard_normal((3, 2)),
         influence_matrix=rng.standard_normal((2, 2)),
-    )  # fmt: skip
+    )
     design = lbt.kalman(plant)
     truth = lbt.Truth(turbulence=turbulence, vibrations=(line,), noise_nm=9.0)
     budget = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
@@ -126,9 +134,9 @@ def test_noise_covariance_may_be_given():
 
 def test_retuning_moves_only_the_vibration():
     plant = lbt_axis_plant()
-    moved = lbt.retuned_plant(plant, 1.5, hold="rms")
+    moved = lbt.models.retuned_plant(plant, 1.5, hold="rms")
     assert moved.vibrations[0].frequency_hz == 21.5
-    back = lbt.retuned_plant(moved, -1.5)
+    back = lbt.models.retuned_plant(moved, -1.5)
     for name in "ABCDL":
         assert np.allclose(getattr(back, name), getattr(plant, name), rtol=1e-12)
 
@@ -147,7 +155,11 @@ def test_retuning_moves_only_the_vibration():
         ({"sensor_matrix": [[np.nan, 0], [0, 1]]}, "sensor_matrix must be finite"),
         ({"turbulence": [slow()] * 3}, r"one a mode \(2\); got 3"),
         (
-            {"turbulence": lbt.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
+            {
+                "turbulence": lbt.models.ARModel(
+                    coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500
+                )
+            },
             "must be sampled at the frame rate",
         ),
         (
@@ -162,19 +174,29 @@ def test_retuning_moves_only_the_vibration():
 )
 def test_wrong_parts_are_refused(change, text):
     parts = {"frame_rate_hz": 800, "turbulence": slow(), "noise_nm": 2.0} | change
-    with pytest.raises(lbt.ProblemError, match=text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
         lbt.tip_tilt_plant(**parts)
 
 
 def test_sizes_that_clash_are_named():
-    good = {"A": np.eye(3) / 2, "B": np.ones((3, 4)), "C": np.ones((1, 3)), "D": np.ones((1, 4)),
-            "L": np.ones((1, 3))}  # fmt: skip
-    for name, value in (("A", np.ones((3, 2))), ("B", np.ones((2, 4))), ("C", np.ones((1, 2))),
-                        ("D", np.ones((1, 3))), ("L", np.ones((1, 5)))):  # fmt: skip
-        with pytest.raises(lbt.DimensionError, match=f"{name} must"):
+    good = {
+        "A": np.eye(3) / 2,
+        "B": np.ones((3, 4)),
+        "C": np.ones((1, 3)),
+        "D": np.ones((1, 4)),
+        "L": np.ones((1, 3)),
+    }
+    for name, value in (
+        ("A", np.ones((3, 2))),
+        ("B", np.ones((2, 4))),
+        ("C", np.ones((1, 2))),
+        ("D", np.ones((1, 3))),
+        ("L", np.ones((1, 5))),
+    ):
+        with pytest.raises(lbt.errors.DimensionError, match=f"{name} must"):
             lbt.EstimationProblem(**(good | {name: value}))
 
 
 def test_a_measurement_without_noise_is_refused():
-    with pytest.raises(lbt.DefinitenessError, match="Every measurement needs noise"):
+    with pytest.raises(lbt.errors.DefinitenessError, match="Every measurement needs noise"):
         lbt.EstimationProblem(A=0.5, B=[[1.0]], C=1.0, D=[[0.0]], L=1.0)

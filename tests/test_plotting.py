@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.plotting import save_figure
+from lbt_synth.report.figures.style import save_figure
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def legend(axis):
 
 
 def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
-    error, rejection, noise = lbt.sigma_figure(designs).axes
+    error, rejection, noise = lbt.report.figures.sigma_figure(designs).axes
     assert legend(error) == ["Kalman", "H-infinity", "vibration"]
     assert legend(rejection) == ["Kalman", "H-infinity", "integrator", "vibration"]
     assert "[nm]" in error.get_ylabel()
@@ -33,29 +33,31 @@ def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
 
 
 def test_curves_are_told_apart_in_grey(designs):
-    lines = lbt.sigma_figure(designs).axes[1].get_lines()[:3]
+    lines = lbt.report.figures.sigma_figure(designs).axes[1].get_lines()[:3]
     assert len({str(line.get_linestyle()) for line in lines}) == 3
     assert len({line.get_color() for line in lines}) == 3
 
 
 @pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
 def test_figures_are_files(tmp_path, designs, ending):
-    path = save_figure(lbt.sigma_figure(designs), tmp_path / f"f.{ending}")
+    path = save_figure(lbt.report.figures.sigma_figure(designs), tmp_path / f"f.{ending}")
     magic = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}[ending]
     assert path.read_bytes().startswith(magic)
     assert path.stat().st_size < 400_000
 
 
 def test_other_endings_are_refused(tmp_path, designs):
-    with pytest.raises(lbt.OutputError, match=r"must end in .png, .pdf, .svg; got 'f.gif'"):
-        save_figure(lbt.sigma_figure(designs), tmp_path / "f.gif")
+    with pytest.raises(lbt.errors.OutputError, match=r"must end in .png, .pdf, .svg; got 'f.gif'"):
+        save_figure(lbt.report.figures.sigma_figure(designs), tmp_path / "f.gif")
 
 
 def test_robustness_figure_draws_the_paper_beside(config):
     rows = list(
-        lbt.frequency_robustness(config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1])
+        lbt.studies.frequency_robustness(
+            config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1]
+        )
     )
-    (axis,) = lbt.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
+    (axis,) = lbt.report.figures.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
     assert legend(axis) == ["Kalman", "Kalman, paper", r"H$_\infty$"]
     assert "[%]" in axis.get_ylabel()
     assert "[Hz]" in axis.get_xlabel()
@@ -65,23 +67,23 @@ def test_simulation_figure(config):
     run = lbt.simulate(
         lbt.kalman(config.plant).controller, config.truth, hardware=config.hardware, frames=600
     )
-    series, spectrum = lbt.simulation_figure(run, title="Kalman").axes
+    series, spectrum = lbt.report.figures.simulation_figure(run, title="Kalman").axes
     assert series.get_xlabel() == "time [s]"
     assert "[nm$^2$/Hz]" in spectrum.get_ylabel()
 
 
 def test_empty_figures_are_refused():
     for empty in (
-        lambda: lbt.sigma_figure({}),
-        lambda: lbt.loop_figure({}),
-        lambda: lbt.robustness_figure([]),
+        lambda: lbt.report.figures.sigma_figure({}),
+        lambda: lbt.report.figures.loop_figure({}),
+        lambda: lbt.report.figures.robustness_figure([]),
     ):
-        with pytest.raises(lbt.ProblemError, match="at least one"):
+        with pytest.raises(lbt.errors.ProblemError, match="at least one"):
             empty()
 
 
 def test_an_unstable_loop_is_named_and_not_drawn(designs):
-    _, rejection, noise = lbt.sigma_figure(designs, sensor_gain=0.4).axes
+    _, rejection, noise = lbt.report.figures.sigma_figure(designs, sensor_gain=0.4).axes
     assert "sensor gain 0.4" in rejection.get_title(loc="right")
     for axis in (rejection, noise):
         assert "H-infinity: unstable" in legend(axis)
@@ -95,17 +97,17 @@ def test_robustness_figure_of_an_unstable_method(config):
 
     truth = replace(config.truth, sensor_gain=0.3)
     rows = list(
-        lbt.frequency_robustness(
+        lbt.studies.frequency_robustness(
             config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05
         )
     )
-    (axis,) = lbt.robustness_figure(rows).axes
+    (axis,) = lbt.report.figures.robustness_figure(rows).axes
     assert legend(axis) == ["Kalman", r"H$_\infty$: unstable"]
 
 
 def test_modal_figure_has_labels_units_and_all_modes():
     residuals = {"integrators": [9.0, 5.0, 2.0], "Kalman filters": [8.0, 4.0, 1.0]}
-    above, below = lbt.modal_figure(
+    above, below = lbt.report.figures.modal_figure(
         residuals, gains=[0.5, 0.4, 0.3], turbulence_nm=[90.0, 50.0, 20.0]
     ).axes
     assert above.get_ylabel() == "integrator gain"
@@ -115,15 +117,15 @@ def test_modal_figure_has_labels_units_and_all_modes():
     for line, values in zip(below.get_lines()[1:], residuals.values(), strict=True):
         assert line.get_xdata().tolist() == [1, 2, 3]
         assert line.get_ydata().tolist() == values
-    assert len(lbt.modal_figure({"one": [1.0]}).axes) == 1
+    assert len(lbt.report.figures.modal_figure({"one": [1.0]}).axes) == 1
 
 
 def test_bad_modal_figures_are_refused():
     for arguments, error, words in (
-        (({},), lbt.ProblemError, "got none"),
-        (({"a": [1.0, 0.0]},), lbt.ProblemError, "a must be above 0"),
-        (({"a": 1.0},), lbt.DimensionError, "one number a mode"),
-        (({"a": [1.0], "b": [1.0, 2.0]},), lbt.DimensionError, "b must have 1 modes"),
+        (({},), lbt.errors.ProblemError, "got none"),
+        (({"a": [1.0, 0.0]},), lbt.errors.ProblemError, "a must be above 0"),
+        (({"a": 1.0},), lbt.errors.DimensionError, "one number a mode"),
+        (({"a": [1.0], "b": [1.0, 2.0]},), lbt.errors.DimensionError, "b must have 1 modes"),
     ):
         with pytest.raises(error, match=words):
-            lbt.modal_figure(*arguments)
+            lbt.report.figures.modal_figure(*arguments)

@@ -14,9 +14,9 @@ from ruamel.yaml import YAML
 
 import lbt_synth as lbt
 from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
-from lbt_synth.gainfile import store
-from lbt_synth.models.interval import FrequencyInterval
-from lbt_synth.norms import band_norm
+from lbt_synth.files.gain_file import store
+from lbt_synth.linear.norms import band_norm
+from lbt_synth.models.frequency_interval import FrequencyInterval
 
 RATE = 800
 
@@ -29,7 +29,7 @@ def plant():
 @pytest.fixture(scope="module")
 def made(plant):
     return {
-        (norm, half): lbt.polytopic(plant, half_width_hz=half, norm=norm)
+        (norm, half): lbt.design.polytopic(plant, half_width_hz=half, norm=norm)
         for norm in ("hinf", "h2")
         for half in (0.0, 0.2, 1.0, 2.0)
     }
@@ -59,17 +59,17 @@ def test_the_plants_of_an_interval_are_a_segment(plant):
 
 
 def test_norms_over_a_band():
-    lag = lbt.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.01)
+    lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.01)
     assert band_norm(lag, 0.0, 50.0).value == pytest.approx(lbt.hinf_norm(lag).value, rel=1e-12)
     edge = abs(1 / (np.exp(2j * np.pi * 0.1) - 0.5))
     assert band_norm(lag, 10.0, 50.0).value == pytest.approx(edge, rel=1e-12)
-    line = lbt.StateSpace(A=[[1.9, -0.99], [1, 0]], B=[[1.0], [0]], C=[[1.0, 0]], D=[[0.0]])
+    line = lbt.linear.StateSpace(A=[[1.9, -0.99], [1, 0]], B=[[1.0], [0]], C=[[1.0, 0]], D=[[0.0]])
     whole = lbt.hinf_norm(line)
     f = whole.peak_frequency_hz
     assert band_norm(line, f / 2, 2 * f).value == pytest.approx(whole.value, rel=1e-10)
     below = band_norm(line, 0.0, f / 2)
     assert below.value == pytest.approx(
-        float(lbt.largest_singular_values(line, [f / 2])[0]), rel=1e-10
+        float(lbt.linear.largest_singular_values(line, [f / 2])[0]), rel=1e-10
     )
 
 
@@ -83,7 +83,10 @@ def test_guarantee_and_search_meet_for_any_filter(modes, shift):
     other = lbt.tip_tilt_plant(
         frame_rate_hz=RATE, turbulence=plant.turbulence, vibrations=wide, noise_nm=15.5, modes=modes
     )
-    for filtered in (predictor(lbt.kalman(other)), predictor(lbt.hinf(other, gamma_ratio=1.3, method="riccati"))):  # fmt: skip
+    for filtered in (
+        predictor(lbt.kalman(other)),
+        predictor(lbt.hinf(other, gamma_ratio=1.3, method="riccati")),
+    ):
         for norm, gap in (("hinf", 1e-8), ("h2", 6e-5)):
             found, where = worst_found(interval, filtered, norm)
             sure = worst_guaranteed(interval, filtered, norm)
@@ -95,9 +98,11 @@ def test_a_worst_frequency_inside_the_interval():
     """The envelope decides, not the ends: a filter that knows the ends and not the middle."""
     plant = lbt_axis_plant()
     interval = FrequencyInterval(plant=plant, half_width_hz=1.0)
-    ends = lbt.spread_plant(plant, frequencies_hz=[19.0, 21.0])
+    ends = lbt.models.spread_plant(plant, frequencies_hz=[19.0, 21.0])
     filtered = predictor(lbt.kalman(ends))
-    at_ends = max(error_size(interval.error_system(a, filtered), "hinf") for a in interval.coefficients)  # fmt: skip
+    at_ends = max(
+        error_size(interval.error_system(a, filtered), "hinf") for a in interval.coefficients
+    )
     found, where = worst_found(interval, filtered, "hinf")
     sure = worst_guaranteed(interval, filtered, "hinf")
     assert found > 1.5 * at_ends
@@ -160,28 +165,34 @@ def test_the_plant_at_an_end_in_the_loop(made):
         line = design.problem.vibrations[0]
         drive = line.ar_model(RATE).driving_rms_nm
         moved = line.moved(f)
-        moved = dataclasses.replace(moved, rms_nm=moved.rms_nm * drive / moved.ar_model(RATE).driving_rms_nm)  # fmt: skip
-        truth = lbt.Truth(turbulence=design.problem.turbulence[0], vibrations=(moved,), noise_nm=15.5)  # fmt: skip
+        moved = dataclasses.replace(
+            moved, rms_nm=moved.rms_nm * drive / moved.ar_model(RATE).driving_rms_nm
+        )
+        truth = lbt.Truth(
+            turbulence=design.problem.turbulence[0], vibrations=(moved,), noise_nm=15.5
+        )
         a1 = design.interval.coefficient(f)
         size = error_size(design.interval.error_system(a1, design.predictor), "h2")
         assert lbt.residual_budget(loop, truth).rms_nm == pytest.approx(size, rel=1e-8)
 
 
 def test_two_axes(made):
-    decoupled = lbt.polytopic(lbt_axis_plant(modes=2), half_width_hz=1.0)
+    decoupled = lbt.design.polytopic(lbt_axis_plant(modes=2), half_width_hz=1.0)
     assert decoupled.bound_guaranteed == pytest.approx(made["hinf", 1.0].bound_guaranteed, rel=1e-4)
-    variance = lbt.polytopic(lbt_axis_plant(modes=2), half_width_hz=1.0, norm="h2")
+    variance = lbt.design.polytopic(lbt_axis_plant(modes=2), half_width_hz=1.0, norm="h2")
     expected = np.sqrt(2) * made["h2", 1.0].bound_guaranteed
     assert variance.bound_guaranteed == pytest.approx(expected, rel=1e-4)
 
 
 def test_coupled_axes_and_an_axis_without_vibration(made):
-    slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
+    slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
     across = dataclasses.replace(line, direction=(1.0, 1.0))
     common = {"frame_rate_hz": RATE, "turbulence": slow, "noise_nm": 15.5}
-    alone = lbt.polytopic(lbt.tip_tilt_plant(vibrations=[line], **common), half_width_hz=1.0)
-    turned = lbt.polytopic(lbt.tip_tilt_plant(vibrations=[across], **common), half_width_hz=1.0)
+    alone = lbt.design.polytopic(lbt.tip_tilt_plant(vibrations=[line], **common), half_width_hz=1.0)
+    turned = lbt.design.polytopic(
+        lbt.tip_tilt_plant(vibrations=[across], **common), half_width_hz=1.0
+    )
     # the same plant in turned axes
     assert turned.bound_guaranteed == pytest.approx(alone.bound_guaranteed, rel=1e-3)
     assert alone.bound_guaranteed == pytest.approx(made["hinf", 1.0].bound_guaranteed, rel=1e-2)
@@ -189,7 +200,9 @@ def test_coupled_axes_and_an_axis_without_vibration(made):
 
 def test_states_that_are_sums_of_others(plant):
     """With AR2 turbulence and two frames the past total is the sum of two other states."""
-    turbulence = lbt.ARModel(coefficients=[1.9, -0.905], driving_rms_nm=5, frame_rate_hz=RATE)
+    turbulence = lbt.models.ARModel(
+        coefficients=[1.9, -0.905], driving_rms_nm=5, frame_rate_hz=RATE
+    )
     redundant = lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
         turbulence=turbulence,
@@ -197,20 +210,25 @@ def test_states_that_are_sums_of_others(plant):
         noise_nm=15.5,
         modes=1,
     )
-    design = lbt.polytopic(redundant, half_width_hz=1.0)
+    design = lbt.design.polytopic(redundant, half_width_hz=1.0)
     assert (redundant.n_states, design.predictor.n_states) == (5, 4)
     assert design.bound_guaranteed < 1.02 * design.worst_achieved
 
 
 def test_another_horizon_is_another_delay(plant):
-    design = lbt.polytopic(plant, half_width_hz=0.5, horizon=2)
+    design = lbt.design.polytopic(plant, half_width_hz=0.5, horizon=2)
     assert design.hardware.delay_frames == 3
     assert design.bound_guaranteed > lbt.hinf(plant, horizon=2, method="riccati").gamma_least
 
 
 def test_wrong_demands(plant):
     lines = [plant.vibrations[0], plant.vibrations[0].retuned(30, frame_rate_hz=RATE)]
-    common = {"frame_rate_hz": RATE, "turbulence": plant.turbulence[0], "noise_nm": 15.5, "modes": 1}  # fmt: skip
+    common = {
+        "frame_rate_hz": RATE,
+        "turbulence": plant.turbulence[0],
+        "noise_nm": 15.5,
+        "modes": 1,
+    }
     two, none = lbt.tip_tilt_plant(vibrations=lines, **common), lbt.tip_tilt_plant(**common)
     for wrong, arguments, text in (
         (two, {}, "one uncertain frequency at a time.*20 Hz with 0.01 and 30 Hz"),
@@ -224,31 +242,41 @@ def test_wrong_demands(plant):
         (plant, {"half_width_hz": 381.0}, "got -361 Hz"),
         (plant, {"horizon": 0.5}, "horizon must be an integer"),
     ):
-        with pytest.raises(lbt.ProblemError, match=text):
-            lbt.polytopic(wrong, **{"half_width_hz": 1.0, **arguments})
-    high = lbt.tip_tilt_plant(vibrations=[lbt.Vibration(frequency_hz=395, damping=0.01, rms_nm=9, direction=(1,))], **common)  # fmt: skip
-    with pytest.raises(lbt.ProblemError, match="below the Nyquist frequency 400 Hz; got 401 Hz"):
-        lbt.polytopic(high, half_width_hz=6)
+        with pytest.raises(lbt.errors.ProblemError, match=text):
+            lbt.design.polytopic(wrong, **{"half_width_hz": 1.0, **arguments})
+    high = lbt.tip_tilt_plant(
+        vibrations=[lbt.Vibration(frequency_hz=395, damping=0.01, rms_nm=9, direction=(1,))],
+        **common,
+    )
+    with pytest.raises(
+        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 401 Hz"
+    ):
+        lbt.design.polytopic(high, half_width_hz=6)
 
 
 def test_a_solver_that_fails_or_lies_is_not_believed(plant, monkeypatch):
-    from lbt_synth.lmi import polytopic as programmes
+    from lbt_synth.linear.lmi import polytopic as programmes
 
     monkeypatch.setattr(programmes, "solve", lambda *_: ("infeasible", 3))
-    with pytest.raises(lbt.NumericalError, match="ended as 'infeasible'.*narrower"):
-        lbt.polytopic(plant, half_width_hz=1.0)
+    with pytest.raises(lbt.errors.NumericalError, match="ended as 'infeasible'.*narrower"):
+        lbt.design.polytopic(plant, half_width_hz=1.0)
     unstable = programmes.SegmentFilter(
-        A=1.01 * np.eye(4), B=np.ones((4, 1)), C=np.ones((1, 4)), bound=1.0, status="optimal", iterations=1
-    )  # fmt: skip
-    monkeypatch.setattr("lbt_synth.lmi.segment_filter", lambda *_, **__: unstable)
-    with pytest.raises(lbt.CertificateError, match="spectral radius of plant and filter"):
-        lbt.polytopic(plant, half_width_hz=1.0)
+        A=1.01 * np.eye(4),
+        B=np.ones((4, 1)),
+        C=np.ones((1, 4)),
+        bound=1.0,
+        status="optimal",
+        iterations=1,
+    )
+    monkeypatch.setattr("lbt_synth.linear.lmi.polytopic.segment_filter", lambda *_, **__: unstable)
+    with pytest.raises(lbt.errors.CertificateError, match="spectral radius of plant and filter"):
+        lbt.design.polytopic(plant, half_width_hz=1.0)
 
 
 def test_a_line_too_narrow_to_be_bounded(made):
     sharp = lbt_axis_plant(damping=1e-7)
     interval = FrequencyInterval(plant=sharp, half_width_hz=2.0)
-    with pytest.raises(lbt.NumericalError, match="too narrow a line"):
+    with pytest.raises(lbt.errors.NumericalError, match="too narrow a line"):
         worst_guaranteed(interval, made["h2", 1.0].predictor, "h2")
 
 
@@ -263,14 +291,18 @@ def test_claims_that_do_not_hold(made):
         ({"controller": made["h2", 1.0].controller}, "controller, against"),
         ({"predictor": made["h2", 1.0].predictor}, "bound over the interval"),
     ):
-        names = [c.name for c in dataclasses.replace(design, **change).recertified().checks if not c.passed]  # fmt: skip
+        names = [
+            c.name
+            for c in dataclasses.replace(design, **change).recertified().checks
+            if not c.passed
+        ]
         assert any(name.startswith(failed) for name in names), (change, names)
 
 
 # -- frequency priors -----------------------------------------------------------
 def test_the_spectrum_is_the_mean_of_the_moved_ones(plant):
     weights = [1.0, 2.0, 4.0, 1.0]
-    spread = lbt.spread_plant(plant, half_width_hz=1.0, lines=4, weights=weights)
+    spread = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=4, weights=weights)
     line = plant.vibrations[0]
     f = np.concatenate([np.linspace(0, 400, 300), np.linspace(18, 22, 300)])
     moved = [line.moved(g).ar_model(RATE).psd(f) for g in (19.25, 19.75, 20.25, 20.75)]
@@ -286,13 +318,19 @@ def test_the_spectrum_is_the_mean_of_the_moved_ones(plant):
 def test_the_prior_filter_is_the_best_on_average(plant):
     """Of the filters at hand it has the least mean variance over the frequencies of the prior."""
     frequencies = [19.2, 19.6, 20.0, 20.4, 20.8]
-    spread = lbt.spread_plant(plant, frequencies_hz=frequencies)
+    spread = lbt.models.spread_plant(plant, frequencies_hz=frequencies)
     line = plant.vibrations[0]
     plants = [
-        lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=plant.turbulence, vibrations=[line.moved(f)], noise_nm=15.5, modes=1)
+        lbt.tip_tilt_plant(
+            frame_rate_hz=RATE,
+            turbulence=plant.turbulence,
+            vibrations=[line.moved(f)],
+            noise_nm=15.5,
+            modes=1,
+        )
         for f in frequencies
-    ]  # fmt: skip
-    from lbt_synth.models.interval import error_system
+    ]
+    from lbt_synth.models.frequency_interval import error_system
 
     def mean(filtered):
         return np.mean([error_size(error_system(p, filtered), "h2") ** 2 for p in plants])
@@ -305,14 +343,19 @@ def test_the_prior_filter_is_the_best_on_average(plant):
 
 def test_one_line_at_the_centre_is_the_plant_itself(plant):
     np.testing.assert_allclose(
-        lbt.spread_plant(plant, half_width_hz=1.0, lines=1).A, plant.A, rtol=1e-12
+        lbt.models.spread_plant(plant, half_width_hz=1.0, lines=1).A, plant.A, rtol=1e-12
     )
     two = lbt_axis_plant(modes=2)
-    assert len(lbt.spread_plant(two, half_width_hz=1.0, lines=3).vibrations) == 6
+    assert len(lbt.models.spread_plant(two, half_width_hz=1.0, lines=3).vibrations) == 6
 
 
 def test_priors_that_cannot_be(plant):
-    common = {"frame_rate_hz": RATE, "turbulence": plant.turbulence[0], "noise_nm": 15.5, "modes": 1}  # fmt: skip
+    common = {
+        "frame_rate_hz": RATE,
+        "turbulence": plant.turbulence[0],
+        "noise_nm": 15.5,
+        "modes": 1,
+    }
     lines = [plant.vibrations[0], plant.vibrations[0].retuned(30, frame_rate_hz=RATE)]
     two, none = lbt.tip_tilt_plant(vibrations=lines, **common), lbt.tip_tilt_plant(**common)
     for wrong, arguments, text in (
@@ -328,10 +371,14 @@ def test_priors_that_cannot_be(plant):
         (plant, {"frequencies_hz": [19.0, 401.0]}, "below the Nyquist frequency"),
         (plant, {"frequencies_hz": [-1.0]}, "got -1 Hz"),
         (plant, {"frequencies_hz": [np.inf]}, "frequencies_hz must be finite"),
-        (two, {"frequencies_hz": [19.0]}, "vibrations of one frequency; got vibrations at 20 and 30"),
-    ):  # fmt: skip
-        with pytest.raises(lbt.ProblemError, match=text):
-            lbt.spread_plant(wrong, **arguments)
+        (
+            two,
+            {"frequencies_hz": [19.0]},
+            "vibrations of one frequency; got vibrations at 20 and 30",
+        ),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=text):
+            lbt.models.spread_plant(wrong, **arguments)
 
 
 GOOD = YAML(typ="safe", pure=True).load(LBT_YAML.read_text())
@@ -350,7 +397,7 @@ def test_priors_of_a_configuration(tmp_path):
     plain = lbt.load_config(LBT_YAML).plant
     for keys, lines in (({"spread_hz": 1.0}, 5), ({"spread_hz": 0.5, "lines": 2}, 2)):
         plant = lbt.load_config(written(tmp_path, **keys)).plant
-        expected = lbt.spread_plant(plain, half_width_hz=keys["spread_hz"], lines=lines)
+        expected = lbt.models.spread_plant(plain, half_width_hz=keys["spread_hz"], lines=lines)
         assert len(plant.vibrations) == 2 * lines
         np.testing.assert_allclose(plant.A, expected.A, rtol=1e-13)
         np.testing.assert_allclose(plant.B, expected.B, rtol=1e-11)
@@ -361,7 +408,7 @@ def test_priors_of_a_configuration(tmp_path):
         ({"spread_hz": 1.0, "lines": 65}, "less than or equal to 64"),
         ({"frequency_hz": 399.0, "spread_hz": 9.0}, r"vibrations\[0\].spread_hz: .*Nyquist"),
     ):
-        with pytest.raises(lbt.ConfigError, match=text):
+        with pytest.raises(lbt.errors.ConfigError, match=text):
             lbt.load_config(written(tmp_path, **keys))
 
 
@@ -370,8 +417,18 @@ def test_priors_of_a_configuration(tmp_path):
 def test_round_trip(tmp_path, made, ending):
     design = made["hinf", 1.0]
     back = lbt.load_gain(lbt.save_gain(tmp_path / f"p.{ending}", design))
-    assert isinstance(back, lbt.PolytopicDesign)
-    for field in ("method", "norm", "half_width_hz", "bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme", "gamma", "rms"):  # fmt: skip
+    assert isinstance(back, lbt.design.PolytopicDesign)
+    for field in (
+        "method",
+        "norm",
+        "half_width_hz",
+        "bound_guaranteed",
+        "worst_achieved",
+        "worst_frequency_hz",
+        "bound_programme",
+        "gamma",
+        "rms",
+    ):
         assert getattr(back, field) == getattr(design, field)
     for name in "ABC":
         assert np.array_equal(getattr(back.predictor, name), getattr(design.predictor, name))
@@ -422,7 +479,7 @@ def test_nonsense_is_inconsistent(tmp_path, made, key, value, text):
         document["meta"]["interval"][key] = value
 
     path = edited(tmp_path, made["hinf", 1.0], change)
-    with pytest.raises(lbt.GainFileError, match=f"inconsistent: .*{text}"):
+    with pytest.raises(lbt.errors.GainFileError, match=f"inconsistent: .*{text}"):
         lbt.load_gain(path)
 
 
@@ -436,8 +493,12 @@ def test_a_file_without_its_plant_or_filter(tmp_path, made):
     def crooked(document):
         document["arrays"]["PREDICTOR_C"] = [[1.0, 2.0]]
 
-    for change, text in ((kind, "needs a plant"), (lost, "PREDICTOR_C is missing"), (crooked, "C must have")):  # fmt: skip
-        with pytest.raises(lbt.GainFileError, match=text):
+    for change, text in (
+        (kind, "needs a plant"),
+        (lost, "PREDICTOR_C is missing"),
+        (crooked, "C must have"),
+    ):
+        with pytest.raises(lbt.errors.GainFileError, match=text):
             lbt.load_gain(edited(tmp_path, made["hinf", 1.0], change))
 
 
@@ -451,7 +512,13 @@ def test_the_command_line(tmp_path, capsys):
     capsys.readouterr()
     assert main(["show", target, "--matrices"]) == 0
     out = capsys.readouterr().out
-    for text in ("norm on the interval, guaranteed", "norm on the interval, worst found", "guaranteed over found", "1.000000", "predictor_A"):  # fmt: skip
+    for text in (
+        "norm on the interval, guaranteed",
+        "norm on the interval, worst found",
+        "guaranteed over found",
+        "1.000000",
+        "predictor_A",
+    ):
         assert text in out
     assert main(["show", target, "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
@@ -463,20 +530,44 @@ def test_the_command_line(tmp_path, capsys):
     capsys.readouterr()
     for wrong, text in (
         (design, "needs the half width of the interval of frequencies; try --half-width-hz 1"),
-        ([*design, "--half-width-hz", "1", "--gamma", "200"], "--gamma goes with --method hinf or mixed; got --method polytopic"),
+        (
+            [*design, "--half-width-hz", "1", "--gamma", "200"],
+            "--gamma goes with --method hinf or mixed; got --method polytopic",
+        ),
         ([*design, "--half-width-hz", "1", "--taps", "3"], "--taps goes with --method mixed"),
-        ([*design, "--half-width-hz", "1", "--route", "lmi"], "--method polytopic takes no --route"),
+        (
+            [*design, "--half-width-hz", "1", "--route", "lmi"],
+            "--method polytopic takes no --route",
+        ),
         ([*design, "--half-width-hz", "25"], "must have a frequency above that"),
-        (["design", config, "--method", "kalman", "--norm", "h2", "-o", target], "--norm goes with --method polytopic; got --method kalman"),
-        (["design", config, "--method", "hinf", "--half-width-hz", "1", "-o", target], "--half-width-hz goes with --method polytopic"),
-        (["design", str(written(tmp_path, spread_hz=1.0)), "--method", "polytopic", "--half-width-hz", "1", "-o", target], "one uncertain frequency at a time"),
-    ):  # fmt: skip
+        (
+            ["design", config, "--method", "kalman", "--norm", "h2", "-o", target],
+            "--norm goes with --method polytopic; got --method kalman",
+        ),
+        (
+            ["design", config, "--method", "hinf", "--half-width-hz", "1", "-o", target],
+            "--half-width-hz goes with --method polytopic",
+        ),
+        (
+            [
+                "design",
+                str(written(tmp_path, spread_hz=1.0)),
+                "--method",
+                "polytopic",
+                "--half-width-hz",
+                "1",
+                "-o",
+                target,
+            ],
+            "one uncertain frequency at a time",
+        ),
+    ):
         assert main(wrong) == 2
         assert text in capsys.readouterr().err
 
 
 def test_the_sigma_figure_draws_its_error(made):
-    figure = lbt.sigma_figure({"interval": made["hinf", 1.0]}, unit_weights=True)
+    figure = lbt.report.figures.sigma_figure({"interval": made["hinf", 1.0]}, unit_weights=True)
     assert len(figure.axes) == 3
 
 
@@ -487,7 +578,7 @@ def test_the_sigma_figure_draws_its_error(made):
 def test_other_dampings_and_delays(norm, damping, delay):
     for half in (0.1, 1.0, 3.0):
         plant = lbt_axis_plant(damping=damping, delay_frames=delay)
-        design = lbt.polytopic(plant, half_width_hz=half, norm=norm)
+        design = lbt.design.polytopic(plant, half_width_hz=half, norm=norm)
         assert design.bound_guaranteed <= 1.0001 * design.worst_achieved
         # the programme itself is less tight where the interval is many times the line's width
         assert design.bound_programme <= (1.06 if damping > 0.001 else 1.15) * design.worst_achieved

@@ -15,25 +15,73 @@ from plants import ROOT
 
 import lbt_synth as lbt
 
-NAMES = sorted(set(lbt.__all__))
+ROOMS = (
+    "config",
+    "design",
+    "design.modal",
+    "design.shaping",
+    "errors",
+    "files",
+    "identification",
+    "interop",
+    "linear",
+    "loop",
+    "models",
+    "report",
+    "report.figures",
+    "storage",
+    "studies",
+)
 
 
-def test_the_stub_lists_what_is_there():
-    stub = ast.parse(Path(lbt.__file__).with_suffix(".pyi").read_text())
-    listed = {
+def room(path):
+    return importlib.import_module(f"lbt_synth.{path}")
+
+
+def public_names(path):
+    """Names that a room shows, without its folders."""
+    if path == "errors":
+        return sorted(name for name in vars(room(path)) if name.endswith("Error"))
+    return sorted(n for n in room(path).__all__ if not inspect.ismodule(getattr(room(path), n)))
+
+
+NAMES = [f"{path}.{name}" for path in ROOMS for name in public_names(path)]
+
+
+def public(name):
+    path, _, last = name.rpartition(".")
+    return getattr(room(path), last)
+
+
+def listed(stub):
+    return {
         alias.asname
-        for node in stub.body
+        for node in ast.parse(stub.read_text()).body
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    assert listed == set(NAMES)
-    for name in NAMES:
-        assert getattr(lbt, name) is not None
+
+
+def test_the_face_has_at_most_forty_names():
+    assert len([name for name in dir(lbt) if not name.startswith("_")]) <= 40
+    assert listed(Path(lbt.__file__).with_suffix(".pyi")) == set(lbt.__all__)
+    for name in lbt.__all__:
+        thing = getattr(lbt, name)
+        if not inspect.ismodule(thing):  # and is one that its room shows
+            assert any(thing is public(other) for other in NAMES), name
+
+
+@pytest.mark.parametrize("path", [path for path in ROOMS if path != "errors"])
+def test_the_stub_of_a_room_lists_what_is_there(path):
+    shown = room(path)
+    assert listed(Path(shown.__file__).with_suffix(".pyi")) == set(shown.__all__)
+    for name in shown.__all__:
+        assert getattr(shown, name) is not None
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_docstrings(name):
-    thing = getattr(lbt, name)
+    thing = public(name)
     text = inspect.getdoc(thing)
     assert text
     if inspect.isfunction(thing):
@@ -46,7 +94,7 @@ def test_docstrings(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_public_fields_say_which_gain_they_are(name):
-    thing = getattr(lbt, name)
+    thing = public(name)
     for field in getattr(thing, "__dataclass_fields__", {}):
         assert field not in {"K", "k"}
 
@@ -103,4 +151,4 @@ def test_no_public_name_is_shadowed_by_a_module():
         if not info.name.endswith("__main__"):
             importlib.import_module(info.name)
     for name in NAMES:
-        assert not inspect.ismodule(getattr(lbt, name)), name
+        assert not inspect.ismodule(public(name)), name

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 import lbt_synth as lbt
 
 RATE = 1000.0
-SHELL = lbt.PositionLoop.of_bandwidth(
+SHELL = lbt.models.PositionLoop.of_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
 )
-SLOW = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
+SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=[0.6, 0.8])
 
 
@@ -27,7 +27,7 @@ def ran(path, *, noise_nm=0.0, sensor_gain=1.0, frames=300, seed=3, gain=0.1):
 
 
 def record(run, path, **more):
-    return lbt.loop_record(
+    return lbt.identification.loop_record(
         run.measurements[0],
         run.commands[0],
         frame_rate_hz=path.frame_rate_hz,
@@ -82,7 +82,7 @@ def test_with_noise_it_is_phase_and_noise_over_the_gain(delay, gains, noise, mov
         u[k] = 0.99 * u[k - 1] + 0.1 * y[k]
         seen = [u[k - i] if k >= i else np.zeros(2) for i in range(len(taps))]
         residual = phase[k] - sum(c * past for c, past in zip(taps, seen, strict=True))
-    seen = lbt.loop_record(
+    seen = lbt.identification.loop_record(
         y, u, frame_rate_hz=RATE, delay_frames=delay, mirror=path.mirror, unit="nm"
     )
     z = seen.pseudo_open_loop(g)
@@ -93,7 +93,7 @@ def test_with_noise_it_is_phase_and_noise_over_the_gain(delay, gains, noise, mov
 
 def test_an_open_loop_is_its_own_series():
     y = np.random.default_rng(0).standard_normal((50, 1))
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert np.array_equal(seen.pseudo_open_loop(), y)
     assert np.array_equal(seen.pseudo_open_loop(0.5), 2 * y)
     assert not seen.corrections().any()
@@ -105,9 +105,11 @@ def test_a_delay_can_come_later():
     run = ran(path)
     u = run.commands[0].copy()
     u[100, 1] = np.nan
-    unknown = lbt.loop_record(run.measurements[0], u, frame_rate_hz=RATE, unit="nm")
+    unknown = lbt.identification.loop_record(run.measurements[0], u, frame_rate_hz=RATE, unit="nm")
     assert unknown.usable.all()
-    with pytest.raises(lbt.ProblemError, match="delay of this loop is not known; give delay_fram"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="delay of this loop is not known; give delay_fram"
+    ):
         unknown.corrections()
     seen = unknown.with_delay(2.4)
     # taps of u(k-2), u(k-3): frame 100 enters 102 and 103
@@ -123,7 +125,9 @@ def test_a_spoilt_command_spoils_what_its_correction_enters():
     run = ran(path)
     u = run.commands[0].copy()
     u[50] = np.inf
-    seen = lbt.loop_record(run.measurements[0], u, frame_rate_hz=RATE, delay_frames=3, unit="nm")
+    seen = lbt.identification.loop_record(
+        run.measurements[0], u, frame_rate_hz=RATE, delay_frames=3, unit="nm"
+    )
     assert np.flatnonzero(~seen.usable).tolist() == [0, 1, 2, 53]
     assert seen.stretches() == ((3, 53), (54, 300))
     good = seen.usable
@@ -152,7 +156,7 @@ def kinds(seen, *, spoils=True):
 
 def test_a_million_clean_frames_show_nothing():
     y = np.random.default_rng(11).standard_normal((1_000_000, 1))
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert seen.health.clean
     assert seen.health.findings == ()
     assert seen.usable.all()
@@ -179,7 +183,7 @@ def high(t):
 def test_strong_lines_and_coarse_numbers_are_no_faults(line, noise, step):
     y = turbulence(60_000, noise=noise, line=line)
     y = y if step is None else step * np.round(y / step)
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert seen.health.rows() == ()
 
 
@@ -187,7 +191,7 @@ def test_strong_lines_and_coarse_numbers_are_no_faults(line, noise, step):
 def test_a_pure_sinusoid_is_no_fault(step):
     y = sinusoid(np.arange(40_000) / RATE)
     y = y if step is None else step * np.floor(y / step)
-    assert lbt.loop_record(y, frame_rate_hz=RATE, unit="nm").health.rows() == ()
+    assert lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm").health.rows() == ()
 
 
 def test_resonances_and_closed_loops_are_no_faults():
@@ -212,7 +216,7 @@ def test_one_spike_is_one_outlier(seed, at, sign):
     rng = np.random.default_rng(seed)
     y = 15 * rng.standard_normal((5000, 2))
     y[at, 1] += sign * 450  # half of it bends the frame beside an end
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     found = np.flatnonzero(~seen.usable)
     assert at in found
     # beside an end the frames that nothing can judge go with it
@@ -226,7 +230,7 @@ def test_one_spike_is_one_outlier(seed, at, sign):
 def test_spikes_side_by_side(length):
     y = 15 * np.random.default_rng(length).standard_normal(5000)
     y[1000 : 1000 + length] += 400
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     found = set(np.flatnonzero(~seen.usable))
     edges = {1000, 1000 + length - 1}
     assert edges <= found
@@ -238,7 +242,7 @@ def test_gaps_of_every_kind():
     y[100, 0] = np.nan
     y[200:203, 1] = np.inf
     y[500:540, 0] = y[500, 0]
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert seen.health.rows() == (
         ("not finite", "measurements", 0, 1, 0.05, 100, "spoilt"),
         ("stuck", "measurements", 0, 40, 2.0, 500, "spoilt"),
@@ -260,7 +264,7 @@ def test_masked_and_absurd_values_are_gaps():
     y[30] = -3e105
     masked = np.ma.masked_array(y, mask=np.arange(100)[:, None] == 50)
     for unit in ("nm", "m"):
-        seen = lbt.loop_record(masked, frame_rate_hz=RATE, unit=unit)
+        seen = lbt.identification.loop_record(masked, frame_rate_hz=RATE, unit=unit)
         assert np.flatnonzero(~seen.usable).tolist() == [20, 30, 50]
         assert np.all(np.abs(seen.measurements) < 1e11)
 
@@ -268,18 +272,20 @@ def test_masked_and_absurd_values_are_gaps():
 def test_a_dead_axis_leaves_nothing():
     y = np.random.default_rng(0).standard_normal((5000, 2))
     y[:, 1] = 0.0
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert not seen.usable.any()
     assert kinds(seen) == {("stuck", "measurements", 1)}
-    with pytest.raises(lbt.ProblemError, match="got 0, the longest stretch 0. 0 of 5000 frames"):
-        lbt.require_length(seen)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="got 0, the longest stretch 0. 0 of 5000 frames"
+    ):
+        lbt.identification.require_length(seen)
 
 
 @pytest.mark.parametrize("ends", [(-np.inf, 25.0), (-25.0, np.inf), (-25.0, 25.0)])
 def test_a_range_that_is_cut_off_is_found(ends):
     y = 15 * np.random.default_rng(4).standard_normal(20_000)
     cut = np.clip(y, *ends)
-    seen = lbt.loop_record(cut, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(cut, frame_rate_hz=RATE, unit="nm")
     assert kinds(seen) == {("saturated", "measurements", 0)}
     assert np.array_equal(seen.usable, cut == y)
 
@@ -290,7 +296,9 @@ def test_clipped_commands_spoil_open_loops_are_reported():
     u = np.clip(run.commands[0], -250, None)
     u[1000:1100] = 0.0
     u[2000:2050, 0] = u[2000, 0]
-    seen = lbt.loop_record(run.measurements[0], u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    seen = lbt.identification.loop_record(
+        run.measurements[0], u, frame_rate_hz=RATE, delay_frames=2, unit="nm"
+    )
     assert kinds(seen, spoils=False) == {
         ("loop open", "commands", None),
         ("held", "commands", 0),
@@ -307,7 +315,7 @@ def test_clipped_commands_spoil_open_loops_are_reported():
 
 def test_an_open_loop_with_zero_commands():
     y = np.random.default_rng(0).standard_normal((200, 2))
-    seen = lbt.loop_record(y, 0 * y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    seen = lbt.identification.loop_record(y, 0 * y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     assert ("loop open", "commands", None, 200, 100.0, 0, "reported") in seen.health.rows()
     assert seen.usable[2:].all()
     assert np.array_equal(seen.pseudo_open_loop(), y)
@@ -316,7 +324,7 @@ def test_an_open_loop_with_zero_commands():
 def test_a_scatter_that_changes_is_said():
     y = np.random.default_rng(0).standard_normal((4000, 2))
     y[:, 1] *= np.linspace(1, 6, 4000)
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     (note,) = seen.health.notes
     assert note.startswith("axis 1 is not stationary: the rms difference of two frames is 2")
     assert seen.usable.all()
@@ -334,7 +342,7 @@ def test_missing_frames_become_holes(by):
     if by != "times":
         clock["frame_numbers"] = 7000 + kept
     rate = RATE if by == "numbers" else None
-    seen = lbt.loop_record(y[kept], frame_rate_hz=rate, unit="nm", **clock)
+    seen = lbt.identification.loop_record(y[kept], frame_rate_hz=rate, unit="nm", **clock)
     assert np.flatnonzero(~seen.usable).tolist() == [100, 101, 300]
     assert seen.frames == 500
     assert seen.frame_rate_hz == pytest.approx(RATE, rel=1e-5)
@@ -346,22 +354,24 @@ def test_rounded_times_of_a_known_rate():
     kept = np.delete(np.arange(2000), [500, 501])
     times = np.round(kept / 800, 3)  # steps of 1 and 2 ms
     y = np.random.default_rng(0).standard_normal(len(kept))
-    seen = lbt.loop_record(y, frame_rate_hz=800, times_s=times, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=800, times_s=times, unit="nm")
     assert np.flatnonzero(~seen.usable).tolist() == [500, 501]
-    with pytest.raises(lbt.ProblemError, match="the times may be rounded. Give frame_rate_hz"):
-        lbt.loop_record(y, times_s=times, unit="nm")
+    with pytest.raises(
+        lbt.errors.ProblemError, match="the times may be rounded. Give frame_rate_hz"
+    ):
+        lbt.identification.loop_record(y, times_s=times, unit="nm")
 
 
 def test_rows_that_come_twice():
     y = np.random.default_rng(0).standard_normal((100, 2))
     order = np.sort(np.concatenate([np.arange(100), [20, 20, 50]]))
     rows = y[order].copy()
-    same = lbt.loop_record(rows, frame_rate_hz=RATE, frame_numbers=order, unit="nm")
+    same = lbt.identification.loop_record(rows, frame_rate_hz=RATE, frame_numbers=order, unit="nm")
     assert same.usable.all()
     assert np.array_equal(same.measurements, y)
     assert same.health.notes == ("3 rows of a time that had been recorded already were left out",)
     rows[np.flatnonzero(order == 50)[1]] += 1  # two stories of one frame
-    torn = lbt.loop_record(rows, times_s=order / RATE, unit="nm")
+    torn = lbt.identification.loop_record(rows, times_s=order / RATE, unit="nm")
     assert np.flatnonzero(~torn.usable).tolist() == [50]
     assert torn.health.rows() == (("repeated", "frames", None, 1, 1.0, 50, "spoilt"),)
 
@@ -389,8 +399,8 @@ def test_rows_that_come_twice():
 )
 def test_clocks_that_are_refused(clock, words):
     y = np.random.default_rng(0).standard_normal((6, 1))
-    with pytest.raises(lbt.ProblemError, match=words):
-        lbt.loop_record(y, unit="nm", **clock)
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        lbt.identification.loop_record(y, unit="nm", **clock)
 
 
 # ------------------------------------------------------------ bridges, length
@@ -401,7 +411,9 @@ def test_short_holes_are_bridged_on_the_pseudo_open_loop():
     y[300, 0] = np.nan
     y[700:703] = np.nan
     y[900:904] = np.nan
-    seen = lbt.loop_record(y, run.commands[0], frame_rate_hz=RATE, delay_frames=2.4, unit="nm")
+    seen = lbt.identification.loop_record(
+        y, run.commands[0], frame_rate_hz=RATE, delay_frames=2.4, unit="nm"
+    )
     whole = seen.bridged(sensor_gain=0.6)
     assert whole.health.bridged == 4
     assert "4 frames in 2 holes of at most 3 were interpolated" in whole.health.notes
@@ -427,7 +439,7 @@ def test_bridges_have_a_budget():
     y = np.random.default_rng(0).standard_normal(1000)
     y[[100, 200, 300]] = np.nan
     y[400:402] = y[500:503] = np.nan
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     part = seen.bridged(most_fraction=0.005)
     assert part.health.bridged == 5
     assert part.health.notes[-1].endswith("1 more such holes were left, beyond 0.5 %")
@@ -435,29 +447,31 @@ def test_bridges_have_a_budget():
     assert seen.bridged(1).health.bridged == 3
     assert seen.bridged(most_fraction=0.0) is seen
     for bad in ({"most": 0}, {"most_fraction": 2}, {"sensor_gain": 0}, {"sensor_gain": [1, 1]}):
-        with pytest.raises(lbt.ProblemError, match="must be"):
+        with pytest.raises(lbt.errors.ProblemError, match="must be"):
             seen.bridged(**bad)
 
 
 def test_a_hole_with_one_frame_beside_it_is_bridged_straight():
     y = np.array([1.0, 2.0, np.nan, 4.0, np.nan, 7.0, 9.0, 3.0, 2.0, 5.0])
-    seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm").bridged(most_fraction=1)
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm").bridged(most_fraction=1)
     assert seen.measurements[[2, 4], 0] == pytest.approx([3.0, 5.5])
 
 
 def test_length():
     y = np.random.default_rng(0).standard_normal(6000)
     y[::200] = np.nan  # stretches of 199
-    broken = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
-    with pytest.raises(lbt.ProblemError, match=r"needs 4096 usable frames \(4.1 s\).*got 0, the l"):
-        lbt.require_length(broken)
-    assert lbt.require_length(broken.bridged()) == 5999
+    broken = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"needs 4096 usable frames \(4.1 s\).*got 0, the l"
+    ):
+        lbt.identification.require_length(broken)
+    assert lbt.identification.require_length(broken.bridged()) == 5999
     whole = broken.bridged()
-    with pytest.raises(lbt.ProblemError, match=r"needs 7000 usable frames \(7 s\)"):
-        lbt.require_length(whole, seconds=7)
-    assert lbt.require_length(whole, resolution_hz=0.2) == 5999
-    with pytest.raises(lbt.ProblemError, match="0.1 Hz apart a stretch of 10000 frames"):
-        lbt.require_length(whole, resolution_hz=0.1)
-    quick = lbt.loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
-    with pytest.raises(lbt.ProblemError, match="needs 8000 usable frames"):
-        lbt.require_length(quick)
+    with pytest.raises(lbt.errors.ProblemError, match=r"needs 7000 usable frames \(7 s\)"):
+        lbt.identification.require_length(whole, seconds=7)
+    assert lbt.identification.require_length(whole, resolution_hz=0.2) == 5999
+    with pytest.raises(lbt.errors.ProblemError, match="0.1 Hz apart a stretch of 10000 frames"):
+        lbt.identification.require_length(whole, resolution_hz=0.1)
+    quick = lbt.identification.loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
+    with pytest.raises(lbt.errors.ProblemError, match="needs 8000 usable frames"):
+        lbt.identification.require_length(quick)

@@ -22,7 +22,9 @@ def noise(frames, seed=0):
 @pytest.mark.parametrize("rounding", [np.round, np.floor])
 def test_rounded_times_lose_no_frame_at_a_known_rate(rate, rounding):
     y, ms = noise(40_000), np.arange(40_000) / rate * 1e3
-    seen = lbt.loop_record(y, frame_rate_hz=rate, times_s=1e-3 * rounding(ms + 0.25), unit="nm")
+    seen = lbt.identification.loop_record(
+        y, frame_rate_hz=rate, times_s=1e-3 * rounding(ms + 0.25), unit="nm"
+    )
     assert seen.frame_rate_hz == rate
     assert np.array_equal(seen.measurements[:, 0], y)
     assert seen.usable.all()
@@ -31,8 +33,10 @@ def test_rounded_times_lose_no_frame_at_a_known_rate(rate, rounding):
 @pytest.mark.parametrize("rate", [800, 900, 997, 998.5, 1001, 1003, 1050, 1200, 1500])
 def test_rounded_times_do_not_tell_the_rate(rate):
     times = np.round(np.arange(30_000) / rate, 3)
-    with pytest.raises(lbt.ProblemError, match="the times may be rounded. Give frame_rate_hz"):
-        lbt.loop_record(noise(30_000), times_s=times, unit="nm")
+    with pytest.raises(
+        lbt.errors.ProblemError, match="the times may be rounded. Give frame_rate_hz"
+    ):
+        lbt.identification.loop_record(noise(30_000), times_s=times, unit="nm")
 
 
 @settings(max_examples=60, deadline=None)
@@ -49,8 +53,8 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
     times = quantum * np.round((kept / rate + phase) / quantum)
     y = noise(frames)
     try:
-        seen = lbt.loop_record(y[kept], frame_rate_hz=rate, times_s=times, unit="nm")
-    except lbt.ProblemError:
+        seen = lbt.identification.loop_record(y[kept], frame_rate_hz=rate, times_s=times, unit="nm")
+    except lbt.errors.ProblemError:
         # never without a reason: times as coarse as frames
         assert quantum * rate > 0.7
         return
@@ -67,7 +71,9 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
 def test_a_lost_frame_of_exact_times_is_still_found():
     kept = np.delete(np.arange(4000), [1700])
     for rate, times in ((1000.0, kept / 1000), (1003.0, kept / 1003)):
-        seen = lbt.loop_record(noise(3999), frame_rate_hz=rate, times_s=times, unit="nm")
+        seen = lbt.identification.loop_record(
+            noise(3999), frame_rate_hz=rate, times_s=times, unit="nm"
+        )
         assert np.flatnonzero(~seen.usable).tolist() == [1700]
 
 
@@ -75,35 +81,50 @@ def test_a_lost_frame_that_rounding_hides_is_refused():
     kept = np.delete(np.arange(40_000), [17_000])
     for rate in (1003, 2000):
         times = np.floor(kept / rate * 1e3 + 1e-6) / 1e3
-        with pytest.raises(lbt.ProblemError, match="cannot tell which frames are missing"):
-            lbt.loop_record(noise(39_999), frame_rate_hz=rate, times_s=times, unit="nm")
+        with pytest.raises(lbt.errors.ProblemError, match="cannot tell which frames are missing"):
+            lbt.identification.loop_record(
+                noise(39_999), frame_rate_hz=rate, times_s=times, unit="nm"
+            )
     # and so it is where the rate is not quite that of the times
     kept = np.delete(np.arange(4000), [1700])
-    with pytest.raises(lbt.ProblemError, match="cannot tell which frames are missing"):
-        lbt.loop_record(noise(3999), frame_rate_hz=1000.1, times_s=kept / 1000, unit="nm")
+    with pytest.raises(lbt.errors.ProblemError, match="cannot tell which frames are missing"):
+        lbt.identification.loop_record(
+            noise(3999), frame_rate_hz=1000.1, times_s=kept / 1000, unit="nm"
+        )
     # 300 frames of 999 Hz in ms: one step of 2 ms, by rounding or by a frame that is lost
     times = np.floor(np.arange(300) / 999 * 1e3 + 0.9) / 1e3
-    with pytest.raises(lbt.ProblemError, match="cannot tell rounding from missing"):
-        lbt.loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
+    with pytest.raises(lbt.errors.ProblemError, match="cannot tell rounding from missing"):
+        lbt.identification.loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
 
 
 def test_a_stated_rate_is_held_against_the_times():
     times = np.arange(20_000) / 1000
     for rate in (1004, 999, 1000.2):
-        with pytest.raises(lbt.ProblemError, match="must be that of the times, 1000 Hz; got"):
-            lbt.loop_record(noise(20_000), frame_rate_hz=rate, times_s=times, unit="nm")
-    near = lbt.loop_record(noise(20_000), frame_rate_hz=1000.05, times_s=times, unit="nm")
+        with pytest.raises(
+            lbt.errors.ProblemError, match="must be that of the times, 1000 Hz; got"
+        ):
+            lbt.identification.loop_record(
+                noise(20_000), frame_rate_hz=rate, times_s=times, unit="nm"
+            )
+    near = lbt.identification.loop_record(
+        noise(20_000), frame_rate_hz=1000.05, times_s=times, unit="nm"
+    )
     assert near.frame_rate_hz == 1000.05
     assert near.health.notes == (
         "frame rate 1000.05 Hz, as stated; by the times 1000 Hz, 1 frames apart over the record",
     )
     # with a counter beside the times, too
-    with pytest.raises(lbt.ProblemError, match="must be that of the times"):
-        lbt.loop_record(
-            noise(20_000), frame_rate_hz=1004, times_s=times, frame_numbers=np.arange(20_000),
+    with pytest.raises(lbt.errors.ProblemError, match="must be that of the times"):
+        lbt.identification.loop_record(
+            noise(20_000),
+            frame_rate_hz=1004,
+            times_s=times,
+            frame_numbers=np.arange(20_000),
             unit="nm",
-        )  # fmt: skip
-    same = lbt.loop_record(noise(20_000), frame_rate_hz=1000, times_s=times, unit="nm")
+        )
+    same = lbt.identification.loop_record(
+        noise(20_000), frame_rate_hz=1000, times_s=times, unit="nm"
+    )
     assert same.health.notes == ()
 
 
@@ -111,16 +132,18 @@ def test_jumps_beyond_all_integers():
     late = np.arange(50.0)
     late[30:] += 1e19
     for clock in ({"frame_numbers": late}, {"times_s": late}):
-        with pytest.raises(lbt.ProblemError, match=r"frames would be missing .* cut the record"):
-            lbt.loop_record(noise(50), frame_rate_hz=500, unit="nm", **clock)
-    with pytest.raises(lbt.ProblemError, match="frames would be missing"):
-        lbt.loop_record(noise(50), times_s=late, unit="nm")
+        with pytest.raises(
+            lbt.errors.ProblemError, match=r"frames would be missing .* cut the record"
+        ):
+            lbt.identification.loop_record(noise(50), frame_rate_hz=500, unit="nm", **clock)
+    with pytest.raises(lbt.errors.ProblemError, match="frames would be missing"):
+        lbt.identification.loop_record(noise(50), times_s=late, unit="nm")
 
 
 def test_repeated_rows_take_a_time_in_proportion():
     rows = np.repeat(np.arange(60_000), 2)
     start = time.perf_counter()
-    seen = lbt.loop_record(
+    seen = lbt.identification.loop_record(
         np.repeat(noise(60_000), 2), frame_rate_hz=500, frame_numbers=rows, unit="nm"
     )
     assert time.perf_counter() - start < 2  # not with its square

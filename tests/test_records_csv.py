@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lbt_synth.records.csvfile import read_csv
+from lbt_synth.identification.records.csv_file import read_csv
 
 
 @settings(max_examples=40)

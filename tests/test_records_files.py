@@ -83,7 +83,7 @@ def test_every_format_gives_the_same_record(tmp_path, series, kind):
             "columns": {"measurements": (0, 1), "commands": (2, 3)},
         }
     seen = lbt.load_record(path, **options)
-    assert isinstance(seen, lbt.LoopRecord)
+    assert isinstance(seen, lbt.identification.LoopRecord)
     assert np.array_equal(seen.measurements, y)
     assert np.array_equal(seen.commands, u)
     assert (seen.frame_rate_hz, seen.delay_frames, seen.source) == (RATE, 2.0, str(path))
@@ -96,11 +96,11 @@ def test_every_format_gives_the_same_record(tmp_path, series, kind):
 def test_telemetry_of_ours(tmp_path):
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.4)
     truth = lbt.Truth(
-        turbulence=None, vibrations=(lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100),)
+        turbulence=None, vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),)
     )
     run = lbt.simulate(lbt.integrator(path, gain=0.2).controller, truth, hardware=path, frames=99)
     for name in ("a.fits", "a.npz"):
-        file = lbt.save_telemetry(tmp_path / name, lbt.telemetry_of(run, path))
+        file = lbt.files.save_telemetry(tmp_path / name, lbt.files.telemetry_of(run, path))
         seen = lbt.load_record(file)
         assert np.array_equal(seen.measurements, run.measurements[0])
         assert np.array_equal(seen.mirror_taps, path.mirror_taps)
@@ -111,23 +111,25 @@ def test_telemetry_of_ours(tmp_path):
             ({"kind": "open_loop"}, "kind must be closed_loop"),
             ({"columns": {"measurements": 0}}, "neither columns nor commands"),
         ):
-            with pytest.raises(lbt.ProblemError, match=words):
+            with pytest.raises(lbt.errors.ProblemError, match=words):
                 lbt.load_record(file, **options)
     damaged = bytearray((tmp_path / "a.fits").read_bytes())
     damaged[12_000] ^= 1
     (tmp_path / "b.fits").write_bytes(damaged)
-    with pytest.raises(lbt.TelemetryError, match=r"b\.fits"):
+    with pytest.raises(lbt.errors.TelemetryError, match=r"b\.fits"):
         lbt.load_record(tmp_path / "b.fits")
 
 
 @pytest.mark.e2e
 def test_telemetry_of_the_standard(tmp_path):
     rng = np.random.default_rng(0)
-    seen = lbt.Telemetry(
-        frame_rate_hz=800, delay_frames=2, commands=rng.standard_normal((50, 2)),
+    seen = lbt.files.Telemetry(
+        frame_rate_hz=800,
+        delay_frames=2,
+        commands=rng.standard_normal((50, 2)),
         measurements=rng.standard_normal((50, 2)),
-    )  # fmt: skip
-    back = lbt.load_record(lbt.save_telemetry(tmp_path / "a.aot.fits", seen))
+    )
+    back = lbt.load_record(lbt.files.save_telemetry(tmp_path / "a.aot.fits", seen))
     assert np.allclose(back.measurements, seen.measurements)
     assert np.allclose(back.commands, seen.commands)
     assert np.flatnonzero(~back.usable).tolist() == [0, 1]
@@ -178,7 +180,9 @@ def test_open_loops(tmp_path, series, names, kind):
 
 def test_measurements_alone_are_not_taken_for_an_open_loop(tmp_path, series):
     path = write_csv(tmp_path / "a.csv", ["y0_nm", "y1_nm"], series[0].T)
-    with pytest.raises(lbt.ProblemError, match="Residuals of a closed loop need its commands"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="Residuals of a closed loop need its commands"
+    ):
         lbt.load_record(path, frame_rate_hz=RATE)
 
 
@@ -189,7 +193,9 @@ def test_open_loop_and_commands(tmp_path, series):
     assert seen.commands is None
     assert "commands were left out: the record is of an open loop" in seen.health.notes
     both = write_csv(tmp_path / "b.csv", ["y_nm", "u_nm", "pol_nm"], [*y.T, u[:, 0]])
-    with pytest.raises(lbt.ProblemError, match="more than one record; say kind: open_loop or clos"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="more than one record; say kind: open_loop or clos"
+    ):
         lbt.load_record(both, frame_rate_hz=RATE)
     assert lbt.load_record(both, kind="open_loop", frame_rate_hz=RATE).measurements[
         :, 0
@@ -203,7 +209,7 @@ def test_columns_are_chosen(tmp_path, series):
     )
     choice = {"measurements": ["a", 1], "commands": ("C", "d"), "times": "stamp"}
     seen = lbt.load_record(path, columns=choice, unit="mas", diameter_m=8, command_unit="nm")
-    assert np.allclose(seen.measurements, lbt.nm_per_mas(8) * y)
+    assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8) * y)
     assert np.array_equal(seen.commands, u)
     assert seen.frame_rate_hz == RATE
     one = lbt.load_record(path, columns={"open_loop": "b"}, unit="nm", frame_rate_hz=RATE)
@@ -215,12 +221,16 @@ def test_axes_of_many_columns(tmp_path):
     y, u = np.random.default_rng(0).standard_normal((2, 60, 5))
     path = tmp_path / "a.npz"
     np.savez(path, y=y, u=u, fs=RATE)
-    with pytest.raises(lbt.ProblemError, match="5 columns of measurements; say which.*axes="):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="5 columns of measurements; say which.*axes="
+    ):
         lbt.load_record(path, unit="nm")
     seen = lbt.load_record(path, unit="nm", axes=(3, 1))
     assert np.array_equal(seen.measurements, y[:, [3, 1]])
     assert np.array_equal(seen.commands, u[:, [3, 1]])
-    with pytest.raises(lbt.ProblemError, match="axes must be one or two different numbers below 5"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="axes must be one or two different numbers below 5"
+    ):
         lbt.load_record(path, unit="nm", axes=(0, 5))
 
 
@@ -235,9 +245,11 @@ def test_commands_from_another_file(tmp_path, series):
     assert np.array_equal(seen.commands, u)
     assert f"commands are from {tmp_path / 'u.npy'}" in seen.health.notes
     np.save(tmp_path / "v.npy", u[:-1])
-    with pytest.raises(lbt.TelemetryError, match="as many frames as the measurements; got 59, 60"):
+    with pytest.raises(
+        lbt.errors.TelemetryError, match="as many frames as the measurements; got 59, 60"
+    ):
         lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "v.npy", unit="nm")
-    with pytest.raises(lbt.TelemetryError, match="cannot read .*w.npy: No such file"):
+    with pytest.raises(lbt.errors.TelemetryError, match="cannot read .*w.npy: No such file"):
         lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "w.npy", unit="nm")
 
 
@@ -254,7 +266,9 @@ def test_gaps_times_and_counters(tmp_path):
     assert seen.frame_rate_hz == 500
     assert np.flatnonzero(~seen.usable).tolist() == [7, 8, 20, 30]
     assert [row[0] for row in seen.health.rows()] == ["missing", "not finite"]
-    with pytest.raises(lbt.ProblemError, match=r"a\.csv: frame_rate_hz must be that of the times"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"a\.csv: frame_rate_hz must be that of the times"
+    ):
         lbt.load_record(path, kind="open_loop", frame_rate_hz=800)
 
 
@@ -266,19 +280,26 @@ def test_rates_in_headers(tmp_path, series, card):
     seen = lbt.load_record(path)
     assert seen.frame_rate_hz == RATE
     assert any(note.startswith("frame_rate_hz 500, by") for note in seen.health.notes)
-    with pytest.raises(lbt.ProblemError, match="frame_rate_hz must be that of the file, 500 by"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="frame_rate_hz must be that of the file, 500 by"
+    ):
         lbt.load_record(path, frame_rate_hz=1000)
 
 
 def test_delays_and_diameters_in_headers(tmp_path, series):
     y, u = series
     path = hdus(
-        tmp_path / "a.fits", image("Y", y, "mas"), image("U", u, "mas"),
-        FRAMRATE=RATE, DELAY=(2.5, "[frames] of the loop"), DIAMETER=8.0, OBSTRUCT=0.11,
-    )  # fmt: skip
+        tmp_path / "a.fits",
+        image("Y", y, "mas"),
+        image("U", u, "mas"),
+        FRAMRATE=RATE,
+        DELAY=(2.5, "[frames] of the loop"),
+        DIAMETER=8.0,
+        OBSTRUCT=0.11,
+    )
     seen = lbt.load_record(path)
     assert (seen.delay_frames, seen.diameter_m, seen.obstruction) == (2.5, 8.0, 0.11)
-    assert np.allclose(seen.measurements, lbt.nm_per_mas(8.0) * y)
+    assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * y)
     other = lbt.load_record(path, delay_frames=3, diameter_m=8.4)
     assert (other.delay_frames, other.diameter_m) == (3.0, 8.4)
     assert any("3 was given; the file has 2.5" in note for note in other.health.notes)
@@ -288,7 +309,7 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     assert seen.delay_frames is None
     assert any("does not say that it is in frames" in note for note in seen.health.notes)
     twice = hdus(tmp_path / "c.fits", image("POL", y, "nm", FPS=400.0), FRAMRATE=RATE)
-    with pytest.raises(lbt.ProblemError, match="frame_rate_hz is told twice"):
+    with pytest.raises(lbt.errors.ProblemError, match="frame_rate_hz is told twice"):
         lbt.load_record(twice)
 
 
@@ -309,24 +330,26 @@ def test_units_have_to_be_told(tmp_path, series):
     y, _ = series
     path = write_csv(tmp_path / "a.csv", ["pol"], [y[:, 0]])
     with pytest.raises(
-        lbt.ProblemError, match="does not tell the unit of the measurements; give u"
+        lbt.errors.ProblemError, match="does not tell the unit of the measurements; give u"
     ):
         lbt.load_record(path, frame_rate_hz=RATE)
     assert lbt.load_record(path, frame_rate_hz=RATE, unit="um").measurements[0, 0] == pytest.approx(
         1e3 * y[0, 0]
     )
     told = write_csv(tmp_path / "b.csv", ["pol_nm"], [y[:, 0]])
-    with pytest.raises(lbt.ProblemError, match="unit must be that of the file, 'nm'; got 'mas'"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="unit must be that of the file, 'nm'; got 'mas'"
+    ):
         lbt.load_record(told, frame_rate_hz=RATE, unit="mas", diameter_m=8)
     assert lbt.load_record(told, frame_rate_hz=RATE, unit="nanometer").axes == 1
     mixed = write_csv(tmp_path / "c.csv", ["pol0_nm", "pol1_um"], y.T)
-    with pytest.raises(lbt.ProblemError, match="must all have the same unit; got nm, um"):
+    with pytest.raises(lbt.errors.ProblemError, match="must all have the same unit; got nm, um"):
         lbt.load_record(mixed, frame_rate_hz=RATE)
     pixels = hdus(tmp_path / "d.fits", image("POL", y, "pixel"), FPS=RATE)
-    with pytest.raises(lbt.ProblemError, match="unit must be one of nm.*got 'pixel'"):
+    with pytest.raises(lbt.errors.ProblemError, match="unit must be one of nm.*got 'pixel'"):
         lbt.load_record(pixels)
     angle = hdus(tmp_path / "e.fits", image("POL", y, "arcsec"), FPS=RATE)
-    with pytest.raises(lbt.ProblemError, match=r"e\.fits: angles of tilt.*give diameter_m"):
+    with pytest.raises(lbt.errors.ProblemError, match=r"e\.fits: angles of tilt.*give diameter_m"):
         lbt.load_record(angle)
 
 
@@ -347,7 +370,7 @@ def test_spectra(tmp_path, form):
         fits.PrimaryHDU(np.vstack([f, s.T])).writeto(path)
         options = {"kind": "spectrum", "unit": "nm**2/Hz"}
     seen = lbt.load_record(path, averages=12, frame_rate_hz=RATE, **options)
-    assert isinstance(seen, lbt.SpectrumRecord)
+    assert isinstance(seen, lbt.identification.SpectrumRecord)
     assert np.array_equal(seen.frequency_hz, f)
     assert np.allclose(seen.density_nm2_hz, s)
     assert (seen.averages, seen.frame_rate_hz, seen.axes) == (12, RATE, 2)
@@ -361,20 +384,22 @@ def test_amplitude_spectra_and_angles(tmp_path):
     f = np.linspace(1, 50, 40)
     path = write_csv(tmp_path / "a.csv", ["f_hz", "asd_mas_rthz"], [f, 0 * f + 3])
     seen = lbt.load_record(path, diameter_m=8.0)
-    assert np.allclose(seen.density_nm2_hz, (3 * lbt.nm_per_mas(8.0)) ** 2)
+    assert np.allclose(seen.density_nm2_hz, (3 * lbt.models.nm_per_mas(8.0)) ** 2)
     power = write_csv(tmp_path / "b.csv", ["f_hz", "psd"], [f, 0 * f + 3])
     seen = lbt.load_record(power, unit="mas^2/Hz", diameter_m=8.0)
-    assert np.allclose(seen.density_nm2_hz, 3 * lbt.nm_per_mas(8.0) ** 2)
-    with pytest.raises(lbt.ProblemError, match="unit of a density is a square over Hz.*got 'nm'"):
+    assert np.allclose(seen.density_nm2_hz, 3 * lbt.models.nm_per_mas(8.0) ** 2)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="unit of a density is a square over Hz.*got 'nm'"
+    ):
         lbt.load_record(power, unit="nm")
     assert any(note.startswith("2 rows with gaps") for note in gapped(tmp_path).notes)
     wrong = write_csv(tmp_path / "c.csv", ["f_hz", "asd_nm2_hz"], [f, f])
-    with pytest.raises(lbt.ProblemError, match="named as an amplitude"):
+    with pytest.raises(lbt.errors.ProblemError, match="named as an amplitude"):
         lbt.load_record(wrong)
     back = write_csv(tmp_path / "d.csv", ["f_hz", "psd_nm2_hz"], [f[::-1], f])
-    with pytest.raises(lbt.ProblemError, match="must increase"):
+    with pytest.raises(lbt.errors.ProblemError, match="must increase"):
         lbt.load_record(back)
-    with pytest.raises(lbt.ProblemError, match="below half the frame rate, 30 Hz; got 50"):
+    with pytest.raises(lbt.errors.ProblemError, match="below half the frame rate, 30 Hz; got 50"):
         lbt.load_record(
             write_csv(tmp_path / "e.csv", ["f_hz", "psd_nm2_hz"], [f, f]), frame_rate_hz=60
         )
@@ -420,7 +445,7 @@ def gapped(folder):
 def test_what_is_refused(tmp_path, series, names, options, words):
     y, u = series
     path = write_csv(tmp_path / "night.csv", names, [*y.T, *u.T])
-    with pytest.raises(lbt.ProblemError, match=words) as caught:
+    with pytest.raises(lbt.errors.ProblemError, match=words) as caught:
         lbt.load_record(path, **{"frame_rate_hz": RATE, **options})
     if "kind must" not in words and "columns must" not in words:
         assert "night.csv" in str(caught.value)
@@ -443,7 +468,7 @@ def test_what_is_refused(tmp_path, series, names, options, words):
 )
 def test_damage(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(lbt.TelemetryError, match=words) as caught:
+    with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
         lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
     assert "Traceback" not in str(caught.value)
 
@@ -471,19 +496,19 @@ def test_no_pickle_is_opened(tmp_path):
     np.save(tmp_path / "a.npy", np.array([{"y": 1}], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "b.npz", y=np.array([{"y": 1}], dtype=object))
     for name in ("a.npy", "b.npz"):
-        with pytest.raises(lbt.TelemetryError, match="cannot read"):
+        with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
             lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
 
 
 def test_a_missing_file():
-    with pytest.raises(lbt.TelemetryError, match=r"cannot read nowhere\.csv: No such file"):
+    with pytest.raises(lbt.errors.TelemetryError, match=r"cannot read nowhere\.csv: No such file"):
         lbt.load_record("nowhere.csv")
 
 
 def test_files_without_series(tmp_path):
     np.savez(tmp_path / "a.npz", frame_rate_hz=3.0)
-    with pytest.raises(lbt.ProblemError, match="holds no series of numbers"):
+    with pytest.raises(lbt.errors.ProblemError, match="holds no series of numbers"):
         lbt.load_record(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", cube=np.ones((3, 4, 5)), text=np.array(["a", "b"]))
-    with pytest.raises(lbt.ProblemError, match="holds no series of numbers"):
+    with pytest.raises(lbt.errors.ProblemError, match="holds no series of numbers"):
         lbt.load_record(tmp_path / "b.npz")

@@ -10,10 +10,10 @@ import pytest
 import lbt_synth as lbt
 
 RATE = 1000.0
-SHELL = lbt.PositionLoop.of_bandwidth(
+SHELL = lbt.models.PositionLoop.of_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
 )
-SLOW = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
+SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
 
 
 # -------------------------------------------------------------------- units
@@ -32,16 +32,18 @@ SLOW = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
 )
 def test_units(unit, factor):
     y = np.array([1.0, 2.0, -1.0])
-    seen = lbt.loop_record(y / factor, frame_rate_hz=RATE, unit=unit, diameter_m=8.22)
+    seen = lbt.identification.loop_record(
+        y / factor, frame_rate_hz=RATE, unit=unit, diameter_m=8.22
+    )
     assert seen.measurements[:, 0] == pytest.approx(y, rel=1e-5)
     if unit in ("mas", "arcsec", "urad", "rad"):
-        with pytest.raises(lbt.ProblemError, match="give diameter_m"):
-            lbt.loop_record(y, frame_rate_hz=RATE, unit=unit)
+        with pytest.raises(lbt.errors.ProblemError, match="give diameter_m"):
+            lbt.identification.loop_record(y, frame_rate_hz=RATE, unit=unit)
 
 
 def test_commands_may_have_a_unit_of_their_own():
     y = np.random.default_rng(0).standard_normal((30, 1))
-    seen = lbt.loop_record(y, y, frame_rate_hz=RATE, unit="nm", command_unit="um")
+    seen = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm", command_unit="um")
     assert np.allclose(seen.commands, 1e3 * y)
 
 
@@ -65,25 +67,27 @@ def test_commands_may_have_a_unit_of_their_own():
 def test_arrays_that_are_refused(change, words):
     y = np.random.default_rng(0).standard_normal((30, 2))
     fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE, "unit": "nm"}
-    with pytest.raises(lbt.ProblemError, match=words):
-        lbt.loop_record(**{**fields, **change})
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        lbt.identification.loop_record(**{**fields, **change})
 
 
 def test_a_mirror_that_does_not_fit_the_rate_is_refused():
     y = np.random.default_rng(0).standard_normal((30, 1))
-    with pytest.raises(lbt.ProblemError, match="whole number of samples a frame"):
-        lbt.loop_record(y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm")
+    with pytest.raises(lbt.errors.ProblemError, match="whole number of samples a frame"):
+        lbt.identification.loop_record(
+            y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm"
+        )
 
 
 def test_records_are_frozen():
-    seen = lbt.loop_record([1.0, 2.0], [1.0, 3.0], frame_rate_hz=RATE, unit="nm")
+    seen = lbt.identification.loop_record([1.0, 2.0], [1.0, 3.0], frame_rate_hz=RATE, unit="nm")
     for name in ("measurements", "commands", "usable", "measured", "commanded"):
         assert not getattr(seen, name).flags.writeable
     with pytest.raises(dataclasses.FrozenInstanceError):
         seen.source = "x"
-    with pytest.raises(lbt.DimensionError, match="usable must be 2 truth values"):
+    with pytest.raises(lbt.errors.DimensionError, match="usable must be 2 truth values"):
         dataclasses.replace(seen, usable=np.ones(3, dtype=bool))
-    with pytest.raises(lbt.DimensionError, match="commands must have 2 rows"):
+    with pytest.raises(lbt.errors.DimensionError, match="commands must have 2 rows"):
         dataclasses.replace(seen, commands=np.ones((3, 1)))
 
 
@@ -96,7 +100,7 @@ def telemetry(frames=60, **changes):
         "commands": rng.standard_normal((frames, 2)),
         "measurements": rng.standard_normal((frames, 2)),
     }
-    return lbt.Telemetry(**{**fields, **changes})
+    return lbt.files.Telemetry(**{**fields, **changes})
 
 
 @pytest.mark.parametrize("axes", [1, 2])
@@ -112,7 +116,7 @@ def test_telemetry_of_a_simulation_with_matrices(axes):
     truth = lbt.Truth(turbulence=SLOW, sensor_gain=0.7)
     design = lbt.integrator(path, gain=0.1)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=400, seed=5)
-    seen = lbt.record_of(lbt.telemetry_of(run, path))
+    seen = lbt.identification.record_of(lbt.files.telemetry_of(run, path))
     assert seen.axes == axes
     first = len(path.mirror_taps)
     z = seen.pseudo_open_loop(0.7)[first:]
@@ -126,17 +130,19 @@ def test_modes_of_many():
     rng = np.random.default_rng(0)
     y, u = rng.standard_normal((2, 60, 5))
     many = telemetry(measurements=y, commands=u, diameter_m=8.0, name="night")
-    with pytest.raises(lbt.ProblemError, match=r"has 5 modes; say which are tip and tilt: modes="):
-        lbt.record_of(many)
-    seen = lbt.record_of(many, modes=(1, 0))
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"has 5 modes; say which are tip and tilt: modes="
+    ):
+        lbt.identification.record_of(many)
+    seen = lbt.identification.record_of(many, modes=(1, 0))
     assert np.array_equal(seen.measurements, y[:, [1, 0]])
     assert np.array_equal(seen.commands, u[:, [1, 0]])
     assert "axes are modes 1, 0 of 5" in seen.health.notes
     assert (seen.diameter_m, seen.source) == (8.0, "night")
-    assert lbt.record_of(many, modes=[3]).axes == 1
+    assert lbt.identification.record_of(many, modes=[3]).axes == 1
     for bad in ((0, 0), (5,), (0, 1, 2), ()):
-        with pytest.raises(lbt.ProblemError, match="one or two different modes below 5"):
-            lbt.record_of(many, modes=bad)
+        with pytest.raises(lbt.errors.ProblemError, match="one or two different modes below 5"):
+            lbt.identification.record_of(many, modes=bad)
 
 
 def test_slopes_with_their_modes_and_without():
@@ -145,7 +151,7 @@ def test_slopes_with_their_modes_and_without():
     phase = rng.standard_normal((60, 3))
     slopes = phase @ S.T
     R = np.linalg.pinv(S)
-    seen = lbt.record_of(
+    seen = lbt.identification.record_of(
         telemetry(
             measurements=slopes @ R.T,
             slopes=slopes,
@@ -157,20 +163,25 @@ def test_slopes_with_their_modes_and_without():
     )
     assert np.allclose(seen.measurements, phase[:, :2])
     # a reconstructor of another gain is taken out
-    half = lbt.record_of(
+    half = lbt.identification.record_of(
         telemetry(
-            measurements=slopes @ R.T / 2, slopes=slopes, interaction_matrix=S,
-            reconstructor=R / 2, commands=phase,
+            measurements=slopes @ R.T / 2,
+            slopes=slopes,
+            interaction_matrix=S,
+            reconstructor=R / 2,
+            commands=phase,
         ),
         modes=(0, 1),
-    )  # fmt: skip
+    )
     assert np.allclose(half.measurements, phase[:, :2])
-    with pytest.raises(lbt.ProblemError, match=r"slopes without modal coefficients.*slopes @ R.T"):
-        lbt.record_of(
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"slopes without modal coefficients.*slopes @ R.T"
+    ):
+        lbt.identification.record_of(
             telemetry(measurements=slopes, interaction_matrix=S, commands=phase), modes=(0, 1)
         )
-    with pytest.raises(lbt.ProblemError, match="slopes without modal coefficients"):
-        lbt.record_of(telemetry(measurements=slopes, influence_matrix=np.eye(2)))
+    with pytest.raises(lbt.errors.ProblemError, match="slopes without modal coefficients"):
+        lbt.identification.record_of(telemetry(measurements=slopes, influence_matrix=np.eye(2)))
 
 
 @pytest.mark.parametrize(
@@ -190,20 +201,23 @@ def test_slopes_with_their_modes_and_without():
     ],
 )
 def test_telemetry_that_is_refused(telemetry_changes, options, words):
-    with pytest.raises(lbt.ProblemError, match=words):
-        lbt.record_of(telemetry(**telemetry_changes), **options)
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        lbt.identification.record_of(telemetry(**telemetry_changes), **options)
 
 
 def test_what_telemetry_does_not_tell_is_given():
-    seen = lbt.record_of(
+    seen = lbt.identification.record_of(
         telemetry(measurement_unit="px", command_unit="V", delay_frames=None),
-        delay_frames=2.5, diameter_m=8.0, unit="mas", command_unit="nm",
-    )  # fmt: skip
+        delay_frames=2.5,
+        diameter_m=8.0,
+        unit="mas",
+        command_unit="nm",
+    )
     assert seen.delay_frames == 2.5
-    assert np.allclose(seen.measurements, lbt.nm_per_mas(8.0) * telemetry().measurements)
+    assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * telemetry().measurements)
     assert np.array_equal(seen.commands, telemetry().commands)
-    other = lbt.record_of(telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5)
+    other = lbt.identification.record_of(telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5)
     assert (other.delay_frames, other.diameter_m) == (3.0, 6.5)
     assert "delay_frames 3 was given; the telemetry has 2" in other.health.notes
-    with pytest.raises(lbt.ProblemError, match="expected a Telemetry"):
-        lbt.record_of("night.fits")
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Telemetry"):
+        lbt.identification.record_of("night.fits")

@@ -23,7 +23,7 @@ from replays import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.replay.estimate import residual_estimate
+from lbt_synth.identification.prediction.estimate import residual_estimate
 
 
 @pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
@@ -41,7 +41,9 @@ def test_a_replay_is_the_run_that_there_would_have_been(delay, gain, mirror, sen
     would = lbt.simulate(new.start(), truth, **size)  # stepped frame by frame
     assert np.array_equal(night.total_nm, would.total_nm)
     z = pseudo_open_loop(night.measurements[0], night.commands[0], path, gain)
-    found = lbt.replayed_residual(z, new, path, noise_nm=15.5, sensor_gain=gain, settle_frames=0)
+    found = lbt.identification.replayed_residual(
+        z, new, path, noise_nm=15.5, sensor_gain=gain, settle_frames=0
+    )
     wanted = would.measurements[0] @ np.linalg.inv(gain * path.sensor).T
     scale = np.max(np.abs(wanted))
     np.testing.assert_allclose(found.measured_nm, wanted, rtol=0, atol=1e-9 * scale)
@@ -68,7 +70,7 @@ def test_without_noise_the_residual_itself_is_found():
     night = lbt.simulate(lbt.integrator(path, gain=0.1).controller, truth, **size)
     z = pseudo_open_loop(night.measurements[0], night.commands[0], path)
     np.testing.assert_allclose(z[1:], night.total_nm[0, :-1], rtol=0, atol=1e-8)
-    found = lbt.replayed_residual(z, new, path, noise_nm=0.0)
+    found = lbt.identification.replayed_residual(z, new, path, noise_nm=0.0)
     begin, end = found.stretches[0]
     would = lbt.simulate(new, truth, **size).residual_nm[0, begin - 1 : end - 1]
     np.testing.assert_allclose(found.covariance_nm2, would.T @ would / len(would), rtol=1e-9)
@@ -86,10 +88,12 @@ def test_scale_and_beginning(seed, scale, start, delay):
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
     new = lbt.integrator(path, gain=0.3).controller
     z = np.random.default_rng(seed).standard_normal((700, 2))
-    whole = lbt.replayed_residual(z[start:], new, path, noise_nm=0.1, settle_frames=7)
+    whole = lbt.identification.replayed_residual(
+        z[start:], new, path, noise_nm=0.1, settle_frames=7
+    )
     torn = np.full_like(z, np.nan)
     torn[start:] = scale * z[start:]
-    part = lbt.replayed_residual(
+    part = lbt.identification.replayed_residual(
         torn, new, path, noise_nm=0.1 * scale, settle_frames=7, stretches=[(start, 700)]
     )
     assert part.stretches == ((start + 7, 700),)
@@ -106,7 +110,7 @@ def test_the_default_settling_is_long_enough():
     path = a_plant().hardware
     z = 1e3 + np.zeros((5000, 2))  # a step: an integrator forgets it at the loop's own pace
     new = lbt.integrator(path, gain=0.02).controller
-    found = lbt.replayed_residual(z, new, path, noise_nm=0.0)
+    found = lbt.identification.replayed_residual(z, new, path, noise_nm=0.0)
     assert 0.01 < np.max(np.abs(found.measured_nm)) < 0.2
     radius = lbt.close_loop(path, new).spectral_radius
     assert found.stretches[0][0] == int(np.ceil(np.log(1e-4) / np.log(radius)))
@@ -120,7 +124,7 @@ def test_the_standard_errors_are_those_of_many_nights():
     rows = np.r_[0:700, 900:1500]
     noise = np.diag([1.0, 4.0])
     mixing = np.array([[1.0, 0.0], [0.8, 0.6]])
-    model = lbt.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    model = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
     # of y = 0.4 x and of x itself, both with the same noise
     exact = np.array([1, 0.16])[:, None, None] * mixing @ mixing.T * model.rms_nm**2
     seen, errors, paired, paired_errors = [], [], [], []
@@ -156,13 +160,13 @@ def test_the_standard_errors_are_those_of_many_nights():
 def test_the_errors_of_a_pure_sinusoid_are_far_too_large():
     """They are those of Gaussian series; the mean square of a sinusoid hardly scatters."""
     path, rng = lbt.LoopHardware(frame_rate_hz=RATE, modes=1), np.random.default_rng(7)
-    air = lbt.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
+    air = lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
     new = lbt.integrator(path, gain=0.3).controller
     seen, errors = [], []
     for phase in rng.uniform(0, 2 * np.pi, 60):
         line = np.sqrt(2) * 200 * np.sin(2 * np.pi * 20 * np.arange(6000) / RATE + phase)
         z = (line + a_series(air, 6000, rng) + 15.5 * rng.standard_normal(6000))[:, None]
-        found = lbt.replayed_residual(z, new, path, noise_nm=15.5)
+        found = lbt.identification.replayed_residual(z, new, path, noise_nm=15.5)
         seen.append(found.total_nm2)
         errors.append(found.total_error_nm2)
     assert 7 < np.sqrt(np.mean(np.square(errors))) / np.std(seen) < 14
@@ -172,8 +176,10 @@ def test_the_noise_of_the_noise_is_added():
     path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=0.5 * np.eye(2))
     z = np.random.default_rng(0).standard_normal((1000, 2))
     new = lbt.integrator(path, gain=0.3).controller
-    plain = lbt.replayed_residual(z, new, path, noise_nm=[0.2, 0.3])
-    given_ = lbt.replayed_residual(z, new, path, noise_nm=[0.2, 0.3], noise_error_nm=[0.01, 0.02])
+    plain = lbt.identification.replayed_residual(z, new, path, noise_nm=[0.2, 0.3])
+    given_ = lbt.identification.replayed_residual(
+        z, new, path, noise_nm=[0.2, 0.3], noise_error_nm=[0.01, 0.02]
+    )
     added = np.sqrt(given_.variance_error_nm2**2 - plain.variance_error_nm2**2)
     np.testing.assert_allclose(added, [2 * 0.2 * 0.01 / 0.25, 2 * 0.3 * 0.02 / 0.25], rtol=1e-9)
     np.testing.assert_allclose(np.diag(given_.noise_nm2), [0.04 / 0.25, 0.09 / 0.25], rtol=1e-12)
@@ -187,7 +193,9 @@ def test_the_noise_of_coupled_sensors_has_common_errors():
     noise, error = np.array([10.0, 8.0]), np.array([1.0, 0.5])
 
     def estimate(noise_nm, error_nm):
-        return lbt.replayed_residual(z, new, path, noise_nm=noise_nm, noise_error_nm=error_nm)
+        return lbt.identification.replayed_residual(
+            z, new, path, noise_nm=noise_nm, noise_error_nm=error_nm
+        )
 
     added = estimate(noise, error).error_nm4 - estimate(noise, 0.0).error_nm4
     more = [estimate(noise + 0.01 * step, 0.0).variance_nm2 for step in np.eye(2)]
@@ -205,14 +213,16 @@ def test_a_residual_far_below_zero_refutes_the_noise():
     idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / RATE)
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     z = 10 * np.random.default_rng(0).standard_normal((4000, 1))
-    right, wrong = (lbt.replayed_residual(z, idle, path, noise_nm=s) for s in (10.0, 12.0))
+    right, wrong = (
+        lbt.identification.replayed_residual(z, idle, path, noise_nm=s) for s in (10.0, 12.0)
+    )
     assert not right.refuted
     assert np.isfinite(right.upper_nm)
     assert wrong.refuted
     assert wrong.errors_below_zero == pytest.approx(44 * np.sqrt(4000 / 2) / 100, rel=0.1)
     assert np.isnan([wrong.upper_nm, wrong.rms_nm, wrong.rms_error_nm]).all()
     # one axis is enough
-    both = lbt.replayed_residual(
+    both = lbt.identification.replayed_residual(
         np.column_stack([z, 10 * z]),
         lbt.Controller(A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=np.zeros((2, 2)), dt_s=1 / RATE),
         PATH,
@@ -230,7 +240,7 @@ def test_a_residual_below_its_noise_is_not_cut_off():
     signs = []
     for seed in range(40):
         z = 10 * np.random.default_rng(seed).standard_normal((400, 2))
-        found = lbt.replayed_residual(z, idle, path, noise_nm=10.0, settle_frames=0)
+        found = lbt.identification.replayed_residual(z, idle, path, noise_nm=10.0, settle_frames=0)
         assert found.total_nm2 == pytest.approx(np.sum(np.mean(z**2, axis=0)) - 200, abs=1e-9)
         assert abs(found.total_nm2) < 5 * found.total_error_nm2
         negative = found.total_nm2 < 0
@@ -268,7 +278,9 @@ def test_the_predictor_is_the_least_squares_of_a_textbook(delay, coupled):
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
     z = np.cumsum(rng.standard_normal((300, 2)), axis=0) @ TILTED
     stretches = [(0, 130), (140, 300)]
-    fit = lbt.least_squares_predictor(z, path, taps=5, stretches=stretches, coupled=coupled)
+    fit = lbt.identification.least_squares_predictor(
+        z, path, taps=5, stretches=stretches, coupled=coupled
+    )
     for i in range(2):
         axes = (0, 1) if coupled else (i,)
         parts = [textbook_regression(z[a:b], path.mirror_taps, 5, axes) for a, b in stretches]
@@ -289,7 +301,7 @@ def test_a_ridge_is_that_of_the_normal_equations():
     X, wanted = textbook_regression(z, path.mirror_taps, 6, (0,))
     gram = X.T @ X
     found = np.linalg.solve(gram + 0.01 * np.trace(gram) / 6 * np.eye(6), X.T @ wanted)
-    fit = lbt.least_squares_predictor(z, path, taps=6, ridge=0.01)
+    fit = lbt.identification.least_squares_predictor(z, path, taps=6, ridge=0.01)
     np.testing.assert_allclose(fit.coefficients.ravel(), found.ravel(), rtol=1e-8)
     assert fit.fitted_nm2[0] == pytest.approx(np.mean((wanted - X @ found) ** 2), rel=1e-9)
 
@@ -300,8 +312,10 @@ def test_the_controller_of_the_predictor_gives_its_residual(delay, gain, mirror,
     rng = np.random.default_rng(4)
     path = a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
     z = np.cumsum(rng.standard_normal((900, 2)), axis=0)
-    fit = lbt.least_squares_predictor(z, path, taps=7, sensor_gain=gain, coupled=True)
-    found = lbt.replayed_residual(
+    fit = lbt.identification.least_squares_predictor(
+        z, path, taps=7, sensor_gain=gain, coupled=True
+    )
+    found = lbt.identification.replayed_residual(
         z, fit.controller, path, noise_nm=1.0, sensor_gain=gain, settle_frames=0
     )
     commands = np.zeros_like(z)
@@ -318,23 +332,23 @@ def test_the_controller_of_the_predictor_gives_its_residual(delay, gain, mirror,
     scaled = lbt.LoopHardware(
         frame_rate_hz=RATE, delay_frames=delay, sensor_matrix=gain * path.sensor, mirror=mirror
     )
-    assert lbt.certify_loop(scaled, fit.controller).passed
+    assert lbt.design.certify_loop(scaled, fit.controller).passed
 
 
 def test_ar_processes_are_predicted_as_in_closed_form():
     """Two frames ahead: a1 x(k+1) + a2 x(k) with x(k+1) = a1 x(k) + a2 x(k-1)."""
     a1, a2 = 1.6, -0.8
-    model = lbt.ARModel(coefficients=[a1, a2], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    model = lbt.models.ARModel(coefficients=[a1, a2], driving_rms_nm=1.0, frame_rate_hz=RATE)
     z = a_series(model, 60_000, np.random.default_rng(0))[:, None]
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    fit = lbt.least_squares_predictor(z, path, taps=4)
+    fit = lbt.identification.least_squares_predictor(z, path, taps=4)
     np.testing.assert_allclose(
         fit.coefficients.ravel(), [a1**2 + a2, a1 * a2, 0, 0], rtol=0, atol=0.02
     )
     assert fit.fitted_nm2[0] == pytest.approx(1 + a1**2, rel=0.02)
     # one frame ahead the coefficients are those of Yule and Walker: the process's own
     near = lbt.LoopHardware(frame_rate_hz=RATE, modes=1, delay_frames=1)
-    fit = lbt.least_squares_predictor(z, near, taps=2)
+    fit = lbt.identification.least_squares_predictor(z, near, taps=2)
     np.testing.assert_allclose(fit.coefficients.ravel(), [a1, a2], rtol=0, atol=0.02)
 
 
@@ -342,20 +356,24 @@ def test_ar_processes_are_predicted_as_in_closed_form():
 def test_more_taps_come_to_the_limit_and_none_passes_it(delay):
     """By the model, exactly: a predictor that was fitted to a long series, over its length."""
     line = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=100, direction=(1,))
-    fast = lbt.ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=RATE)
+    fast = lbt.models.ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=RATE)
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=fast, vibrations=[line], noise_nm=20.0, modes=1,
+        frame_rate_hz=RATE,
+        turbulence=fast,
+        vibrations=[line],
+        noise_nm=20.0,
+        modes=1,
         delay_frames=delay,
-    )  # fmt: skip
+    )
     path, rng = plant.hardware, np.random.default_rng(5)
     z = a_series(fast, 50_000, rng) + a_series(line.ar_model(RATE), 50_000, rng)
     z = (z + 20 * rng.standard_normal(z.size))[:, None]
     limit = lbt.lqg(plant).rms
     left = []
     for taps in (1, 4, 16, 64):
-        fit = lbt.least_squares_predictor(z, path, taps=taps)
+        fit = lbt.identification.least_squares_predictor(z, path, taps=taps)
         loop = lbt.close_loop(path, fit.controller)
-        left.append(lbt.model_budget(loop, plant).rms_nm / limit)
+        left.append(lbt.loop.model_budget(loop, plant).rms_nm / limit)
     assert np.all(np.diff(left) < 0)
     assert left[0] > 1.2
     assert 1 < left[-1] < 1.01
@@ -365,12 +383,12 @@ def test_regressors_that_depend_on_each_other():
     """A sinusoid without noise: two values say all; the coefficients of least norm are taken."""
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     z = 100 * np.sin(2 * np.pi * 20 / RATE * np.arange(3000))[:, None]
-    fit = lbt.least_squares_predictor(z, path, taps=32)
+    fit = lbt.identification.least_squares_predictor(z, path, taps=32)
     X, wanted = textbook_regression(z, path.mirror_taps, 32, (0,))
     found = np.linalg.pinv(X, rcond=1e-9) @ wanted[:, 0]
     np.testing.assert_allclose(fit.coefficients.ravel(), found, rtol=0, atol=1e-9)
     assert np.sum(fit.coefficients**2) < 1
-    left = lbt.replayed_residual(z, fit.controller, path, noise_nm=0.0)
+    left = lbt.identification.replayed_residual(z, fit.controller, path, noise_nm=0.0)
     assert np.max(np.abs(left.measured_nm)) < 1e-9
 
 
@@ -387,7 +405,7 @@ def test_on_held_out_data_no_predictor_beats_the_limit():
             settle_frames=0,
         )
         z = pseudo_open_loop(night.measurements[0], night.commands[0], plant.hardware)
-        table = lbt.prediction_against_data(plant, z, {}, taps=24)
+        table = lbt.identification.prediction_against_data(plant, z, {}, taps=24)
         row = table["least-squares predictor"].replayed
         assert row.total_nm2 > limit**2 - 4 * row.total_error_nm2
 
@@ -409,10 +427,12 @@ def test_halves_are_apart_and_in_order(lengths, gap, share):
     first = np.flatnonzero(usable)[: int(share * usable.sum())]
     # nothing to fit, or everything after the fit lies in the gap
     if first.size == 0 or not usable[first[-1] + 1 + gap :].any():
-        with pytest.raises(lbt.ProblemError, match="must leave frames to fit and to test on"):
-            lbt.split_halves(stretches, frames, **arguments)
+        with pytest.raises(
+            lbt.errors.ProblemError, match="must leave frames to fit and to test on"
+        ):
+            lbt.identification.split_halves(stretches, frames, **arguments)
         return
-    fit, test = lbt.split_halves(stretches, frames, **arguments)
+    fit, test = lbt.identification.split_halves(stretches, frames, **arguments)
     fitted, tested = np.zeros((2, frames), dtype=bool)
     for mask, parts in ((fitted, fit), (tested, test)):
         for a, b in parts:
@@ -441,8 +461,8 @@ def test_halves_are_apart_and_in_order(lengths, gap, share):
     ],
 )
 def test_stretches_that_are_refused(arguments, message):
-    with pytest.raises(lbt.ProblemError, match=message):
-        lbt.split_halves(*arguments)
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        lbt.identification.split_halves(*arguments)
 
 
 @pytest.mark.parametrize(
@@ -455,8 +475,8 @@ def test_stretches_that_are_refused(arguments, message):
     ],
 )
 def test_halves_that_are_refused(more, message):
-    with pytest.raises(lbt.ProblemError, match=message):
-        lbt.split_halves(None, 40, **more)
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        lbt.identification.split_halves(None, 40, **more)
 
 
 # --- what is refused ----------------------------------------------------------------------------
@@ -482,21 +502,21 @@ def test_halves_that_are_refused(more, message):
 )
 def test_replays_that_are_refused(series, more, message):
     new = lbt.integrator(PATH, gain=0.3).controller
-    with pytest.raises(lbt.ProblemError, match=message):
-        lbt.replayed_residual(series, new, PATH, **({"noise_nm": 1.0} | more))
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        lbt.identification.replayed_residual(series, new, PATH, **({"noise_nm": 1.0} | more))
 
 
 def test_loops_that_cannot_be_replayed():
     new = lbt.integrator(PATH, gain=0.3).controller
-    with pytest.raises(lbt.ProblemError, match="can be inverted; got \\(2, 2\\) of rank 1"):
-        lbt.replayed_residual(GOOD, new, FLAT, noise_nm=1.0)
-    with pytest.raises(lbt.UnstableLoopError, match="must be stable"):
-        lbt.replayed_residual(GOOD, new, PATH, noise_nm=1.0, sensor_gain=4.0)
-    with pytest.raises(lbt.ProblemError, match="expected a LoopHardware"):
-        lbt.replayed_residual(GOOD, new, a_plant(), noise_nm=1.0)
-    one = lbt.replayed_residual(GOOD, new, PATH, noise_nm=1.0)
-    other = lbt.replayed_residual(GOOD, new, PATH, noise_nm=1.0, settle_frames=500)
-    with pytest.raises(lbt.ProblemError, match="on the same frames only"):
+    with pytest.raises(lbt.errors.ProblemError, match="can be inverted; got \\(2, 2\\) of rank 1"):
+        lbt.identification.replayed_residual(GOOD, new, FLAT, noise_nm=1.0)
+    with pytest.raises(lbt.errors.UnstableLoopError, match="must be stable"):
+        lbt.identification.replayed_residual(GOOD, new, PATH, noise_nm=1.0, sensor_gain=4.0)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a LoopHardware"):
+        lbt.identification.replayed_residual(GOOD, new, a_plant(), noise_nm=1.0)
+    one = lbt.identification.replayed_residual(GOOD, new, PATH, noise_nm=1.0)
+    other = lbt.identification.replayed_residual(GOOD, new, PATH, noise_nm=1.0, settle_frames=500)
+    with pytest.raises(lbt.errors.ProblemError, match="on the same frames only"):
         one.above(other)
 
 
@@ -517,5 +537,5 @@ def test_loops_that_cannot_be_replayed():
     ],
 )
 def test_predictors_that_are_refused(path, more, message):
-    with pytest.raises(lbt.ProblemError, match=message):
-        lbt.least_squares_predictor(GOOD, path, **more)
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        lbt.identification.least_squares_predictor(GOOD, path, **more)

@@ -28,13 +28,16 @@ import lbt_synth as lbt
 # --- the table ----------------------------------------------------------------------------------
 def two_different_axes():
     turbulence = [
-        lbt.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE),
-        lbt.ARModel(coefficients=[0.9886], driving_rms_nm=50.0, frame_rate_hz=RATE),
+        lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE),
+        lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=50.0, frame_rate_hz=RATE),
     ]
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=turbulence, vibrations=LINES,
-        noise_nm=np.diag([15.0, 10.0]) ** 2, sensor_gain=0.6,
-    )  # fmt: skip
+        frame_rate_hz=RATE,
+        turbulence=turbulence,
+        vibrations=LINES,
+        noise_nm=np.diag([15.0, 10.0]) ** 2,
+        sensor_gain=0.6,
+    )
     frames, rng = 30_000, np.random.default_rng(6)
     total = np.column_stack(
         [
@@ -45,7 +48,7 @@ def two_different_axes():
     noise = rng.standard_normal((frames, 2)) * [15.0, 10.0]
     ran = lbt.integrator(plant.hardware, gain=0.25)
     loop = lbt.close_loop(plant.hardware, ran.controller)
-    series = lbt.filter_series(loop.system, np.hstack([total, noise]))
+    series = lbt.loop.filter_series(loop.system, np.hstack([total, noise]))
     y, u = series[:, 4:], series[:, 2:4]
     return plant, ran, y, pseudo_open_loop(y, u, plant.hardware)
 
@@ -54,14 +57,18 @@ def test_the_table():
     plant, ran, y, z = two_different_axes()
     kalman, hinf = lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.2, method="riccati")
     given_ = {"Kalman": kalman, "H-infinity": hinf.controller}
-    table = lbt.prediction_against_data(
+    table = lbt.identification.prediction_against_data(
         plant, z, given_, measurements=y, running=ran, imaging=CAMERA
     )
     names = [entry.name for entry in table.entries]
     assert names == [
-        "what ran", "best integrator", "Kalman", "H-infinity", "least-squares predictor",
+        "what ran",
+        "best integrator",
+        "Kalman",
+        "H-infinity",
+        "least-squares predictor",
         "limit of performance",
-    ]  # fmt: skip
+    ]
     assert table.notes == ()
     for entry in table.entries[:-1]:
         assert abs(entry.deviations) < 4, entry.name
@@ -85,10 +92,14 @@ def test_the_table():
         rtol=1e-9,
     )
     # and its replay is what it measured
-    again = lbt.replayed_residual(
-        z, ran.controller, plant.hardware, noise_nm=[15.0, 10.0], stretches=[(0, end)],
+    again = lbt.identification.replayed_residual(
+        z,
+        ran.controller,
+        plant.hardware,
+        noise_nm=[15.0, 10.0],
+        stretches=[(0, end)],
         settle_frames=begin,
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(again.measured_nm, part, rtol=0, atol=1e-7)
     gained, error = table["what ran"].replayed.above(table["Kalman"].replayed)
     assert gained > 4 * error
@@ -97,10 +108,10 @@ def test_the_table():
     assert table.headings[:3] == ("controller", "tip_nm", "tilt_nm")
     assert rows[2][3] == table["Kalman"].replayed.rms_nm
     np.testing.assert_allclose(rows[-1][1:3], limit.model_axis_nm)
-    best = lbt.model_integrator(plant)
+    best = lbt.design.model_integrator(plant)
     loop = lbt.close_loop(plant.hardware, best.controller)
-    assert table["best integrator"].model_nm == lbt.model_budget(loop, plant).rms_nm
-    unknown = lbt.prediction_against_data(plant, z, {}, measurements=y)["what ran"]
+    assert table["best integrator"].model_nm == lbt.loop.model_budget(loop, plant).rms_nm
+    unknown = lbt.identification.prediction_against_data(plant, z, {}, measurements=y)["what ran"]
     assert unknown.model_nm2 is None
     assert np.isnan([unknown.model_nm, unknown.ratio, unknown.deviations]).all()
 
@@ -113,25 +124,30 @@ def test_a_table_of_one_axis():
     rng = np.random.default_rng(8)
     z = a_series(SLOW, 9000, rng) + a_series(line.ar_model(RATE), 9000, rng)
     z = (z + 15.5 * rng.standard_normal(z.size))[:, None]
-    table = lbt.prediction_against_data(
-        plant, z, {"Kalman": lbt.kalman(plant)}, imaging=CAMERA, fit=[(0, 3000)],
-        test=[(3000, 5000), (5100, 9000)], settle_frames=500,
-    )  # fmt: skip
+    table = lbt.identification.prediction_against_data(
+        plant,
+        z,
+        {"Kalman": lbt.kalman(plant)},
+        imaging=CAMERA,
+        fit=[(0, 3000)],
+        test=[(3000, 5000), (5100, 9000)],
+        settle_frames=500,
+    )
     assert table.headings[:3] == ("controller", "tip_nm", "data_nm")
     assert table.fit == ((0, 3000),)
     assert table.test == ((3500, 5000), (5600, 9000))
     row = table["Kalman"]
     assert abs(row.deviations) < 4
     assert row.strehl == pytest.approx(
-        lbt.jitter_strehl([[row.replayed_nm**2]], imaging=CAMERA), rel=1e-12
+        lbt.loop.jitter_strehl([[row.replayed_nm**2]], imaging=CAMERA), rel=1e-12
     )
 
 
 def test_a_wrong_model_is_found_out():
     """A filter for another frequency: its model promises what the data does not show."""
     plant, _, _, z = two_different_axes()
-    wrong = lbt.retuned_plant(plant, 6.0)
-    table = lbt.prediction_against_data(wrong, z, {"Kalman": lbt.kalman(wrong)})
+    wrong = lbt.models.retuned_plant(plant, 6.0)
+    table = lbt.identification.prediction_against_data(wrong, z, {"Kalman": lbt.kalman(wrong)})
     row, right = table["Kalman"], lbt.kalman(plant).rms
     assert row.deviations > 5
     assert row.model_nm < 1.05 * right < row.replayed_nm / 1.1
@@ -148,7 +164,9 @@ def test_replays_are_quick():
     for _ in range(3):
         start = time.process_time()
         for controller in controllers * 2:
-            lbt.replayed_residual(z, controller, plant.hardware, noise_nm=[15.0, 10.0])
+            lbt.identification.replayed_residual(
+                z, controller, plant.hardware, noise_nm=[15.0, 10.0]
+            )
         best = min(best, time.process_time() - start)
     assert best < 0.3
 
@@ -159,22 +177,20 @@ def test_a_limit_that_is_not_known_is_a_note():
         frame_rate_hz=RATE, turbulence=SLOW, vibrations=[LINES[0], crossed], noise_nm=15.5
     )
     z = np.random.default_rng(0).standard_normal((4000, 2)).cumsum(axis=0)
-    table = lbt.prediction_against_data(plant, z, {})
-    assert [entry.name for entry in table.entries] == [
-        "best integrator", "least-squares predictor"
-    ]  # fmt: skip
+    table = lbt.identification.prediction_against_data(plant, z, {})
+    assert [entry.name for entry in table.entries] == ["best integrator", "least-squares predictor"]
     assert "no limit of performance: a limit needs modes that decouple" in table.notes[0]
 
 
 @pytest.mark.parametrize("correlation", [0.6, -0.9])
 def test_the_noise_of_the_table_has_its_correlations(correlation):
     S, R = np.array([[1.0, 0.8], [0.3, 1.0]]), 100 * np.array([[1, correlation], [correlation, 1]])
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
     plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=slow, noise_nm=R, sensor_matrix=S)
     rng = np.random.default_rng(0)
     total = np.column_stack([a_series(slow, 20_000, rng) for _ in range(2)])
     z = total + rng.multivariate_normal([0, 0], R, 20_000) @ np.linalg.inv(S).T
-    table = lbt.prediction_against_data(plant, z, {"Kalman": lbt.kalman(plant)})
+    table = lbt.identification.prediction_against_data(plant, z, {"Kalman": lbt.kalman(plant)})
     assert abs(table["Kalman"].deviations) < 4
     assert 0.95 < table["Kalman"].ratio < 1.05
     back = np.linalg.inv(S)
@@ -185,13 +201,18 @@ def test_the_noise_of_the_table_has_its_correlations(correlation):
 
 
 def test_more_noise_than_the_data_has_is_a_note():
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
     rng = np.random.default_rng(0)
     z = (a_series(slow, 8000, rng) + 10 * rng.standard_normal(8000))[:, None]
     path = {"frame_rate_hz": RATE, "turbulence": slow, "modes": 1}
     right, wrong = (lbt.tip_tilt_plant(**path, noise_nm=s) for s in (10.0, 60.0))
-    assert lbt.prediction_against_data(right, z, {"mine": lbt.kalman(right)}).notes == ()
-    table = lbt.prediction_against_data(wrong, z, {"mine": lbt.kalman(right)}, measurements=z)
+    assert (
+        lbt.identification.prediction_against_data(right, z, {"mine": lbt.kalman(right)}).notes
+        == ()
+    )
+    table = lbt.identification.prediction_against_data(
+        wrong, z, {"mine": lbt.kalman(right)}, measurements=z
+    )
     (note,) = table.notes
     assert "of what ran, best integrator, mine, least-squares predictor: its variance is" in note
     assert "standard errors below zero" in note
@@ -206,11 +227,11 @@ def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor)
     plant = a_plant(delay=delay, gain=gain, mirror=mirror, sensor=sensor)
     controller = lbt.integrator(plant.hardware, gain=0.2).controller
     loop = lbt.close_loop(plant.hardware, controller)
-    own, other = lbt.model_budget(loop, plant), lbt.residual_budget(loop, a_truth())
+    own, other = lbt.loop.model_budget(loop, plant), lbt.residual_budget(loop, a_truth())
     for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "total_nm2"):
         np.testing.assert_allclose(getattr(own, name), getattr(other, name), rtol=1e-9, atol=1e-9)
     bare = a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
-    again = lbt.model_budget(lbt.close_loop(bare, controller, sensor_gain=gain), plant)
+    again = lbt.loop.model_budget(lbt.close_loop(bare, controller, sensor_gain=gain), plant)
     np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
 
 
@@ -218,13 +239,16 @@ def test_noise_that_is_correlated_between_axes():
     noise = np.array([[200.0, 60.0], [60.0, 100.0]])
     plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, noise_nm=noise)
     design = lbt.kalman(plant)
-    budget = lbt.model_budget(lbt.close_loop(plant.hardware, design.controller), plant)
+    budget = lbt.loop.model_budget(lbt.close_loop(plant.hardware, design.controller), plant)
     assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
 
 
 def test_the_integrator_of_a_plant_is_that_of_its_truth():
     plant = a_plant()
-    own, other = lbt.model_integrator(plant), lbt.optimal_integrator(plant.hardware, a_truth())
+    own, other = (
+        lbt.design.model_integrator(plant),
+        lbt.design.optimal_integrator(plant.hardware, a_truth()),
+    )
     assert own.gain == pytest.approx(other.gain, rel=1e-5)
     assert own.certificate.passed
 
@@ -233,8 +257,10 @@ def test_a_budget_of_another_loop_is_refused():
     plant = a_plant()
     for other in (a_plant(delay=3.0), a_plant(gain=0.5), a_plant(mirror=SHELL)):
         loop = lbt.close_loop(other.hardware, lbt.integrator(other.hardware, gain=0.1).controller)
-        with pytest.raises(lbt.ProblemError, match="plant's sensor, mirror and delay; got another"):
-            lbt.model_budget(loop, plant)
+        with pytest.raises(
+            lbt.errors.ProblemError, match="plant's sensor, mirror and delay; got another"
+        ):
+            lbt.loop.model_budget(loop, plant)
     unstable = lbt.close_loop(
         plant.hardware, lbt.integrator(plant.hardware, gain=0.9).controller, sensor_gain=1.0
     )
@@ -242,14 +268,14 @@ def test_a_budget_of_another_loop_is_refused():
         A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
     )
     assert unstable.is_stable
-    with pytest.raises(lbt.UnstableLoopError):
-        lbt.model_budget(lbt.close_loop(plant.hardware, wild), plant)
-    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
-        lbt.model_budget(unstable, a_truth())
-    with pytest.raises(lbt.ProblemError, match="expected a ClosedLoop"):
-        lbt.model_budget(unstable.system, plant)
-    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
-        lbt.model_integrator(a_truth())
+    with pytest.raises(lbt.errors.UnstableLoopError):
+        lbt.loop.model_budget(lbt.close_loop(plant.hardware, wild), plant)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.loop.model_budget(unstable, a_truth())
+    with pytest.raises(lbt.errors.ProblemError, match="expected a ClosedLoop"):
+        lbt.loop.model_budget(unstable.system, plant)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.design.model_integrator(a_truth())
 
 
 # --- what is refused ----------------------------------------------------------------------------
@@ -275,18 +301,20 @@ def test_a_budget_of_another_loop_is_refused():
 )
 def test_tables_that_are_refused(more, message):
     arguments = {"controllers": {}} | more
-    with pytest.raises(lbt.ProblemError, match=message):
-        lbt.prediction_against_data(a_plant(), GOOD, **arguments)
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        lbt.identification.prediction_against_data(a_plant(), GOOD, **arguments)
 
 
 def test_tables_of_what_does_not_hold():
     wild = lbt.Controller(
         A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
     )
-    with pytest.raises(lbt.UnstableLoopError, match="mine: the closed loop must be stable"):
-        lbt.prediction_against_data(a_plant(), GOOD, {"mine": wild})
-    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
-        lbt.prediction_against_data(PATH, GOOD, {})
-    table = lbt.prediction_against_data(a_plant(), GOOD, {})
-    with pytest.raises(lbt.ProblemError, match="the table has the rows best integrator, .*'mine'"):
+    with pytest.raises(lbt.errors.UnstableLoopError, match="mine: the closed loop must be stable"):
+        lbt.identification.prediction_against_data(a_plant(), GOOD, {"mine": wild})
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.identification.prediction_against_data(PATH, GOOD, {})
+    table = lbt.identification.prediction_against_data(a_plant(), GOOD, {})
+    with pytest.raises(
+        lbt.errors.ProblemError, match="the table has the rows best integrator, .*'mine'"
+    ):
         table["mine"]

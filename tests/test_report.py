@@ -20,14 +20,14 @@ from plants import LBT_YAML, lbt_axis_plant
 from test_cli import run
 
 import lbt_synth as lbt
-from lbt_synth.certify import Certificate, Check
-from lbt_synth.pages import Table
-from lbt_synth.report.designs import possible_errors, steps_of
-from lbt_synth.report.designs_page import design_page
-from lbt_synth.report.designs_simulation import exact_spectrum, step_response
-from lbt_synth.report.designs_verdict import good_range, verdict
-from lbt_synth.report.making import time_of_making
-from lbt_synth.report.words import fixed_text, listing_text, number_text, signed_text
+from lbt_synth.design import Certificate, Check
+from lbt_synth.report.designs.page import design_page
+from lbt_synth.report.designs.report import possible_errors, steps_of
+from lbt_synth.report.designs.simulation import exact_spectrum, step_response
+from lbt_synth.report.designs.verdict import good_range, verdict
+from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
+from lbt_synth.report.provenance import time_of_making
+from lbt_synth.storage.tables import Table
 
 SMALL = re.sub(
     r"errors_hz: .*",
@@ -63,18 +63,23 @@ def designs(config):
 
 @pytest.fixture(scope="module")
 def report(config, designs):
-    return lbt.design_report(config, designs)
+    return lbt.report.design_report(config, designs)
 
 
 @pytest.fixture(scope="module")
 def text(report, folder):
-    lbt.write_report(report, folder / "a.html", pdf=folder / "a.pdf")
+    lbt.report.write_report(report, folder / "a.html", pdf=folder / "a.pdf")
     return (folder / "a.html").read_text()
 
 
 def test_the_numbers_are_those_of_the_library(report, config, designs):
-    study = lbt.limit_study(designs, config.hardware, config.truth, config.imaging,
-                            errors_hz=config.settings.robustness.errors_hz)  # fmt: skip
+    study = lbt.studies.limit_study(
+        designs,
+        config.hardware,
+        config.truth,
+        config.imaging,
+        errors_hz=config.settings.robustness.errors_hz,
+    )
     for (one, row), limits in zip(report.rows, study.rows, strict=True):
         assert row.residual_nm == pytest.approx(limits.residual_nm, rel=1e-9, nan_ok=True)
         assert row.above_limit_percent == pytest.approx(limits.above_limit_percent, nan_ok=True)
@@ -85,10 +90,11 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         assert one.residual_nm == pytest.approx(budget.rms_nm, rel=1e-12)
         assert one.strehl == pytest.approx(lbt.strehl(budget, config.imaging), rel=1e-12)
         assert one.margins == lbt.loop_margins(loop)
-        low, high = lbt.stable_sensor_gains(config.hardware, one.design.controller)
+        low, high = lbt.loop.stable_sensor_gains(config.hardware, one.design.controller)
         assert one.sensor_gains == (pytest.approx((low, high), rel=1e-9),)
-        found = lbt.strehl_map(one.design, config.truth, config.imaging, errors_hz=[-2.0, 0.0],
-                               sensor_gains=[0.5, 1.0])  # fmt: skip
+        found = lbt.studies.strehl_map(
+            one.design, config.truth, config.imaging, errors_hz=[-2.0, 0.0], sensor_gains=[0.5, 1.0]
+        )
         at = [int(np.flatnonzero(one.map.errors_hz == e)[0]) for e in (-2.0, 0.0)]
         gains = [int(np.flatnonzero(one.map.sensor_gains == g)[0]) for g in (0.5, 1.0)]
         assert one.map.strehl[0][np.ix_(gains, at)] == pytest.approx(found.strehl[0], rel=1e-9)
@@ -134,9 +140,9 @@ def test_simulations_agree_with_the_exact_answer(report):
 def test_the_exact_spectrum_has_the_exact_power():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     design = lbt.integrator(path, gain=0.4)
-    slow = lbt.ARModel(coefficients=[0.9], driving_rms_nm=10.0, frame_rate_hz=800)
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=10.0, frame_rate_hz=800)
     shake = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=40, direction=(1,))
-    line = lbt.SinusoidalVibration(frequency_hz=31.7, rms_nm=30.0, direction=(1,))
+    line = lbt.models.SinusoidalVibration(frequency_hz=31.7, rms_nm=30.0, direction=(1,))
     truth = lbt.Truth(turbulence=slow, vibrations=(shake, line), noise_nm=5.0)
     loop = lbt.close_loop(path, design.controller)
     length = 2048
@@ -181,17 +187,17 @@ def test_the_verdict_is_made_of_the_numbers(report):
 def test_equals_are_told_as_equals(config, designs):
     kalman = designs["kalman"]
     pair = {"one": kalman, "two": kalman}
-    words = verdict(lbt.design_report(config, pair)).replace("\u00a0", " ")
+    words = verdict(lbt.report.design_report(config, pair)).replace("\u00a0", " ")
     assert "Of 2 stable designs, one and two leave the least, " in words
     assert ": they bear them alike." in words
-    three = verdict(lbt.design_report(config, {"slow": designs["slow"], **pair}))
+    three = verdict(lbt.report.design_report(config, {"slow": designs["slow"], **pair}))
     assert "Of 3 stable designs, one and two leave the least, " in three
     assert ": one and two bear them best." in three or ": slow bears them best." in three
 
 
 def test_a_limit_of_nothing_is_no_limit(config, designs):
     still = lbt.Truth(turbulence=None, noise_nm=config.truth.noise_nm)
-    report = lbt.design_report(replace(config, truth=still), {"slow": designs["slow"]})
+    report = lbt.report.design_report(replace(config, truth=still), {"slow": designs["slow"]})
     assert report.limits.limit.rms_nm == 0
     assert "above the limit" not in words_of(report)
     assert "passed, 1 check " in words_of(report) + " "
@@ -200,11 +206,24 @@ def test_a_limit_of_nothing_is_no_limit(config, designs):
 def test_the_page_has_all_that_it_should(text, report, config):
     reader = Reader(text)
     titles = " ".join(reader.texts["h2"] + reader.texts["h3"])
-    for word in ("Summary", "Rejection and noise", "Strehl ratio over the frequency error", "Poles",
-                 "Answer to a step", "Certificates", "Configuration and versions"):  # fmt: skip
+    for word in (
+        "Summary",
+        "Rejection and noise",
+        "Strehl ratio over the frequency error",
+        "Poles",
+        "Answer to a step",
+        "Certificates",
+        "Configuration and versions",
+    ):
         assert word in titles
-    for heading in ("method", "Strehl ratio, exact [%]", "modulus margin", "states of the controller",
-                    "stable real sensor gains", "certificate, computed anew"):  # fmt: skip
+    for heading in (
+        "method",
+        "Strehl ratio, exact [%]",
+        "modulus margin",
+        "states of the controller",
+        "stable real sensor gains",
+        "certificate, computed anew",
+    ):
         assert heading in reader.texts["th"]
     kalman = report.assessments[0]
     cells = reader.texts["td"]
@@ -237,7 +256,7 @@ def words_of(report):
 
 def test_a_truth_without_vibrations(config, designs):
     calm = replace(config, truth=replace(config.truth, vibrations=()))
-    report = lbt.design_report(calm, {"slow": designs["slow"]})
+    report = lbt.report.design_report(calm, {"slow": designs["slow"]})
     assert report.errors_hz.tolist() == [0.0]
     page = design_page(report, title="calm")
     assert "sensor-gain" in [chart.key for chart in page.charts]
@@ -247,7 +266,7 @@ def test_a_truth_without_vibrations(config, designs):
 
 
 def test_errors_that_would_leave_the_band_are_left_out(config):
-    line = lbt.SinusoidalVibration(frequency_hz=2.0, rms_nm=10)
+    line = lbt.models.SinusoidalVibration(frequency_hz=2.0, rms_nm=10)
     low = replace(config, truth=replace(config.truth, vibrations=(line,)))
     errors = possible_errors(low)
     assert errors[0] == -3.5
@@ -258,7 +277,7 @@ def test_errors_that_would_leave_the_band_are_left_out(config):
 
 def test_many_designs_fill_several_sheets(config):
     many = {f"design {i}": lbt.integrator(config.hardware, gain=0.2 + 0.02 * i) for i in range(8)}
-    report = lbt.design_report(config, many)
+    report = lbt.report.design_report(config, many)
     keys = [chart.key for chart in design_page(report).charts]
     assert {"map", "map-2", "poles-2", "spectra-2", "series-2"} <= set(keys)
     (section,) = [s for s in design_page(report).sections if s.key == "summary"]
@@ -267,7 +286,7 @@ def test_many_designs_fill_several_sheets(config):
 
 
 def test_nothing_stable_is_needed(config, designs):
-    report = lbt.design_report(config, {"wild": designs["wild"]})
+    report = lbt.report.design_report(config, {"wild": designs["wild"]})
     text = words_of(report)
     charts = design_page(report).charts
     assert [chart.key for chart in charts] == ["map", "poles"]  # none of them is empty
@@ -284,10 +303,10 @@ def test_a_certificate_that_cannot_be_computed(config, monkeypatch):
     slow = lbt.integrator(config.hardware, gain=0.4)
 
     def broken(self):
-        raise lbt.NumericalError("the norm did not settle.")
+        raise lbt.errors.NumericalError("the norm did not settle.")
 
     monkeypatch.setattr(type(slow), "recertified", broken)
-    report = lbt.design_report(config, {"slow": slow})
+    report = lbt.report.design_report(config, {"slow": slow})
     assert not report.assessments[0].certified
     text = words_of(report)
     assert "The certificate of slow fails: the norm did not settle." in text
@@ -306,15 +325,24 @@ def test_a_design_that_was_tampered_with_fails(config, designs):
             rms_per_output=np.ones(2),
         ),
     )
-    one = lbt.design_report(config, {"wrong": wrong}).assessments[0]
+    one = lbt.report.design_report(config, {"wrong": wrong}).assessments[0]
     assert not one.certified
     assert "believe me" not in [check.name for check in one.checks]
 
 
 def test_numbers_as_texts():
-    assert [number_text(v) for v in (0.0, 27.701, 1234.56, 123456.0, 1e-9, -2.5, np.inf, np.nan)] == [
-        "0", "27.7", "1235", "123456", "1e\u22129", "\u22122.5", "∞", "\u2013",
-    ]  # fmt: skip
+    assert [
+        number_text(v) for v in (0.0, 27.701, 1234.56, 123456.0, 1e-9, -2.5, np.inf, np.nan)
+    ] == [
+        "0",
+        "27.7",
+        "1235",
+        "123456",
+        "1e\u22129",
+        "\u22122.5",
+        "∞",
+        "\u2013",
+    ]
     assert fixed_text(-0.001, 1) == "0.0"
     assert fixed_text(float("nan"), 1) == "\u2013"
     assert fixed_text(float("-inf"), 1) == "\u2212∞"
@@ -329,7 +357,7 @@ def test_the_time_of_making(monkeypatch):
     assert time_of_making() == datetime(1970, 1, 2, tzinfo=UTC)
     for wrong in ("tomorrow", "1e400", str(10**30)):
         monkeypatch.setenv("SOURCE_DATE_EPOCH", wrong)
-        with pytest.raises(lbt.ProblemError, match="SOURCE_DATE_EPOCH must be a number"):
+        with pytest.raises(lbt.errors.ProblemError, match="SOURCE_DATE_EPOCH must be a number"):
             time_of_making()
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
     assert abs((datetime.now(UTC) - time_of_making()).total_seconds()) < 60
@@ -337,7 +365,7 @@ def test_the_time_of_making(monkeypatch):
 
 def test_what_is_counted(config, designs):
     done = []
-    lbt.design_report(config, designs, advance=done.append)
+    lbt.report.design_report(config, designs, advance=done.append)
     assert sum(done) == steps_of(3) - 1  # the unstable one is not simulated
 
 
@@ -418,10 +446,10 @@ def test_pages_name_no_directories(folder, designs, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["red\x1b[31m", "two\nlines", "bad\udcff", "turned\u202e"])
 def test_names_that_no_page_can_show_are_refused(folder, designs, report, tmp_path, capsys, name):
-    with pytest.raises(lbt.ProblemError, match="name of a design must be of letters"):
-        lbt.design_report(report.config, {name: designs["slow"]})
-    with pytest.raises(lbt.ProblemError, match="title must be of letters"):
-        lbt.write_report(report, tmp_path / "r.html", title=name)
+    with pytest.raises(lbt.errors.ProblemError, match="name of a design must be of letters"):
+        lbt.report.design_report(report.config, {name: designs["slow"]})
+    with pytest.raises(lbt.errors.ProblemError, match="title must be of letters"):
+        lbt.report.write_report(report, tmp_path / "r.html", title=name)
     lbt.save_gain(tmp_path / "k.fits", designs["slow"])
     odd = (tmp_path / "k.fits").rename(tmp_path / f"{name}.fits")
     status, out, error = run(
@@ -438,8 +466,11 @@ def test_a_wrong_time_is_refused_before_libraries_read_it(wrong):
     # numpy and scipy read it when they are loaded: only a new process shows that
     done = subprocess.run(
         [sys.executable, "-m", "lbt_synth.cli.main", "report", "a.yaml", "k.fits", "-o", "x.html"],
-        env=os.environ | {"SOURCE_DATE_EPOCH": wrong}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        env=os.environ | {"SOURCE_DATE_EPOCH": wrong},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "SOURCE_DATE_EPOCH must be a number of seconds" in done.stderr
@@ -492,28 +523,28 @@ def test_bad_input_ends_in_one_line(gains, capsys, monkeypatch, arguments, text)
 
 def test_both_files_or_none(report, tmp_path, monkeypatch):
     (tmp_path / "a.html").write_text("old")
-    monkeypatch.setattr("lbt_synth.pages.writing.page_html", lambda page: b"new")
-    monkeypatch.setattr("lbt_synth.pages.writing.page_pdf", lambda page: 1 / 0)
+    monkeypatch.setattr("lbt_synth.report.page.page_files.page_html", lambda page: b"new")
+    monkeypatch.setattr("lbt_synth.report.page.page_files.page_pdf", lambda page: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        lbt.write_report(report, tmp_path / "a.html", pdf=tmp_path / "a.pdf")
+        lbt.report.write_report(report, tmp_path / "a.html", pdf=tmp_path / "a.pdf")
     assert (tmp_path / "a.html").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
 
 
 def test_refused_in_the_library(report, config, designs, tmp_path):
-    with pytest.raises(lbt.ProblemError, match="needs 1 to 36 designs; got 0"):
-        lbt.design_report(config, {})
-    with pytest.raises(lbt.ProblemError, match="title must hold"):
-        lbt.write_report(report, tmp_path / "a.html", title=" ")
-    with pytest.raises(lbt.OutputError, match="must end in .html"):
-        lbt.write_report(report, tmp_path / "a.txt")
-    with pytest.raises(lbt.FileError, match="cannot read"):
-        lbt.design_report(config, designs, gain_files={"kalman": tmp_path / "none.fits"})
-    with pytest.raises(lbt.ProblemError, match="expected a Config"):
-        lbt.design_report("lbt.yaml", designs)
+    with pytest.raises(lbt.errors.ProblemError, match="needs 1 to 36 designs; got 0"):
+        lbt.report.design_report(config, {})
+    with pytest.raises(lbt.errors.ProblemError, match="title must hold"):
+        lbt.report.write_report(report, tmp_path / "a.html", title=" ")
+    with pytest.raises(lbt.errors.OutputError, match="must end in .html"):
+        lbt.report.write_report(report, tmp_path / "a.txt")
+    with pytest.raises(lbt.errors.FileError, match="cannot read"):
+        lbt.report.design_report(config, designs, gain_files={"kalman": tmp_path / "none.fits"})
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Config"):
+        lbt.report.design_report("lbt.yaml", designs)
     gone = tmp_path / "gone.yaml"
     shutil.copy(config.source, gone)
     loaded = lbt.load_config(gone)
     gone.unlink()
-    with pytest.raises(lbt.FileError, match="cannot read"):
-        lbt.design_report(loaded, designs)
+    with pytest.raises(lbt.errors.FileError, match="cannot read"):
+        lbt.report.design_report(loaded, designs)

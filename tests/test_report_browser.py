@@ -12,15 +12,22 @@ from plants import LBT_YAML
 from study_pages import page_of, results
 
 import lbt_synth as lbt
-from lbt_synth.pages import page_html
+from lbt_synth.report.page.html import page_html
 
 pytestmark = pytest.mark.browser
 
 OPTIONS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--disable-dev-shm-usage", "--host-resolver-rules=MAP * ~NOTFOUND",
-)  # fmt: skip
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--host-resolver-rules=MAP * ~NOTFOUND",
+)
 PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
 DESK = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
 # elements in the page and in shadow roots below one
@@ -42,7 +49,7 @@ def pages(tmp_path_factory):
         "kalman": lbt.kalman(config.plant),
         "integrator with a rather long name of its file": lbt.integrator(config.hardware, gain=0.4),
     }
-    lbt.write_report(lbt.design_report(config, designs), folder / "report.html")
+    lbt.report.write_report(lbt.report.design_report(config, designs), folder / "report.html")
     (folder / "study.html").write_bytes(page_html(page_of(results())))
     (folder / "marks.html").write_bytes(page_html(whole_page()))
     (folder / "hostile.html").write_bytes(page_html(whole_page(HOSTILE)))

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from plants import ROOT, lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
-from lbt_synth.riccati import gamma_riccati, kalman_riccati, least_gamma
+from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.gamma import gamma_riccati, least_gamma
 
 
 def residual(A, B, Q, R, S, X):
@@ -64,7 +65,7 @@ def test_similarity_and_scaling(seed):
 
 def test_an_ordinary_plant_that_scipy_refuses():
     """AR2 turbulence and a lightly damped vibration."""
-    turbulence = lbt.ARModel(
+    turbulence = lbt.models.ARModel(
         coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
     )
     line = lbt.Vibration(frequency_hz=20, damping=1e-4, rms_nm=800, direction=(1,))
@@ -89,21 +90,25 @@ def test_kalman_riccati_against_slycot(axis_plant):
 
 
 def test_undetectable_pairs_name_the_mode():
-    with pytest.raises(lbt.DetectabilityError, match=r"mode of A at 1.2.*no measurement sees it"):
+    with pytest.raises(
+        lbt.errors.DetectabilityError, match=r"mode of A at 1.2.*no measurement sees it"
+    ):
         lbt.kalman(
             lbt.EstimationProblem(
                 A=np.diag([1.2, 0.5]), B=np.eye(2, 3), C=[[0, 1]], D=[[0, 0, 1]], L=[[1, 1]]
             )
         )
-    with pytest.raises(lbt.DetectabilityError, match=r"must be stabilisable.*at 2"):
+    with pytest.raises(lbt.errors.DetectabilityError, match=r"must be stabilisable.*at 2"):
         lbt.solve_dare(np.diag([2.0, 0.5]), [[0.0], [1.0]], np.eye(2), 1)
 
 
 def test_an_undriven_mode_on_the_unit_circle_is_refused():
-    with pytest.raises(lbt.DetectabilityError, match="must be driven by noise") as caught:
+    with pytest.raises(lbt.errors.DetectabilityError, match="must be driven by noise") as caught:
         lbt.kalman(lbt.EstimationProblem(A=1.0, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0))
     assert caught.value.eigenvalue == pytest.approx(1)
-    with pytest.raises(lbt.DetectabilityError, match="Q must see every mode on the unit circle"):
+    with pytest.raises(
+        lbt.errors.DetectabilityError, match="Q must see every mode on the unit circle"
+    ):
         lbt.solve_dare(1, 1, 0, 1)
 
 
@@ -124,7 +129,7 @@ def test_an_undriven_mode_on_the_unit_circle_is_refused():
     ],
 )
 def test_wrong_equations_are_refused(arguments, text):
-    with pytest.raises(lbt.ProblemError, match=text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
         lbt.solve_dare(*arguments)
 
 
@@ -189,10 +194,10 @@ def test_one_bad_equation_of_a_stack_is_named():
     A = np.array([[[0.5]], [[2.0]], [[0.5]]])
     B = np.array([[[1.0]], [[0.0]], [[1.0]]])
     with pytest.raises(
-        lbt.DetectabilityError, match=r"equation 1: \(A, B\) must be stabilis.* at 2"
+        lbt.errors.DetectabilityError, match=r"equation 1: \(A, B\) must be stabilis.* at 2"
     ):
         lbt.solve_dare(A, B, 1, 1)
-    with pytest.raises(lbt.DetectabilityError, match=r"equation \(0, 1\)"):
+    with pytest.raises(lbt.errors.DetectabilityError, match=r"equation \(0, 1\)"):
         lbt.solve_dare(A[None], B[None], 1, 1)
 
 
@@ -232,7 +237,9 @@ def test_a_unit_circle_zero_of_a_singular_problem_is_named():
     B = np.array([[1.0], [0.0]])
     C = np.array([[1.0, -0.7]])  # C (z I - A)^-1 B = (z - 1) / ((z - 0.5) (z - 0.3))
     assert np.allclose(transmission_zeros(A, B, C), [1.0])
-    with pytest.raises(lbt.DetectabilityError, match="zero on the unit circle, at 1") as caught:
+    with pytest.raises(
+        lbt.errors.DetectabilityError, match="zero on the unit circle, at 1"
+    ) as caught:
         lbt.solve_dare(A, B, C.T @ C, 0)
     assert caught.value.eigenvalue == pytest.approx(1)
 
@@ -258,15 +265,17 @@ def test_an_indefinite_level_that_cannot_be_met_is_refused():
     """x+ = 0.9 x + w + u, z = x: below the least level of state feedback there is no X."""
     met = lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-4.0, 1.0]))
     assert met.X[0, 0] > 0
-    with pytest.raises((lbt.InfeasibleError, lbt.NumericalError, lbt.DetectabilityError)):
+    with pytest.raises(
+        (lbt.errors.InfeasibleError, lbt.errors.NumericalError, lbt.errors.DetectabilityError)
+    ):
         lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-0.5, 1.0]))
 
 
 def test_a_saddle_with_the_wrong_signs_is_refused(monkeypatch):
     """A stabilising X that changes the signs of the weight is no H-infinity solution."""
-    with pytest.raises(lbt.InfeasibleError, match="as many negative eigenvalues as R"):
+    with pytest.raises(lbt.errors.InfeasibleError, match="as many negative eigenvalues as R"):
         lbt.solve_dare([[0.0]], [[1.0]], [[2.0]], [[-1.0]])
-    with pytest.raises(lbt.InfeasibleError, match="X must be positive semidefinite"):
+    with pytest.raises(lbt.errors.InfeasibleError, match="X must be positive semidefinite"):
         lbt.solve_dare([[0.0]], [[0.5]], [[-2.0]], [[-1.0]])
 
 
@@ -286,18 +295,18 @@ def test_badly_scaled_states_are_balanced():
 
 
 def test_the_chain_is_reported_when_everything_fails(monkeypatch):
-    import lbt_synth.riccati.dare as module
+    import lbt_synth.linear.riccati.dare as module
 
     def nothing(equations):
         return np.full_like(equations.Q, np.nan), np.zeros(len(equations.Q), dtype=np.int64)
 
     monkeypatch.setattr(module, "ROUTES", (("one", nothing), ("two", nothing)))
-    with pytest.raises(lbt.NumericalError, match="one, two gave no stable closed loop"):
+    with pytest.raises(lbt.errors.NumericalError, match="one, two gave no stable closed loop"):
         lbt.solve_dare(0.5, 1, 1, 1)
 
 
 def test_a_later_route_takes_over(monkeypatch):
-    import lbt_synth.riccati.dare as module
+    import lbt_synth.linear.riccati.dare as module
 
     def wrong(equations):
         return 2 * np.ones_like(equations.Q) * 1e9, np.ones(len(equations.Q), dtype=np.int64)
@@ -327,18 +336,28 @@ def test_sb10dd_the_published_digits():
     plant = [script[name] for name in "ABCD"]
     controller = script["central_controller"](*plant, gamma=111.294, **sizes)
     printed = (
-        [[-18.0030, 52.0376, 26.0831, -0.4271, -40.9022, 18.0857],
-         [18.8203, -57.6244, -29.0938, 0.5870, 45.3309, -19.8644],
-         [-26.5994, 77.9693, 39.0368, -1.4020, -60.1129, 26.6910],
-         [-21.4163, 62.1719, 30.7507, -0.9201, -48.6221, 21.8351],
-         [-0.8911, 4.2787, 2.3286, -0.2424, -3.0376, 1.2169],
-         [-5.3286, 16.1955, 8.4824, -0.2489, -12.2348, 5.1590]],
-        [[16.9788, 14.1648], [-18.9215, -15.6726], [25.2046, 21.2848],
-         [20.1122, 16.8322], [1.4104, 1.2040], [5.3181, 4.5149]],
-        [[-9.1941, 27.5165, 13.7364, -0.3639, -21.5983, 9.6025],
-         [3.6490, -10.6194, -5.2772, 0.2432, 8.1108, -3.6293]],
+        [
+            [-18.0030, 52.0376, 26.0831, -0.4271, -40.9022, 18.0857],
+            [18.8203, -57.6244, -29.0938, 0.5870, 45.3309, -19.8644],
+            [-26.5994, 77.9693, 39.0368, -1.4020, -60.1129, 26.6910],
+            [-21.4163, 62.1719, 30.7507, -0.9201, -48.6221, 21.8351],
+            [-0.8911, 4.2787, 2.3286, -0.2424, -3.0376, 1.2169],
+            [-5.3286, 16.1955, 8.4824, -0.2489, -12.2348, 5.1590],
+        ],
+        [
+            [16.9788, 14.1648],
+            [-18.9215, -15.6726],
+            [25.2046, 21.2848],
+            [20.1122, 16.8322],
+            [1.4104, 1.2040],
+            [5.3181, 4.5149],
+        ],
+        [
+            [-9.1941, 27.5165, 13.7364, -0.3639, -21.5983, 9.6025],
+            [3.6490, -10.6194, -5.2772, 0.2432, 8.1108, -3.6293],
+        ],
         [[9.0317, 7.5348], [-3.4006, -2.8219]],
-    )  # fmt: skip
+    )
     for found, digits in zip(controller, printed, strict=True):
         assert np.max(np.abs(found - digits)) < 5.1e-5
     loop = script["closed_loop"](*plant, controller, **sizes)
@@ -358,18 +377,23 @@ def test_undriven_blocks_on_the_unit_circle_are_named(seed, size):
     B[size:] = rng.standard_normal((2, 2))
     turn = np.linalg.qr(rng.standard_normal((n, n)))[0]
     problem = lbt.EstimationProblem(
-        A=turn @ A @ turn.T, B=np.hstack([turn @ B, np.zeros((n, 1))]), L=np.ones((1, n)),
-        C=rng.standard_normal((1, n)), D=[[0.0, 0.0, 1.0]],
-    )  # fmt: skip
+        A=turn @ A @ turn.T,
+        B=np.hstack([turn @ B, np.zeros((n, 1))]),
+        L=np.ones((1, n)),
+        C=rng.standard_normal((1, n)),
+        D=[[0.0, 0.0, 1.0]],
+    )
     with pytest.raises(
-        lbt.DetectabilityError, match="must be driven by noise; the mode of A at"
+        lbt.errors.DetectabilityError, match="must be driven by noise; the mode of A at"
     ) as caught:
         lbt.kalman(problem)
     assert abs(caught.value.eigenvalue - 1) < 1e-4
     if (
         size == 1
     ):  # a larger block is driven by the rounding of Q = B B', which is all solve_dare sees
-        with pytest.raises(lbt.DetectabilityError, match="Q must see every mode on the unit"):
+        with pytest.raises(
+            lbt.errors.DetectabilityError, match="Q must see every mode on the unit"
+        ):
             lbt.solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R)
 
 
@@ -391,7 +415,7 @@ def test_sizes_from_1e_minus_300_to_1e300():
         assert np.allclose(found.X / size, expected.X, rtol=1e-12)
         assert 0 < found.residual < 1e-14
     for numbers in ((1e200, 1, 1, 1), ([[0, 1e160], [0, 0]], [[0], [1]], np.eye(2), 1)):
-        with pytest.raises(lbt.NumericalError, match="was not solved"):
+        with pytest.raises(lbt.errors.NumericalError, match="was not solved"):
             lbt.solve_dare(*numbers)
 
 
@@ -414,7 +438,7 @@ def test_no_solution_is_made_up_where_a_pole_is_on_the_circle(seed):
     inner = np.array([[1, 1, 0], [0, 1, 1], [0, 0, 0.5]]) if seed % 2 else np.diag([1, 0.3, 0.5])
     A, weighted = T @ inner @ np.linalg.inv(T), np.linalg.inv(T)[2]
     B = rng.integers(-2, 3, (3, 1)).astype(float)
-    with pytest.raises((lbt.DetectabilityError, lbt.NumericalError)):
+    with pytest.raises((lbt.errors.DetectabilityError, lbt.errors.NumericalError)):
         lbt.solve_dare(A, B, np.outer(weighted, weighted), 1)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.config import robust_design
+from lbt_synth.config.robust import robust_design
 
 EXAMPLE = Path("examples/lbt_robust.yaml")
 SMALL = """
@@ -49,7 +49,7 @@ def test_the_example_holds_at_every_row_and_sensor_gain(example):
     config = lbt.load_config(EXAMPLE)
     camera = replace(config.imaging, other_modes=0.841)
     noise = replace(config.truth, noise_nm=15.5)
-    found = lbt.strehl_map(
+    found = lbt.studies.strehl_map(
         example, noise, camera, errors_hz=np.arange(-7, 8) / 2, sensor_gains=[1, 0.7, 0.5, 0.358]
     )
     worst = 100 * np.min(found.strehl[0], axis=1)
@@ -59,7 +59,7 @@ def test_the_example_holds_at_every_row_and_sensor_gain(example):
 
 def test_the_example_is_stable_over_its_interval_with_its_margin_and_few_states(example):
     hardware = example.hardware
-    low, high = lbt.stable_sensor_gains(hardware, example.controller)
+    low, high = lbt.loop.stable_sensor_gains(hardware, example.controller)
     assert low < 0.25
     assert high > 1.3
     assert lbt.loop_margins(lbt.close_loop(hardware, example.controller)).modulus >= 0.45

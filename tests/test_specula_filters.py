@@ -26,7 +26,7 @@ def designs():
     return {
         "kalman": lbt.kalman(loaded.plant),
         "hinf": lbt.hinf(loaded.plant, gamma_ratio=1.2),
-        "integrator": lbt.optimal_integrator(loaded.hardware, loaded.truth),
+        "integrator": lbt.design.optimal_integrator(loaded.hardware, loaded.truth),
     }
 
 
@@ -37,7 +37,7 @@ def files(designs, tmp_path_factory):
     made = {}
     for name, design in designs.items():
         made[name, "ssr"] = lbt.save_gain(folder / f"{name}.fits", design)
-        made[name, "iir"] = lbt.export_iir(folder / f"{name}_iir.fits", design).files[0]
+        made[name, "iir"] = lbt.interop.export_iir(folder / f"{name}_iir.fits", design).files[0]
     return made
 
 
@@ -94,7 +94,7 @@ def test_the_stated_error_of_a_transfer_function_is_what_specula_finds(designs, 
     """Within a factor of ten: the disturbances of the two runs are not the same."""
     precision, series = run
     loop = series["kalman", "iir"][0]
-    stated = lbt.export_iir(tmp_path / "again.fits", designs["kalman"])
+    stated = lbt.interop.export_iir(tmp_path / "again.fits", designs["kalman"])
     own = series["kalman", "ssr"][0]
     found = relative(loop, own)
     claimed = (stated.error, stated.error_single)[precision]

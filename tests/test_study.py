@@ -9,7 +9,7 @@ import scipy.linalg
 import lbt_synth as lbt
 
 
-def random_plant(rng: np.random.Generator) -> lbt.TipTiltPlant:
+def random_plant(rng: np.random.Generator) -> lbt.models.TipTiltPlant:
     """One axis with 1 to 6 vibrations, AR1 or AR2 turbulence, noise over six decades."""
     rate = 800.0
     if rng.random() < 0.5:
@@ -19,8 +19,8 @@ def random_plant(rng: np.random.Generator) -> lbt.TipTiltPlant:
         damping = rng.uniform(0.05, 0.9)
         decay = np.exp(-damping * slow)
         coefficients = [2 * decay * np.cos(slow * np.sqrt(1 - damping**2)), -(decay**2)]
-    unit = lbt.ARModel(coefficients=coefficients, driving_rms_nm=1.0, frame_rate_hz=rate)
-    turbulence = lbt.ARModel(
+    unit = lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=1.0, frame_rate_hz=rate)
+    turbulence = lbt.models.ARModel(
         coefficients=coefficients, driving_rms_nm=600 / unit.rms_nm, frame_rate_hz=rate
     )
     vibrations = [
@@ -33,9 +33,13 @@ def random_plant(rng: np.random.Generator) -> lbt.TipTiltPlant:
         for _ in range(rng.integers(1, 7))
     ]
     return lbt.tip_tilt_plant(
-        frame_rate_hz=rate, delay_frames=int(rng.integers(1, 4)), turbulence=turbulence,
-        vibrations=vibrations, noise_nm=10 ** rng.uniform(-3, 3), modes=1,
-    )  # fmt: skip
+        frame_rate_hz=rate,
+        delay_frames=int(rng.integers(1, 4)),
+        turbulence=turbulence,
+        vibrations=vibrations,
+        noise_nm=10 ** rng.uniform(-3, 3),
+        modes=1,
+    )
 
 
 def plain_residual(plant, P):

@@ -7,8 +7,9 @@ import pytest
 from studies import BASE, LBT_TEXT, study_file
 
 import lbt_synth as lbt
-from lbt_synth.study import batch, point
-from lbt_synth.study.meeting import changes_beliefs_only, changes_numbers_only
+from lbt_synth.studies.study import batch
+from lbt_synth.studies.study import reference_evaluation as point
+from lbt_synth.studies.study.sample_arrays import changes_beliefs_only, changes_numbers_only
 
 COUNT = 8
 LBT = LBT_TEXT.replace("kind: ar1", "kind: {kind}")
@@ -19,11 +20,11 @@ BOTH = "{kalman: {design: kalman}, told: {design: kalman, for: sample}}"
 
 def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
     """Hold each column against the evaluation point by point; return the results."""
-    study = lbt.load_study(
+    study = lbt.studies.load_study(
         study_file(tmp_path, base=base, controllers=controllers, parameters=parameters, **more)
     )
     values = study.values(0, count)
-    found = lbt.evaluate_samples(study, values, 0)
+    found = lbt.studies.evaluate_samples(study, values, 0)
     single = point.evaluate_samples(study, values, 0)
     assert found.columns.keys() == single.columns.keys()
     for name, expected in single.columns.items():
@@ -65,12 +66,12 @@ def test_the_telescope_of_the_paper(tmp_path, kind):
 
 
 def test_filters_told_their_samples(tmp_path, monkeypatch):
-    study = lbt.load_study(
+    study = lbt.studies.load_study(
         study_file(tmp_path, base=LBT_TEXT, controllers=TOLD, parameters=WEATHER)
     )
     single = point.evaluate_samples(study, study.values(0, 6), 0)
     rows = counted(monkeypatch)
-    found = lbt.evaluate_samples(study, study.values(0, 6), 0)
+    found = lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
     assert rows == [3]  # all of them at once, and one by itself
     for name, expected in single.columns.items():
         assert found.columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
@@ -86,7 +87,7 @@ def test_the_sensor_gain_that_designs_believe_in(tmp_path, monkeypatch):
     }"""
     study, _ = agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=6)
     rows = counted(monkeypatch)
-    lbt.evaluate_samples(study, study.values(0, 6), 0)
+    lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
     assert rows == [3, 3]  # all at once, one by itself for each controller
     one = "{model.sensor_gain: {uniform: [0.6, 1.2]}}"
     agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=one, count=5)
@@ -213,11 +214,14 @@ def test_samples_that_the_configuration_refuses(tmp_path):
     values = study.values(0, COUNT)
     values[2, 0] = -5.0
     values[4, 1] = 0.0
-    found = lbt.evaluate_samples(study, values, 100)
+    found = lbt.studies.evaluate_samples(study, values, 100)
     single = point.evaluate_samples(study, values, 100)
     assert [(f.row, f.controller) for f in found.failures] == [
-        (102, "slow"), (102, "kalman"), (104, "slow"), (104, "kalman"),
-    ]  # fmt: skip
+        (102, "slow"),
+        (102, "kalman"),
+        (104, "slow"),
+        (104, "kalman"),
+    ]
     assert found.failures == single.failures
     assert np.isnan(found.columns["slow.stable"]).sum() == 2
 
@@ -231,7 +235,7 @@ def test_a_filter_that_cannot_be_designed(tmp_path):
     study, _ = agree(tmp_path, base=BASE, controllers=TOLD, parameters=parameters)
     values = study.values(0, COUNT)
     values[3, 1] = 1e170  # its variance overflows
-    found = lbt.evaluate_samples(study, values, 0)
+    found = lbt.studies.evaluate_samples(study, values, 0)
     assert {f.row for f in found.failures} == {3}
     assert np.isfinite(found.columns["told.strehl"]).sum() == COUNT - 1
 
@@ -239,14 +243,21 @@ def test_a_filter_that_cannot_be_designed(tmp_path):
 def test_simulations_are_done_one_by_one(tmp_path):
     parameters = "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}}"
     agree(
-        tmp_path, base=BASE, controllers=FIXED, parameters=parameters, count=2,
+        tmp_path,
+        base=BASE,
+        controllers=FIXED,
+        parameters=parameters,
+        count=2,
         evaluation="simulation",
-    )  # fmt: skip
+    )
 
 
 def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
-    study = lbt.load_study(study_file(tmp_path, base=LBT_TEXT, controllers=FIXED,
-                                      parameters="{truth.sensor_gain: 1.0}"))  # fmt: skip
+    study = lbt.studies.load_study(
+        study_file(
+            tmp_path, base=LBT_TEXT, controllers=FIXED, parameters="{truth.sensor_gain: 1.0}"
+        )
+    )
     numbers = [
         ("truth", "sensor_gain"),
         ("atmosphere", "seeing_arcsec"),
@@ -254,9 +265,14 @@ def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
         ("sensor", "pyramid", "photons"),
     ]
     assert all(changes_numbers_only(study, keys) for keys in numbers)
-    others = [("telescope", "diameter_m"), ("model", "turbulence"), ("loop", "frame_rate_hz"),
-              ("model", "vibrations", 0, "rms_mas"), ("imaging", "wavelength_um"),
-              ("atmosphere", "seeing_wavelength_um")]  # fmt: skip
+    others = [
+        ("telescope", "diameter_m"),
+        ("model", "turbulence"),
+        ("loop", "frame_rate_hz"),
+        ("model", "vibrations", 0, "rms_mas"),
+        ("imaging", "wavelength_um"),
+        ("atmosphere", "seeing_wavelength_um"),
+    ]
     assert not any(changes_numbers_only(study, keys) for keys in others)
     assert changes_beliefs_only(study, ("model", "vibrations", 0, "rms_mas"))
     assert changes_beliefs_only(study, ("model", "sensor_gain"))
@@ -264,7 +280,7 @@ def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
 
 
 def test_two_answers_stop_a_study(tmp_path, monkeypatch):
-    study = lbt.load_study(
+    study = lbt.studies.load_study(
         study_file(
             tmp_path,
             base=BASE,
@@ -279,5 +295,5 @@ def test_two_answers_stop_a_study(tmp_path, monkeypatch):
         return replace(found, noise_nm2=1.001 * found.noise_nm2)
 
     monkeypatch.setattr(batch, "residuals_of_matrices", wrong)
-    with pytest.raises(lbt.CertificateError, match="row 14 has slow.*by itself"):
-        lbt.evaluate_samples(study, study.values(10, 16)[:8], 11)
+    with pytest.raises(lbt.errors.CertificateError, match="row 14 has slow.*by itself"):
+        lbt.studies.evaluate_samples(study, study.values(10, 16)[:8], 11)

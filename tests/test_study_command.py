@@ -20,8 +20,8 @@ from test_cli import run
 from test_study_run import TWO, assert_whole, quick, table
 
 import lbt_synth as lbt
-from lbt_synth.study.cluster import connected
-from lbt_synth.study.store import part_list
+from lbt_synth.studies.study.cluster import connected
+from lbt_synth.studies.study.store import part_list
 
 PARAMETERS = (
     "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, truth.sensor_gain: {uniform: [0.5, 1]}, "
@@ -63,8 +63,8 @@ def test_the_command(tmp_path, capsys):
         assert text in out
     assert "200 of 200 samples computed in" in out
     assert "when their number is a power of two; 200 is none" in out
-    study = lbt.load_study(path)
-    assert_whole(tmp_path / "out", study, lbt.evaluate_samples)
+    study = lbt.studies.load_study(path)
+    assert_whole(tmp_path / "out", study, lbt.studies.evaluate_samples)
     assert b"<svg" in (tmp_path / "out" / "summary.html").read_bytes()
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out")
     assert status == 0
@@ -213,7 +213,7 @@ def waits(study, values, start):
 def test_a_worker_killed_on_dask(tmp_path, cluster):
     from distributed import Client
 
-    study = lbt.load_study(study_file(tmp_path, samples="60", parameters=PARAMETERS))
+    study = lbt.studies.load_study(study_file(tmp_path, samples="60", parameters=PARAMETERS))
     folder = tmp_path / "out"
     folder.mkdir()
     killed = []
@@ -225,10 +225,14 @@ def test_a_worker_killed_on_dask(tmp_path, cluster):
             killed.append(victim)
 
     with Client(cluster, set_as_default=False) as client:
-        result = lbt.run_study(
-            study, folder, executor=client.get_executor(pure=False), workers=2, evaluate=waits,
+        result = lbt.studies.run_study(
+            study,
+            folder,
+            executor=client.get_executor(pure=False),
+            workers=2,
+            evaluate=waits,
             progress=kill,
-        )  # fmt: skip
+        )
     assert killed
     assert (result.computed, result.failures) == (60, 0)
     assert_whole(folder, study)
@@ -244,18 +248,18 @@ def poison(study, values, start):
 def test_a_row_that_kills_its_workers_on_dask(tmp_path, cluster, monkeypatch):
     from distributed import Client
 
-    study = lbt.load_study(study_file(tmp_path, samples="6", parameters=PARAMETERS))
+    study = lbt.studies.load_study(study_file(tmp_path, samples="6", parameters=PARAMETERS))
     folder = tmp_path / "out"
     folder.mkdir()
     monkeypatch.setattr(cluster.scheduler, "allowed_failures", 0)  # one death is enough
     with Client(cluster, set_as_default=False) as client:
-        result = lbt.run_study(
+        result = lbt.studies.run_study(
             study, folder, executor=client.get_executor(pure=False), workers=2, evaluate=poison
         )
     assert (result.failures, result.retry) == (1, 1)
     found = table(folder / "results.csv")
     assert np.flatnonzero(np.isnan(found["slow.strehl"])).tolist() == [4]
-    again = lbt.run_study(study, folder, evaluate=quick)
+    again = lbt.studies.run_study(study, folder, evaluate=quick)
     assert (again.computed, again.retry) == (1, 0)
     assert_whole(folder, study)
 
@@ -276,7 +280,7 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     assert not (tmp_path / "out").exists()
     status, _, error = run(capsys, *arguments)
     assert status == 0, error
-    assert_whole(tmp_path / "out", lbt.load_study(path), lbt.evaluate_samples)
+    assert_whole(tmp_path / "out", lbt.studies.load_study(path), lbt.studies.evaluate_samples)
 
 
 @pytest.mark.e2e
@@ -293,7 +297,7 @@ def test_dask_logs_no_tracebacks(capsys, cluster):
 @pytest.mark.e2e
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""])
 def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
-    monkeypatch.setattr("lbt_synth.study.cluster._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     before = time.monotonic()
     status, _, error = run(capsys, "study", path, "-o", tmp_path / "out", "--dask", address)
@@ -307,7 +311,7 @@ def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
 def test_a_scheduler_without_workers(tmp_path, capsys, monkeypatch):
     from distributed import LocalCluster
 
-    monkeypatch.setattr("lbt_synth.study.cluster._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
         status, _, error = run(

@@ -13,8 +13,9 @@ from studies import BASE, LBT_TEXT, loaded, study_file
 
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError, GainFileError, ProblemError
-from lbt_synth.study.distributions import Listed
-from lbt_synth.study.sample import sample_of
+from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.studies.study.distributions import Listed
+from lbt_synth.studies.study.sample import sample_of
 
 ONE = "truth.vibrations[0].rms_nm"
 
@@ -33,7 +34,7 @@ def test_rows_do_not_depend_on_who_asks(tmp_path, sampling):
     assert whole.shape == (37, 4)
     pieces = [study.values(a, b) for a, b in [(0, 1), (1, 2), (2, 20), (20, 20), (20, 37)]]
     np.testing.assert_array_equal(np.vstack(pieces), whole)
-    np.testing.assert_array_equal(lbt.load_study(study.source).values(), whole)
+    np.testing.assert_array_equal(lbt.studies.load_study(study.source).values(), whole)
     assert np.all(whole[:, 2] == 2.5)
     again = pickle.loads(pickle.dumps(study))
     np.testing.assert_array_equal(again.values(5, 9), whole[5:9])
@@ -162,10 +163,18 @@ def test_controllers(tmp_path):
     assert a.design.gain == 0.4
     assert b.design.certificate.passed
     assert (c.design, c.for_sample, c.request.options) == (None, True, {"gamma_ratio": 1.5})
-    assert d.design.gain == lbt.optimal_integrator(study.config.hardware, study.config.truth).gain
+    assert (
+        d.design.gain
+        == lbt.design.optimal_integrator(study.config.hardware, study.config.truth).gain
+    )
     assert study.result_columns[:6] == (
-        "a.strehl", "a.residual_nm", "a.turbulence_nm", "a.vibration_nm", "a.noise_nm", "a.stable",
-    )  # fmt: skip
+        "a.strehl",
+        "a.residual_nm",
+        "a.turbulence_nm",
+        "a.vibration_nm",
+        "a.noise_nm",
+        "a.stable",
+    )
     assert study.columns[:2] == ("row", ONE)
     assert [path.name for path in study.inputs] == ["study.yaml", "base.yaml", "a.fits"]
 
@@ -174,7 +183,7 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
     first = loaded(tmp_path).digest
     assert loaded(tmp_path, results="parquet").digest == first
     study_file(tmp_path).write_text("# a comment\n" + (tmp_path / "study.yaml").read_text())
-    assert lbt.load_study(tmp_path / "study.yaml").digest == first
+    assert lbt.studies.load_study(tmp_path / "study.yaml").digest == first
     assert loaded(tmp_path, seed="4").digest != first
     assert loaded(tmp_path, base=BASE.replace("15.0", "15.1")).digest != first
     digests = set()
@@ -193,8 +202,16 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
         ({"samples": None}, "the key samples is missing", "samples"),
         ({"samples": "0"}, "samples: input should be greater than or equal to 1; got 0", "samples"),
         ({"samples": "1.5"}, "samples: input should be a valid integer", "samples"),
-        ({"sampling": "random"}, "sampling: input should be 'sobol' or 'latin_hypercube'", "sampling"),
-        ({"evaluation": "fast"}, "evaluation: input should be 'exact' or 'simulation'", "evaluation"),
+        (
+            {"sampling": "random"},
+            "sampling: input should be 'sobol' or 'latin_hypercube'",
+            "sampling",
+        ),
+        (
+            {"evaluation": "fast"},
+            "evaluation: input should be 'exact' or 'simulation'",
+            "evaluation",
+        ),
         ({"results": "xls"}, "results: input should be 'csv' or 'parquet'", "results"),
         ({"version": "2"}, "version: input should be less than or equal to 1", "version"),
         ({"controllers": "{}"}, "controllers", "controllers"),
@@ -204,63 +221,183 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
             r"unknown key parameters\.truth\.vibrations\[0\]\.rms_nm\.unifrom; did you mean uniform",
             f"parameters.{ONE}.unifrom",
         ),
-        ({"parameters": f"{{'{ONE}': {{uniform: [2, 1]}}}}"}, r"must be \[low, high\]; got \[2, 1\]", None),
+        (
+            {"parameters": f"{{'{ONE}': {{uniform: [2, 1]}}}}"},
+            r"must be \[low, high\]; got \[2, 1\]",
+            None,
+        ),
         ({"parameters": f"{{'{ONE}': {{uniform: [1]}}}}"}, "uniform", None),
         ({"parameters": f"{{'{ONE}': {{uniform: [1, .inf]}}}}"}, "finite", None),
         ({"parameters": f"{{'{ONE}': {{}}}}"}, "expected a number or exactly one of", None),
-        ({"parameters": f"{{'{ONE}': {{fixed: 1, list: [2]}}}}"}, "expected a number or exactly one", None),
+        (
+            {"parameters": f"{{'{ONE}': {{fixed: 1, list: [2]}}}}"},
+            "expected a number or exactly one",
+            None,
+        ),
         ({"parameters": f"{{'{ONE}': fast}}"}, ONE.replace("[", r"\["), None),
         ({"parameters": f"{{'{ONE}': {{list: []}}}}"}, "list", None),
         ({"parameters": f"{{'{ONE}': {{list: [a]}}}}"}, "valid number; got 'a'", None),
-        ({"parameters": f"{{'{ONE}': {{list: [1, 2], weights: [1]}}}}"}, "weights goes with list", None),
-        ({"parameters": f"{{'{ONE}': {{uniform: [1, 2], weights: [1]}}}}"}, "weights goes with list", None),
+        (
+            {"parameters": f"{{'{ONE}': {{list: [1, 2], weights: [1]}}}}"},
+            "weights goes with list",
+            None,
+        ),
+        (
+            {"parameters": f"{{'{ONE}': {{uniform: [1, 2], weights: [1]}}}}"},
+            "weights goes with list",
+            None,
+        ),
         ({"parameters": f"{{'{ONE}': {{list: [1, 2], weights: [1, 0]}}}}"}, "greater than 0", None),
-        ({"parameters": f"{{'{ONE}': {{normal: {{mean: 1, deviation: 0}}}}}}"}, "deviation: input should be gr", None),
-        ({"parameters": f"{{'{ONE}': {{normal: {{mean: 1, deviation: 1, low: 3, high: 2}}}}}}"}, "low must be below high", None),
-        ({"parameters": f"{{'{ONE}': {{normal: {{mean: 1, deviation: 0.01, low: 3, high: 4}}}}}}"}, "has nothing between 3 and 4", None),
-        ({"parameters": "{'truth.vibration[0].rms_nm': 5}"}, "truth has no vibration; did you mean vibrations", None),
-        ({"parameters": "{'truth.vibrations[1].rms_nm': 5}"}, r"truth\.vibrations has 1 entry, counted from 0; got \[1\]", None),
-        ({"parameters": "{truth.vibrations.rms_nm: 5}"}, r"truth\.vibrations has no keys; it is a list of 1", None),
+        (
+            {"parameters": f"{{'{ONE}': {{normal: {{mean: 1, deviation: 0}}}}}}"},
+            "deviation: input should be gr",
+            None,
+        ),
+        (
+            {"parameters": f"{{'{ONE}': {{normal: {{mean: 1, deviation: 1, low: 3, high: 2}}}}}}"},
+            "low must be below high",
+            None,
+        ),
+        (
+            {
+                "parameters": f"{{'{ONE}': {{normal: {{mean: 1, deviation: 0.01, low: 3, high: 4}}}}}}"
+            },
+            "has nothing between 3 and 4",
+            None,
+        ),
+        (
+            {"parameters": "{'truth.vibration[0].rms_nm': 5}"},
+            "truth has no vibration; did you mean vibrations",
+            None,
+        ),
+        (
+            {"parameters": "{'truth.vibrations[1].rms_nm': 5}"},
+            r"truth\.vibrations has 1 entry, counted from 0; got \[1\]",
+            None,
+        ),
+        (
+            {"parameters": "{truth.vibrations.rms_nm: 5}"},
+            r"truth\.vibrations has no keys; it is a list of 1",
+            None,
+        ),
         ({"parameters": "{'truth[0]': 5}"}, "truth is no list", None),
         ({"parameters": "{truth.turbulence: 5}"}, "is not set in the configuration", None),
         ({"parameters": "{'truth.vibrations[0].kind': 5}"}, "must lead to a number", None),
-        ({"parameters": "{truth: 5}"}, "must lead to a number of the configuration; it is a section", None),
-        ({"parameters": "{atmosphere.seeing_arcsec: 5}"}, "atmosphere has no keys; it is not set", None),
+        (
+            {"parameters": "{truth: 5}"},
+            "must lead to a number of the configuration; it is a section",
+            None,
+        ),
+        (
+            {"parameters": "{atmosphere.seeing_arcsec: 5}"},
+            "atmosphere has no keys; it is not set",
+            None,
+        ),
         ({"parameters": "{'a b': 5}"}, "is no path in a configuration", None),
         ({"parameters": "{'': 5}"}, "is no path in a configuration", None),
-        ({"parameters": "{error.delay: 5}"}, "error.delay_frames and error.noise_factor; got error.delay", None),
-        ({"parameters": f"{{error.noise_factor: {{fixed: 1, also: ['{ONE}']}}}}"}, "leave also out", None),
-        ({"parameters": f"{{'{ONE}': {{fixed: 1, also: [sensor.noise_nm]}}, sensor.noise_nm: 3}}"}, "is given twice", None),
+        (
+            {"parameters": "{error.delay: 5}"},
+            "error.delay_frames and error.noise_factor; got error.delay",
+            None,
+        ),
+        (
+            {"parameters": f"{{error.noise_factor: {{fixed: 1, also: ['{ONE}']}}}}"},
+            "leave also out",
+            None,
+        ),
+        (
+            {
+                "parameters": f"{{'{ONE}': {{fixed: 1, also: [sensor.noise_nm]}}, sensor.noise_nm: 3}}"
+            },
+            "is given twice",
+            None,
+        ),
         ({"parameters": f"{{'{ONE}': {{fixed: 1, also: ['{ONE}']}}}}"}, "is given twice", None),
-        ({"parameters": f"{{'{ONE}': {{uniform: [0, 5]}}}}"}, r"parameters\.truth.*rms_nm at 0: .*greater than 0", None),
-        ({"parameters": "{'truth.vibrations[0].frequency_hz': {list: [20, 30, 401]}}"}, "at 401: .*below the Nyquist", None),
+        (
+            {"parameters": f"{{'{ONE}': {{uniform: [0, 5]}}}}"},
+            r"parameters\.truth.*rms_nm at 0: .*greater than 0",
+            None,
+        ),
+        (
+            {"parameters": "{'truth.vibrations[0].frequency_hz': {list: [20, 30, 401]}}"},
+            "at 401: .*below the Nyquist",
+            None,
+        ),
         ({"parameters": f"{{'{ONE}': {{normal: {{mean: 10, deviation: 20}}}}}}"}, "at -", None),
         ({"parameters": "{loop.axes: {list: [1, 1.5]}}"}, "valid integer", None),
-        ({"parameters": "{error.delay_frames: {uniform: [-1.5, 0]}}"}, "at -1.5: .*the real loop.*at least 1", None),
+        (
+            {"parameters": "{error.delay_frames: {uniform: [-1.5, 0]}}"},
+            "at -1.5: .*the real loop.*at least 1",
+            None,
+        ),
         ({"parameters": "{error.noise_factor: -1}"}, "the real loop.*at least 0", None),
         ({"controllers": "{9a: {design: kalman}}"}, "9a", None),
         ({"controllers": "{a b: {design: kalman}}"}, "a b", None),
-        ({"controllers": "{a: {design: kalman}, A: {design: lqg}}"}, "differs by more than its case", "controllers.A"),
-        ({"controllers": "{row_3: {design: kalman}}"}, "names that begin with row_", "controllers.row_3"),
-        ({"controllers": "{sensor: {design: kalman}}", "parameters": "{sensor.noise_nm: 4}"}, "both a parameter and a result", "controllers.sensor"),
+        (
+            {"controllers": "{a: {design: kalman}, A: {design: lqg}}"},
+            "differs by more than its case",
+            "controllers.A",
+        ),
+        (
+            {"controllers": "{row_3: {design: kalman}}"},
+            "names that begin with row_",
+            "controllers.row_3",
+        ),
+        (
+            {"controllers": "{sensor: {design: kalman}}", "parameters": "{sensor.noise_nm: 4}"},
+            "both a parameter and a result",
+            "controllers.sensor",
+        ),
         ({"controllers": "{a: {}}"}, "expected exactly one of design, file", "controllers.a"),
-        ({"controllers": "{a: {design: kalmn}}"}, r"controllers\.a\.design: input should be 'kalman'", "controllers.a.design"),
-        ({"controllers": "{a: {design: kalman, file: a.fits}}"}, "expected exactly one of design, file", None),
+        (
+            {"controllers": "{a: {design: kalmn}}"},
+            r"controllers\.a\.design: input should be 'kalman'",
+            "controllers.a.design",
+        ),
+        (
+            {"controllers": "{a: {design: kalman, file: a.fits}}"},
+            "expected exactly one of design, file",
+            None,
+        ),
         ({"controllers": "{a: {file: a.fits, for: sample}}"}, "for goes with design", None),
         ({"controllers": "{a: {file: a.fits, gain: 0.5}}"}, "gain goes with design", None),
-        ({"controllers": "{a: {design: kalman, gain: 0.5}}"}, "gain goes with design: integrator", None),
-        ({"controllers": "{a: {design: kalman, route: lmi}}"}, "takes riccati or sdp; got route 'lmi'", None),
+        (
+            {"controllers": "{a: {design: kalman, gain: 0.5}}"},
+            "gain goes with design: integrator",
+            None,
+        ),
+        (
+            {"controllers": "{a: {design: kalman, route: lmi}}"},
+            "takes riccati or sdp; got route 'lmi'",
+            None,
+        ),
         ({"controllers": "{a: {design: mixed, route: lmi}}"}, "takes no route", None),
         ({"controllers": "{a: {design: polytopic}}"}, "needs half_width_hz", None),
         ({"controllers": "{a: {design: lqg, horizon: 2}}"}, "takes no horizon", None),
-        ({"controllers": "{a: {design: hinf, gamma: 5, gamma_ratio: 2}}"}, "at most one of gamma", None),
-        ({"controllers": "{a: {design: robust}}"}, "controllers.a: .*design.robust is missing", "design.robust"),
-        ({"parameters": "{loop.frame_rate_hz: {list: [700, 800, 900]}}"}, "controllers.slow, parameters.loop.frame_rate_hz at 700: the controller must run at", None),
+        (
+            {"controllers": "{a: {design: hinf, gamma: 5, gamma_ratio: 2}}"},
+            "at most one of gamma",
+            None,
+        ),
+        (
+            {"controllers": "{a: {design: robust}}"},
+            "controllers.a: .*design.robust is missing",
+            "design.robust",
+        ),
+        (
+            {"parameters": "{loop.frame_rate_hz: {list: [700, 800, 900]}}"},
+            "controllers.slow, parameters.loop.frame_rate_hz at 700: the controller must run at",
+            None,
+        ),
         ({"config": "none.yaml"}, "cannot read .*none.yaml", None),
         ({"config": '"a\\0.yaml"'}, "cannot read .*null byte", None),
-        ({"parameters": "{simulation.frames: {uniform: [200, 400]}}"}, "it is an integer, which takes a list", "parameters.simulation.frames"),
+        (
+            {"parameters": "{simulation.frames: {uniform: [200, 400]}}"},
+            "it is an integer, which takes a list",
+            "parameters.simulation.frames",
+        ),
     ],
-)  # fmt: skip
+)
 def test_refusals(tmp_path, changes, message, path):
     with pytest.raises(ConfigError, match=message) as caught:
         loaded(tmp_path, **changes)
@@ -304,7 +441,7 @@ def test_a_point_is_what_the_library_says(tmp_path):
         "error.noise_factor: 1.5, truth.sensor_gain: 0.7}",
     )
     values = study.values()
-    batch = lbt.evaluate_samples(study, values[1:], 1)
+    batch = lbt.studies.evaluate_samples(study, values[1:], 1)
     assert (batch.start, batch.failures) == (1, ())
     assert tuple(batch.columns) == study.result_columns
     config = study.config
@@ -312,14 +449,19 @@ def test_a_point_is_what_the_library_says(tmp_path):
     for i, (frequency, delay, _, _) in enumerate(values[1:]):
         line = replace(config.plant.vibrations[0], frequency_hz=frequency)
         plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, turbulence=config.plant.turbulence[0], vibrations=[line],
-            noise_nm=15.0, modes=1,
-        )  # fmt: skip
+            frame_rate_hz=800,
+            turbulence=config.plant.turbulence[0],
+            vibrations=[line],
+            noise_nm=15.0,
+            modes=1,
+        )
         hardware = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=2 + delay)
         truth = lbt.Truth(
             turbulence=config.plant.turbulence[0],
             vibrations=(
-                lbt.SinusoidalVibration(frequency_hz=frequency, rms_nm=500, direction=(1.0,)),
+                lbt.models.SinusoidalVibration(
+                    frequency_hz=frequency, rms_nm=500, direction=(1.0,)
+                ),
             ),
             noise_nm=22.5,
             sensor_gain=0.7,
@@ -345,7 +487,7 @@ def test_unstable_loops_and_samples_that_fail(tmp_path):
         parameters="{truth.sensor_gain: {list: [0.3, 1.4]}, loop.delay_frames: {list: [2, 4]}}",
     )
     values = study.values()
-    batch = lbt.evaluate_samples(study, values, 0)
+    batch = lbt.studies.evaluate_samples(study, values, 0)
     unstable = values[:, 0] == 1.4
     stable, strehl = batch.columns["wild.stable"], batch.columns["wild.strehl"]
     assert np.all(stable[unstable] == 0)
@@ -364,18 +506,22 @@ def test_a_sample_that_is_no_configuration_fails_alone(tmp_path):
     study = loaded(tmp_path, controllers="{a: {design: kalman}, b: {design: integrator}}")
     values = study.values(0, 3)
     values[1] = -5.0
-    batch = lbt.evaluate_samples(study, values, 10)
+    batch = lbt.studies.evaluate_samples(study, values, 10)
     assert [(f.row, f.controller) for f in batch.failures] == [(11, "a"), (11, "b")]
     assert "greater than 0" in batch.failures[0].error
     assert np.isnan(batch.columns["a.stable"]).tolist() == [False, True, False]
 
 
 def test_simulated_samples(tmp_path):
-    study = loaded(tmp_path, evaluation="simulation", controllers="{a: {design: kalman}, b: "
-                   "{design: integrator, gain: 0.3}, c: {design: integrator, gain: 0.9}}",
-                   parameters="{truth.sensor_gain: {uniform: [1.2, 1.3]}}")  # fmt: skip
+    study = loaded(
+        tmp_path,
+        evaluation="simulation",
+        controllers="{a: {design: kalman}, b: "
+        "{design: integrator, gain: 0.3}, c: {design: integrator, gain: 0.9}}",
+        parameters="{truth.sensor_gain: {uniform: [1.2, 1.3]}}",
+    )
     assert study.result_columns[:3] == ("a.strehl", "a.residual_nm", "a.stable")
-    batch = lbt.evaluate_samples(study, study.values(3, 5), 3)
+    batch = lbt.studies.evaluate_samples(study, study.values(3, 5), 3)
     assert batch.columns["c.stable"].tolist() == [0, 0]
     for i, row in enumerate((3, 4)):
         sample = sample_of(study, study.values(row, row + 1)[0])
@@ -385,18 +531,23 @@ def test_simulated_samples(tmp_path):
             )
             for c in study.controllers[:2]
         ]
-        settle = max(100, *(lbt.simulation.settling_frames(x.spectral_radius) for x in loops))
+        settle = max(100, *(settling_frames(x.spectral_radius) for x in loops))
         for loop, name in zip(loops, "ab", strict=True):
             run = lbt.simulate(
-                loop.controller, sample.truth, hardware=sample.hardware, frames=400, cases=1,
-                seed=study.seed_of(row), settle_frames=settle,
-            )  # fmt: skip
+                loop.controller,
+                sample.truth,
+                hardware=sample.hardware,
+                frames=400,
+                cases=1,
+                seed=study.seed_of(row),
+                settle_frames=settle,
+            )
             assert batch.columns[f"{name}.strehl"][i] == run.strehl(study.config.imaging).mean()
     assert study.seed_of(3) != study.seed_of(4)
 
 
 def test_the_example():
-    study = lbt.load_study(ROOT / "examples" / "study.yaml")
-    batch = lbt.evaluate_samples(study, study.values(0, 1), 0)
+    study = lbt.studies.load_study(ROOT / "examples" / "study.yaml")
+    batch = lbt.studies.evaluate_samples(study, study.values(0, 1), 0)
     assert not batch.failures
     assert 0.2 < batch.columns["kalman.strehl"][0] < 0.845

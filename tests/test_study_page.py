@@ -12,14 +12,16 @@ from plants import ROOT
 from study_pages import CONTROLLERS, INFO, PARAMETERS, page_of, results
 
 import lbt_synth as lbt
-from lbt_synth.pages import Cell, Listing, Notice, Paragraph, Table, page_html
-from lbt_synth.pages.interactive import interactive
-from lbt_synth.report.study import study_page
-from lbt_synth.report.study_charts import distribution_chart, loss_chart
-from lbt_synth.report.study_info import study_info
-from lbt_synth.study.binning import binned_map, cumulative, histogram
-from lbt_synth.study.names import short_names
-from lbt_synth.study.outcomes import outcomes
+from lbt_synth.report.page.blocks import Listing, Notice, Paragraph
+from lbt_synth.report.page.bokeh_charts import interactive
+from lbt_synth.report.page.html import page_html
+from lbt_synth.report.study.charts import distribution_chart, loss_chart
+from lbt_synth.report.study.info import study_info
+from lbt_synth.report.study.page import study_page
+from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.studies.study.binning import binned_map, cumulative, histogram
+from lbt_synth.studies.study.sample_status import outcomes
+from lbt_synth.studies.study.table_names import short_names
 
 
 @pytest.fixture(scope="module")
@@ -96,12 +98,27 @@ def test_names_are_short_and_explained_once(page):
 
 def test_every_section_has_content_and_every_chart_its_words(page):
     assert [section.key for section in page.sections] == [
-        "summary", "samples", "controllers", "comparison", "dependence", "worst", "reading", "origin",
-    ]  # fmt: skip
+        "summary",
+        "samples",
+        "controllers",
+        "comparison",
+        "dependence",
+        "worst",
+        "reading",
+        "origin",
+    ]
     keys = [chart.key for chart in page.charts]
     assert keys == [
-        "distribution", "parameters", "loss", "sensitivity", "curves", "unstable", "map-1", "map-2", "map-3",
-    ]  # fmt: skip
+        "distribution",
+        "parameters",
+        "loss",
+        "sensitivity",
+        "curves",
+        "unstable",
+        "map-1",
+        "map-2",
+        "map-3",
+    ]
 
 
 @pytest.mark.parametrize("n", [1, 21])
@@ -123,13 +140,13 @@ def test_nothing_evaluated_makes_a_page_without_figures():
 
 def test_no_sample_yet_is_refused():
     columns = {name: values[:0] for name, values in results().items()}
-    with pytest.raises(lbt.ProblemError, match="at least one sample; got none"):
+    with pytest.raises(lbt.errors.ProblemError, match="at least one sample; got none"):
         page_of(columns)
 
 
 def test_columns_of_other_results_are_refused():
-    statistics = lbt.study_statistics(results(), PARAMETERS, CONTROLLERS)
-    with pytest.raises(lbt.ProblemError, match="300 samples of the statistics; got 200"):
+    statistics = lbt.studies.study_statistics(results(), PARAMETERS, CONTROLLERS)
+    with pytest.raises(lbt.errors.ProblemError, match="300 samples of the statistics; got 200"):
         study_page(INFO, statistics, results(200))
 
 
@@ -201,16 +218,16 @@ def test_short_names_are_different():
 # --------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def study():
-    return lbt.load_study(ROOT / "examples" / "study.yaml")
+    return lbt.studies.load_study(ROOT / "examples" / "study.yaml")
 
 
 def test_a_page_from_a_study_file(study, tmp_path):
     values = study.values(0, 3)
     columns = dict(zip(study.parameter_names, values.T, strict=True))
-    columns |= lbt.evaluate_samples(study, values, 0).columns
+    columns |= lbt.studies.evaluate_samples(study, values, 0).columns
     folder = tmp_path / "a folder"
     folder.mkdir()
-    files = lbt.write_study_page(
+    files = lbt.report.write_study_page(
         study, columns, folder / "summary.html", pdf=folder / "summary.pdf"
     )
     assert [file.name for file in files] == ["summary.html", "summary.pdf"]
@@ -229,8 +246,8 @@ def test_a_page_from_a_study_file(study, tmp_path):
 
 
 def test_a_page_must_have_the_name_of_one(study, tmp_path):
-    with pytest.raises(lbt.OutputError, match=r"must end in \.html"):
-        lbt.write_study_page(study, {}, tmp_path / "summary.txt")
+    with pytest.raises(lbt.errors.OutputError, match=r"must end in \.html"):
+        lbt.report.write_study_page(study, {}, tmp_path / "summary.txt")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -16,9 +16,9 @@ from studies import LBT_TEXT, loaded
 
 import lbt_synth as lbt
 from lbt_synth.errors import MissingExtraError, NumericalError, OutputError, ProblemError
-from lbt_synth.study.batches import Batches
-from lbt_synth.study.engine import DIED
-from lbt_synth.study.store import missing_rows, part_list
+from lbt_synth.studies.study.batches import Batches
+from lbt_synth.studies.study.engine import DIED
+from lbt_synth.studies.study.store import missing_rows, part_list
 
 ONE = "truth.vibrations[0].rms_nm"
 TWO = "{a: {design: kalman}, b: {design: integrator, gain: 0.4}}"
@@ -27,16 +27,14 @@ TWO = "{a: {design: kalman}, b: {design: integrator, gain: 0.4}}"
 def quick(study, values, start):
     """Columns that tell which row they are of."""
     rows = start + np.arange(len(values))
-    columns = {
-        name: rows + values[:, 0] / 7 + i for i, name in enumerate(study.result_columns)
-    }  # fmt: skip
-    return lbt.BatchResult(start=start, columns=columns)
+    columns = {name: rows + values[:, 0] / 7 + i for i, name in enumerate(study.result_columns)}
+    return lbt.studies.BatchResult(start=start, columns=columns)
 
 
 @pytest.fixture
 def small_batches(monkeypatch):
     """As if every row took long: batches are shares of what is left."""
-    monkeypatch.setattr("lbt_synth.study.batches._CRUMB_SECONDS", 0.0)
+    monkeypatch.setattr("lbt_synth.studies.study.batches._CRUMB_SECONDS", 0.0)
 
 
 def output(tmp_path, name="out"):
@@ -71,10 +69,10 @@ def assert_whole(folder, study, evaluate=quick):
 # ---------------------------------------------------------------- what a run writes
 def test_a_run_and_its_results(tmp_path):
     study, folder, counts = loaded(tmp_path, samples="50", controllers=TWO), output(tmp_path), []
-    run = lbt.run_study(study, folder, progress=counts.append)
+    run = lbt.studies.run_study(study, folder, progress=counts.append)
     assert (run.samples, run.computed, run.failures, run.retry) == (50, 50, 0, 0)
     assert sum(counts) == 50
-    assert_whole(folder, study, lbt.evaluate_samples)
+    assert_whole(folder, study, lbt.studies.evaluate_samples)
     assert (folder / "failed.csv").read_text() == "row,controller,error\n"
     assert lbt.load_gain(folder / "a.fits").method == "kalman"
     text = (folder / "results.csv").read_text()
@@ -84,12 +82,12 @@ def test_a_run_and_its_results(tmp_path):
 
 def test_a_finished_study_is_not_run_again(tmp_path):
     study, folder, counts = loaded(tmp_path), output(tmp_path), []
-    lbt.run_study(study, folder)
+    lbt.studies.run_study(study, folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    again = lbt.run_study(study, folder, evaluate=None, progress=counts.append)
+    again = lbt.studies.run_study(study, folder, evaluate=None, progress=counts.append)
     assert (again.computed, sum(counts)) == (0, 16)
     seen = []
-    lbt.run_study(study, folder, evaluate=None, whole=seen.append)
+    lbt.studies.run_study(study, folder, evaluate=None, whole=seen.append)
     assert not seen[0].new
     assert seen[0].computing_s == json.loads(before["study.json"])["computing_seconds"] > 0
     np.testing.assert_array_equal(seen[0].columns["row"], np.arange(16))
@@ -105,9 +103,9 @@ def test_failures_are_listed_and_their_rows_are_there(tmp_path):
         parameters="{loop.delay_frames: {list: [2, 4]}}",
     )
     folder = output(tmp_path)
-    run = lbt.run_study(study, folder)
+    run = lbt.studies.run_study(study, folder)
     found = table(folder / "results.csv")
-    assert_whole(folder, study, lbt.evaluate_samples)
+    assert_whole(folder, study, lbt.studies.evaluate_samples)
     noisy = np.flatnonzero(found["loop.delay_frames"] == 4)
     lines = (folder / "failed.csv").read_text().splitlines()[1:]
     assert [line.split(",")[:2] for line in lines] == [[str(row), "tight"] for row in noisy]
@@ -129,7 +127,7 @@ def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
         return quick(study, values, start)
 
     with pytest.raises(KeyboardInterrupt):
-        lbt.run_study(study, folder, evaluate=stops)
+        lbt.studies.run_study(study, folder, evaluate=stops)
     parts = [(part.start, part.stop) for part in part_list(folder)]
     assert parts == seen[:3]
     part_list(folder)[1].path.unlink()  # a hole
@@ -140,7 +138,7 @@ def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
         return quick(study, values, start)
 
     counts = []
-    run = lbt.run_study(study, folder, evaluate=watches, progress=counts.append)
+    run = lbt.studies.run_study(study, folder, evaluate=watches, progress=counts.append)
     kept = parts[0][1] + parts[2][1] - parts[2][0]
     assert (run.computed, counts[0], sum(counts)) == (100 - kept, kept, 100)
     assert sum(stop - start for start, stop in seen) == run.computed
@@ -196,7 +194,7 @@ def test_slow_rows_come_one_by_one():
 
 
 def test_missing_rows(tmp_path):
-    from lbt_synth.study.store import Part
+    from lbt_synth.studies.study.store import Part
 
     parts = [Part(start=a, stop=b, path=tmp_path) for a, b in [(2, 4), (4, 6), (9, 10)]]
     assert missing_rows(parts, 12) == [(0, 2), (6, 9), (10, 12)]
@@ -215,61 +213,61 @@ def test_other_studies_and_damage_are_refused(tmp_path):
         return quick(study, values, start)
 
     with pytest.raises(KeyboardInterrupt):
-        lbt.run_study(study, folder, evaluate=stops)
+        lbt.studies.run_study(study, folder, evaluate=stops)
     other = loaded(tmp_path, samples="60", controllers=TWO, seed="8")
     with pytest.raises(OutputError, match="is of another study"):
-        lbt.run_study(other, folder)
+        lbt.studies.run_study(other, folder)
     with pytest.raises(OutputError, match="is of another study"):
-        lbt.load_study(other.source, directory=folder)
+        lbt.studies.load_study(other.source, directory=folder)
     with pytest.raises(OutputError, match="is of another study"):
-        lbt.replay_row(other, folder, 0)
+        lbt.studies.replay_row(other, folder, 0)
     manifest = (folder / "study.json").read_text()
     (folder / "study.json").write_text(
         manifest.replace(lbt.__version__, "0.0.1").replace(study.digest, "0")
     )
     with pytest.raises(OutputError, match=r"was made by lbt_synth 0\.0\.1; this is"):
-        lbt.run_study(study, folder)
+        lbt.studies.run_study(study, folder)
     (folder / "study.json").write_text("{}")
     with pytest.raises(OutputError, match="no manifest of a study"):
-        lbt.run_study(study, folder)
+        lbt.studies.run_study(study, folder)
     (folder / "study.json").write_text(
         json.dumps({"schema": "lbt_synth study", "schema_version": 1})
     )
     with pytest.raises(OutputError, match="no manifest of a study"):
-        lbt.run_study(study, folder)
+        lbt.studies.run_study(study, folder)
     (folder / "study.json").write_text("{")
     with pytest.raises(OutputError, match="cannot read"):
-        lbt.run_study(study, folder)
+        lbt.studies.run_study(study, folder)
     (folder / "study.json").unlink()
     with pytest.raises(OutputError, match=r"parts of a study without its study\.json"):
-        lbt.run_study(study, folder)
+        lbt.studies.run_study(study, folder)
     (folder / "study.json").write_text(manifest)
     part = part_list(folder)[0].path
     content = part.read_bytes()
     for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
         part.write_bytes(damage)
         with pytest.raises(OutputError, match="is damaged. Delete it"):
-            lbt.run_study(study, folder)
+            lbt.studies.run_study(study, folder)
     part.write_bytes(content)
     twin = part.with_name("0000000003-0000000005.npz")
     twin.write_bytes(content)
     with pytest.raises(OutputError, match="has rows that are in"):
-        lbt.run_study(study, folder)
+        lbt.studies.run_study(study, folder)
     twin.unlink()
     design = (folder / "b.fits").read_bytes()
     lbt.save_gain(folder / "b.fits", lbt.integrator(study.config.hardware, gain=0.2))
     with pytest.raises(OutputError, match="is not the design that the study was begun with"):
-        lbt.run_study(study, folder)
+        lbt.studies.run_study(study, folder)
     (folder / "b.fits").write_bytes(design)
-    lbt.run_study(study, folder, evaluate=quick)
+    lbt.studies.run_study(study, folder, evaluate=quick)
     assert_whole(folder, study)
 
 
 def test_designs_are_read_where_a_study_was_begun(tmp_path, monkeypatch):
     study, folder = loaded(tmp_path, controllers=TWO), output(tmp_path)
-    lbt.run_study(study, folder, evaluate=quick)
-    monkeypatch.setattr("lbt_synth.study.load.designed", None)  # nothing is designed
-    again = lbt.load_study(study.source, directory=folder)
+    lbt.studies.run_study(study, folder, evaluate=quick)
+    monkeypatch.setattr("lbt_synth.studies.study.load.designed", None)  # nothing is designed
+    again = lbt.studies.load_study(study.source, directory=folder)
     for one, other in zip(study.controllers, again.controllers, strict=True):
         np.testing.assert_array_equal(one.design.controller.A, other.design.controller.A)
     assert again.digest == study.digest
@@ -278,12 +276,12 @@ def test_designs_are_read_where_a_study_was_begun(tmp_path, monkeypatch):
 def test_no_directory_and_inputs_in_the_way(tmp_path):
     study = loaded(tmp_path)
     with pytest.raises(OutputError, match="cannot write into"):
-        lbt.run_study(study, tmp_path / "nowhere")
+        lbt.studies.run_study(study, tmp_path / "nowhere")
     made = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
     lbt.save_gain(tmp_path / "b.fits", made)
     study = loaded(tmp_path, controllers="{a: {file: b.fits}, b: {design: kalman}}")
     with pytest.raises(OutputError, match="must not replace the input"):
-        lbt.run_study(study, tmp_path)
+        lbt.studies.run_study(study, tmp_path)
 
 
 def test_files_of_others_are_not_replaced(tmp_path):
@@ -291,7 +289,7 @@ def test_files_of_others_are_not_replaced(tmp_path):
     for name in ("slow.fits", "results.csv", "summary.html", "summary.pdf"):
         (folder / name).write_text("mine")
         with pytest.raises(OutputError, match=f"{name} is of no study that was begun there"):
-            lbt.run_study(study, folder, evaluate=quick)
+            lbt.studies.run_study(study, folder, evaluate=quick)
         assert [path.name for path in folder.iterdir() if path.name != ".lock"] == [name]
         (folder / name).unlink()
 
@@ -305,13 +303,13 @@ def test_killed_before_the_designs_were_written(tmp_path, monkeypatch):
         return lbt.save_gain(path, design)
 
     with monkeypatch.context() as patch:
-        patch.setattr("lbt_synth.study.store.save_gain", interrupted)
+        patch.setattr("lbt_synth.studies.study.store.save_gain", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            lbt.run_study(study, folder, evaluate=quick)
+            lbt.studies.run_study(study, folder, evaluate=quick)
     assert (folder / "a.fits").exists()
     assert not (folder / "b.fits").exists()
-    again = lbt.load_study(study.source, directory=folder)
-    lbt.run_study(again, folder, evaluate=quick)
+    again = lbt.studies.load_study(study.source, directory=folder)
+    lbt.studies.run_study(again, folder, evaluate=quick)
     assert_whole(folder, study)
     assert set(json.loads((folder / "study.json").read_text())["designs"]) == {"a", "b"}
 
@@ -328,7 +326,7 @@ def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
     for path in begun:
         path.write_bytes(b"half")
     (folder / ".mine.csv.abcd_123").write_bytes(b"whole")
-    lbt.run_study(study, folder, evaluate=quick)
+    lbt.studies.run_study(study, folder, evaluate=quick)
     assert_whole(folder, study)
     assert not any(path.exists() for path in begun)
     assert (folder / ".mine.csv.abcd_123").exists()
@@ -337,7 +335,7 @@ def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
 def test_jobs_without_number(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 10)
     with pytest.raises(ProblemError, match="jobs must be at most 80 on this machine; got 81"):
-        lbt.run_study(loaded(tmp_path), output(tmp_path), jobs=81)
+        lbt.studies.run_study(loaded(tmp_path), output(tmp_path), jobs=81)
 
 
 def test_parquet_without_its_package(tmp_path, monkeypatch):
@@ -345,7 +343,7 @@ def test_parquet_without_its_package(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", None)
     study = loaded(tmp_path, results="parquet")
     with pytest.raises(MissingExtraError, match=r'pip install "lbt-synth\[parquet\]"'):
-        lbt.run_study(study, output(tmp_path))
+        lbt.studies.run_study(study, output(tmp_path))
 
 
 def wrong(study, values, start):
@@ -370,14 +368,14 @@ def raises(study, values, start):
 )
 def test_evaluations_that_are_none(tmp_path, evaluate, message):
     with pytest.raises(NumericalError, match=message):
-        lbt.run_study(loaded(tmp_path), output(tmp_path), evaluate=evaluate)
+        lbt.studies.run_study(loaded(tmp_path), output(tmp_path), evaluate=evaluate)
 
 
 # ---------------------------------------------------------------- executors
 def test_any_executor(tmp_path):
     study = loaded(tmp_path, samples="300")
     with ThreadPoolExecutor(3) as pool:
-        lbt.run_study(study, folder := output(tmp_path), executor=pool, evaluate=quick)
+        lbt.studies.run_study(study, folder := output(tmp_path), executor=pool, evaluate=quick)
         assert pool.submit(int, "3").result() == 3  # it was left open
     assert_whole(folder, study)
 
@@ -409,9 +407,9 @@ def test_an_executor_that_breaks_keeps_what_is_finished(tmp_path, kind, message)
     study, folder = loaded(tmp_path, samples="300"), output(tmp_path)
     Breaks.calls, Breaks.kind = 0, kind
     with Breaks(1) as pool, pytest.raises(NumericalError, match=message):
-        lbt.run_study(study, folder, executor=pool, evaluate=quick)
+        lbt.studies.run_study(study, folder, executor=pool, evaluate=quick)
     assert 1 <= len(part_list(folder)) <= 3
-    lbt.run_study(study, folder, evaluate=quick)
+    lbt.studies.run_study(study, folder, evaluate=quick)
     assert_whole(folder, study)
 
 
@@ -433,7 +431,7 @@ def test_processes_that_die(tmp_path, monkeypatch):
     monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
     monkeypatch.setenv("STUDY_POISON", "1")
     study, folder = loaded(tmp_path, samples="10"), output(tmp_path)
-    run = lbt.run_study(study, folder, jobs=2, evaluate=dies)
+    run = lbt.studies.run_study(study, folder, jobs=2, evaluate=dies)
     assert (tmp_path / "died").exists()
     assert (run.computed, run.failures, run.retry) == (10, 1, 1)
     found = table(folder / "results.csv")
@@ -448,8 +446,8 @@ def test_processes_that_die(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # its tables are new, what it knows of them is not
-        lbt.run_study(study, folder, evaluate=dies, whole=interrupted)
-    again = lbt.run_study(study, folder, evaluate=dies)  # only that is tried again
+        lbt.studies.run_study(study, folder, evaluate=dies, whole=interrupted)
+    again = lbt.studies.run_study(study, folder, evaluate=dies)  # only that is tried again
     assert (again.computed, again.failures, again.retry) == (0, 0, 0)
     assert_whole(folder, study)
 
@@ -459,10 +457,10 @@ def always_dies(study, values, start):
 
 
 def test_processes_that_die_without_end(tmp_path, monkeypatch):
-    monkeypatch.setattr("lbt_synth.study.engine._MOST_DEATHS", 0)
+    monkeypatch.setattr("lbt_synth.studies.study.engine._MOST_DEATHS", 0)
     study = loaded(tmp_path, samples="400")
     with pytest.raises(NumericalError, match="1 times one after the other a process ended"):
-        lbt.run_study(study, output(tmp_path), jobs=2, evaluate=always_dies)
+        lbt.studies.run_study(study, output(tmp_path), jobs=2, evaluate=always_dies)
 
 
 # ---------------------------------------------------------------- the disk
@@ -482,9 +480,9 @@ def test_a_full_disk(tmp_path, monkeypatch, calls):
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         with pytest.raises(OutputError, match="No space left on device.*its free space"):
-            lbt.run_study(study, folder, evaluate=quick)
+            lbt.studies.run_study(study, folder, evaluate=quick)
     assert not list(folder.rglob(".*.*"))  # nothing half-written
-    lbt.run_study(study, folder, evaluate=quick)
+    lbt.studies.run_study(study, folder, evaluate=quick)
     assert_whole(folder, study)
 
 
@@ -512,8 +510,8 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
         "[0.1, 0.3]}, error.noise_factor: {uniform: [1.2, 1.6]}, truth.sensor_gain: 0.8}",
     )
     folder = output(tmp_path)
-    lbt.run_study(study, folder)
-    again = lbt.replay_row(study, folder, 2)
+    lbt.studies.run_study(study, folder)
+    again = lbt.studies.replay_row(study, folder, 2)
     assert [path.name for path in again.files] == ["row_2.yaml", "row_2_told.fits"]
     assert set(again.fresh) == set(again.stored) == set(study.result_columns)
     for name, value in again.stored.items():
@@ -530,17 +528,26 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
             found = lbt.strehl(lbt.residual_budget(loop, real.truth), real.imaging)
         else:
             section = real.settings.simulation
-            found = lbt.simulate(
-                design.controller, real.truth, hardware=real.hardware, frames=300, cases=2,
-                seed=section.seed, settle_frames=section.settle_frames,
-            ).strehl(real.imaging).mean()  # fmt: skip
+            found = (
+                lbt.simulate(
+                    design.controller,
+                    real.truth,
+                    hardware=real.hardware,
+                    frames=300,
+                    cases=2,
+                    seed=section.seed,
+                    settle_frames=section.settle_frames,
+                )
+                .strehl(real.imaging)
+                .mean()
+            )
         assert found == pytest.approx(again.fresh[f"{name}.strehl"], rel=1e-9)
 
 
 @pytest.mark.usefixtures("small_batches")
 def test_a_row_of_an_unfinished_study(tmp_path):
     study, folder = loaded(tmp_path, samples="60"), output(tmp_path)
-    assert lbt.replay_row(study, folder, 3).stored == {}
+    assert lbt.studies.replay_row(study, folder, 3).stored == {}
 
     def stops(study, values, start):
         if start >= 40:
@@ -548,14 +555,14 @@ def test_a_row_of_an_unfinished_study(tmp_path):
         return quick(study, values, start)
 
     with pytest.raises(KeyboardInterrupt):
-        lbt.run_study(study, folder, evaluate=stops)
+        lbt.studies.run_study(study, folder, evaluate=stops)
     last = part_list(folder)[-1].stop - 1
-    stored = lbt.replay_row(study, folder, last).stored
+    stored = lbt.studies.replay_row(study, folder, last).stored
     values = study.values(last, last + 1)
     assert stored["slow.strehl"] == quick(study, values, last).columns["slow.strehl"][0]
-    assert lbt.replay_row(study, folder, 59).stored == {}
+    assert lbt.studies.replay_row(study, folder, 59).stored == {}
     with pytest.raises(ProblemError, match="rows 0 to 59; got row 60"):
-        lbt.replay_row(study, folder, 60)
+        lbt.studies.replay_row(study, folder, 60)
 
 
 def test_a_row_whose_design_fails(tmp_path):
@@ -565,14 +572,14 @@ def test_a_row_whose_design_fails(tmp_path):
         controllers="{tight: {design: integrator, gain: 0.7, for: sample}}",
         parameters="{loop.delay_frames: {list: [4, 5]}}",
     )
-    again = lbt.replay_row(study, output(tmp_path), 1)
+    again = lbt.studies.replay_row(study, output(tmp_path), 1)
     assert "failed its certificate" in again.failures[0].error
     assert [path.name for path in again.files] == ["row_1.yaml"]
 
 
 def test_a_row_without_noise(tmp_path):
     study, folder = loaded(tmp_path, parameters="{error.noise_factor: 0}"), output(tmp_path)
-    again = lbt.replay_row(study, folder, 1)
+    again = lbt.studies.replay_row(study, folder, 1)
     assert again.fresh["slow.noise_nm"] == 0
     assert again.fresh["slow.strehl"] > 0.1
     assert again.files == ()
@@ -581,21 +588,21 @@ def test_a_row_without_noise(tmp_path):
 
 def test_a_table_of_results_that_was_changed(tmp_path):
     study, folder = loaded(tmp_path), output(tmp_path)
-    lbt.run_study(study, folder, evaluate=quick)
+    lbt.studies.run_study(study, folder, evaluate=quick)
     lines = (folder / "results.csv").read_text().splitlines()
     (folder / "results.csv").write_text("\n".join(lines[:8]) + "\n")
     with pytest.raises(OutputError, match="is not as the study wrote it"):
-        lbt.replay_row(study, folder, 9)
+        lbt.studies.replay_row(study, folder, 9)
     (folder / "results.csv").write_text("\n".join([*lines[:8], lines[8].replace("7", "8")]))
     with pytest.raises(OutputError, match="is not as the study wrote it"):
-        lbt.run_study(study, folder, evaluate=quick)
+        lbt.studies.run_study(study, folder, evaluate=quick)
     (folder / "results.csv").unlink()
-    assert lbt.run_study(study, folder, evaluate=quick).computed == 16
+    assert lbt.studies.run_study(study, folder, evaluate=quick).computed == 16
     (folder / "failed.csv").write_text("row,controller,error\n3,slow,made up\n")
     with pytest.raises(OutputError, match=r"failed\.csv is not as the study wrote it"):
-        lbt.run_study(study, folder, evaluate=quick)
+        lbt.studies.run_study(study, folder, evaluate=quick)
     (folder / "failed.csv").unlink()
-    lbt.run_study(study, folder, evaluate=quick)
+    lbt.studies.run_study(study, folder, evaluate=quick)
     assert_whole(folder, study)
 
 
@@ -607,13 +614,13 @@ def test_an_estimate(tmp_path):
         time.sleep(1e-3 * len(values))
         return quick(study, values, start)
 
-    cost = lbt.estimate_study(study, workers=1, evaluate=slow)
+    cost = lbt.studies.estimate_study(study, workers=1, evaluate=slow)
     assert 4 < cost.seconds < 9
     assert cost.measured_rows >= 1000
-    far = lbt.estimate_study(study, workers=100, local=False, evaluate=slow)
+    far = lbt.studies.estimate_study(study, workers=100, local=False, evaluate=slow)
     assert far.seconds < 0.09
     with pytest.raises(ProblemError, match="workers must be at least 1"):
-        lbt.estimate_study(study, workers=0)
+        lbt.studies.estimate_study(study, workers=0)
 
 
 # ---------------------------------------------------------------- optional packages
@@ -623,7 +630,7 @@ def test_parquet(tmp_path):
 
     study = loaded(tmp_path, samples="70", results="parquet", controllers=TWO)
     folder = output(tmp_path)
-    run = lbt.run_study(study, folder, evaluate=quick)
+    run = lbt.studies.run_study(study, folder, evaluate=quick)
     assert run.results.name == "results.parquet"
     found = pq.read_table(run.results)
     assert tuple(found.column_names) == study.columns
@@ -632,5 +639,5 @@ def test_parquet(tmp_path):
     expected = quick(study, study.values(), 0).columns
     for name in study.result_columns:
         assert found[name].to_pylist() == expected[name].tolist()  # all digits
-    assert lbt.replay_row(study, folder, 69).stored["a.strehl"] == expected["a.strehl"][69]
-    assert lbt.run_study(study, folder, evaluate=None).computed == 0
+    assert lbt.studies.replay_row(study, folder, 69).stored["a.strehl"] == expected["a.strehl"][69]
+    assert lbt.studies.run_study(study, folder, evaluate=None).computed == 0

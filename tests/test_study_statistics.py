@@ -10,9 +10,9 @@ from scipy import stats
 from scipy.stats import qmc
 
 import lbt_synth as lbt
-from lbt_synth.study.conditional import conditional_curve
-from lbt_synth.study.percentiles import percentiles, share
-from lbt_synth.study.summary import (
+from lbt_synth.studies.study.conditional import conditional_curve
+from lbt_synth.studies.study.percentiles import percentiles, share
+from lbt_synth.studies.study.summary import (
     comparison_table,
     sensitivity_table,
     varying_parameters,
@@ -31,7 +31,7 @@ def draw(kind, n, dimensions, seed):
 
 def index(parameter, result):
     order = np.argsort(parameter, kind="stable")
-    return lbt.first_order_index(parameter[order], result[order])
+    return lbt.studies.first_order_index(parameter[order], result[order])
 
 
 def study(parameters, strehls, **changes):
@@ -117,7 +117,7 @@ def test_even_samples_are_not_corrected_as_if_they_were_independent():
 def test_an_additive_model_has_the_shares_of_its_terms(weights):
     u = draw("sobol", 4096, 3, seed=1)
     columns = study({f"p{i}": u[:, i] for i in range(3)}, {"a": u @ np.array(weights) / 10})
-    found = lbt.study_statistics(columns, ["p0", "p1", "p2"], ["a"]).sensitivities[0]
+    found = lbt.studies.study_statistics(columns, ["p0", "p1", "p2"], ["a"]).sensitivities[0]
     expected = np.square(weights) / np.sum(np.square(weights))
     np.testing.assert_allclose([p.index.value for p in found.parameters], expected, atol=2e-3)
     assert found.interactions == pytest.approx(0, abs=3e-3)
@@ -138,7 +138,7 @@ def test_what_only_two_together_do_is_in_no_index():
     u = draw("independent", 5000, 2, seed=4)
     result = (u[:, 0] - 0.5) * (u[:, 1] - 0.5) + 0.5
     columns = study({"p": u[:, 0], "q": u[:, 1]}, {"a": result})
-    found = lbt.study_statistics(columns, ["p", "q"], ["a"]).sensitivities[0]
+    found = lbt.studies.study_statistics(columns, ["p", "q"], ["a"]).sensitivities[0]
     for each in found.parameters:
         assert abs(each.index.value) < 4 * each.index.error
         assert each.index.value < 0.02
@@ -178,7 +178,7 @@ def test_the_index_of_a_list_is_epsilon_squared():
 def test_constants_have_no_index():
     u = draw("independent", 200, 1, seed=0)
     columns = study({"p": u[:, 0], "fixed": np.full(200, 0.9)}, {"a": u[:, 0], "b": 0 * u[:, 0]})
-    found = lbt.study_statistics(columns, ["p", "fixed"], ["a", "b"])
+    found = lbt.studies.study_statistics(columns, ["p", "fixed"], ["a", "b"])
     varying, fixed = found.sensitivities[0].parameters
     assert varying.index.value == pytest.approx(1, abs=1e-3)
     assert np.isnan(fixed.index.value)
@@ -213,7 +213,7 @@ def test_rank_correlation_is_scipys(ties):
     if ties:
         p, strehl = np.round(p, 1), np.round(strehl, 1)
     columns = study({"p": p}, {"a": strehl})
-    found = lbt.study_statistics(columns, ["p"], ["a"]).sensitivities[0].parameters[0]
+    found = lbt.studies.study_statistics(columns, ["p"], ["a"]).sensitivities[0].parameters[0]
     assert found.spearman == pytest.approx(stats.spearmanr(p, strehl).statistic, abs=1e-12)
 
 
@@ -278,7 +278,7 @@ def small():
 
 
 def test_unstable_counts_as_zero_and_failed_is_left_out(small):
-    found = lbt.study_statistics(small, ["gain"], ["a", "b"], levels=[0.5])
+    found = lbt.studies.study_statistics(small, ["gain"], ["a", "b"], levels=[0.5])
     a, b = found.controllers
     assert (a.samples, a.failed, a.unstable.count) == (4, 1, 1)
     assert (b.samples, b.failed, b.unstable.count) == (5, 0, 2)
@@ -294,7 +294,7 @@ def test_unstable_counts_as_zero_and_failed_is_left_out(small):
 
 
 def test_comparison_is_of_the_samples_on_which_neither_failed(small):
-    pair = lbt.study_statistics(small, ["gain"], ["a", "b"]).comparisons[0]
+    pair = lbt.studies.study_statistics(small, ["gain"], ["a", "b"]).comparisons[0]
     assert (pair.first, pair.second) == ("a", "b")
     assert pair.better.total == 4
     assert pair.better.count == 2  # rows 10 and 12
@@ -304,19 +304,19 @@ def test_comparison_is_of_the_samples_on_which_neither_failed(small):
 
 
 def test_loss_is_against_the_best_of_each_sample(small):
-    a, b = lbt.study_statistics(small, ["gain"], ["a", "b"]).controllers
+    a, b = lbt.studies.study_statistics(small, ["gain"], ["a", "b"]).controllers
     assert (a.loss.best.count, a.loss.best.total) == (4, 4)
     assert b.loss.best.count == 2
     assert b.loss.loss[0].value == pytest.approx(0.05)
 
 
 def test_worst_rows_are_the_unstable_then_those_of_least_strehl(small):
-    a, b = lbt.study_statistics(small, ["gain"], ["a", "b"], worst=3).controllers
+    a, b = lbt.studies.study_statistics(small, ["gain"], ["a", "b"], worst=3).controllers
     assert [each.row for each in a.worst] == [11, 12, 14]
     assert [each.stable for each in a.worst] == [False, True, True]
     assert a.worst[1].parameters == {"gain": 0.7}
     assert [each.row for each in b.worst] == [11, 12, 13]
-    none = lbt.study_statistics(small, ["gain"], ["a"], worst=0).controllers[0]
+    none = lbt.studies.study_statistics(small, ["gain"], ["a"], worst=0).controllers[0]
     assert none.worst == ()
 
 
@@ -326,7 +326,7 @@ def test_a_stable_loop_without_light_comes_after_unstable_ones_and_ties_by_row()
         {}, {"a": strehl}, row=np.array([4, 9, 2, 8, 1]), **{"a.stable": [1, 1, 1, 0, 1]}
     )
     for count in (4, 10):
-        worst = lbt.study_statistics(columns, [], ["a"], worst=count).controllers[0].worst
+        worst = lbt.studies.study_statistics(columns, [], ["a"], worst=count).controllers[0].worst
         assert [each.row for each in worst] == [8, 4, 1, 2, 9][:count]
 
 
@@ -341,11 +341,13 @@ def test_the_order_of_samples_is_of_no_matter(seed):
     columns["a.stable"][rng.random(60) < 0.2] = 0
     columns["b.stable"][rng.random(60) < 0.2] = NAN
     order = rng.permutation(60)
-    here = lbt.study_statistics(columns, ["p", "q"], ["a", "b"])
-    there = lbt.study_statistics(
+    here = lbt.studies.study_statistics(columns, ["p", "q"], ["a", "b"])
+    there = lbt.studies.study_statistics(
         {name: values[order] for name, values in columns.items()}, ["p", "q"], ["a", "b"]
     )
-    assert [t.rows for t in lbt.summary_tables(here)] == [t.rows for t in lbt.summary_tables(there)]
+    assert [t.rows for t in lbt.studies.summary_tables(here)] == [
+        t.rows for t in lbt.studies.summary_tables(there)
+    ]
     for one, other in zip(here.controllers, there.controllers, strict=True):
         assert [w.row for w in one.worst] == [w.row for w in other.worst]
 
@@ -354,11 +356,11 @@ def test_a_controller_that_always_failed_has_dashes_and_no_numbers():
     columns = study({"p": np.linspace(0, 1, 50)}, {"a": np.linspace(0, 1, 50)})
     columns |= {"b.stable": np.full(50, NAN), "b.strehl": np.full(50, NAN)}
     columns["b.residual_nm"] = np.full(50, NAN)
-    found = lbt.study_statistics(columns, ["p"], ["a", "b"])
+    found = lbt.studies.study_statistics(columns, ["p"], ["a", "b"])
     assert found.controllers[1].samples == 0
     assert found.controllers[1].failed == 50
     assert found.controllers[1].worst == ()
-    first = lbt.summary_tables(found)[0]
+    first = lbt.studies.summary_tables(found)[0]
     column = {row[0]: text(row[2]) for row in first.rows if len(row) > 1}
     assert (column.pop("evaluated"), column.pop("failed")) == ("0", "50")
     assert set(column.values()) == {"-"}
@@ -369,8 +371,8 @@ def text(cell):
 
 
 def test_tables(small):
-    found = lbt.study_statistics(small, ["gain"], ["a", "b"])
-    tables = {table.caption.split(" over")[0]: table for table in lbt.summary_tables(found)}
+    found = lbt.studies.study_statistics(small, ["gain"], ["a", "b"])
+    tables = {table.caption.split(" over")[0]: table for table in lbt.studies.summary_tables(found)}
     assert len(tables) == 3  # too few samples for indices
     strehl = {text(row[0]): text(row[1]) for row in tables["Strehl ratio"].rows if len(row) > 1}
     assert strehl["mean ± standard error"] == "45.00 ± 17.08"
@@ -388,7 +390,7 @@ def test_tables(small):
 
 def test_a_table_compares_every_pair(small):
     small |= {name.replace("b.", "c."): small[name] for name in list(small) if name[:2] == "b."}
-    found = lbt.study_statistics(small, ["gain"], ["a", "b", "c"])
+    found = lbt.studies.study_statistics(small, ["gain"], ["a", "b", "c"])
     rows = comparison_table(found).rows
     assert [row[0] for row in rows] == ["a less b", "a less c", "b less c"]
     assert rows[0][1:4] == ("50.0", "50.0", "12.50 ± 9.46")
@@ -398,13 +400,16 @@ def test_a_table_compares_every_pair(small):
 
 def test_tables_of_one_controller_have_no_comparison():
     columns = study({"p": np.linspace(0, 1, 50)}, {"a": np.linspace(0, 1, 50)})
-    found = lbt.study_statistics(columns, ["p"], ["a"])
-    captions = [table.caption for table in lbt.summary_tables(found)]
+    found = lbt.studies.study_statistics(columns, ["p"], ["a"])
+    captions = [table.caption for table in lbt.studies.summary_tables(found)]
     assert not any("same samples" in caption for caption in captions)
-    index = next(t for t in lbt.summary_tables(found) if t.caption.startswith("Variance"))
+    index = next(t for t in lbt.studies.summary_tables(found) if t.caption.startswith("Variance"))
     assert [row[0] for row in index.rows] == [
-        "p", "all of them", "sum", "only together (interactions)",
-    ]  # fmt: skip
+        "p",
+        "all of them",
+        "sum",
+        "only together (interactions)",
+    ]
     assert index.rows[0][1] == "100.0 ± 0.0"
     named = sensitivity_table(found, names={"p": "short"})
     assert named.rows[0][0] == "short"
@@ -413,26 +418,34 @@ def test_tables_of_one_controller_have_no_comparison():
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [
-        ({"a.stable": [1, 2, 1, 1, 1]}, lbt.ProblemError, "must be 1, 0 or nan; got 2 at index 1"),
+        (
+            {"a.stable": [1, 2, 1, 1, 1]},
+            lbt.errors.ProblemError,
+            "must be 1, 0 or nan; got 2 at index 1",
+        ),
         (
             {"a.strehl": [NAN] * 5},
-            lbt.NonFiniteError,
+            lbt.errors.NonFiniteError,
             "finite and within .0, 1.*got nan at index 0",
         ),
-        ({"a.strehl": [1.2, 0, 0, 0, 0]}, lbt.ProblemError, "within .0, 1.*got 1.2 at index 0"),
-        ({"a.residual_nm": [-1, 0, 0, 0, 0]}, lbt.ProblemError, "at least 0 .*got -1"),
-        ({"a.residual_nm": [np.inf, 0, 0, 0, 0]}, lbt.NonFiniteError, "got inf at index 0"),
-        ({"b.stable": [1, 1]}, lbt.DimensionError, "'b.stable' must have 5 rows"),
-        ({"a.strehl": [1, 1]}, lbt.DimensionError, "'a.strehl' must have 5 rows"),
-        ({"gain": [1, 2, NAN, 4, 5]}, lbt.NonFiniteError, "'gain' must be finite; got nan"),
-        ({"gain": [[1, 2]]}, lbt.DimensionError, "'gain' must have 5 rows"),
-        ({"gain": list("abcde")}, lbt.ProblemError, "'gain' must be an array of numbers"),
-        ({"row": [0, 1, NAN, 3, 4]}, lbt.NonFiniteError, "'row' must be finite"),
+        (
+            {"a.strehl": [1.2, 0, 0, 0, 0]},
+            lbt.errors.ProblemError,
+            "within .0, 1.*got 1.2 at index 0",
+        ),
+        ({"a.residual_nm": [-1, 0, 0, 0, 0]}, lbt.errors.ProblemError, "at least 0 .*got -1"),
+        ({"a.residual_nm": [np.inf, 0, 0, 0, 0]}, lbt.errors.NonFiniteError, "got inf at index 0"),
+        ({"b.stable": [1, 1]}, lbt.errors.DimensionError, "'b.stable' must have 5 rows"),
+        ({"a.strehl": [1, 1]}, lbt.errors.DimensionError, "'a.strehl' must have 5 rows"),
+        ({"gain": [1, 2, NAN, 4, 5]}, lbt.errors.NonFiniteError, "'gain' must be finite; got nan"),
+        ({"gain": [[1, 2]]}, lbt.errors.DimensionError, "'gain' must have 5 rows"),
+        ({"gain": list("abcde")}, lbt.errors.ProblemError, "'gain' must be an array of numbers"),
+        ({"row": [0, 1, NAN, 3, 4]}, lbt.errors.NonFiniteError, "'row' must be finite"),
     ],
 )
 def test_columns_that_cannot_be_are_refused(small, change, error, says):
     with pytest.raises(error, match=says):
-        lbt.study_statistics(small | change, ["gain"], ["a", "b"])
+        lbt.studies.study_statistics(small | change, ["gain"], ["a", "b"])
 
 
 @pytest.mark.parametrize(
@@ -449,5 +462,5 @@ def test_columns_that_cannot_be_are_refused(small, change, error, says):
     ],
 )
 def test_arguments_that_cannot_be_are_refused(small, arguments, options, says):
-    with pytest.raises(lbt.ProblemError, match=says):
-        lbt.study_statistics(small, *arguments, **options)
+    with pytest.raises(lbt.errors.ProblemError, match=says):
+        lbt.studies.study_statistics(small, *arguments, **options)

@@ -14,13 +14,16 @@ from hypothesis import strategies as st
 from plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth import archive
-from lbt_synth.telemetry import CONVENTION, LAYERS, layout, losses
+from lbt_synth.files.telemetry import layout
+from lbt_synth.files.telemetry.aot import losses
+from lbt_synth.files.telemetry.layout import LAYERS
+from lbt_synth.files.telemetry.record import CONVENTION
+from lbt_synth.storage import array_file as archive
 
 ENDINGS = ("fits", "npz")
 
 
-SHELL = lbt.PositionLoop.of_bandwidth(
+SHELL = lbt.models.PositionLoop.of_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=150, sampling_hz=24_000, ramp_samples=3
 )
 
@@ -60,16 +63,16 @@ def full(*, frames=6, with_slopes=True, random=0, **changes):
         "name": "LBT, côté gauche",
         "metadata": {"target": "HD 1'0\n", "airmass": 1.2, "binning": 1, "night": True, "é": ""},
     }
-    return lbt.Telemetry(**{**fields, **changes})
+    return lbt.files.Telemetry(**{**fields, **changes})
 
 
 def same(one, other, *, but=(), rtol=0.0):
     """Whether two telemetries hold the same, field by field."""
-    for field in dataclasses.fields(lbt.Telemetry):
+    for field in dataclasses.fields(lbt.files.Telemetry):
         if field.name in but:
             continue
         a, b = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(a, lbt.PositionLoop):
+        if isinstance(a, lbt.models.PositionLoop):
             assert dataclasses.asdict(a) == dataclasses.asdict(b)
         elif isinstance(a, lbt.Controller):
             for name in "ABCD":
@@ -91,13 +94,17 @@ def same(one, other, *, but=(), rtol=0.0):
 @pytest.mark.parametrize("slopes", [True, False])
 def test_round_trip_keeps_every_bit(tmp_path, ending, slopes):
     seen = full(with_slopes=slopes)
-    assert same(seen, lbt.load_telemetry(lbt.save_telemetry(tmp_path / f"t.{ending}", seen)))
+    assert same(
+        seen, lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen))
+    )
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_the_least_telemetry(tmp_path, ending):
-    seen = lbt.Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])
-    assert same(seen, lbt.load_telemetry(lbt.save_telemetry(tmp_path / f"t.{ending}", seen)))
+    seen = lbt.files.Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])
+    assert same(
+        seen, lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen))
+    )
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -126,7 +133,7 @@ def telemetries(draw):
         st.one_of(words, st.booleans(), st.integers(-(2**70), 2**70), finite),
         max_size=4,
     )
-    return lbt.Telemetry(
+    return lbt.files.Telemetry(
         frame_rate_hz=draw(st.floats(1e-3, 1e6)),
         commands=series(m),
         measurements=series(q),
@@ -140,35 +147,39 @@ def telemetries(draw):
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seen=telemetries(), ending=st.sampled_from(ENDINGS))
 def test_any_telemetry_comes_back(tmp_path, seen, ending):
-    assert same(seen, lbt.load_telemetry(lbt.save_telemetry(tmp_path / f"t.{ending}", seen)))
+    assert same(
+        seen, lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen))
+    )
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_float32_rounds_series_and_nothing_else(tmp_path, ending):
     seen = full(frames=5000)
-    path = lbt.save_telemetry(tmp_path / f"t.{ending}", seen, precision="float32")
-    back = lbt.load_telemetry(path)
+    path = lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen, precision="float32")
+    back = lbt.files.load_telemetry(path)
     series = [layer.field for layer in LAYERS.values() if layer.series and layer.field != "times_s"]
     assert same(seen, back, but=series)
     for name in series:
         assert np.array_equal(getattr(back, name), getattr(seen, name).astype(np.float32))
-    exact = lbt.save_telemetry(tmp_path / f"exact.{ending}", seen)
+    exact = lbt.files.save_telemetry(tmp_path / f"exact.{ending}", seen)
     assert path.stat().st_size < 0.75 * exact.stat().st_size
 
 
 def test_float32_refuses_what_it_cannot_hold(tmp_path):
-    seen = lbt.Telemetry(frame_rate_hz=1.0, commands=[[1e39]], measurements=[[2.0]])
-    with pytest.raises(lbt.ProblemError, match="commands has values beyond the range of float32"):
-        lbt.save_telemetry(tmp_path / "t.fits", seen, precision="float32")
-    with pytest.raises(lbt.ProblemError, match="precision must be one of float64, float32"):
-        lbt.save_telemetry(tmp_path / "t.fits", seen, precision="half")
+    seen = lbt.files.Telemetry(frame_rate_hz=1.0, commands=[[1e39]], measurements=[[2.0]])
+    with pytest.raises(
+        lbt.errors.ProblemError, match="commands has values beyond the range of float32"
+    ):
+        lbt.files.save_telemetry(tmp_path / "t.fits", seen, precision="float32")
+    with pytest.raises(lbt.errors.ProblemError, match="precision must be one of float64, float32"):
+        lbt.files.save_telemetry(tmp_path / "t.fits", seen, precision="half")
     assert not list(tmp_path.iterdir())
 
 
 def test_the_fits_file_explains_itself(tmp_path):
     """Read with astropy alone: names, units, axes, timing."""
     seen = full()
-    with fits.open(lbt.save_telemetry(tmp_path / "t.fits", seen)) as units:
+    with fits.open(lbt.files.save_telemetry(tmp_path / "t.fits", seen)) as units:
         header = units[0].header
         assert units[0].data is None
         assert header["LBTTELEM"] == 1
@@ -190,8 +201,8 @@ def test_the_fits_file_explains_itself(tmp_path):
 
 def test_the_same_telemetry_is_the_same_file(tmp_path):
     for ending in ENDINGS:
-        one = lbt.save_telemetry(tmp_path / f"a.{ending}", full()).read_bytes()
-        assert lbt.save_telemetry(tmp_path / f"b.{ending}", full()).read_bytes() == one
+        one = lbt.files.save_telemetry(tmp_path / f"a.{ending}", full()).read_bytes()
+        assert lbt.files.save_telemetry(tmp_path / f"b.{ending}", full()).read_bytes() == one
 
 
 # ---------------------------------------------------------------- timing
@@ -206,15 +217,15 @@ def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
         sensor_matrix=rng.standard_normal((3, 2)),
         influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
     )
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
     truth = lbt.Truth(turbulence=slow, noise_nm=0.0, sensor_gain=0.6)
     design = lbt.integrator(path, gain=0.2)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=60, cases=2, seed=5)
-    lbt.save_telemetry(
+    lbt.files.save_telemetry(
         tmp_path / f"t.{ending}",
-        lbt.telemetry_of(run, path, case=1, sensor_gain=0.6, design=design),
+        lbt.files.telemetry_of(run, path, case=1, sensor_gain=0.6, design=design),
     )
-    seen = lbt.load_telemetry(tmp_path / f"t.{ending}")
+    seen = lbt.files.load_telemetry(tmp_path / f"t.{ending}")
     # y(k) = g S phi_res(k-1)
     expected = seen.sensor_gain * seen.residual_nm[:-1] @ seen.interaction_matrix.T
     assert np.allclose(seen.measurements[1:], expected, atol=1e-9)
@@ -248,13 +259,13 @@ def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind,
         influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
         mirror=SHELL,
     )
-    slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
     truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
     design = lbt.integrator(path, gain=0.1)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=120, seed=5)
-    written = lbt.telemetry_of(run, path, design=design)
+    written = lbt.files.telemetry_of(run, path, design=design)
     name = "t.aot.fits" if kind == "aot" else f"t.{kind}"
-    seen = lbt.load_telemetry(lbt.save_telemetry(tmp_path / name, written))
+    seen = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / name, written))
     assert "phi_cor(k) = N (c0 u(k) + c1 u(k-1)" in seen.convention
     assert "u(k-d+1)" not in seen.convention
     taps, u = seen.mirror_taps, seen.commands
@@ -276,10 +287,10 @@ def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind,
 def test_the_taps_stand_in_the_file(tmp_path):
     """For who reads it without this package: an array of FITS or NumPy, and the words."""
     seen = full()
-    with fits.open(lbt.save_telemetry(tmp_path / "t.fits", seen)) as units:
+    with fits.open(lbt.files.save_telemetry(tmp_path / "t.fits", seen)) as units:
         assert np.array_equal(units["MIRROR_TAPS"].data, seen.hardware.mirror_taps)
         assert "with the mirror taps c" in units[0].header["TIMING"]
-    with np.load(lbt.save_telemetry(tmp_path / "t.npz", seen)) as arrays:
+    with np.load(lbt.files.save_telemetry(tmp_path / "t.npz", seen)) as arrays:
         assert np.array_equal(arrays["MIRROR_TAPS"], seen.hardware.mirror_taps)
 
 
@@ -319,43 +330,45 @@ def test_taps_and_mirror_must_agree(edit, text):
     ],
 )
 def test_a_mirror_that_does_not_fit_is_refused(changes, text):
-    with pytest.raises(lbt.ProblemError, match=text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
         full(**changes)
 
 
 def test_the_camera_gives_telescope_and_strehl_ratio():
     path = lbt.LoopHardware(frame_rate_hz=800)
     design = lbt.integrator(path, gain=0.5)
-    shake = lbt.SinusoidalVibration(frequency_hz=20, rms_nm=200)
+    shake = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=200)
     truth = lbt.Truth(turbulence=None, vibrations=(shake,))
     run = lbt.simulate(design.controller, truth, hardware=path, frames=200, cases=2)
     camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
-    seen = lbt.telemetry_of(run, path, case=1, imaging=camera, name="a", metadata={"b": 1})
+    seen = lbt.files.telemetry_of(run, path, case=1, imaging=camera, name="a", metadata={"b": 1})
     assert seen.strehl == run.strehl(camera)[1]
     assert (seen.diameter_m, seen.obstruction, seen.imaging_wavelength_um) == (8.22, 0.11, 2.2)
     assert (seen.name, dict(seen.metadata), seen.controller) == ("a", {"b": 1}, None)
     three = lbt.LoopHardware(frame_rate_hz=800, modes=3)
     slow = lbt.integrator(three, gain=0.5).controller
     wide = lbt.simulate(slow, lbt.Truth(turbulence=None), hardware=three, frames=5)
-    assert lbt.telemetry_of(wide, three, imaging=camera).strehl is None
+    assert lbt.files.telemetry_of(wide, three, imaging=camera).strehl is None
 
 
 def test_telemetry_of_refuses(axis_plant):
     path = axis_plant.hardware
     design = lbt.kalman(axis_plant)
     run = lbt.simulate(design.controller, lbt.Truth(turbulence=None), hardware=path, frames=5)
-    with pytest.raises(lbt.ProblemError, match="case must be below the number of cases, 1; got 1"):
-        lbt.telemetry_of(run, path, case=1)
-    with pytest.raises(lbt.ProblemError, match="must be that of the simulation, at 800 Hz"):
-        lbt.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=500, modes=1))
-    with pytest.raises(lbt.ProblemError, match="expected a Simulation; got int"):
-        lbt.telemetry_of(3, path)
-    with pytest.raises(lbt.ProblemError, match="expected a LoopHardware; got int"):
-        lbt.telemetry_of(run, 3)
-    with pytest.raises(lbt.ProblemError, match="expected a Design; got Controller"):
-        lbt.telemetry_of(run, path, design=design.controller)
-    with pytest.raises(lbt.DimensionError, match="interaction_matrix must have 1 row"):
-        lbt.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))
+    with pytest.raises(
+        lbt.errors.ProblemError, match="case must be below the number of cases, 1; got 1"
+    ):
+        lbt.files.telemetry_of(run, path, case=1)
+    with pytest.raises(lbt.errors.ProblemError, match="must be that of the simulation, at 800 Hz"):
+        lbt.files.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=500, modes=1))
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Simulation; got int"):
+        lbt.files.telemetry_of(3, path)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a LoopHardware; got int"):
+        lbt.files.telemetry_of(run, 3)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got Controller"):
+        lbt.files.telemetry_of(run, path, design=design.controller)
+    with pytest.raises(lbt.errors.DimensionError, match="interaction_matrix must have 1 row"):
+        lbt.files.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))
 
 
 def test_hardware_of_slopes_is_seen_through_the_reconstructor():
@@ -370,12 +383,19 @@ def test_hardware_of_slopes_is_seen_through_the_reconstructor():
     ("changes", "text"),
     [
         ({"delay_frames": None, "mirror": None}, "does not tell the delay"),
-        ({"influence_matrix": None, "commands": np.ones((6, 3)), "controller": None,
-          "integrator_gains": None}, "3 commands of 2 modes, and no influence_matrix"),
+        (
+            {
+                "influence_matrix": None,
+                "commands": np.ones((6, 3)),
+                "controller": None,
+                "integrator_gains": None,
+            },
+            "3 commands of 2 modes, and no influence_matrix",
+        ),
     ],
-)  # fmt: skip
+)
 def test_hardware_that_is_not_told(changes, text):
-    with pytest.raises(lbt.ProblemError, match=text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
         _ = full(**changes).hardware
 
 
@@ -414,7 +434,10 @@ def test_hardware_that_is_not_told(changes, text):
         ({"slope_unit": "µm"}, "slope_unit must be a word"),
         ({"slope_unit": " pixel"}, "slope_unit must be a word"),
         ({"command_unit": "x" * 30}, "command_unit must be a word"),
-        ({"slope_unit": "'/"}, "slope_unit must be a word of at most 24 ASCII signs without a quote"),
+        (
+            {"slope_unit": "'/"},
+            "slope_unit must be a word of at most 24 ASCII signs without a quote",
+        ),
         ({"command_unit": ""}, "command_unit must not be empty"),
         ({"measurement_unit": "m"}, "measurement_unit must be nm for lengths; got 'm'"),
         ({"measurement_unit": 3}, "measurement_unit must be a word"),
@@ -427,11 +450,14 @@ def test_hardware_that_is_not_told(changes, text):
         ({"metadata": {"a": float("inf")}}, "metadata must be finite; got inf for 'a'"),
         ({"integrator_gains": [0.4]}, "integrator_gains must have shape"),
         ({"controller": 3}, "controller must be a Controller; got int"),
-        ({"frame_rate_hz": 801.0, "mirror": None}, "controller must run at 801 Hz; got one for 800 Hz"),
+        (
+            {"frame_rate_hz": 801.0, "mirror": None},
+            "controller must run at 801 Hz; got one for 800 Hz",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_does_not_fit_is_refused(changes, text):
-    with pytest.raises(lbt.ProblemError, match=text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
         full(**changes)
 
 
@@ -439,7 +465,7 @@ def test_a_controller_of_other_sizes_is_refused():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     one = lbt.integrator(path, gain=0.4).controller
     with pytest.raises(
-        lbt.DimensionError, match="must map 2 measurements to 2 commands; got 1 to 1"
+        lbt.errors.DimensionError, match="must map 2 measurements to 2 commands; got 1 to 1"
     ):
         full(controller=one)
 
@@ -464,12 +490,12 @@ def test_telemetry_cannot_be_changed():
 # ---------------------------------------------------------------- files that are no good
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_truncated_files_are_refused(tmp_path, ending):
-    path = lbt.save_telemetry(tmp_path / f"t.{ending}", full())
+    path = lbt.files.save_telemetry(tmp_path / f"t.{ending}", full())
     content = path.read_bytes()
     for length in np.linspace(0, len(content) - 40, 30).astype(int):
         path.write_bytes(content[:length])
-        with pytest.raises(lbt.TelemetryError) as caught:
-            lbt.load_telemetry(path)
+        with pytest.raises(lbt.errors.TelemetryError) as caught:
+            lbt.files.load_telemetry(path)
         assert "\n" not in str(caught.value)
         assert caught.value.path == path
 
@@ -480,13 +506,13 @@ def test_truncated_files_are_refused(tmp_path, ending):
 )
 def test_a_flipped_bit_is_found_or_harmless(tmp_path, ending, place, bit):
     seen = full()
-    path = lbt.save_telemetry(tmp_path / f"t.{ending}", seen)
+    path = lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen)
     content = bytearray(path.read_bytes())
     content[int(place * len(content))] ^= 1 << bit
     path.write_bytes(bytes(content))
     try:
-        back = lbt.load_telemetry(path)
-    except lbt.TelemetryError:
+        back = lbt.files.load_telemetry(path)
+    except lbt.errors.TelemetryError:
         return
     assert same(seen, back)
 
@@ -500,10 +526,10 @@ def test_foreign_files_are_refused(tmp_path):
     pickled = tmp_path / "pickled.npz"
     np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
     for path in (picture, other, gain, pickled):
-        with pytest.raises(lbt.TelemetryError, match=f"{path.name} is "):
-            lbt.load_telemetry(path)
-    with pytest.raises(lbt.GainFileError, match="is not a gain file"):
-        lbt.load_gain(lbt.save_telemetry(tmp_path / "t.fits", full()))
+        with pytest.raises(lbt.errors.TelemetryError, match=f"{path.name} is "):
+            lbt.files.load_telemetry(path)
+    with pytest.raises(lbt.errors.GainFileError, match="is not a gain file"):
+        lbt.load_gain(lbt.files.save_telemetry(tmp_path / "t.fits", full()))
 
 
 def edited(tmp_path, change, *, resign=True):
@@ -536,10 +562,10 @@ def edited(tmp_path, change, *, resign=True):
         (lambda a, m: m.update(metadata=3), True, "inconsistent"),
         (lambda a, m: m.update(metadata={"a": [1]}), True, "metadata must hold"),
     ],
-)  # fmt: skip
+)
 def test_edited_files_are_refused(tmp_path, change, resign, text):
-    with pytest.raises(lbt.TelemetryError, match=text):
-        lbt.load_telemetry(edited(tmp_path, change, resign=resign))
+    with pytest.raises(lbt.errors.TelemetryError, match=text):
+        lbt.files.load_telemetry(edited(tmp_path, change, resign=resign))
 
 
 def test_names_and_formats(tmp_path):
@@ -551,30 +577,30 @@ def test_names_and_formats(tmp_path):
         ("t.aot.fits", "fits", "does not fit the format 'fits'"),
         ("t.fits", "hdf5", "must be one of fits, npz, aot; got 'hdf5'"),
     ):
-        with pytest.raises(lbt.OutputError, match=text):
-            lbt.save_telemetry(tmp_path / name, seen, format=kind)
-    with pytest.raises(lbt.OutputError, match="holds a Telemetry; got int"):
-        lbt.save_telemetry(tmp_path / "t.fits", 3)
-    with pytest.raises(lbt.OutputError, match="No such file or directory"):
-        lbt.save_telemetry(tmp_path / "nowhere" / "t.fits", seen)
-    with pytest.raises(lbt.TelemetryError, match="must end in"):
-        lbt.load_telemetry(tmp_path / "t.txt")
+        with pytest.raises(lbt.errors.OutputError, match=text):
+            lbt.files.save_telemetry(tmp_path / name, seen, format=kind)
+    with pytest.raises(lbt.errors.OutputError, match="holds a Telemetry; got int"):
+        lbt.files.save_telemetry(tmp_path / "t.fits", 3)
+    with pytest.raises(lbt.errors.OutputError, match="No such file or directory"):
+        lbt.files.save_telemetry(tmp_path / "nowhere" / "t.fits", seen)
+    with pytest.raises(lbt.errors.TelemetryError, match="must end in"):
+        lbt.files.load_telemetry(tmp_path / "t.txt")
     (tmp_path / "folder.fits").mkdir()
-    with pytest.raises(lbt.TelemetryError, match="cannot read"):
-        lbt.load_telemetry(tmp_path / "folder.fits")
-    with pytest.raises(lbt.TelemetryError, match="null"):
-        lbt.load_telemetry("x\0y.npz")
+    with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
+        lbt.files.load_telemetry(tmp_path / "folder.fits")
+    with pytest.raises(lbt.errors.TelemetryError, match="null"):
+        lbt.files.load_telemetry("x\0y.npz")
 
 
 def test_nothing_half_written_stays(tmp_path, monkeypatch):
-    path = lbt.save_telemetry(tmp_path / "t.fits", full())
+    path = lbt.files.save_telemetry(tmp_path / "t.fits", full())
     before = path.read_bytes()
 
     def full_disk(_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(lbt.OutputError, match="No space left on device"):
-        lbt.save_telemetry(path, full(random=1))
+    with pytest.raises(lbt.errors.OutputError, match="No space left on device"):
+        lbt.files.save_telemetry(path, full(random=1))
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["t.fits"]

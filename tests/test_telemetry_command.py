@@ -13,7 +13,7 @@ from test_cli import run
 from test_telemetry import full, same
 
 import lbt_synth as lbt
-from lbt_synth.telemetry import losses
+from lbt_synth.files.telemetry.aot import losses
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def gain(tmp_path_factory):
 
 @pytest.fixture
 def night(tmp_path):
-    return lbt.save_telemetry(tmp_path / "night.fits", full(name="LBT"))
+    return lbt.files.save_telemetry(tmp_path / "night.fits", full(name="LBT"))
 
 
 def test_simulate_writes_its_first_case(tmp_path, capsys, gain):
@@ -37,7 +37,7 @@ def test_simulate_writes_its_first_case(tmp_path, capsys, gain):
     assert (status, error) == (0, "")
     data = json.loads(text)
     assert data["telemetry"] == str(out)
-    seen = lbt.load_telemetry(out)
+    seen = lbt.files.load_telemetry(out)
     assert seen.commands.shape == (300, 2)
     rms = np.sqrt(np.sum(np.mean(seen.residual_nm**2, axis=0)))
     assert rms == pytest.approx(data["residual_nm"][0])
@@ -92,10 +92,10 @@ def test_conversion_between_formats(tmp_path, capsys, night):
     status, text, _ = run(capsys, "telemetry", night, "-o", out)
     assert status == 0
     assert f"written: {out} (telemetry)" in text
-    assert same(lbt.load_telemetry(night), lbt.load_telemetry(out))
+    assert same(lbt.files.load_telemetry(night), lbt.files.load_telemetry(out))
     short = tmp_path / "short.fits"
     assert run(capsys, "telemetry", out, "-o", short, "--precision", "float32")[0] == 0
-    assert np.allclose(lbt.load_telemetry(short).commands, full().commands, rtol=1e-6)
+    assert np.allclose(lbt.files.load_telemetry(short).commands, full().commands, rtol=1e-6)
 
 
 @pytest.mark.e2e
@@ -104,8 +104,8 @@ def test_conversion_to_the_standard_says_what_is_lost(tmp_path, capsys, night):
     status, text, _ = run(capsys, "telemetry", night, "-o", out, "--format", "aot")
     assert status == 0
     assert "the AOT standard has no place for residual_nm, total_nm, controller" in text
-    seen = lbt.load_telemetry(night)
-    assert same(seen, lbt.load_telemetry(out), but=losses(seen), rtol=1e-14)
+    seen = lbt.files.load_telemetry(night)
+    assert same(seen, lbt.files.load_telemetry(out), but=losses(seen), rtol=1e-14)
     status, text, _ = run(capsys, "telemetry", out, "--json", "-o", tmp_path / "b.aot.fits")
     assert status == 0
     assert json.loads(text)["lost"] == []

@@ -7,7 +7,7 @@ import pytest
 from plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.telemetry.filters import integrator_gains, time_filters
+from lbt_synth.files.telemetry.time_filters import integrator_gains, time_filters
 
 
 def filtered(filters, series):

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.identification.tracking.glitches import glitches
+from lbt_synth.identification.tracking.trend import extrapolated
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.loop.simulation.long_series import last_state
+from lbt_synth.loop.simulation.run import step_loop
 from lbt_synth.models.plant import with_vibrations
-from lbt_synth.simulation.linear import last_state
-from lbt_synth.simulation.run import step_loop
-from lbt_synth.simulation.series import draw_disturbance, draw_noise
-from lbt_synth.tracking.glitches import glitches
-from lbt_synth.tracking.trend import extrapolated
 
-SHELL = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
-AIR = lbt.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
+SHELL = lbt.models.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
+AIR = lbt.models.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
 
 
 def line(frequency_hz, damping=0.02):
@@ -35,7 +35,7 @@ def axis(*frequencies_hz, noise_nm=15.5, **changes):
 
 def disturbed(plant, *, frames, hz=20, seed=0):
     """Total phase and noise, (1, frames, n) each."""
-    shake = lbt.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=(1,))
+    shake = lbt.models.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=(1,))
     truth = lbt.Truth(turbulence=AIR, vibrations=(shake,), noise_nm=15.5)
     rng = np.random.default_rng(seed)
     size = {"frames": frames, "cases": 1, "rng": rng}
@@ -53,7 +53,7 @@ class Exchanged:
 
     def __init__(self, old, new, frame, **options):
         self.old, self.new, self.frame = old, new, frame
-        self.running = lbt.SwitchedController(old, **options)
+        self.running = lbt.identification.SwitchedController(old, **options)
 
     def reset(self):
         self.k = 0
@@ -112,10 +112,15 @@ def test_the_last_state_is_that_of_the_recursion(seed, n, frames):
 def sensed(plant):
     """The plant with two axes, coupled sensor and mirror, and a sensor gain."""
     return lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=AIR, noise_nm=15.5, delay_frames=2.4,
-        vibrations=[replace(line(21), direction=(1, 0.5))], sensor_gain=0.8,
-        sensor_matrix=[[1, 0.1], [0.2, 0.9], [0.3, -0.4]], influence_matrix=[[1, 0.2], [0, 0.9]],
-    )  # fmt: skip
+        frame_rate_hz=800,
+        turbulence=AIR,
+        noise_nm=15.5,
+        delay_frames=2.4,
+        vibrations=[replace(line(21), direction=(1, 0.5))],
+        sensor_gain=0.8,
+        sensor_matrix=[[1, 0.1], [0.2, 0.9], [0.3, -0.4]],
+        influence_matrix=[[1, 0.2], [0, 0.9]],
+    )
 
 
 PLANTS = {
@@ -135,7 +140,7 @@ def test_alone_it_is_the_controller_of_the_design(name):
     n, q = plant.hardware.modes, plant.hardware.n_measurements
     rng = np.random.default_rng(1)
     series = 100 * rng.standard_normal((1, 300, n)), rng.standard_normal((1, 300, q))
-    one = run(lbt.SwitchedController(design), plant, series)
+    one = run(lbt.identification.SwitchedController(design), plant, series)
     other = run(design.controller.start(), plant, series)
     assert np.allclose(one, other, rtol=0, atol=1e-11 * np.abs(other).max())
 
@@ -144,11 +149,11 @@ def test_the_same_filter_changes_nothing_at_all():
     plant = axis(20)
     series = disturbed(plant, frames=1500)
     design, again = lbt.kalman(plant), lbt.kalman(axis(20))
-    kept = run(lbt.SwitchedController(design), plant, series)
+    kept = run(lbt.identification.SwitchedController(design), plant, series)
     for memory_s in (0.1, 8):
         change = Exchanged(design, again, 1000, memory_s=memory_s)
         assert np.array_equal(run(change, plant, series), kept)
-        assert change.report == lbt.SwitchReport(copied=True, frames=0, left=0.0)
+        assert change.report == lbt.identification.SwitchReport(copied=True, frames=0, left=0.0)
 
 
 def test_the_same_filter_run_over_the_record_changes_no_command():
@@ -157,7 +162,7 @@ def test_the_same_filter_run_over_the_record_changes_no_command():
     series = disturbed(plant, frames=4000)
     design = lbt.kalman(plant)
     almost = lbt.kalman(axis(20, sensor_matrix=[[1 + 2**-52]]))
-    kept = run(lbt.SwitchedController(design), plant, series)
+    kept = run(lbt.identification.SwitchedController(design), plant, series)
     # all is recorded; and the record is shorter than the run, but longer than the filter's memory
     for memory_s in (8, 3):
         change = Exchanged(design, almost, 3500, memory_s=memory_s)
@@ -219,7 +224,7 @@ def test_a_cold_exchange_bumps_the_residual_and_this_one_does_not():
 
 def test_measurements_that_are_not_numbers_hold_the_command():
     plant = axis(20)
-    running = lbt.SwitchedController(lbt.kalman(plant))
+    running = lbt.identification.SwitchedController(lbt.kalman(plant))
     total, noise = disturbed(plant, frames=1200)
     clean = run(running, plant, (total, noise))
     broken = noise.copy()
@@ -250,21 +255,24 @@ def test_only_filters_of_the_same_loop_are_exchanged():
     design = lbt.kalman(plant)
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     for wrong in (lbt.kalman(walk), lbt.integrator(plant.hardware, gain=0.3), lbt.lqg(plant), None):
-        with pytest.raises(lbt.ProblemError, match="only filters of a TipTiltPlant"):
-            lbt.SwitchedController(wrong)
-    running = lbt.SwitchedController(design)
+        with pytest.raises(lbt.errors.ProblemError, match="only filters of a TipTiltPlant"):
+            lbt.identification.SwitchedController(wrong)
+    running = lbt.identification.SwitchedController(design)
     for other in (
-        axis(20, delay_frames=3), axis(20, mirror=SHELL), axis(20, influence_matrix=[[2.0]]),
-        axis(20, sensor_matrix=[[1.0], [1.0]]), lbt_axis_plant(modes=2),
-    ):  # fmt: skip
-        with pytest.raises(lbt.ProblemError, match="must be for the running loop"):
+        axis(20, delay_frames=3),
+        axis(20, mirror=SHELL),
+        axis(20, influence_matrix=[[2.0]]),
+        axis(20, sensor_matrix=[[1.0], [1.0]]),
+        lbt_axis_plant(modes=2),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match="must be for the running loop"):
             running.switch(lbt.kalman(other))
     assert running.design is design
-    with pytest.raises(lbt.DimensionError, match=r"y must have shape \(1,\)"):
+    with pytest.raises(lbt.errors.DimensionError, match=r"y must have shape \(1,\)"):
         running.step([1.0, 2.0])
     for memory_s in (0, 1e-4, np.inf):
-        with pytest.raises(lbt.ProblemError, match="memory_s"):
-            lbt.SwitchedController(design, memory_s=memory_s)
+        with pytest.raises(lbt.errors.ProblemError, match="memory_s"):
+            lbt.identification.SwitchedController(design, memory_s=memory_s)
 
 
 def test_a_filter_of_another_sensor_gain_is_told_by_its_own():
@@ -354,12 +362,13 @@ def test_lines_are_found_in_the_pseudo_open_loop():
         draw_noise(truth, plant.hardware, **size),
     )
     corrections = 500 * rng.standard_normal(total.shape)  # whatever the loop did
-    follow, errors = lbt.LineFollower(plant), []
+    follow, errors = lbt.identification.LineFollower(plant), []
     for k in range(12):
         follow.reset()
         found = follow((total - corrections)[k] @ sensor.T + noise[k], corrections[k])
-        errors.append([a.frequency_hz - b.frequency_hz for a, b in
-                       zip(found.vibrations, true, strict=True)])  # fmt: skip
+        errors.append(
+            [a.frequency_hz - b.frequency_hz for a, b in zip(found.vibrations, true, strict=True)]
+        )
         assert [v.rms_nm for v in found.vibrations] == [v.rms_nm for v in lines]
         assert np.array_equal(found.hardware.sensor, sensor)
     # in four seconds a resonance wanders by a part of its width, sqrt(k f / (2 pi 4 s)) and more
@@ -398,7 +407,7 @@ def sinusoids(*parts, seed, axis=0, frames=3200):
 )
 def test_neighbours_are_found_each_at_its_own_peak(frames, parts):
     for order in (1, -1):
-        follow = lbt.LineFollower(neighbours([20, 22][::order]))
+        follow = lbt.identification.LineFollower(neighbours([20, 22][::order]))
         for seed in range(2):
             follow.reset()
             series = sinusoids(*parts, seed=seed, frames=frames)
@@ -407,12 +416,19 @@ def test_neighbours_are_found_each_at_its_own_peak(frames, parts):
             assert [v.frequency_hz for v in found.vibrations] == pytest.approx(wanted, abs=0.06)
 
 
-@pytest.mark.parametrize("parts", [
-    [(21, 400)], [(21, 4000)], [(21, 40)], [(20, 140)], [(19.3, 1000)],
-    [(20.9, 300), (21.2, 300)],  # closer than the window resolves
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [(21, 400)],
+        [(21, 4000)],
+        [(21, 40)],
+        [(20, 140)],
+        [(19.3, 1000)],
+        [(20.9, 300), (21.2, 300)],  # closer than the window resolves
+    ],
+)
 def test_two_lines_are_not_found_on_one_peak(parts):
-    follow = lbt.LineFollower(neighbours([20, 22]))
+    follow = lbt.identification.LineFollower(neighbours([20, 22]))
     for seed in range(3):
         series = sinusoids(*parts, seed=seed)
         assert follow(series, np.zeros_like(series)) is None
@@ -421,18 +437,19 @@ def test_two_lines_are_not_found_on_one_peak(parts):
 def test_lines_along_other_directions_are_no_neighbours():
     plant = neighbours([20, 22], second=(0, 1))
     series = sinusoids((21.3, 400), seed=0) + sinusoids((21.2, 300), seed=1, axis=1)
-    found = lbt.LineFollower(plant)(series, np.zeros_like(series))
+    found = lbt.identification.LineFollower(plant)(series, np.zeros_like(series))
     assert [v.frequency_hz for v in found.vibrations] == pytest.approx([21.3, 21.2], abs=0.02)
 
 
 def test_no_line_is_no_plant():
     plant = axis(20)
-    follow = lbt.LineFollower(plant)
+    follow = lbt.identification.LineFollower(plant)
     still = lbt.Truth(turbulence=AIR, noise_nm=15.5)
     rng = np.random.default_rng(5)
     size = {"frames": 3200, "cases": 1, "rng": rng}
-    calm = (draw_disturbance(still, plant.hardware, **size)
-            + draw_noise(still, plant.hardware, **size))[0]  # fmt: skip
+    calm = (
+        draw_disturbance(still, plant.hardware, **size) + draw_noise(still, plant.hardware, **size)
+    )[0]
     assert follow(calm, np.zeros_like(calm)) is None
     assert follow(calm[:100], np.zeros((100, 1))) is None  # nor is a window without resolution
     shaken = calm + 30 * np.cos(2 * np.pi * 22 * np.arange(3200)[:, None] / 800)
@@ -441,27 +458,33 @@ def test_no_line_is_no_plant():
 
 
 def test_wrong_followers_are_refused():
-    with pytest.raises(lbt.ProblemError, match="a vibration to follow"):
-        lbt.LineFollower(axis())
+    with pytest.raises(lbt.errors.ProblemError, match="a vibration to follow"):
+        lbt.identification.LineFollower(axis())
     blind = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=AIR, noise_nm=1, sensor_matrix=[[1.0, 1.0]],
+        frame_rate_hz=800,
+        turbulence=AIR,
+        noise_nm=1,
+        sensor_matrix=[[1.0, 1.0]],
         vibrations=[replace(line(20), direction=(1, 0))],
-    )  # fmt: skip
-    with pytest.raises(lbt.ProblemError, match="every mode must be measured"):
-        lbt.LineFollower(blind)
-    with pytest.raises(lbt.ProblemError, match="span_hz must be above 0"):
-        lbt.LineFollower(axis(20), span_hz=0)
-    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
-        lbt.LineFollower("plant")
-    with pytest.raises(lbt.DimensionError, match=r"must be \(frames, 1\) and \(frames, 1\)"):
-        lbt.LineFollower(axis(20))(np.zeros((100, 2)), np.zeros((100, 1)))
+    )
+    with pytest.raises(lbt.errors.ProblemError, match="every mode must be measured"):
+        lbt.identification.LineFollower(blind)
+    with pytest.raises(lbt.errors.ProblemError, match="span_hz must be above 0"):
+        lbt.identification.LineFollower(axis(20), span_hz=0)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.identification.LineFollower("plant")
+    with pytest.raises(lbt.errors.DimensionError, match=r"must be \(frames, 1\) and \(frames, 1\)"):
+        lbt.identification.LineFollower(axis(20))(np.zeros((100, 2)), np.zeros((100, 1)))
 
 
 def test_the_whole_model_is_found_in_a_window():
     """Two axes with other lines, noises and gains than the plant believes."""
     believed = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=AIR, noise_nm=10, vibrations=[replace(line(20), direction=(1, 0))],
-    )  # fmt: skip
+        frame_rate_hz=800,
+        turbulence=AIR,
+        noise_nm=10,
+        vibrations=[replace(line(20), direction=(1, 0))],
+    )
     gains, noises, lines_hz = (0.7, 1.0), (12.0, 25.0), (23.0, 41.0)
     true = [
         replace(line(hz, damping=0.01), direction=tuple(np.eye(2)[i]))
@@ -473,7 +496,7 @@ def test_the_whole_model_is_found_in_a_window():
         lbt.integrator(path, gain=0.5).controller, truth, hardware=path, frames=8000, seed=3
     )
     y, u = loop.measurements[0, 2:], loop.commands[0, :-2]
-    identify = lbt.LoopIdentifier(believed)
+    identify = lbt.identification.LoopIdentifier(believed)
     for _ in range(2):  # from nothing, and from what it was
         found = identify(y, u)
         assert np.allclose(np.diag(found.hardware.sensor), gains, rtol=0.12)
@@ -482,23 +505,23 @@ def test_the_whole_model_is_found_in_a_window():
             along = [w for w in found.vibrations if w.direction == v.direction]
             assert min(abs(w.frequency_hz - v.frequency_hz) for w in along) < 0.5
     assert lbt.kalman(found).certificate.passed
-    given = lbt.LoopIdentifier(believed, find_gain=False, most_lines=1)(y, u)
+    given = lbt.identification.LoopIdentifier(believed, find_gain=False, most_lines=1)(y, u)
     assert np.array_equal(given.hardware.sensor, believed.hardware.sensor)
 
 
 def test_wrong_identifiers_are_refused():
     plant = axis(20)
-    with pytest.raises(lbt.ProblemError, match="each measurement must be of one axis"):
-        lbt.LoopIdentifier(sensed(None))
-    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
-        lbt.LoopIdentifier(None)
-    with pytest.raises(lbt.ProblemError, match="most_lines must be at least 0"):
-        lbt.LoopIdentifier(plant, most_lines=-1)
-    identify = lbt.LoopIdentifier(plant)
-    with pytest.raises(lbt.DimensionError, match=r"must be \(frames, 1\)"):
+    with pytest.raises(lbt.errors.ProblemError, match="each measurement must be of one axis"):
+        lbt.identification.LoopIdentifier(sensed(None))
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.identification.LoopIdentifier(None)
+    with pytest.raises(lbt.errors.ProblemError, match="most_lines must be at least 0"):
+        lbt.identification.LoopIdentifier(plant, most_lines=-1)
+    identify = lbt.identification.LoopIdentifier(plant)
+    with pytest.raises(lbt.errors.DimensionError, match=r"must be \(frames, 1\)"):
         identify(np.zeros((3200, 1)), np.zeros((3200, 2)))
     # a window that is too short is told in the history of the tracker
-    tracker = lbt.TrackingController(plant, window_s=0.25)
+    tracker = lbt.identification.TrackingController(plant, window_s=0.25)
     simulated(tracker, frames=400)
     assert tracker.kept == len(tracker.history) > 0
     assert "at least 512 frames" in tracker.history[0].reason
@@ -525,7 +548,9 @@ class Oracle:
         return with_vibrations(self.plant, [self.plant.vibrations[0].moved(frequency_hz)])
 
 
-DRIFT = lbt.DriftingVibration(start_hz=18, end_hz=22, duration_s=8, rms_nm=300, direction=(1,))
+DRIFT = lbt.models.DriftingVibration(
+    start_hz=18, end_hz=22, duration_s=8, rms_nm=300, direction=(1,)
+)
 SHAKEN = lbt.Truth(turbulence=AIR, vibrations=(DRIFT,), noise_nm=15.5)
 
 
@@ -538,7 +563,7 @@ def simulated(controller, truth=SHAKEN, frames=7200):
 def test_a_trend_is_ahead_of_the_windows():
     """With the exact frequency of each window's middle, the filter has that of its own time."""
     plant = axis(18)
-    tracker = lbt.TrackingController(
+    tracker = lbt.identification.TrackingController(
         plant, Oracle(plant, lambda t: 18 + 0.5 * t, 1.0, 0.5), window_s=1, update_s=0.5
     )
     simulated(tracker, frames=1600)
@@ -546,17 +571,22 @@ def test_a_trend_is_ahead_of_the_windows():
         assert update.middle_s == update.time_s - 0.5
         assert update.fitted_hz[0] == pytest.approx(18 + 0.5 * update.middle_s)
         assert update.frequencies_hz[0] == pytest.approx(18 + 0.5 * (update.time_s + 0.25))
-    bare = lbt.TrackingController(
-        plant, Oracle(plant, lambda t: 18 + 0.5 * t, 1.0, 0.5), window_s=1, update_s=0.5,
+    bare = lbt.identification.TrackingController(
+        plant,
+        Oracle(plant, lambda t: 18 + 0.5 * t, 1.0, 0.5),
+        window_s=1,
+        update_s=0.5,
         extrapolate=False,
-    )  # fmt: skip
+    )
     simulated(bare, frames=1600)
     assert all(update.frequencies_hz == update.fitted_hz for update in bare.history)
 
 
 def test_the_tracker_follows_a_drift_and_a_fixed_filter_does_not():
     plant = axis(18)
-    tracker = lbt.TrackingController(plant, lbt.LineFollower(plant), window_s=2, update_s=0.5)
+    tracker = lbt.identification.TrackingController(
+        plant, lbt.identification.LineFollower(plant), window_s=2, update_s=0.5
+    )
     followed = simulated(tracker)
     fixed = simulated(lbt.kalman(plant).controller)
     assert tracker.kept == tracker.spoilt == 0
@@ -576,8 +606,10 @@ def test_the_tracker_follows_a_drift_and_a_fixed_filter_does_not():
 
 def test_without_a_change_the_commands_are_those_of_the_fixed_filter():
     plant = axis(18)
-    same = lbt.TrackingController(plant, lambda _y, _c: plant, window_s=0.5, update_s=0.25)
-    fixed = simulated(lbt.SwitchedController(lbt.kalman(plant)), frames=1600)
+    same = lbt.identification.TrackingController(
+        plant, lambda _y, _c: plant, window_s=0.5, update_s=0.25
+    )
+    fixed = simulated(lbt.identification.SwitchedController(lbt.kalman(plant)), frames=1600)
     assert np.array_equal(simulated(same, frames=1600).commands, fixed.commands)
     assert same.kept == 0
     assert all(update.switched and update.reason == "" for update in same.history)
@@ -598,10 +630,11 @@ def broken(_measurements, _corrections):
 )
 def test_a_fit_that_fails_keeps_the_filter_and_is_told(identifier, words):
     plant = axis(18)
-    tracker = lbt.TrackingController(plant, identifier, window_s=0.5, update_s=0.25)
+    tracker = lbt.identification.TrackingController(plant, identifier, window_s=0.5, update_s=0.25)
     out = simulated(tracker, frames=800)
     assert np.array_equal(
-        out.commands, simulated(lbt.SwitchedController(lbt.kalman(plant)), frames=800).commands
+        out.commands,
+        simulated(lbt.identification.SwitchedController(lbt.kalman(plant)), frames=800).commands,
     )
     assert tracker.kept == len(tracker.history) == 11
     for update in tracker.history:
@@ -619,10 +652,12 @@ def test_a_design_that_fails_keeps_the_filter():
     def design(problem):
         calls.append(problem)
         if len(calls) in (3, 4):
-            raise (lbt.CertificateError("not today"), ZeroDivisionError("nor now"))[len(calls) - 3]
+            raise (lbt.errors.CertificateError("not today"), ZeroDivisionError("nor now"))[
+                len(calls) - 3
+            ]
         return lbt.kalman(problem)
 
-    tracker = lbt.TrackingController(
+    tracker = lbt.identification.TrackingController(
         plant, lambda _y, _c: axis(19), window_s=0.5, update_s=0.25, design=design
     )
     simulated(tracker, frames=0 + 400)
@@ -635,8 +670,8 @@ def test_a_design_that_fails_keeps_the_filter():
 
 def test_a_window_with_holes_is_not_identified():
     plant = axis(18)
-    tracker = lbt.TrackingController(
-        plant, lbt.LineFollower(plant), window_s=1, update_s=0.5, extrapolate=False
+    tracker = lbt.identification.TrackingController(
+        plant, lbt.identification.LineFollower(plant), window_s=1, update_s=0.5, extrapolate=False
     )
     total, noise = disturbed(plant, frames=3200, hz=19)
     noise[0, 1000:1020] = np.nan
@@ -652,10 +687,15 @@ def test_a_window_with_holes_is_not_identified():
 def test_a_glitch_is_no_noise(size_nm, whole):
     """One measurement that is off by far, in the first windows."""
     plant = axis(18)
-    tracker = lbt.TrackingController(
-        plant, lbt.LoopIdentifier(plant) if whole else lbt.LineFollower(plant), window_s=2,
-        update_s=0.5, extrapolate=False,
-    )  # fmt: skip
+    tracker = lbt.identification.TrackingController(
+        plant,
+        lbt.identification.LoopIdentifier(plant)
+        if whole
+        else lbt.identification.LineFollower(plant),
+        window_s=2,
+        update_s=0.5,
+        extrapolate=False,
+    )
     total, noise = disturbed(plant, frames=4000, hz=19)
     run(tracker, plant, (total, noise))
     clean = tracker.history
@@ -691,7 +731,9 @@ def test_clean_windows_have_no_outliers(frames):
 
 def test_glitches_that_come_often_keep_the_filter():
     plant = axis(18)
-    tracker = lbt.TrackingController(plant, lbt.LineFollower(plant), window_s=1, update_s=0.5)
+    tracker = lbt.identification.TrackingController(
+        plant, lbt.identification.LineFollower(plant), window_s=1, update_s=0.5
+    )
     total, noise = disturbed(plant, frames=2400, hz=19)
     few, many, near = noise.copy(), noise.copy(), noise.copy()
     few[0, 100:800:120] += 5e3  # 6, and 2 of the beginning
@@ -709,9 +751,11 @@ def test_glitches_that_come_often_keep_the_filter():
 
 def test_two_lines_are_followed_each_for_itself():
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=AIR, noise_nm=15.5,
+        frame_rate_hz=800,
+        turbulence=AIR,
+        noise_nm=15.5,
         vibrations=[replace(line(20), direction=(1, 0)), replace(line(21), direction=(0, 1))],
-    )  # fmt: skip
+    )
     calls = []
 
     def crossing(_measurements, _corrections):
@@ -724,7 +768,7 @@ def test_two_lines_are_followed_each_for_itself():
         # the order of an estimator is its own affair
         return with_vibrations(plant, lines if len(calls) % 2 else lines[::-1])
 
-    tracker = lbt.TrackingController(plant, crossing, window_s=0.5, update_s=0.5)
+    tracker = lbt.identification.TrackingController(plant, crossing, window_s=0.5, update_s=0.5)
     for _ in range(3200):
         tracker.step(np.zeros(2))
     update = tracker.history[-1]
@@ -736,7 +780,7 @@ def test_two_lines_are_followed_each_for_itself():
 
 def test_wrong_trackers_are_refused():
     plant = axis(20)
-    follow = lbt.LineFollower(plant)
+    follow = lbt.identification.LineFollower(plant)
     for wrong, words in (
         ({"window_s": 0.001}, "window_s must be at least"),
         ({"update_s": 0}, "update_s must be at least"),
@@ -744,35 +788,38 @@ def test_wrong_trackers_are_refused():
         ({"design": lambda p: lbt.integrator(p.hardware, gain=0.3)}, "only filters of"),
         ({"design": 3}, "design must be a callable plant -> FilterDesign.*got int"),
     ):
-        with pytest.raises(lbt.ProblemError, match=words):
-            lbt.TrackingController(plant, follow, **wrong)
-    with pytest.raises(lbt.ProblemError, match="identifier must be a callable"):
-        lbt.TrackingController(plant, "follow")
-    with pytest.raises(lbt.ProblemError, match="expected a TipTiltPlant"):
-        lbt.TrackingController(plant.hardware, follow)
-    with pytest.raises(lbt.DimensionError, match=r"y must have shape \(1,\)"):
-        lbt.TrackingController(plant, follow).step([0.0, 0.0])
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            lbt.identification.TrackingController(plant, follow, **wrong)
+    with pytest.raises(lbt.errors.ProblemError, match="identifier must be a callable"):
+        lbt.identification.TrackingController(plant, "follow")
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.identification.TrackingController(plant.hardware, follow)
+    with pytest.raises(lbt.errors.DimensionError, match=r"y must have shape \(1,\)"):
+        lbt.identification.TrackingController(plant, follow).step([0.0, 0.0])
     for running in (
-        lbt.TrackingController(plant, follow), lbt.SwitchedController(lbt.kalman(plant))
-    ):  # fmt: skip
+        lbt.identification.TrackingController(plant, follow),
+        lbt.identification.SwitchedController(lbt.kalman(plant)),
+    ):
         for wrong, words in (
             (["a"], "y must be an array of numbers; got list"),
             ([1j], "y must be real; got complex numbers"),
             ([None], "y must be an array of numbers"),
             ([[1.0], [1.0, 2.0]], "y must be a rectangular array"),
         ):
-            with pytest.raises(lbt.ProblemError, match=words):
+            with pytest.raises(lbt.errors.ProblemError, match=words):
                 running.step(wrong)
         assert np.array_equal(running.step([0]), [0.0])  # nothing was taken in
 
 
 def test_the_figure_has_the_frequencies_and_the_residuals():
     plant = axis(18)
-    tracker = lbt.TrackingController(
+    tracker = lbt.identification.TrackingController(
         plant, Oracle(plant, DRIFT.frequency_hz_at, 1.0, 1.0), window_s=1, update_s=1
     )
     runs = {"tracking": simulated(tracker, frames=2400)}
-    figure = lbt.tracking_figure(tracker.history, runs, truth=[DRIFT], start_s=2.0, bin_s=0.5)
+    figure = lbt.report.figures.tracking_figure(
+        tracker.history, runs, truth=[DRIFT], start_s=2.0, bin_s=0.5
+    )
     upper, lower = figure.axes
     assert "[Hz]" in upper.get_ylabel()
     assert "[nm rms]" in lower.get_ylabel()
@@ -782,10 +829,12 @@ def test_the_figure_has_the_frequencies_and_the_residuals():
     drawn = lower.get_lines()[0].get_ydata()
     power = runs["tracking"].residual_nm[0, :, 0] ** 2
     assert drawn == pytest.approx(np.sqrt(power.reshape(6, 400).mean(axis=1)))
-    with pytest.raises(lbt.ProblemError, match="at least one update and one run; got 0 and 1"):
-        lbt.tracking_figure([], runs)
-    with pytest.raises(lbt.ProblemError, match="at least 60 s long; got 3 s of 'tracking'"):
-        lbt.tracking_figure(tracker.history, runs, bin_s=60)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="at least one update and one run; got 0 and 1"
+    ):
+        lbt.report.figures.tracking_figure([], runs)
+    with pytest.raises(lbt.errors.ProblemError, match="at least 60 s long; got 3 s of 'tracking'"):
+        lbt.report.figures.tracking_figure(tracker.history, runs, bin_s=60)
 
 
 @pytest.mark.study

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.limits import least_model_residual
+from lbt_synth.loop.least_residuals.residual import least_model_residual
 
 RATE = 800.0
-SLOW = lbt.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
-QUICK = lbt.ARModel(coefficients=[1.6, -0.65], driving_rms_nm=25.0, frame_rate_hz=RATE)
-TABLE = lbt.TabulatedSpectrum(frequency_hz=[1, 20, 120], density_nm2_hz=[900, 400, 3])
+SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
+QUICK = lbt.models.ARModel(coefficients=[1.6, -0.65], driving_rms_nm=25.0, frame_rate_hz=RATE)
+TABLE = lbt.models.TabulatedSpectrum(frequency_hz=[1, 20, 120], density_nm2_hz=[900, 400, 3])
 LINES = (
     lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 0)),
-    lbt.SinusoidalVibration(frequency_hz=33, rms_nm=90, direction=(0, 1)),
+    lbt.models.SinusoidalVibration(frequency_hz=33, rms_nm=90, direction=(0, 1)),
 )
 uneven = partial(lbt.Truth, noise_nm=(15.5, 6.0), sensor_gain=0.8)
 
@@ -56,7 +56,7 @@ def test_axes_without_coupling_are_loops_of_their_own(loops, spectra):
     budget = lbt.residual_budget(
         lbt.close_loop(both, lbt.integrator(both, gain=0.4).controller, sensor_gain=0.8), truth
     )
-    limit = lbt.least_residual(both, truth)
+    limit = lbt.loop.least_residual(both, truth)
     for axis in (0, 1):
         loop = lbt.close_loop(single, lbt.integrator(single, gain=0.4).controller, sensor_gain=0.8)
         alone = one_axis(truth, axis)
@@ -66,7 +66,7 @@ def test_axes_without_coupling_are_loops_of_their_own(loops, spectra):
                 getattr(own, name)[0, 0], rel=1e-9
             ), name
         assert limit.variance_nm2[axis] == pytest.approx(
-            lbt.least_residual(single, alone).variance_nm2[0], rel=1e-9
+            lbt.loop.least_residual(single, alone).variance_nm2[0], rel=1e-9
         )
     assert abs(budget.turbulence_nm2[0, 1]) < 1e-9
 
@@ -117,10 +117,13 @@ def test_a_mode_keeps_its_weather_when_the_other_changes(loops):
         lbt.simulate(
             design.controller,
             lbt.Truth(turbulence=[SLOW, other]),
-            hardware=both, frames=50, cases=2, seed=1,
+            hardware=both,
+            frames=50,
+            cases=2,
+            seed=1,
         )
         for other in (QUICK, TABLE, None)
-    ]  # fmt: skip
+    ]
     for run in runs[1:]:
         np.testing.assert_array_equal(run.residual_nm[..., 0], runs[0].residual_nm[..., 0])
         assert not np.array_equal(run.residual_nm[..., 1], runs[0].residual_nm[..., 1])
@@ -132,7 +135,7 @@ def test_the_map_is_the_budget_at_each_point(loops):
     truth = lbt.Truth(turbulence=[SLOW, TABLE], noise_nm=[15.5, 6.0], vibrations=LINES)
     design = lbt.integrator(both, gain=0.4)
     camera = lbt.Imaging(diameter_m=8.22)
-    found = lbt.strehl_map(design, truth, camera, errors_hz=[0], sensor_gains=[0.6, 1.0])
+    found = lbt.studies.strehl_map(design, truth, camera, errors_hz=[0], sensor_gains=[0.6, 1.0])
     for i, gain in enumerate([0.6, 1.0]):
         loop = lbt.close_loop(both, design.controller, sensor_gain=gain)
         real = lbt.Truth(
@@ -146,15 +149,17 @@ def test_the_map_is_the_budget_at_each_point(loops):
 def test_equal_models_may_be_turned_into_each_other(loops):
     """Two models of the same numbers are one turbulence: a vibration across them decouples."""
     both, _ = loops
-    again = lbt.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
+    again = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 1))
-    one = lbt.least_residual(both, lbt.Truth(turbulence=SLOW, vibrations=[line], noise_nm=5))
-    two = lbt.least_residual(
+    one = lbt.loop.least_residual(both, lbt.Truth(turbulence=SLOW, vibrations=[line], noise_nm=5))
+    two = lbt.loop.least_residual(
         both, lbt.Truth(turbulence=[SLOW, again], vibrations=[line], noise_nm=5)
     )
     assert two.rms_nm == pytest.approx(one.rms_nm, rel=1e-12)
-    with pytest.raises(lbt.ProblemError, match="a limit needs modes that decouple"):
-        lbt.least_residual(both, lbt.Truth(turbulence=[SLOW, QUICK], vibrations=[line], noise_nm=5))
+    with pytest.raises(lbt.errors.ProblemError, match="a limit needs modes that decouple"):
+        lbt.loop.least_residual(
+            both, lbt.Truth(turbulence=[SLOW, QUICK], vibrations=[line], noise_nm=5)
+        )
 
 
 def test_the_plant_of_uneven_axes_is_two_plants():
@@ -180,13 +185,17 @@ def test_the_plant_of_uneven_axes_is_two_plants():
 @pytest.mark.parametrize(
     ("arguments", "error", "text"),
     [
-        ({"turbulence": []}, lbt.DimensionError, "got an empty sequence"),
-        ({"turbulence": [SLOW, 3.0]}, lbt.ProblemError, "one a mode; got float"),
-        ({"turbulence": "slow"}, lbt.ProblemError, "one a mode; got str"),
-        ({"turbulence": None, "noise_nm": [[1.0]]}, lbt.DimensionError, r"got shape \(1, 1\)"),
-        ({"turbulence": None, "noise_nm": []}, lbt.DimensionError, r"got shape \(0,\)"),
-        ({"turbulence": None, "noise_nm": [1.0, -1.0]}, lbt.ProblemError, "noise_nm"),
-        ({"turbulence": None, "noise_nm": [1.0, np.nan]}, lbt.ProblemError, "noise_nm"),
+        ({"turbulence": []}, lbt.errors.DimensionError, "got an empty sequence"),
+        ({"turbulence": [SLOW, 3.0]}, lbt.errors.ProblemError, "one a mode; got float"),
+        ({"turbulence": "slow"}, lbt.errors.ProblemError, "one a mode; got str"),
+        (
+            {"turbulence": None, "noise_nm": [[1.0]]},
+            lbt.errors.DimensionError,
+            r"got shape \(1, 1\)",
+        ),
+        ({"turbulence": None, "noise_nm": []}, lbt.errors.DimensionError, r"got shape \(0,\)"),
+        ({"turbulence": None, "noise_nm": [1.0, -1.0]}, lbt.errors.ProblemError, "noise_nm"),
+        ({"turbulence": None, "noise_nm": [1.0, np.nan]}, lbt.errors.ProblemError, "noise_nm"),
     ],
 )
 def test_wrong_truths_are_refused(arguments, error, text):
@@ -202,16 +211,16 @@ def test_truths_of_other_loops_are_refused(loops):
     loop = lbt.close_loop(single, design.controller)
     for act in (
         lambda truth: lbt.residual_budget(loop, truth),
-        lambda truth: lbt.least_residual(single, truth),
+        lambda truth: lbt.loop.least_residual(single, truth),
         lambda truth: lbt.simulate(design.controller, truth, hardware=single, frames=9, seed=0),
-        lambda truth: lbt.optimal_integrator(single, truth),
+        lambda truth: lbt.design.optimal_integrator(single, truth),
     ):
-        with pytest.raises(lbt.DimensionError, match=r"one a mode \(1\); got 2"):
+        with pytest.raises(lbt.errors.DimensionError, match=r"one a mode \(1\); got 2"):
             act(two)
-        with pytest.raises(lbt.DimensionError, match=r"one a measurement \(1\); got 2"):
+        with pytest.raises(lbt.errors.DimensionError, match=r"one a measurement \(1\); got 2"):
             act(noisy)
     for wrong in ({"noise_nm": [1.0]}, {"noise_nm": 1.0, "sensor_gain": [1.0]}):
-        with pytest.raises(lbt.DimensionError, match="measurement"):
+        with pytest.raises(lbt.errors.DimensionError, match="measurement"):
             lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, **wrong)
-    with pytest.raises(lbt.ProblemError, match="the truth must disturb the loop"):
-        lbt.optimal_integrator(both, lbt.Truth(turbulence=[None, None], noise_nm=[0, 0]))
+    with pytest.raises(lbt.errors.ProblemError, match="the truth must disturb the loop"):
+        lbt.design.optimal_integrator(both, lbt.Truth(turbulence=[None, None], noise_nm=[0, 0]))

@@ -23,7 +23,7 @@ def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough):
         D=rng.normal(size=(2, 3)) if feedthrough else np.zeros((2, 3)),
         dt_s=1 / 800,
     )
-    loop = lbt.close_loop(path, lbt.youla_controller(path, parameter))
+    loop = lbt.close_loop(path, lbt.loop.youla_controller(path, parameter))
     assert loop.is_stable
     f = np.array([0.0, 3.0, 20.0, 150.0, 400.0])
     z = np.exp(2j * np.pi * f / 800)[:, None, None]
@@ -35,5 +35,7 @@ def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough):
 
 def test_a_filter_of_another_size_is_refused():
     path = lbt.LoopHardware(frame_rate_hz=800)
-    with pytest.raises(lbt.DimensionError, match="map 2 measurements to 2 commands; got 1 to 1"):
-        lbt.youla_controller(path, lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800))
+    with pytest.raises(
+        lbt.errors.DimensionError, match="map 2 measurements to 2 commands; got 1 to 1"
+    ):
+        lbt.loop.youla_controller(path, lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800))

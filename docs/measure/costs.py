@@ -23,7 +23,7 @@ def ratios() -> None:
         for ratio in (1.0, 1.01, 1.05, 1.1, 1.2, 1.3, 1.5)
     }
     for name, design in designs.items():
-        low, high = lbt.stable_sensor_gains(PLANT.hardware, design.controller)
+        low, high = lbt.loop.stable_sensor_gains(PLANT.hardware, design.controller)
         loop = lbt.close_loop(PLANT.hardware, design.controller)
         budget = lbt.residual_budget(loop, CONFIG.truth)
         print(
@@ -47,12 +47,14 @@ def turbulence_models() -> None:
     """AR1 and AR2 turbulence against the integrator, without any vibration."""
     calm = lbt.Truth(turbulence=CONFIG.atmosphere, noise_nm=CONFIG.noise_nm)
     path = PLANT.hardware
-    designs = {"integrator": lbt.optimal_integrator(path, calm)}
+    designs = {"integrator": lbt.design.optimal_integrator(path, calm)}
     for name, model in (
-        ("Kalman, AR1", lbt.ar1_turbulence(CONFIG.atmosphere, frame_rate_hz=800)),
+        ("Kalman, AR1", lbt.models.ar1_turbulence(CONFIG.atmosphere, frame_rate_hz=800)),
         (
             "Kalman, AR2",
-            lbt.ar2_turbulence(CONFIG.atmosphere, frame_rate_hz=800, noise_nm=CONFIG.noise_nm),
+            lbt.models.ar2_turbulence(
+                CONFIG.atmosphere, frame_rate_hz=800, noise_nm=CONFIG.noise_nm
+            ),
         ),
     ):
         designs[name] = lbt.kalman(
@@ -60,7 +62,7 @@ def turbulence_models() -> None:
         )
     for name, design in designs.items():
         budget = lbt.residual_budget(lbt.close_loop(path, design.controller), calm)
-        low, high = lbt.stable_sensor_gains(path, design.controller)
+        low, high = lbt.loop.stable_sensor_gains(path, design.controller)
         print(
             f"{name:12s} residual {budget.rms_nm:5.1f} nm (turbulence {budget.turbulence_nm:.1f}, "
             f"noise {budget.noise_nm:.1f}), Strehl "
@@ -73,9 +75,12 @@ def fractional() -> None:
     """What interpolation between two frames costs at a fractional delay."""
     for delay in (2.0, 2.25, 2.5, 2.75, 3.0):
         plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, turbulence=PLANT.turbulence, vibrations=PLANT.vibrations,
-            noise_nm=CONFIG.noise_nm, delay_frames=delay,
-        )  # fmt: skip
+            frame_rate_hz=800,
+            turbulence=PLANT.turbulence,
+            vibrations=PLANT.vibrations,
+            noise_nm=CONFIG.noise_nm,
+            delay_frames=delay,
+        )
         design = lbt.kalman(plant)
         loop = lbt.close_loop(plant.hardware, design.controller)
         model = lbt.Truth(
@@ -93,12 +98,14 @@ def norms() -> None:
     error = PLANT.error_system(lbt.kalman(PLANT).gain_predictor)
     ours = lbt.hinf_norm(error)
     grid = np.linspace(0, 400, 400_001)
-    best = float(np.max(lbt.largest_singular_values(error, grid)))
+    best = float(np.max(lbt.linear.largest_singular_values(error, grid)))
     theirs = control.norm(error.to_control(), "inf")
     print(f"norm: level sets {ours.value:.9f}, grid {best:.9f}, python-control {theirs:.9f}")
-    lag = lbt.StateSpace(A=[[1 - 1e-6]], B=[[1e-6]], C=[[1.0]], D=[[0.0]])
-    print(f"norm of a pole at 1 - 1e-6: level sets {lbt.hinf_norm(lag).value:.9f}, "
-          f"python-control {control.norm(lag.to_control(), 'inf')}")  # fmt: skip
+    lag = lbt.linear.StateSpace(A=[[1 - 1e-6]], B=[[1e-6]], C=[[1.0]], D=[[0.0]])
+    print(
+        f"norm of a pole at 1 - 1e-6: level sets {lbt.hinf_norm(lag).value:.9f}, "
+        f"python-control {control.norm(lag.to_control(), 'inf')}"
+    )
 
 
 def speed() -> None:
@@ -110,13 +117,18 @@ def speed() -> None:
     )
     middle = time.perf_counter()
     slow = lbt.simulate(
-        design.controller.start(), CONFIG.truth, hardware=PLANT.hardware, frames=8000,
+        design.controller.start(),
+        CONFIG.truth,
+        hardware=PLANT.hardware,
+        frames=8000,
         settle_frames=1000,
-    )  # fmt: skip
+    )
     end = time.perf_counter()
     apart = np.max(np.abs(fast.residual_nm - slow.residual_nm))
-    print(f"9000 frames: blocks {middle - began:.3f} s, frame by frame {end - middle:.3f} s, "
-          f"residuals differ by {apart:.1e} nm")  # fmt: skip
+    print(
+        f"9000 frames: blocks {middle - began:.3f} s, frame by frame {end - middle:.3f} s, "
+        f"residuals differ by {apart:.1e} nm"
+    )
 
 
 def imports() -> None:

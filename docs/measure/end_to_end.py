@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.endtoend import optics
+from lbt_synth.interop.specula import optics
 
 CACHE = sys.argv[2] if len(sys.argv) > 2 else None
 SETUP = replace(lbt.load_config("examples/lbt.yaml").end_to_end, frames=800)
 STILL = replace(SETUP, vibrations=())
 
 
-def mean(runs: list[lbt.EndToEndRun]) -> str:
+def mean(runs: list[lbt.interop.EndToEndRun]) -> str:
     strehls = [100 * run.strehl for run in runs]
     gains = [run.tip_tilt_gain for run in runs]
     noise = [run.tip_tilt_noise_nm for run in runs]
@@ -52,7 +52,7 @@ def optimised() -> None:
     first = replace(setup, seed=1).run(None, cache=CACHE)
     path = setup.system.hardware
     gains = np.maximum(first.optical_gain, 0.1)
-    found = lbt.modal_gains_from_telemetry(
+    found = lbt.design.modal.modal_gains_from_telemetry(
         first.measurements,
         first.commands,
         frame_rate_hz=path.frame_rate_hz,
@@ -67,10 +67,12 @@ def optimised() -> None:
             f"optimised gain {found.gains[part].mean():.2f}",
             flush=True,
         )
-    control = lbt.MixedController.integrators(found.gains, leak=setup.leaks)
+    control = lbt.design.modal.MixedController.integrators(found.gains, leak=setup.leaks)
     for seed in (1, 2):
         uniform = first if seed == 1 else replace(setup, seed=seed).run(None, cache=CACHE)
-        run = lbt.run_end_to_end(setup.system, control, frames=setup.frames, seed=seed, cache=CACHE)
+        run = lbt.interop.run_end_to_end(
+            setup.system, control, frames=setup.frames, seed=seed, cache=CACHE
+        )
         print(f"seed {seed}, gain {setup.gain}: {mean([uniform])}", flush=True)
         print(f"seed {seed}, optimised: {mean([run])}", flush=True)
 

@@ -12,7 +12,7 @@ import slycot
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.lyapunov import stationary_covariance
+from lbt_synth.linear.lyapunov import stationary_covariance
 
 sys.path.insert(0, "tests")
 from darex import EXAMPLES, example_2_1, example_2_4
@@ -69,23 +69,25 @@ def output_feedback() -> None:
 def responses() -> None:
     """The Schur form and single solutions next to a pole at 1 - 1e-6."""
     A, B, C, D = random_system(0, 6, 1, 2, 1 - 1e-6)
-    system = lbt.StateSpace(A=A, B=B, C=C, D=D)
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D)
     with mpmath.workdps(40):
         G = mpmath.matrix(C.tolist()) * mpmath.lu_solve(
             -mpmath.eye(6) - mpmath.matrix(A.tolist()), mpmath.matrix(B.tolist())
         ) + mpmath.matrix(D.tolist())
         exact = float(mpmath.sqrt(sum(abs(x) ** 2 for x in G)))
-    one = lbt.largest_singular_values(system, [0.5])[0]
-    many = lbt.largest_singular_values(system, np.linspace(0, 0.5, 101))[-1]
-    print(f"response next to a pole at 1 - 1e-6: Schur form {abs(many / exact - 1):.1e}, "
-          f"one by one {abs(one / exact - 1):.1e}")  # fmt: skip
+    one = lbt.linear.largest_singular_values(system, [0.5])[0]
+    many = lbt.linear.largest_singular_values(system, np.linspace(0, 0.5, 101))[-1]
+    print(
+        f"response next to a pole at 1 - 1e-6: Schur form {abs(many / exact - 1):.1e}, "
+        f"one by one {abs(one / exact - 1):.1e}"
+    )
 
 
 def mixed() -> None:
     """Least variance at 1.05 times the least gamma: central, best own gain, mixed."""
     plant = lbt_axis_plant()
     bound = 1.05 * lbt.hinf(plant, method="riccati").gamma_least
-    central = lbt.central(plant, gamma=bound)
+    central = lbt.design.central(plant, gamma=bound)
     gain = central.gain_predictor
     unit = np.abs(gain.ravel())
 
@@ -101,9 +103,12 @@ def mixed() -> None:
         return (bound - float(lbt.hinf_norm(error))) / 100 if error.spectral_radius < 1 else -10.0
 
     found = minimize(
-        lambda g: deviation(g) ** 2 / 1e4, gain.ravel() / unit, method="SLSQP",
-        constraints=[{"type": "ineq", "fun": room}], options={"maxiter": 200, "ftol": 1e-10},
-    )  # fmt: skip
+        lambda g: deviation(g) ** 2 / 1e4,
+        gain.ravel() / unit,
+        method="SLSQP",
+        constraints=[{"type": "ineq", "fun": room}],
+        options={"maxiter": 200, "ftol": 1e-10},
+    )
     own = deviation(found.x)
     print(f"rms at {bound:.2f} nm: central {central.rms:.2f}, best own gain {own:.2f}")
     for taps in (1, 4, 16, 48, 64):

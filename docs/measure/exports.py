@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.export import c_text
+from lbt_synth.interop.c import text as c_text
 
 sys.path.insert(0, "benchmarks")  # the timing is that of the benchmark
 
@@ -21,27 +21,27 @@ def transfer_functions(folder: Path) -> None:
     for lines in (1, 2, 3, 4, 5):
         plant = CONFIG.plant
         if lines > 1:
-            plant = lbt.spread_plant(plant, half_width_hz=3.5, lines=lines)
+            plant = lbt.models.spread_plant(plant, half_width_hz=3.5, lines=lines)
         design = lbt.kalman(plant)
         try:
-            written = lbt.export_iir(folder / "iir.fits", design)
+            written = lbt.interop.export_iir(folder / "iir.fits", design)
             said = f"double {written.error:.1e}, single {written.error_single:.1e}"
-        except lbt.NumericalError as error:
+        except lbt.errors.NumericalError as error:
             said = f"double {error.residual:.1e}: refused"
         print(f"{lines} lines an axis, {design.controller.n_states} states: {said}")
 
 
 def source(folder: Path) -> None:
     """Operations, and what single precision changes."""
-    prior = lbt.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)
+    prior = lbt.models.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)
     for name, design in (
         ("kalman", lbt.kalman(CONFIG.plant)),
         ("hinf", lbt.hinf(CONFIG.plant, gamma_ratio=1.2)),
-        ("integrator", lbt.optimal_integrator(CONFIG.hardware, CONFIG.truth)),
+        ("integrator", lbt.design.optimal_integrator(CONFIG.hardware, CONFIG.truth)),
         ("15 lines an axis", lbt.kalman(prior)),
     ):
-        cost = lbt.frame_cost(design)
-        written = lbt.export_c(folder / "c.c", design, precision="single")
+        cost = lbt.interop.frame_cost(design)
+        written = lbt.interop.export_c(folder / "c.c", design, precision="single")
         print(
             f"{name}: {cost.states} states, {cost.multiplications} multiplications "
             f"({cost.dense_multiplications} dense), single precision {written.error:.1e}"
@@ -53,21 +53,27 @@ def forms() -> None:
     kalman = lbt.kalman(CONFIG.plant)
     designs = {
         "kalman": kalman,
-        "15 lines an axis": lbt.kalman(lbt.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)),
+        "15 lines an axis": lbt.kalman(
+            lbt.models.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)
+        ),
     }
     rng = np.random.default_rng(0)
     for n in (10, 24, 44, 80):
         A = rng.standard_normal((n, n))
         A *= 0.9 / np.max(np.abs(np.linalg.eigvals(A)))
         full = lbt.Controller(
-            A=A, B=rng.standard_normal((n, 2)), C=rng.standard_normal((2, n)),
+            A=A,
+            B=rng.standard_normal((n, 2)),
+            C=rng.standard_normal((2, n)),
             D=rng.standard_normal((2, 2)),
-        )  # fmt: skip
+        )
         # the loop of the design is not what is timed
         designs[f"no zeros, {n} states"] = lbt.Design(
-            method="random", controller=full, certificate=kalman.certificate,
+            method="random",
+            controller=full,
+            certificate=kalman.certificate,
             solver=kalman.solver,
-        )  # fmt: skip
+        )
     chosen = c_text.written_out
     for name, design in designs.items():
         times = []

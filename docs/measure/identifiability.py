@@ -27,8 +27,11 @@ def refit(start: np.ndarray) -> tuple[np.ndarray, float]:
 def show(name: str, parameters: np.ndarray, rms: float) -> None:
     """One line: what was held, the weights found, the distance from the column."""
     vibration, turbulence, gamma = np.exp(parameters)
-    print(f"{name:24s} vibration {vibration:.3f}  turbulence {turbulence:.3f}  "
-          f"gamma {gamma:.3f}  rms {rms:.2f} points", flush=True)  # fmt: skip
+    print(
+        f"{name:24s} vibration {vibration:.3f}  turbulence {turbulence:.3f}  "
+        f"gamma {gamma:.3f}  rms {rms:.2f} points",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ class Case:
     frozen: bool
     path: lbt.LoopHardware
     truth: lbt.Truth
-    record: lbt.LoopRecord
+    record: lbt.identification.LoopRecord
     total_nm: np.ndarray
 
 
@@ -46,7 +46,7 @@ def case(seed: int, frames: int) -> Case:
     noise = float(np.exp(rng.uniform(np.log(2), np.log(30))))
     sensor_gain = float(rng.uniform(0.4, 1.0))
     frozen = bool(seed % 2)
-    turbulence: lbt.Spectrum
+    turbulence: lbt.models.Spectrum
     if frozen:
         turbulence = lbt.Atmosphere(
             seeing_arcsec=float(rng.uniform(0.5, 1.5)),
@@ -58,7 +58,7 @@ def case(seed: int, frames: int) -> Case:
         corner = float(np.exp(rng.uniform(np.log(0.2), np.log(3))))
         damping, rms = float(rng.uniform(0.1, 1.0)), float(rng.uniform(200, 800))
         a1, a2, drive = coefficients(2 * np.pi * corner / RATE, damping)
-        turbulence = lbt.ARModel(
+        turbulence = lbt.models.ARModel(
             coefficients=[a1, a2], driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=RATE
         )
     lines = tuple(
@@ -77,20 +77,20 @@ def case(seed: int, frames: int) -> Case:
     run = lbt.simulate(
         ran.controller, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000
     )
-    record = lbt.loop_record(
+    record = lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
     return Case(frozen, path, truth, record, run.total_nm[0])
 
 
-def exact_plant(it: Case) -> lbt.TipTiltPlant:
+def exact_plant(it: Case) -> lbt.models.TipTiltPlant:
     """Return the plant of the truth; frozen flow as the AR2 process fitted to its spectrum."""
     truth, turbulence = it.truth, it.truth.turbulence
     if isinstance(turbulence, lbt.Atmosphere):
-        turbulence = lbt.ar2_turbulence(
+        turbulence = lbt.models.ar2_turbulence(
             turbulence, frame_rate_hz=RATE, noise_nm=truth.noise_nm / truth.sensor_gain
         )
-    assert isinstance(turbulence, lbt.ARModel)
+    assert isinstance(turbulence, lbt.models.ARModel)
     return lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
         delay_frames=2,
@@ -120,7 +120,7 @@ def background(it: Case, line: lbt.Vibration) -> float:
     return found + sum(float(other.ar_model(RATE).psd(f)[0]) for other in others)
 
 
-def judged(it: Case, axis: lbt.IdentifiedAxis) -> dict[str, list[tuple[float, ...]]]:
+def judged(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[tuple[float, ...]]]:
     """Match the lines that were found with those there are, the strongest first."""
     spare = list(axis.lines)
     out: dict[str, list[tuple[float, ...]]] = {"found": [], "missed": [], "false": []}
@@ -135,9 +135,13 @@ def judged(it: Case, axis: lbt.IdentifiedAxis) -> dict[str, list[tuple[float, ..
             spare.remove(near)
         if clear:
             facts = (
-                line.frequency_hz, line.damping, line.rms_nm, own / background(it, line),
-                float(away), float(bound),
-            )  # fmt: skip
+                line.frequency_hz,
+                line.damping,
+                line.rms_nm,
+                own / background(it, line),
+                float(away),
+                float(bound),
+            )
             out["found" if away < NEAR_HZ else "missed"].append(facts)
     out["false"] = [(x.frequency_hz, x.damping, x.rms_nm, x.evidence) for x in spare]
     return out
@@ -153,11 +157,11 @@ def studied(seed: int, frames: int) -> dict:
     end = time.process_time()
     axis = model.axes[0]
     best = left(it, lbt.kalman(exact_plant(it)).controller)
-    limit = lbt.least_residual(it.path, it.truth).rms_nm ** 2
-    half, other = lbt.split_halves(it.record.stretches(), it.record.frames)
+    limit = lbt.loop.least_residual(it.path, it.truth).rms_nm ** 2
+    half, other = lbt.identification.split_halves(it.record.stretches(), it.record.frames)
     halved = lbt.identify(it.record, stretches=half)
     gain = halved.sensor_gains[0]
-    predictor = lbt.least_squares_predictor(
+    predictor = lbt.identification.least_squares_predictor(
         it.record.pseudo_open_loop(gain),
         it.path,
         taps=32,
@@ -167,7 +171,7 @@ def studied(seed: int, frames: int) -> dict:
     half_filter = lbt.kalman(halved.plant()).controller
     true_open = it.record.pseudo_open_loop(it.truth.sensor_gain)
     replays = [
-        lbt.replayed_residual(
+        lbt.identification.replayed_residual(
             true_open,
             controller,
             it.path,
@@ -208,8 +212,10 @@ def table(results: list[dict]) -> None:
     print(f"found within {NEAR_HZ:g} Hz                       {100 * len(found) / total:.1f} %")
     print(f"false lines a record                       {len(false) / len(results):.3f}")
     for facts in missed:
-        print("  missed: record {} {:.2f} Hz, damping {:.4f}, {:.1f} nm, {:.3g} x background; "
-              "nearest {:.3f} Hz away, least error {:.3f} Hz".format(*facts))  # fmt: skip
+        print(
+            "  missed: record {} {:.2f} Hz, damping {:.4f}, {:.1f} nm, {:.3g} x background; "
+            "nearest {:.3f} Hz away, least error {:.3f} Hz".format(*facts)
+        )
     for facts in false:
         print(
             "  false: record {} {:.2f} Hz, damping {:.4f}, {:.1f} nm, evidence {:.1f}".format(
@@ -258,16 +264,19 @@ def times() -> None:
     lines = tuple(
         lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=r, direction=d)
         for f, r, d in (
-            (13.0, 40.0, (1.0, 0.0)), (31.0, 80.0, (1.0, 0.0)), (74.0, 15.0, (1.0, 0.0)),
-            (22.0, 60.0, (0.0, 1.0)), (110.0, 20.0, (0.0, 1.0)),
+            (13.0, 40.0, (1.0, 0.0)),
+            (31.0, 80.0, (1.0, 0.0)),
+            (74.0, 15.0, (1.0, 0.0)),
+            (22.0, 60.0, (0.0, 1.0)),
+            (110.0, 20.0, (0.0, 1.0)),
         )
-    )  # fmt: skip
+    )
     air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
     truth = lbt.Truth(turbulence=air, vibrations=lines, noise_nm=10.0, sensor_gain=0.6)
     run = lbt.simulate(
         lbt.integrator(path, gain=0.5).controller, truth, hardware=path, frames=60_000
     )
-    record = lbt.loop_record(
+    record = lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
     lbt.identify(record)  # imports

@@ -11,9 +11,9 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
-from lbt_synth.models.interval import FrequencyInterval
+from lbt_synth.models.frequency_interval import FrequencyInterval
 
-SLOW = lbt.ARModel(
+SLOW = lbt.models.ARModel(
     coefficients=[0.9886], driving_rms_nm=591.6 * np.sqrt(1 - 0.9886**2), frame_rate_hz=800
 )
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1.0,))
@@ -21,12 +21,12 @@ COMMON = {"frame_rate_hz": 800, "turbulence": SLOW, "noise_nm": 15.5, "modes": 1
 PLANT = lbt.tip_tilt_plant(vibrations=[LINE], **COMMON)
 
 
-def predictor(design: lbt.FilterDesign) -> lbt.Controller:
+def predictor(design: lbt.design.FilterDesign) -> lbt.Controller:
     """Filter from ybar(k) to the estimate of z(k+1)."""
     return lbt.EstimationProblem.controller(design.problem, design.gain_predictor)
 
 
-def mixture(interval: FrequencyInterval, lines: int, *, covering: bool) -> lbt.TipTiltPlant:
+def mixture(interval: FrequencyInterval, lines: int, *, covering: bool) -> lbt.models.TipTiltPlant:
     """Plant with lines over the interval, as strong together as the worst plant, or below it.
 
     Where its vibration has more power at every frequency than the worst plant of the interval
@@ -58,10 +58,11 @@ def main() -> None:
             "kalman": predictor(lbt.kalman(PLANT)),
         }
         for lines in (5, 15):
-            spread = lbt.spread_plant(PLANT, half_width_hz=half, lines=lines)
+            spread = lbt.models.spread_plant(PLANT, half_width_hz=half, lines=lines)
             designs[f"kalman, {lines} lines"] = predictor(lbt.kalman(spread))
         made = {
-            norm: lbt.polytopic(PLANT, half_width_hz=half, norm=norm) for norm in ("hinf", "h2")
+            norm: lbt.design.polytopic(PLANT, half_width_hz=half, norm=norm)
+            for norm in ("hinf", "h2")
         }
         for lines in (5, 9):
             plant = mixture(interval, lines, covering=True)
@@ -90,7 +91,7 @@ def main() -> None:
         ]
         print(f"  no filter of any order reaches {max(level or 0.0 for level in refuted):.2f}")
         for name, design in made.items():
-            gains = lbt.stable_sensor_gains(PLANT.hardware, design.controller)
+            gains = lbt.loop.stable_sensor_gains(PLANT.hardware, design.controller)
             print(f"  polytopic {name}: sensor gains {gains[0]:.3f} to {gains[1]:.3f}")
 
 

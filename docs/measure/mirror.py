@@ -10,30 +10,32 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.plotting import save_figure
+from lbt_synth.report.figures.style import save_figure
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
 SHELL = {"natural_frequency_hz": 20.0, "damping": 0.5}
 MIRRORS = {"settled": None} | {
-    f"{hz} Hz": lbt.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=hz)
+    f"{hz} Hz": lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=hz)
     for hz in (500, 250, 150, 100, 60)
 }
 
 
-def moving(plant: lbt.TipTiltPlant, mirror: lbt.PositionLoop | None) -> lbt.TipTiltPlant:
+def moving(
+    plant: lbt.models.TipTiltPlant, mirror: lbt.models.PositionLoop | None
+) -> lbt.models.TipTiltPlant:
     """Return the same plant with another mirror."""
     return replace(plant, hardware=replace(plant.hardware, mirror=mirror))
 
 
-def study(plant: lbt.TipTiltPlant) -> None:
+def study(plant: lbt.models.TipTiltPlant) -> None:
     """Residual, Strehl ratio and what is left, for every mirror and design."""
     names = "integrator", "kalman, settled", "kalman, real", "lqg"
     print(f"{'mirror':8s} {'settles':>8s} {'limit':>6s}" + "".join(f"{n:>26s}" for n in names))
     for name, mirror in MIRRORS.items():
         here = moving(plant, mirror)
         settling = 0.0 if mirror is None else 1e3 * mirror.step_response().settling_s
-        rows = lbt.mirror_study(here, CONFIG.truth, CONFIG.imaging)
-        limit = lbt.least_residual(here.hardware, CONFIG.truth).rms_nm
+        rows = lbt.studies.mirror_study(here, CONFIG.truth, CONFIG.imaging)
+        limit = lbt.loop.least_residual(here.hardware, CONFIG.truth).rms_nm
         cells = [
             f"{r.residual_nm:8.2f} {100 * r.strehl:6.2f} ({r.unsettled_nm:7.2f})"
             if r.stable
@@ -49,9 +51,12 @@ def delays() -> None:
     pole = CONFIG.plant
     for delay in (2.0, 2.25, 2.4, 2.6, 2.75, 3.0):
         plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, delay_frames=delay, turbulence=pole.turbulence,
-            vibrations=pole.vibrations, noise_nm=pole.R,
-        )  # fmt: skip
+            frame_rate_hz=800,
+            delay_frames=delay,
+            turbulence=pole.turbulence,
+            vibrations=pole.vibrations,
+            noise_nm=pole.R,
+        )
         truth = lbt.Truth(
             turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=CONFIG.noise_nm
         )
@@ -59,12 +64,15 @@ def delays() -> None:
             lbt.residual_budget(lbt.close_loop(plant.hardware, d.controller), truth).rms_nm
             for d in (lbt.kalman(plant), lbt.lqg(plant))
         ]
-        limit = lbt.least_residual(plant.hardware, truth).rms_nm
+        limit = lbt.loop.least_residual(plant.hardware, truth).rms_nm
         print(f"{delay:5.2f}: {found[0]:8.3f} {found[1]:8.3f} {limit:8.3f}")
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, delay_frames=2.5, turbulence=pole.turbulence,
-        vibrations=pole.vibrations, noise_nm=pole.R,
-    )  # fmt: skip
+        frame_rate_hz=800,
+        delay_frames=2.5,
+        turbulence=pole.turbulence,
+        vibrations=pole.vibrations,
+        noise_nm=pole.R,
+    )
     for weight in (1e-2, 1e-3, 1e-4):
         print(f" 2.50, command weight {weight:g}: {lbt.lqg(plant, command_weight=weight).rms:.3f}")
 
@@ -76,7 +84,7 @@ def stable_to(hardware: lbt.LoopHardware, design: lbt.Design, low: float, high: 
     """
 
     def is_stable(bandwidth: float) -> bool:
-        mirror = lbt.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=bandwidth)
+        mirror = lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=bandwidth)
         real = replace(hardware, mirror=mirror)
         return lbt.close_loop(real, design.controller).is_stable
 
@@ -92,7 +100,7 @@ def errors() -> None:
     """How wrong the mirror may be: ends of stability, residual with a wrong bandwidth."""
     settled = lbt.kalman(CONFIG.plant)
     edge = stable_to(CONFIG.hardware, settled, 500, 250)
-    mirror = lbt.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=edge)
+    mirror = lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=edge)
     real = replace(CONFIG.hardware, mirror=mirror)
     poles = lbt.close_loop(real, settled.controller).system.poles
     fails_hz = abs(np.angle(poles[np.argmax(np.abs(poles))])) * real.frame_rate_hz / (2 * np.pi)
@@ -114,7 +122,7 @@ def errors() -> None:
             f"modulus {margins.modulus:.3f}, delay margin {margins.delay_frames:.2f} frames"
         )
         for factor in (0.9, 0.95, 1.05, 1.1):
-            real = lbt.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=believed * factor)
+            real = lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=believed * factor)
             loop = lbt.close_loop(replace(here.hardware, mirror=real), design.controller)
             budget = lbt.residual_budget(loop, CONFIG.truth) if loop.is_stable else None
             text = "unstable" if budget is None else f"{budget.rms_nm:.2f} nm"
@@ -126,7 +134,7 @@ def main() -> None:
     print("AR1 turbulence in the filters (examples/lbt.yaml)")
     study(CONFIG.plant)
     print("AR2 turbulence in the filters")
-    ar2 = lbt.ar2_turbulence(CONFIG.atmosphere, frame_rate_hz=800, noise_nm=CONFIG.noise_nm)
+    ar2 = lbt.models.ar2_turbulence(CONFIG.atmosphere, frame_rate_hz=800, noise_nm=CONFIG.noise_nm)
     study(
         lbt.tip_tilt_plant(
             frame_rate_hz=800,
@@ -139,7 +147,9 @@ def main() -> None:
     errors()
     if len(sys.argv) > 1:
         for name, file in (("500 Hz", "mirror_quick.png"), ("100 Hz", "mirror_slow.png")):
-            figure = lbt.mirror_figure(replace(CONFIG.hardware, mirror=MIRRORS[name]))
+            figure = lbt.report.figures.mirror_figure(
+                replace(CONFIG.hardware, mirror=MIRRORS[name])
+            )
             print(save_figure(figure, f"{sys.argv[1]}/{file}"))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 import lbt_synth as lbt
-from lbt_synth.plotting import save_figure
+from lbt_synth.report.figures.style import save_figure
 
 MODES, RATE_HZ, FRAMES = 672, 800.0, 4000
 
@@ -38,26 +38,28 @@ def main() -> None:
     parser.add_argument("-o", "--output")
     output = parser.parse_args().output
     air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
-    modes = lbt.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
-    radial, _ = lbt.noll_orders(MODES)
-    noise = lbt.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
+    modes = lbt.models.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
+    radial, _ = lbt.models.noll_orders(MODES)
+    noise = lbt.models.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
 
     def integrators(gains):
-        loop = lbt.modal_loop(lbt.MixedController.integrators(gains))
+        loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators(gains))
         return loop.residual_rms_nm(modes, noise_nm=noise)
 
     best = minimize_scalar(
         lambda g: total(integrators(np.full(MODES, g))), bounds=(0.01, 0.9), method="bounded"
     )
-    optimised = lbt.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
-    filters = lbt.modal_filters(modes, noise_nm=noise)
+    optimised = lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
+    filters = lbt.design.modal.modal_filters(modes, noise_nm=noise)
     rows = {
         f"integrators, gain {best.x:.2f}": integrators(np.full(MODES, best.x)),
         "integrators, optimised gains": optimised.rms_nm,
         "Kalman filters": filters.rms_nm,
     }
-    print(f"{'residual [nm rms], AR1 turbulence':36s} {'all':>7s} {'n = 1':>7s} "
-          f"{'2 to 9':>7s} {'10 to 36':>8s}")  # fmt: skip
+    print(
+        f"{'residual [nm rms], AR1 turbulence':36s} {'all':>7s} {'n = 1':>7s} "
+        f"{'2 to 9':>7s} {'10 to 36':>8s}"
+    )
     parts = [radial > 0, radial == 1, (radial > 1) & (radial < 10), radial > 9]
     for name, rms in {"no correction": modes.rms_nm, **rows}.items():
         figures = [total(rms[part]) for part in parts]
@@ -68,12 +70,16 @@ def main() -> None:
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
     shaken = {0: [line], 1: [line]}
     print("with a vibration of 563.6 nm at 20 Hz on tip and on tilt:")
-    gains = lbt.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ, vibrations=shaken)
-    tilt = lbt.modal_filters(
+    gains = lbt.design.modal.modal_gains(
+        modes, noise_nm=noise, frame_rate_hz=RATE_HZ, vibrations=shaken
+    )
+    tilt = lbt.design.modal.modal_filters(
         [modes.model(0), modes.model(1)], noise_nm=noise[:2], vibrations=shaken
     )
-    mixed = lbt.modal_loop(lbt.MixedController(filter=tilt, gains=gains.gains))
-    every = lbt.modal_filters(modes, noise_nm=noise, vibrations=shaken)
+    mixed = lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
+    )
+    every = lbt.design.modal.modal_filters(modes, noise_nm=noise, vibrations=shaken)
     rows_shaken = {
         "integrators, optimised gains": gains.rms_nm,
         "mixed: tip/tilt Kalman, the rest so": mixed.residual_rms_nm(
@@ -84,15 +90,19 @@ def main() -> None:
     for name, rms in rows_shaken.items():
         print(f"{name:36s} {total(rms):7.1f} {total(rms[:2]):7.1f}")
 
-    design = timed(lambda: lbt.modal_filters(modes, noise_nm=noise))
-    search = timed(lambda: lbt.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ))
+    design = timed(lambda: lbt.design.modal.modal_filters(modes, noise_nm=noise))
+    search = timed(
+        lambda: lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
+    )
     print(f"design of {MODES} certified filters: {design:.0f} ms; optimised gains: {search:.0f} ms")
-    loop = lbt.modal_loop(filters)
+    loop = lbt.design.modal.modal_loop(filters)
     series = np.random.default_rng(0).standard_normal((2, MODES, FRAMES))
     run, copy = timed(lambda: loop.run(*series)), timed(lambda: [part.copy() for part in series])
-    print(f"loop of {MODES} filters over {FRAMES} frames: {run:.0f} ms, "
-          f"{MODES * FRAMES / run / 1e3:.0f} million mode-frames a second; "
-          f"a copy of its two series: {copy:.0f} ms")  # fmt: skip
+    print(
+        f"loop of {MODES} filters over {FRAMES} frames: {run:.0f} ms, "
+        f"{MODES * FRAMES / run / 1e3:.0f} million mode-frames a second; "
+        f"a copy of its two series: {copy:.0f} ms"
+    )
     matrices, states = np.ones((5, 5, MODES)), np.ones((5, MODES))
     turned, columns = np.ones((MODES, 5, 5)), np.ones((MODES, 5, 1))
     last = timed(lambda: [np.einsum("jis,js->is", matrices, states) for _ in range(1000)])
@@ -101,7 +111,9 @@ def main() -> None:
         f"a step of {MODES} states of 5: modes last {last:.1f} us, batched products {first:.1f} us"
     )
     if output:
-        figure = lbt.modal_figure(rows, gains=optimised.gains, turbulence_nm=modes.rms_nm)
+        figure = lbt.report.figures.modal_figure(
+            rows, gains=optimised.gains, turbulence_nm=modes.rms_nm
+        )
         print(f"written: {save_figure(figure, output)}")
 
 

@@ -16,18 +16,22 @@ MODES, RATE_HZ, NOISE_NM, POLE, SETTLE = 60, 800.0, 15.5, 0.9999, 30_000
 def main() -> None:
     """Print one row a record length."""
     rng = np.random.default_rng(5)
-    air = lbt.ModalTurbulence(coefficients=[[POLE]], driving_rms_nm=[1.0], frame_rate_hz=RATE_HZ)
-    exact = lbt.modal_gains(air, noise_nm=NOISE_NM, frame_rate_hz=RATE_HZ)
+    air = lbt.models.ModalTurbulence(
+        coefficients=[[POLE]], driving_rms_nm=[1.0], frame_rate_hz=RATE_HZ
+    )
+    exact = lbt.design.modal.modal_gains(air, noise_nm=NOISE_NM, frame_rate_hz=RATE_HZ)
     print(f"exact: gain {exact.gains[0]:.4f}, {exact.rms_nm[0]:.2f} nm")
     print("| frames | gain | rms_nm, noise given | rms_nm, noise found |\n|---:|---:|---:|---:|")
-    loop = lbt.modal_loop(lbt.MixedController.integrators(np.full(MODES, 0.1)))
+    loop = lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController.integrators(np.full(MODES, 0.1))
+    )
     for frames in (2048, 8192, 40_000):
         white = rng.standard_normal((MODES, frames + SETTLE))
         total = lfilter([1.0], [1.0, -POLE], white, axis=1)[:, SETTLE:]
         run = loop.run(total, NOISE_NM * rng.standard_normal(total.shape), all_series=True)
         cells = []
         for noise in (NOISE_NM, None):
-            found = lbt.modal_gains_from_telemetry(
+            found = lbt.design.modal.modal_gains_from_telemetry(
                 run.measurements.T, run.commands.T, frame_rate_hz=RATE_HZ, noise_nm=noise
             )
             if not cells:

@@ -8,7 +8,7 @@ import numpy as np
 import lbt_synth as lbt
 
 RATE, FRAMES, CASES, OFF_HZ = 800, 3200, 30, 0.8
-AIR = lbt.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=RATE)
+AIR = lbt.models.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=RATE)
 
 
 def line(frequency_hz, damping, rms_nm):
@@ -29,7 +29,7 @@ for lines in (
     windows = lbt.simulate(
         idle, truth, hardware=plant.hardware, frames=FRAMES, cases=CASES
     ).measurements
-    follow, errors, begin = lbt.LineFollower(plant), [], time.process_time()
+    follow, errors, begin = lbt.identification.LineFollower(plant), [], time.process_time()
     for window in windows:
         follow.reset()
         found = follow(window, np.zeros_like(window))

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.records.clock import clock_of
+from lbt_synth.identification.records.clock import clock_of
 
 RATE = 1000.0
 
@@ -39,7 +39,7 @@ def alarms() -> None:
         * np.round((592 * turbulence / turbulence.std() + 15.5 * rng.standard_normal(frames)) / 30),
     }
     for name, series in cases.items():
-        seen = lbt.loop_record(series, frame_rate_hz=RATE, unit="nm")
+        seen = lbt.identification.loop_record(series, frame_rate_hz=RATE, unit="nm")
         print(f"faulty of 1e6, {name}: {frames - seen.health.usable}")
 
 
@@ -67,7 +67,7 @@ def rounded_times() -> None:
         try:
             frame = clock_of(len(kept), frame_rate_hz=rate, times_s=times).frame_of_row
             word = "right" if np.array_equal(frame, kept) else "wrong"
-        except lbt.ProblemError:
+        except lbt.errors.ProblemError:
             word = "refused"
         key = (rows, count > 0, word)
         counts[key] = counts.get(key, 0) + 1
@@ -82,7 +82,7 @@ def missed() -> None:
         y = rng.standard_normal(400_000)
         at = np.arange(200, 400_000, 400)
         y[at] += size * np.sign(rng.standard_normal(at.size))
-        seen = lbt.loop_record(y, frame_rate_hz=RATE, unit="nm")
+        seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
         found = ~seen.usable
         print(
             f"spikes of {size} sigma: {100 * found[at].mean():.1f} % found, "
@@ -92,17 +92,17 @@ def missed() -> None:
 
 def pseudo_open_loop() -> None:
     """Error of the pseudo-open loop of a simulated loop without noise."""
-    shell = lbt.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.of_bandwidth(
         natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
     )
-    air = lbt.ARModel(coefficients=[0.99], driving_rms_nm=80.0, frame_rate_hz=RATE)
+    air = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80.0, frame_rate_hz=RATE)
     for delay in (1, 2, 2.4, 3):
         for mirror in (None, shell):
             path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, mirror=mirror)
             truth = lbt.Truth(turbulence=air, sensor_gain=0.4)
             controller = lbt.integrator(path, gain=0.2).controller
             run = lbt.simulate(controller, truth, hardware=path, frames=30_000)
-            seen = lbt.record_of(lbt.telemetry_of(run, path))
+            seen = lbt.identification.record_of(lbt.files.telemetry_of(run, path))
             good = np.flatnonzero(seen.usable)
             error = seen.pseudo_open_loop(0.4)[good] - run.total_nm[0, good - 1]
             print(
@@ -117,7 +117,7 @@ def times() -> None:
     best = np.inf
     for _ in range(5):
         start = time.perf_counter()
-        lbt.loop_record(y, u, frame_rate_hz=RATE, delay_frames=2.4, unit="nm")
+        lbt.identification.loop_record(y, u, frame_rate_hz=RATE, delay_frames=2.4, unit="nm")
         best = min(best, time.perf_counter() - start)
     print(f"60 000 frames, two axes, measurements and commands: {1e3 * best:.0f} ms")
 

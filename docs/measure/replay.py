@@ -10,14 +10,14 @@ RATE, GAIN, FRAMES = 800, 0.6, 48_000
 CAMERA = lbt.Imaging(diameter_m=8.22)
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 0))
 SIDE = lbt.Vibration(frequency_hz=33, damping=0.02, rms_nm=100, direction=(0, 1))
-SWELL = lbt.ar2_turbulence(
+SWELL = lbt.models.ar2_turbulence(
     lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22),
     frame_rate_hz=RATE,
     noise_nm=15.5,
 )
 
 
-def plant(lines=(LINE, SIDE), sensor_gain: float = GAIN, **more) -> lbt.TipTiltPlant:
+def plant(lines=(LINE, SIDE), sensor_gain: float = GAIN, **more) -> lbt.models.TipTiltPlant:
     return lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
         turbulence=SWELL,
@@ -44,7 +44,9 @@ def open_loop(y, u, path: lbt.LoopHardware):
 
 
 def identity() -> None:
-    shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5, bandwidth_hz=300)
+    shell = lbt.models.PositionLoop.of_bandwidth(
+        natural_frequency_hz=20, damping=0.5, bandwidth_hz=300
+    )
     truth = lbt.Truth(turbulence=SWELL, vibrations=(LINE, SIDE), noise_nm=15.5)
     for name, more in (
         ("delay 2", {}),
@@ -55,7 +57,9 @@ def identity() -> None:
         path, design = model.hardware, lbt.lqg(model)
         y, u, _ = night(path, 1, 5000)
         z = open_loop(y, u, path)
-        found = lbt.replayed_residual(z, design.controller, path, noise_nm=15.5, settle_frames=0)
+        found = lbt.identification.replayed_residual(
+            z, design.controller, path, noise_nm=15.5, settle_frames=0
+        )
         would = lbt.simulate(
             design.controller.start(), truth, hardware=path, frames=5000, seed=1, settle_frames=0
         )
@@ -63,7 +67,7 @@ def identity() -> None:
         print(f"identity, {name}: {np.max(np.abs(missed)) / np.max(np.abs(found.measured_nm)):.1e}")
 
 
-def show(table: lbt.PredictionTable) -> None:
+def show(table: lbt.identification.PredictionTable) -> None:
     for row, entry in zip(table.rows(), table.entries, strict=True):
         name, tip, tilt, data, error, model, ratio, seen, promised = row
         print(
@@ -83,7 +87,7 @@ def tables() -> None:
         "H-infinity, 1.2 gamma_min": lbt.hinf(model, gamma_ratio=1.2, method="riccati"),
     }
     known = {"measurements": y[2:], "running": ran, "imaging": CAMERA}
-    table = lbt.prediction_against_data(model, z[2:], designs, **known)
+    table = lbt.identification.prediction_against_data(model, z[2:], designs, **known)
     show(table)
     gained, error = table["what ran"].replayed.above(table["Kalman"].replayed)
     print(f"what ran less Kalman: {gained:.0f} +- {error:.0f} nm^2")
@@ -95,13 +99,21 @@ def tables() -> None:
     print(f"predictor less Kalman: {more:.0f} +- {error:.0f} nm^2, unpaired +- {apart:.0f}")
 
     print("lines 3 Hz too high in the model")
-    wrong = lbt.retuned_plant(model, 3.0)
-    show(lbt.prediction_against_data(wrong, z[2:], {"Kalman": lbt.kalman(wrong)}, **known))
+    wrong = lbt.models.retuned_plant(model, 3.0)
+    show(
+        lbt.identification.prediction_against_data(
+            wrong, z[2:], {"Kalman": lbt.kalman(wrong)}, **known
+        )
+    )
 
     print("sensor gain believed 20 % too large")
     off = plant(sensor_gain=1.2 * GAIN)
     bent = open_loop(y, u, off.hardware)
-    show(lbt.prediction_against_data(off, bent[2:], {"Kalman": lbt.kalman(off)}, **known))
+    show(
+        lbt.identification.prediction_against_data(
+            off, bent[2:], {"Kalman": lbt.kalman(off)}, **known
+        )
+    )
 
 
 def predictors() -> None:
@@ -110,17 +122,18 @@ def predictors() -> None:
     z, limit = open_loop(y, u, model.hardware)[2:], lbt.kalman(model).rms
     for taps in (2, 4, 8, 16, 32, 64, 128):
         start = time.perf_counter()
-        fit = lbt.least_squares_predictor(
+        fit = lbt.identification.least_squares_predictor(
             z, model.hardware, taps=taps, stretches=[(0, len(z) // 2)]
         )
         took = time.perf_counter() - start
         loop = lbt.close_loop(model.hardware, fit.controller)
-        found = lbt.replayed_residual(
+        found = lbt.identification.replayed_residual(
             z, fit.controller, model.hardware, noise_nm=15.5, stretches=[(len(z) // 2, len(z))]
         )
         print(
             f"{taps} taps: {found.rms_nm:.2f} +- {found.rms_error_nm:.2f} nm on the data, "
-            f"{lbt.model_budget(loop, model).rms_nm:.2f} nm by the model, limit {limit:.2f} nm; "
+            f"{lbt.loop.model_budget(loop, model).rms_nm:.2f} nm by the model, "
+            f"limit {limit:.2f} nm; "
             f"{1e3 * took:.0f} ms"
         )
 
@@ -128,11 +141,11 @@ def predictors() -> None:
 def errors(nights: int = 200) -> None:
     model = plant()
     path, design = model.hardware, lbt.kalman(model)
-    exact = lbt.model_budget(lbt.close_loop(path, design.controller), model).rms_nm ** 2
+    exact = lbt.loop.model_budget(lbt.close_loop(path, design.controller), model).rms_nm ** 2
     seen = []
     for seed in range(nights):
         y, u, _ = night(path, 1000 + seed, 6000)
-        found = lbt.replayed_residual(
+        found = lbt.identification.replayed_residual(
             open_loop(y, u, path)[2:], design.controller, path, noise_nm=15.5
         )
         seen.append(((found.total_nm2 - exact) / found.total_error_nm2, found.total_error_nm2))
@@ -160,11 +173,16 @@ def times() -> None:
         return 1e3 * min(spent)
 
     replay = best(
-        lambda: [lbt.replayed_residual(z, one, model.hardware, noise_nm=15.5) for one in four]
+        lambda: [
+            lbt.identification.replayed_residual(z, one, model.hardware, noise_nm=15.5)
+            for one in four
+        ]
     )
     named = dict(zip("abcd", four, strict=True))
-    table = best(lambda: lbt.prediction_against_data(model, z, named, imaging=CAMERA))
-    integrator = best(lambda: lbt.model_integrator(model))
+    table = best(
+        lambda: lbt.identification.prediction_against_data(model, z, named, imaging=CAMERA)
+    )
+    integrator = best(lambda: lbt.design.model_integrator(model))
     print(
         f"30 000 frames, 2 axes: four replays {replay:.0f} ms, the whole table {table:.0f} ms, of "
         f"which the best integrator {integrator:.0f} ms"

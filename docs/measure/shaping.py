@@ -9,30 +9,39 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 import lbt_synth as lbt
-from lbt_synth.shaping.basis import Basis, laguerre_basis, orthonormal_basis
-from lbt_synth.shaping.channel import Channel
-from lbt_synth.shaping.measured import mode_loop
-from lbt_synth.shaping.reduction import Solved, reduced, solved
-from lbt_synth.statespace import Controller
+from lbt_synth.design.shaping.basis import Basis, laguerre_basis, orthonormal_basis
+from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.exact_evaluation import mode_loop
+from lbt_synth.design.shaping.reduction import Solved, reduced, solved
+from lbt_synth.linear import Controller
 
 RATE_HZ, NOISE_NM = 800.0, 15.5
 PATH = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=1)
 AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
-DEMANDS = (lbt.ModulusMargin(at_least=0.45), lbt.SensorGainRange(low=0.25, high=1.3))
+DEMANDS = (
+    lbt.design.shaping.ModulusMargin(at_least=0.45),
+    lbt.design.shaping.SensorGainRange(low=0.25, high=1.3),
+)
 
 
-def specification(gains: tuple[float, ...]) -> lbt.Specification:
+def specification(gains: tuple[float, ...]) -> lbt.design.shaping.Specification:
     """Turbulence, noise and a vibration of 797 nm rms from 16.5 to 23.5 Hz."""
-    terms: list[lbt.ResidualVariance | lbt.VibrationBand] = []
+    terms: list[lbt.design.shaping.ResidualVariance | lbt.design.shaping.VibrationBand] = []
     for gain in gains:
         terms += [
-            lbt.ResidualVariance(turbulence=AIR, noise_nm=NOISE_NM, sensor_gain=gain),
-            lbt.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797, sensor_gain=gain),
+            lbt.design.shaping.ResidualVariance(
+                turbulence=AIR, noise_nm=NOISE_NM, sensor_gain=gain
+            ),
+            lbt.design.shaping.VibrationBand(
+                low_hz=16.5, high_hz=23.5, rms_nm=797, sensor_gain=gain
+            ),
         ]
-    return lbt.Specification(objective=lbt.Total(terms=tuple(terms)), demands=DEMANDS)
+    return lbt.design.shaping.Specification(
+        objective=lbt.design.shaping.Total(terms=tuple(terms)), demands=DEMANDS
+    )
 
 
-def timed(spec: lbt.Specification, size: int, pole: float) -> tuple[Solved, float]:
+def timed(spec: lbt.design.shaping.Specification, size: int, pole: float) -> tuple[Solved, float]:
     """Solve with Laguerre functions, and take the time."""
     basis = laguerre_basis(size, pole, dt_s=PATH.dt_s)
     start = time.perf_counter()
@@ -45,41 +54,49 @@ def truncated(long: Controller, order: int) -> Controller:
     observed = solve_discrete_lyapunov(long.A.T, long.A.T @ long.C.T @ long.C @ long.A)
     _, vectors = np.linalg.eigh(observed)
     keep = vectors[:, -order:]
-    return Controller(A=keep.T @ long.A @ keep, B=keep.T @ long.B, C=long.C @ keep,
-                      D=np.zeros((1, 1)), dt_s=long.dt_s)  # fmt: skip
+    return Controller(
+        A=keep.T @ long.A @ keep,
+        B=keep.T @ long.B,
+        C=long.C @ keep,
+        D=np.zeros((1, 1)),
+        dt_s=long.dt_s,
+    )
 
 
-def objective_nm(spec: lbt.Specification, parameter: Controller) -> float:
+def objective_nm(spec: lbt.design.shaping.Specification, parameter: Controller) -> float:
     """Root of the objective; nan if a loop is unstable."""
     try:
         return float(np.sqrt(spec.objective.measured_nm2(mode_loop(PATH, parameter))))
-    except lbt.UnstableLoopError:
+    except lbt.errors.UnstableLoopError:
         return float("nan")
 
 
-def refitted(spec: lbt.Specification, parameter: Controller) -> float:
+def refitted(spec: lbt.design.shaping.Specification, parameter: Controller) -> float:
     """The programme solved anew with a parameter's poles."""
     basis: Basis = orthonormal_basis(np.linalg.eigvals(parameter.A), dt_s=PATH.dt_s)
     try:
         return solved(spec, Channel(hardware=PATH, basis=basis)).objective_nm
-    except (lbt.SynthesisError, lbt.ProblemError):
+    except (lbt.errors.SynthesisError, lbt.errors.ProblemError):
         return float("nan")
 
 
 def main() -> None:
     """Print all figures."""
     unit = specification((1.0,))
-    limit = lbt.least_worst_residual(
-        PATH, lbt.Truth(turbulence=AIR, noise_nm=NOISE_NM), band_hz=(16.5, 23.5), rms_nm=797,
+    limit = lbt.loop.least_worst_residual(
+        PATH,
+        lbt.Truth(turbulence=AIR, noise_nm=NOISE_NM),
+        band_hz=(16.5, 23.5),
+        rms_nm=797,
         direction=(1.0,),
-    )  # fmt: skip
+    )
     print(f"limit without demands: {limit.rms_nm:.2f} nm")
     print("functions, pole: root of the objective at unit gain, seconds")
     for size, pole in ((60, 0.0), (120, 0.0), (30, 0.7), (60, 0.5), (60, 0.7), (60, 0.85)):
         found, seconds = timed(unit, size, pole)
         print(f"{size:4d} {pole:5.2f}: {found.objective_nm:6.2f} nm  {seconds:5.1f} s", flush=True)
 
-    free = lbt.Specification(objective=unit.objective)
+    free = lbt.design.shaping.Specification(objective=unit.objective)
     print(f"without demands, 60 functions: {timed(free, 60, 0.7)[0].objective_nm:.2f} nm")
 
     several = specification((1.0, 0.7, 0.5, 0.358))
@@ -93,8 +110,11 @@ def main() -> None:
         start = time.perf_counter()
         few = reduced(several, long, order, 10.0, fewest=False).objective_nm
         seconds = time.perf_counter() - start
-        print(f"{order:4d}: {objective_nm(several, cut):8.2f} {refitted(several, cut):8.2f} "
-              f"{few:8.2f}  ({seconds:.1f} s)", flush=True)  # fmt: skip
+        print(
+            f"{order:4d}: {objective_nm(several, cut):8.2f} {refitted(several, cut):8.2f} "
+            f"{few:8.2f}  ({seconds:.1f} s)",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

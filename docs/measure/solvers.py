@@ -9,21 +9,23 @@ from scipy.linalg import solve_discrete_are
 
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.lmi import hinf_lmi, kalman_sdp, least_gamma_lmi
-from lbt_synth.lmi.coordinates import balanced
-from lbt_synth.lmi.solver import solve
-from lbt_synth.riccati import gamma_riccati, kalman_riccati
+from lbt_synth.linear.lmi.balanced_coordinates import balanced
+from lbt_synth.linear.lmi.hinf import hinf_lmi, least_gamma_lmi
+from lbt_synth.linear.lmi.kalman import kalman_sdp
+from lbt_synth.linear.lmi.solver import solve
+from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.gamma import gamma_riccati
 
 RATE_HZ = 800.0
 AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
 
 
-def plant(damping: float, *, order: int, lines: int) -> lbt.TipTiltPlant:
+def plant(damping: float, *, order: int, lines: int) -> lbt.models.TipTiltPlant:
     """One axis with lines at 20, 33, 46, ... Hz."""
     turbulence = (
-        lbt.ar1_turbulence(AIR, frame_rate_hz=RATE_HZ)
+        lbt.models.ar1_turbulence(AIR, frame_rate_hz=RATE_HZ)
         if order == 1
-        else lbt.ar2_turbulence(AIR, frame_rate_hz=RATE_HZ, noise_nm=15.5)
+        else lbt.models.ar2_turbulence(AIR, frame_rate_hz=RATE_HZ, noise_nm=15.5)
     )
     return lbt.tip_tilt_plant(
         frame_rate_hz=RATE_HZ,
@@ -54,8 +56,10 @@ def riccati_routes() -> None:
                     solve_discrete_are(p.A.T, p.C.T, p.Q, p.R)
                 except (np.linalg.LinAlgError, ValueError):
                     schur_failed += 1
-    print(f"Riccati: {total} plants; failures: ours {doubling_failed}, Schur {schur_failed}; "
-          f"our worst relative residual {worst:.1e}")  # fmt: skip
+    print(
+        f"Riccati: {total} plants; failures: ours {doubling_failed}, Schur {schur_failed}; "
+        f"our worst relative residual {worst:.1e}"
+    )
 
 
 def coordinates() -> None:

@@ -30,5 +30,7 @@ if __name__ == "__main__":
     named = [f"ssr:{gain}", *(f"iir:{file}" for file in transfer)]
     found = commands(("double", "single").index(precision), CONFIG, named)
     for text, (their_loop, their_noise) in zip(named, found, strict=True):
-        print(f"{text}, {precision}: loop {relative(their_loop, loop):.1e}, "
-              f"random measurements {relative(their_noise, noise):.1e}")  # fmt: skip
+        print(
+            f"{text}, {precision}: loop {relative(their_loop, loop):.1e}, "
+            f"random measurements {relative(their_noise, noise):.1e}"
+        )

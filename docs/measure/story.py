@@ -14,21 +14,21 @@ from rich.table import Table
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.config import robust_design
-from lbt_synth.paper import parameters as paper
-from lbt_synth.paper.compute import paper_filters
-from lbt_synth.plotting.style import house_style
+from lbt_synth.config.robust import robust_design
+from lbt_synth.report.figures.style import house_style
+from lbt_synth.studies.paper import parameters as paper
+from lbt_synth.studies.paper.tables import paper_filters
 
 ERRORS = np.arange(-7, 8) / 2
 GAINS = [1.0, 0.7, 0.5, 0.358]
 CAMERA = replace(paper.imaging(), other_modes=0.841)
 TRUTH = replace(paper.PAPER_TRUTH, sensor_gain=1.0)
-AR2 = lbt.ar2_turbulence(
+AR2 = lbt.models.ar2_turbulence(
     paper.ATMOSPHERE, frame_rate_hz=paper.FRAME_RATE_HZ, noise_nm=paper.NOISE_NM
 )
 
 
-def plant(turbulence: lbt.ARModel, damping: float, rms_nm: float) -> lbt.TipTiltPlant:
+def plant(turbulence: lbt.models.ARModel, damping: float, rms_nm: float) -> lbt.models.TipTiltPlant:
     """One line at 20 Hz on either axis."""
     return lbt.tip_tilt_plant(
         frame_rate_hz=paper.FRAME_RATE_HZ,
@@ -43,7 +43,7 @@ def plant(turbulence: lbt.ARModel, damping: float, rms_nm: float) -> lbt.TipTilt
 
 def worst_strehl(design: lbt.Design, errors=ERRORS) -> np.ndarray:
     """Worst Strehl ratio over the rows, at each sensor gain [%]; 0 where unstable."""
-    found = lbt.strehl_map(design, TRUTH, CAMERA, errors_hz=errors, sensor_gains=GAINS)
+    found = lbt.studies.strehl_map(design, TRUTH, CAMERA, errors_hz=errors, sensor_gains=GAINS)
     return 100 * np.min(np.nan_to_num(found.strehl[0]), axis=1)
 
 
@@ -54,7 +54,7 @@ def tuned(make, start: list[float], what: str) -> lbt.Design:
     def cost(x: np.ndarray) -> float:
         try:
             return -float(np.mean(worst_strehl(make(*np.exp(x)), ERRORS[::2])))
-        except (lbt.SynthesisError, lbt.ProblemError):
+        except (lbt.errors.SynthesisError, lbt.errors.ProblemError):
             return 0.0
 
     with console.status(f"tuning {what}"):
@@ -66,9 +66,11 @@ def tuned(make, start: list[float], what: str) -> lbt.Design:
     return make(*parameters)
 
 
-def multi_mode(damping: float, rms_nm: float) -> lbt.FilterDesign:
+def multi_mode(damping: float, rms_nm: float) -> lbt.design.FilterDesign:
     """Kalman filter of AR2 turbulence and five lines from 16.5 to 23.5 Hz."""
-    return lbt.kalman(lbt.spread_plant(plant(AR2, damping, rms_nm), half_width_hz=3.5, lines=5))
+    return lbt.kalman(
+        lbt.models.spread_plant(plant(AR2, damping, rms_nm), half_width_hz=3.5, lines=5)
+    )
 
 
 def designs() -> dict[str, lbt.Design]:
@@ -90,14 +92,14 @@ def designs() -> dict[str, lbt.Design]:
 
 def limit_strehl(residual_nm: float) -> float:
     """Strehl ratio of a residual shared evenly by the axes [%]."""
-    return 100 * lbt.jitter_strehl(np.eye(2) * residual_nm**2 / 2, imaging=CAMERA)
+    return 100 * lbt.loop.jitter_strehl(np.eye(2) * residual_nm**2 / 2, imaging=CAMERA)
 
 
 def main() -> None:
     """Print the table, draw the figure."""
     every = designs()
     bands = {
-        gain: lbt.least_worst_residual(
+        gain: lbt.loop.least_worst_residual(
             every["shaped"].hardware,
             replace(TRUTH, vibrations=(), sensor_gain=gain),
             band_hz=(16.5, 23.5),
@@ -106,10 +108,19 @@ def main() -> None:
         for gain in GAINS
     }
     table = Table(title="Worst Strehl ratio over 15 rows [%], by sensor gain")
-    for heading in ("controller", *map(str, GAINS), "stable gains", "modulus", "states",
-                    "residual [nm]", "above limit [%]"):  # fmt: skip
+    for heading in (
+        "controller",
+        *map(str, GAINS),
+        "stable gains",
+        "modulus",
+        "states",
+        "residual [nm]",
+        "above limit [%]",
+    ):
         table.add_column(heading, justify="left" if heading == "controller" else "right")
-    study = lbt.limit_study(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
+    study = lbt.studies.limit_study(
+        every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS
+    )
     for (name, design), row in zip(every.items(), study.rows, strict=True):
         margins = lbt.loop_margins(lbt.close_loop(design.hardware, design.controller))
         table.add_row(
@@ -121,8 +132,15 @@ def main() -> None:
             f"{row.worst_nm:.1f}",
             f"{row.above_band_limit_percent:.0f}",
         )
-    table.add_row("limit", *(f"{limit_strehl(bands[g]):.2f}" for g in GAINS), "", "", "",
-                  f"{bands[1.0]:.1f}", "0")  # fmt: skip
+    table.add_row(
+        "limit",
+        *(f"{limit_strehl(bands[g]):.2f}" for g in GAINS),
+        "",
+        "",
+        "",
+        f"{bands[1.0]:.1f}",
+        "0",
+    )
     Console(width=150).print(table)
     draw(every, bands)
 
@@ -138,7 +156,7 @@ def draw(every: dict[str, lbt.Design], bands: dict[float, float]) -> None:
             for (name, design), style, colour in track(
                 list(zip(every.items(), styles, colours, strict=True)), transient=True
             ):
-                found = lbt.strehl_map(
+                found = lbt.studies.strehl_map(
                     design, TRUTH, CAMERA, errors_hz=-shifts, sensor_gains=[gain]
                 )
                 axis.plot(20 + shifts, 100 * found.strehl[0, 0], ls=style, color=colour, label=name)

@@ -29,10 +29,10 @@ parameters:
 """
 
 
-def nothing(study: lbt.Study, values: np.ndarray, start: int) -> lbt.BatchResult:
+def nothing(study: lbt.studies.Study, values: np.ndarray, start: int) -> lbt.studies.BatchResult:
     """Numbers of as many digits as results have."""
     columns = {n: np.abs(values[:, 0] * (i + 1) / 7) for i, n in enumerate(study.result_columns)}
-    return lbt.BatchResult(start=start, columns=columns)
+    return lbt.studies.BatchResult(start=start, columns=columns)
 
 
 def main(samples: int = 1_000_000, jobs: int = 1) -> None:
@@ -41,12 +41,14 @@ def main(samples: int = 1_000_000, jobs: int = 1) -> None:
         (folder / "study.yaml").write_text(STUDY.format(samples=samples))
         source = Path(__file__).parents[2] / "examples" / "lbt.yaml"
         (folder / "lbt.yaml").write_bytes(source.read_bytes())
-        study = lbt.load_study(folder / "study.yaml")
+        study = lbt.studies.load_study(folder / "study.yaml")
         before = time.process_time()
-        run = lbt.run_study(study, folder, jobs=jobs, evaluate=nothing)
+        run = lbt.studies.run_study(study, folder, jobs=jobs, evaluate=nothing)
         spent = time.process_time() - before
-        memory = [resource.getrusage(who).ru_maxrss / 1e3 for who in
-                  (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]  # fmt: skip
+        memory = [
+            resource.getrusage(who).ru_maxrss / 1e3
+            for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        ]
         print(
             f"{samples} samples, {jobs} processes: {run.seconds:.1f} s, of the client's processor "
             f"{1e6 * spent / samples:.1f} us a sample; {memory[0]:.0f} MB, a worker {memory[1]:.0f}"

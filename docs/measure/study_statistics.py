@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import qmc
 
 import lbt_synth as lbt
-from lbt_synth.study.percentiles import percentiles
+from lbt_synth.studies.study.percentiles import percentiles
 
 KINDS = ("independent", "latin hypercube", "sobol")
 
@@ -42,7 +42,9 @@ def index_errors(repeats=100):
                 u = draw(kind, n, 6, seed)
                 y = ishigami(u)
                 orders = [np.argsort(u[:, j]) for j in range(4)]
-                found.append([lbt.first_order_index(u[o, j], y[o]) for j, o in enumerate(orders)])
+                found.append(
+                    [lbt.studies.first_order_index(u[o, j], y[o]) for j, o in enumerate(orders)]
+                )
             values = np.array([[each.value for each in row] for row in found])
             errors = np.array([[each.error for each in row] for row in found])
             rms = 100 * np.sqrt(np.mean((values - exact_indices()) ** 2, axis=0))
@@ -68,7 +70,7 @@ def corrections(repeats=100):
                 y = ishigami(u)
                 for j in range(6):
                     order = np.argsort(u[:, j])
-                    found = lbt.first_order_index(u[order, j], y[order])
+                    found = lbt.studies.first_order_index(u[order, j], y[order])
                     p, left = 2 * found.groups, 1 - found.value - found.correction
                     row = [found.value, 1 - left, 1 - left - (p - 1) / (n - p) * left]
                     total[seed] += row
@@ -107,7 +109,7 @@ def pairs_of_a_sobol_sequence():
             for j in range(8):
                 order = np.argsort(u[:, j])
                 for i in set(range(8)) - {j}:
-                    found = lbt.first_order_index(u[order, j], y[order, i])
+                    found = lbt.studies.first_order_index(u[order, j], y[order, i])
                     worst = max(worst, found.value)
                     ratio = max(ratio, found.value / found.error)
                     means = max(means, correlation_ratio(y[order, i], round(n**0.5)))
@@ -148,7 +150,7 @@ def cost(n=2**20):
         columns[f"{name}.residual_nm"] = rng.random(n)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     start = time.process_time()
-    lbt.study_statistics(columns, names, list("abcd"))
+    lbt.studies.study_statistics(columns, names, list("abcd"))
     spent = time.process_time() - start
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(

@@ -13,10 +13,10 @@ import aotpy
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.telemetry.filters import time_filters
+from lbt_synth.files.telemetry.time_filters import time_filters
 
 
-def sizes(seen: lbt.Telemetry, folder: Path) -> None:
+def sizes(seen: lbt.files.Telemetry, folder: Path) -> None:
     print(f"{seen.frames} frames, {seen.modes} modes")
     for name, precision in (
         ("t.fits", "float64"),
@@ -25,10 +25,10 @@ def sizes(seen: lbt.Telemetry, folder: Path) -> None:
         ("t.aot.fits", "float64"),
     ):
         start = time.perf_counter()
-        path = lbt.save_telemetry(folder / name, seen, precision=precision)
+        path = lbt.files.save_telemetry(folder / name, seen, precision=precision)
         written = time.perf_counter() - start
         start = time.perf_counter()
-        lbt.load_telemetry(path)
+        lbt.files.load_telemetry(path)
         read = time.perf_counter() - start
         kilobytes = path.stat().st_size / 1e3
         print(f"{name:11s} {precision}: {kilobytes:6.0f} kB, {written:.3f} s, {read:.3f} s")
@@ -77,13 +77,13 @@ def main() -> None:
             run = lbt.simulate(
                 design.controller, config.truth, hardware=config.hardware, frames=8000
             )
-            seen = lbt.telemetry_of(
+            seen = lbt.files.telemetry_of(
                 run, config.hardware, sensor_gain=config.truth.sensor_gain, design=design
             )
             if method == "integrator":
                 sizes(seen, folder)
-            path = lbt.save_telemetry(folder / "t.aot.fits", seen)
-            metres = np.max(np.abs(lbt.load_telemetry(path).commands / seen.commands - 1))
+            path = lbt.files.save_telemetry(folder / "t.aot.fits", seen)
+            metres = np.max(np.abs(lbt.files.load_telemetry(path).commands / seen.commands - 1))
             print(
                 f"{method:10s} time filters {response_error(design.controller):.1e}, "
                 f"next command {next_command_error(path):.1e}, through metres {metres:.1e}"

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import lbt_synth as lbt
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.loop.simulation.run import step_loop
 from lbt_synth.models.plant import with_vibrations
-from lbt_synth.plotting import save_figure
-from lbt_synth.simulation.run import step_loop
-from lbt_synth.simulation.series import draw_disturbance, draw_noise
+from lbt_synth.report.figures.style import save_figure
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
 RATE_HZ, RMS_NM = 800.0, 797.0
@@ -27,34 +27,42 @@ class Case:
     """A loop and what shakes it."""
 
     name: str
-    plant: lbt.TipTiltPlant
-    turbulence: lbt.Spectrum
+    plant: lbt.models.TipTiltPlant
+    turbulence: lbt.models.Spectrum
     damping: float | None
     sensor_gain: float = 1.0
 
     @property
-    def line(self) -> lbt.DriftingVibration:
+    def line(self) -> lbt.models.DriftingVibration:
         """The vibration that drifts."""
-        return lbt.DriftingVibration(
-            start_hz=FROM_HZ, end_hz=TO_HZ, duration_s=DRIFT_S, rms_nm=RMS_NM,
-            damping=self.damping, direction=(1,),
-        )  # fmt: skip
+        return lbt.models.DriftingVibration(
+            start_hz=FROM_HZ,
+            end_hz=TO_HZ,
+            duration_s=DRIFT_S,
+            rms_nm=RMS_NM,
+            damping=self.damping,
+            direction=(1,),
+        )
 
     def truth(self, *lines: object) -> lbt.Truth:
         """Return the truth with these vibrations."""
         noise_nm = float(np.sqrt(self.plant.R[0, 0]))
         return lbt.Truth(
-            turbulence=self.turbulence, vibrations=lines, noise_nm=noise_nm,
+            turbulence=self.turbulence,
+            vibrations=lines,
+            noise_nm=noise_nm,
             sensor_gain=self.sensor_gain,
-        )  # fmt: skip
+        )
 
-    def design(self, frequency_hz: float) -> lbt.FilterDesign:
+    def design(self, frequency_hz: float) -> lbt.design.FilterDesign:
         """Return the filter for a frequency."""
         (line,) = self.plant.vibrations
         return lbt.kalman(with_vibrations(self.plant, [line.moved(frequency_hz)]))
 
 
-def axis(turbulence: lbt.ARModel, noise_nm: float, damping: float = 0.01) -> lbt.TipTiltPlant:
+def axis(
+    turbulence: lbt.models.ARModel, noise_nm: float, damping: float = 0.01
+) -> lbt.models.TipTiltPlant:
     """One axis of the LBT, designed for 20 Hz."""
     line = lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=RMS_NM, direction=(1,))
     return lbt.tip_tilt_plant(
@@ -66,22 +74,33 @@ def cases() -> list[Case]:
     """The cases of the table."""
     out = []
     for noise_nm in (15.5, 60.0):
-        air = lbt.ar2_turbulence(CONFIG.atmosphere, frame_rate_hz=RATE_HZ, noise_nm=noise_nm)
+        air = lbt.models.ar2_turbulence(CONFIG.atmosphere, frame_rate_hz=RATE_HZ, noise_nm=noise_nm)
         for name, damping in (("sinusoid", None), ("resonance", 0.01)):
             plant = axis(air, noise_nm)
             out.append(
-                Case(name=f"{name}, noise {noise_nm:g} nm", plant=plant, turbulence=air,
-                     damping=damping)
-            )  # fmt: skip
-    ar1 = lbt.ar1_turbulence(CONFIG.atmosphere, frame_rate_hz=RATE_HZ)
+                Case(
+                    name=f"{name}, noise {noise_nm:g} nm",
+                    plant=plant,
+                    turbulence=air,
+                    damping=damping,
+                )
+            )
+    ar1 = lbt.models.ar1_turbulence(CONFIG.atmosphere, frame_rate_hz=RATE_HZ)
     papers = axis(ar1, 15.5, 0.0051)
     return out + [
-        Case(name=f"paper's model, gain {gain:g}, {name}", plant=papers, damping=damping,
-             turbulence=CONFIG.atmosphere, sensor_gain=gain)
-        for gain, name, damping in (
-            (1.0, "sinusoid", None), (0.358, "sinusoid", None), (0.358, "resonance", 0.01)
+        Case(
+            name=f"paper's model, gain {gain:g}, {name}",
+            plant=papers,
+            damping=damping,
+            turbulence=CONFIG.atmosphere,
+            sensor_gain=gain,
         )
-    ]  # fmt: skip
+        for gain, name, damping in (
+            (1.0, "sinusoid", None),
+            (0.358, "sinusoid", None),
+            (0.358, "resonance", 0.01),
+        )
+    ]
 
 
 class Told:
@@ -89,9 +108,11 @@ class Told:
 
     def __init__(self, case: Case) -> None:
         self._case, self._every = case, round(UPDATE_S * RATE_HZ)
-        self._running = lbt.SwitchedController(self._at(-SETTLE_S), memory_s=WINDOW_S)
+        self._running = lbt.identification.SwitchedController(
+            self._at(-SETTLE_S), memory_s=WINDOW_S
+        )
 
-    def _at(self, time_s: float) -> lbt.FilterDesign:
+    def _at(self, time_s: float) -> lbt.design.FilterDesign:
         return self._case.design(float(self._case.line.frequency_hz_at(time_s)))
 
     def reset(self) -> None:
@@ -106,30 +127,39 @@ class Told:
         return command
 
 
-def study(case: Case, seed: int = 1) -> tuple[dict[str, lbt.Simulation], lbt.TrackingController]:
+def study(
+    case: Case, seed: int = 1
+) -> tuple[dict[str, lbt.loop.Simulation], lbt.identification.TrackingController]:
     """Run the four controllers against the same disturbances."""
     middle = (
-        lbt.SinusoidalVibration(frequency_hz=20, rms_nm=RMS_NM, direction=(1,))
+        lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=RMS_NM, direction=(1,))
         if case.damping is None
         else lbt.Vibration(frequency_hz=20, damping=case.damping, rms_nm=RMS_NM, direction=(1,))
     )
     hardware = case.plant.hardware
-    tracker = lbt.TrackingController(
-        case.plant, lbt.LineFollower(case.plant), window_s=WINDOW_S, update_s=UPDATE_S
+    tracker = lbt.identification.TrackingController(
+        case.plant,
+        lbt.identification.LineFollower(case.plant),
+        window_s=WINDOW_S,
+        update_s=UPDATE_S,
     )
     controllers = {
         "tracking": tracker,
         "told the frequency": Told(case),
         "fixed at 20 Hz": case.design(20.0).controller,
-        "integrator": lbt.optimal_integrator(hardware, case.truth(middle)).controller,
+        "integrator": lbt.design.optimal_integrator(hardware, case.truth(middle)).controller,
     }
     runs = {
         name: lbt.simulate(
-            controller, case.truth(case.line), hardware=hardware, frames=round(DRIFT_S * RATE_HZ),
-            seed=seed, settle_frames=round(SETTLE_S * RATE_HZ),
+            controller,
+            case.truth(case.line),
+            hardware=hardware,
+            frames=round(DRIFT_S * RATE_HZ),
+            seed=seed,
+            settle_frames=round(SETTLE_S * RATE_HZ),
         )
         for name, controller in controllers.items()
-    }  # fmt: skip
+    }
     return runs, tracker
 
 
@@ -164,11 +194,17 @@ def identifiers() -> None:
     """The same with the whole model found in every window."""
     print("LoopIdentifier: Strehl ratio [%] (residual [nm rms]); times of the fit")
     for case in cases():
-        tracker = lbt.TrackingController(case.plant, window_s=WINDOW_S, update_s=UPDATE_S)
+        tracker = lbt.identification.TrackingController(
+            case.plant, window_s=WINDOW_S, update_s=UPDATE_S
+        )
         run = lbt.simulate(
-            tracker, case.truth(case.line), hardware=case.plant.hardware, seed=1,
-            frames=round(DRIFT_S * RATE_HZ), settle_frames=round(SETTLE_S * RATE_HZ),
-        )  # fmt: skip
+            tracker,
+            case.truth(case.line),
+            hardware=case.plant.hardware,
+            seed=1,
+            frames=round(DRIFT_S * RATE_HZ),
+            settle_frames=round(SETTLE_S * RATE_HZ),
+        )
         taken = [1e3 * update.identify_s for update in tracker.history]
         print(
             f"  {case.name:40s}{100 * run.strehl(CONFIG.imaging)[0]:6.2f} ({run.rms_nm[0]:6.1f}), "
@@ -186,24 +222,32 @@ def windows() -> None:
         for window_s, update_s in ((2, 0.5), (2, 1), (4, 1), (4, 2), (8, 1), (8, 4)):
             found = [
                 lbt.simulate(
-                    lbt.TrackingController(
-                        case.plant, lbt.LineFollower(case.plant), window_s=window_s,
-                        update_s=update_s, extrapolate=trend,
+                    lbt.identification.TrackingController(
+                        case.plant,
+                        lbt.identification.LineFollower(case.plant),
+                        window_s=window_s,
+                        update_s=update_s,
+                        extrapolate=trend,
                     ),
-                    case.truth(case.line), hardware=case.plant.hardware, seed=1,
-                    frames=round(DRIFT_S * RATE_HZ), settle_frames=round(SETTLE_S * RATE_HZ),
+                    case.truth(case.line),
+                    hardware=case.plant.hardware,
+                    seed=1,
+                    frames=round(DRIFT_S * RATE_HZ),
+                    settle_frames=round(SETTLE_S * RATE_HZ),
                 ).strehl(CONFIG.imaging)[0]
                 for trend in (True, False)
-            ]  # fmt: skip
-            print(f"  {case.name:40s}{window_s:4g} s{update_s:5g} s"
-                  + "".join(f"{100 * value:8.2f}" for value in found))  # fmt: skip
+            ]
+            print(
+                f"  {case.name:40s}{window_s:4g} s{update_s:5g} s"
+                + "".join(f"{100 * value:8.2f}" for value in found)
+            )
 
 
 def frame_times() -> None:
     """Time of a frame of the exchangeable filter, and of the controller alone."""
     case = cases()[0]
     for name, running in (
-        ("exchangeable", lbt.SwitchedController(case.design(20.0))),
+        ("exchangeable", lbt.identification.SwitchedController(case.design(20.0))),
         ("controller alone", case.design(20.0).controller.start()),
     ):
         y, started = np.zeros(1), time.perf_counter()
@@ -215,7 +259,9 @@ def frame_times() -> None:
 class Exchanged:
     """A filter that another replaces at a frame, in one of several ways."""
 
-    def __init__(self, old: lbt.FilterDesign, new: lbt.FilterDesign, frame: int, how: str) -> None:
+    def __init__(
+        self, old: lbt.design.FilterDesign, new: lbt.design.FilterDesign, frame: int, how: str
+    ) -> None:
         self._designs, self._frame, self._how = (old, new), frame, how
         self.reset()
 
@@ -223,7 +269,7 @@ class Exchanged:
         """Begin again."""
         old, new = self._designs
         self._k, self._command = 0, np.zeros(1)
-        self._switched = lbt.SwitchedController(old, memory_s=WINDOW_S)
+        self._switched = lbt.identification.SwitchedController(old, memory_s=WINDOW_S)
         self._old, self._new = old.controller.start(), new.controller.start()
         self._shadow = new.estimator.start()
 
@@ -250,7 +296,9 @@ def bumps() -> None:
     """What an exchange of filters does to the residual."""
     case, frame, frames, many = cases()[0], 8000, 9600, 20
     hardware = case.plant.hardware
-    truth = case.truth(lbt.SinusoidalVibration(frequency_hz=20, rms_nm=RMS_NM, direction=(1,)))
+    truth = case.truth(
+        lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=RMS_NM, direction=(1,))
+    )
     rng = np.random.default_rng(0)
     size = {"frames": frames, "cases": many, "rng": rng}
     total, noise = draw_disturbance(truth, hardware, **size), draw_noise(truth, hardware, **size)
@@ -270,7 +318,7 @@ def bumps() -> None:
             f"{apart:10.1e}"
         )
     same = Exchanged(case.design(19.5), case.design(19.5), frame, "replayed")
-    never = lbt.SwitchedController(case.design(19.5), memory_s=WINDOW_S)
+    never = lbt.identification.SwitchedController(case.design(19.5), memory_s=WINDOW_S)
     one, other = (step_loop(c, 1.0, hardware, total[:1], noise[:1]) for c in (same, never))
     print(f"  the same filter: {np.max(np.abs(one - other)):g} nm")
 
@@ -285,7 +333,9 @@ def main() -> None:
     if len(sys.argv) > 1:
         case = cases()[5]
         runs, tracker = study(case)
-        figure = lbt.tracking_figure(tracker.history, runs, truth=[case.line], start_s=SETTLE_S)
+        figure = lbt.report.figures.tracking_figure(
+            tracker.history, runs, truth=[case.line], start_s=SETTLE_S
+        )
         print(save_figure(figure, f"{sys.argv[1]}/tracking.png"))
 
 

@@ -20,18 +20,7 @@ DONE, FAILED, WRONG = 0, 1, 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program's name; those of the process by default.
-
-    Returns
-    -------
-    int
-        0 done, 1 a design or a verification failed, 2 wrong usage or bad input.
-    """
+    """Run one command and return its exit status."""
     arguments = build_parser().parse_args(argv)
     given = os.environ.get("SOURCE_DATE_EPOCH")
     if given is not None:  # libraries read it, too, when they are loaded
@@ -45,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 WRONG,
                 as_json=arguments.json,
             )
-    commands = importlib.import_module("lbt_synth.cli.commands")
+    commands = importlib.import_module("lbt_synth.cli.command_table")
     try:
         report = commands.COMMANDS[arguments.command](arguments)
     except SynthesisError as error:

@@ -41,24 +41,12 @@ class TableText:
 
 @dataclass(kw_only=True)
 class Report:
-    """Result of a command.
+    """Result of a command."""
 
-    Attributes
-    ----------
-    data : dict
-        What ``--json`` prints; nan and inf become null.
-    tables : list of TableText
-        What people see.
-    notes : list of str
-        Lines below the tables.
-    passed : bool
-        False makes the exit status 1.
-    """
-
-    data: dict[str, Any]
-    tables: list[TableText] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    passed: bool = True
+    data: dict[str, Any]  # What ``--json`` prints; nan and inf become null
+    tables: list[TableText] = field(default_factory=list)  # What people see
+    notes: list[str] = field(default_factory=list)  # Lines below the tables
+    passed: bool = True  # False makes the exit status 1
 
     def print(self, *, as_json: bool) -> None:
         """Print to standard output."""

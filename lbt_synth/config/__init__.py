@@ -1,8 +1,10 @@
-"""Configuration files: YAML with units in the keys, checked against a schema."""
+"""Configuration files in YAML, with units in their keys.
 
-from lbt_synth.config.identified import identified_config
-from lbt_synth.config.load import Config, load_config
-from lbt_synth.config.robust import robust_design
-from lbt_synth.config.write import save_config
+The schema refuses unknown keys and says where the mistake is.
+A loaded configuration builds the plant, the truth, the hardware and the imaging camera.
+An identified model is written as a configuration that loads again.
+"""
 
-__all__ = ["Config", "identified_config", "load_config", "robust_design", "save_config"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,13 +13,7 @@ T = TypeVar("T")
 
 
 def axes_of(settings: FileSection) -> int:
-    """Return the number of modes n: of ``loop.axes``, else of the matrices, else 2.
-
-    Raises
-    ------
-    ConfigError
-        If ``loop.axes`` is not that of a matrix.
-    """
+    """Return the number of modes n: of ``loop.axes``, else of the matrices, else 2."""
     sensor, influence = settings.sensor.matrix, settings.mirror.influence_matrix
     sizes = [
         *([("sensor.matrix", "columns", len(sensor[0]))] if sensor else []),
@@ -43,13 +37,7 @@ def measurements_of(settings: FileSection) -> int:
 
 
 def fitted(values: list[T], count: int, key: str, what: str) -> list[T]:
-    """Return a list that has one value for each of ``count`` axes or measurements.
-
-    Raises
-    ------
-    ConfigError
-        If a list has another length.
-    """
+    """Return a list that has one value for each of ``count`` axes or measurements."""
     if len(values) != count:
         raise ConfigError(
             f"{key}: must be one for all, or a list of one {what} ({count}); got {len(values)}.",
@@ -61,13 +49,7 @@ def fitted(values: list[T], count: int, key: str, what: str) -> list[T]:
 def directions_of(
     section: VibrationSection | TrueVibrationSection, axes: int, key: str
 ) -> list[tuple[float, ...]]:
-    """Return the directions of the vibrations that one entry of a list makes.
-
-    Raises
-    ------
-    ConfigError
-        If its direction is not one of the loop's axes.
-    """
+    """Return the directions of the vibrations that one entry of a list makes."""
     if axes == 1:
         if section.axis in ("tilt", "both") or section.direction_deg is not None:
             raise ConfigError(

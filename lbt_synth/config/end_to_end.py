@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lbt_synth.config.needs import needed_atmosphere, needed_telescope
+from lbt_synth.config.required_sections import needed_atmosphere, needed_telescope
 from lbt_synth.config.schema import FileSection
-from lbt_synth.endtoend import EndToEndSetup, EndToEndSystem
 from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.interop import EndToEndSetup, EndToEndSystem
 from lbt_synth.models import LoopHardware, Truth
 
 _HINT = "an end-to-end simulation needs it"
 
 
 def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth) -> EndToEndSetup:
-    """Build the simulation that a configuration describes.
-
-    Raises
-    ------
-    ConfigError
-        If a section is missing that is needed, or says what optics cannot follow.
-    """
+    """Build the simulation that a configuration describes."""
     pyramid, asked = settings.sensor.pyramid, settings.end_to_end
     telescope = needed_telescope(settings, _HINT)
     air = needed_atmosphere(settings, _HINT)

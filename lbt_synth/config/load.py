@@ -12,13 +12,13 @@ from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from lbt_synth.config.builders import noise_of, plant_of, reference_gain, truth_of
 from lbt_synth.config.end_to_end import end_to_end_setup
-from lbt_synth.config.mistakes import described
-from lbt_synth.config.needs import atmosphere_of, needed_atmosphere
-from lbt_synth.config.parts import noise_of, plant_of, reference_gain, truth_of
+from lbt_synth.config.required_sections import atmosphere_of, needed_atmosphere
 from lbt_synth.config.schema import FileSection
-from lbt_synth.endtoend import EndToEndSetup
+from lbt_synth.config.schema_errors import described
 from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.validation import FloatArray
@@ -114,13 +114,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
 
 
 def validated(schema: type[Checked], raw: Mapping[str, Any], source: Path) -> Checked:
-    """Return the sections of a file, checked.
-
-    Raises
-    ------
-    ConfigError
-        If a key is unknown, missing or has an impossible value, with its path.
-    """
+    """Return the sections of a file, checked."""
     try:
         return schema.model_validate(raw)
     except ValidationError as error:
@@ -129,13 +123,7 @@ def validated(schema: type[Checked], raw: Mapping[str, Any], source: Path) -> Ch
 
 
 def read_mapping(source: Path) -> dict[str, Any]:
-    """Read a YAML file that holds a mapping.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be read, is no YAML or holds something else.
-    """
+    """Read a YAML file that holds a mapping."""
     try:
         text = source.read_text(encoding="utf-8")
     except OSError as error:
@@ -157,13 +145,7 @@ def read_mapping(source: Path) -> dict[str, Any]:
 
 
 def config_of(settings: FileSection, source: Path) -> Config:
-    """Build what the settings of a file describe.
-
-    Raises
-    ------
-    ConfigError
-        If they do not fit together.
-    """
+    """Build what the settings of a file describe."""
     try:
         atmosphere = atmosphere_of(settings)
         noise_nm = noise_of(settings)

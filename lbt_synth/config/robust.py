@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from lbt_synth.config.builders import rms_nm
 from lbt_synth.config.load import Config
-from lbt_synth.config.parts import rms_nm
 from lbt_synth.config.schema import BandSection
 from lbt_synth.design import ShapedDesign, robust
-from lbt_synth.design.shaped import noise_of_modes
-from lbt_synth.errors import ConfigError, ProblemError
-from lbt_synth.models import Spectrum
-from lbt_synth.models.truth import spectrum_key
-from lbt_synth.shaping import (
+from lbt_synth.design.shaped_design import noise_of_modes
+from lbt_synth.design.shaping import (
     Attenuation,
     CommandRms,
     DelayError,
-    Demand,
     MirrorUncertainty,
     NoisePeak,
     VibrationBand,
 )
+from lbt_synth.design.shaping.demand_types import Demand
+from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.models import Spectrum
+from lbt_synth.models.truth import spectrum_key
 
 _KEY = "design.robust"
 

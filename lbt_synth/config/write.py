@@ -12,7 +12,7 @@ from ruamel.yaml.error import YAMLError
 
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import write_atomically
+from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import instance
 
 _COLUMN = 40  # where comments begin
@@ -88,8 +88,11 @@ def save_config(
     >>> import lbt_synth as lbt
     >>> settings = lbt.load_config("examples/lbt.yaml").settings
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = lbt.save_config(pathlib.Path(folder) / "again.yaml", settings,
-    ...                            comments={"telescope.diameter_m": "Table I"})
+    ...     path = lbt.config.save_config(
+    ...         pathlib.Path(folder) / "again.yaml",
+    ...         settings,
+    ...         comments={"telescope.diameter_m": "Table I"},
+    ...     )
     ...     print(path.read_text().splitlines()[3])
     ...     lbt.load_config(path).settings == settings
       diameter_m: 8.22                      # Table I

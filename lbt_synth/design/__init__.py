@@ -1,48 +1,21 @@
-"""Designs: Kalman, H-infinity and integrator, each certified before it is returned."""
+"""Controllers by convex synthesis, each with a certificate.
 
-from lbt_synth.design.central import central
-from lbt_synth.design.hinf import hinf
-from lbt_synth.design.integrator import (
-    integrator,
-    integrator_gain_limit,
-    model_integrator,
-    optimal_integrator,
-)
-from lbt_synth.design.kalman import kalman
-from lbt_synth.design.lqg import lqg
-from lbt_synth.design.lqg_result import LqgDesign
-from lbt_synth.design.mixed import mixed
-from lbt_synth.design.polytopic import PolytopicDesign, polytopic
-from lbt_synth.design.result import (
-    Design,
-    EstimatorDesign,
-    FilterDesign,
-    IntegratorDesign,
-    SolverReport,
-)
-from lbt_synth.design.robust import robust
-from lbt_synth.design.shape import shape
-from lbt_synth.design.shaped import ShapedDesign
+Each method takes a plant or an estimation problem and returns a design.
+The certificate is computed after the synthesis and does not trust the solver.
+A design that fails its certificate is never returned: the method raises.
+"""
 
-__all__ = [
-    "Design",
-    "EstimatorDesign",
-    "FilterDesign",
-    "IntegratorDesign",
-    "LqgDesign",
-    "PolytopicDesign",
-    "ShapedDesign",
-    "SolverReport",
-    "central",
-    "hinf",
-    "integrator",
-    "integrator_gain_limit",
-    "kalman",
-    "lqg",
-    "mixed",
-    "model_integrator",
-    "optimal_integrator",
-    "polytopic",
-    "robust",
-    "shape",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# A function that shares its module's name hides the module, whichever is imported first.
+from lbt_synth.design.central import central as central  # noqa: E402
+from lbt_synth.design.hinf import hinf as hinf  # noqa: E402
+from lbt_synth.design.integrator import integrator as integrator  # noqa: E402
+from lbt_synth.design.kalman import kalman as kalman  # noqa: E402
+from lbt_synth.design.lqg import lqg as lqg  # noqa: E402
+from lbt_synth.design.mixed import mixed as mixed  # noqa: E402
+from lbt_synth.design.polytopic import polytopic as polytopic  # noqa: E402
+from lbt_synth.design.robust import robust as robust  # noqa: E402
+from lbt_synth.design.shape import shape as shape  # noqa: E402

@@ -9,10 +9,11 @@ from scipy.optimize import brentq
 
 from lbt_synth.design.hinf import Gains, hinf, require_reachable
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
-from lbt_synth.lyapunov import stationary_covariance
-from lbt_synth.models.problem import EstimationProblem, require_problem
-from lbt_synth.norms import hinf_norm
-from lbt_synth.riccati import gamma_riccati, kalman_riccati
+from lbt_synth.linear import EstimationProblem, hinf_norm
+from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.gamma import gamma_riccati
 from lbt_synth.validation import number
 
 _DECADES = 4.0  # of gamma, over which a member is searched
@@ -46,7 +47,7 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     --------
     >>> import lbt_synth as lbt
     >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> round(lbt.central(walk, gamma=1.5).gamma, 6)
+    >>> round(lbt.design.central(walk, gamma=1.5).gamma, 6)
     1.5
     """
     require_problem(problem)
@@ -87,11 +88,6 @@ class CentralFamily:
         """Gains of the member at which a rising measure of norm and deviation is zero.
 
         An end of the family where the measure does not change its sign.
-
-        Parameters
-        ----------
-        measure : callable
-            Function of norm and standard deviation, negative towards the least gamma.
         """
         gains: dict[float, Gains] = {0.0: self.least}
         found = {0.0: measure(self.least.gamma, self.least.rms)}

@@ -10,17 +10,12 @@ import numpy as np
 from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
-from lbt_synth.models.problem import EstimationProblem, require_problem
-from lbt_synth.norms import hinf_norm
-from lbt_synth.riccati import (
-    FilterRiccati,
-    gamma_riccati,
-    kalman_riccati,
-    least_gamma,
-    worst_invisible,
-)
+from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_level
+from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
+from lbt_synth.linear.riccati.gamma import gamma_riccati, least_gamma
+from lbt_synth.linear.riccati.invisible_disturbance import worst_invisible
 from lbt_synth.validation import FloatArray, choice, frozen, number
-from lbt_synth.witness import Witness, infeasible_level
 
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9
@@ -160,13 +155,7 @@ def hinf(
 
 
 def require_reachable(gamma: float, least: float) -> None:
-    """Refuse a level below the least one.
-
-    Raises
-    ------
-    InfeasibleError
-        With both levels.
-    """
+    """Refuse a level below the least one."""
     if gamma < least * (1 - _AT_LEAST):
         raise InfeasibleError(
             f"gamma must be at least {least:.12g}, the least of this problem; got {gamma:.12g}. "
@@ -225,14 +214,14 @@ class _LmiRoute:
         self.scale = _kalman_bracket(problem, start)[1]
 
     def least(self) -> tuple[_Solved, Witness]:
-        from lbt_synth.lmi import least_gamma_lmi
+        from lbt_synth.linear.lmi.hinf import least_gamma_lmi
 
         solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
         assert solution.witness is not None  # the least gamma has a dual solution
         return solution, solution.witness
 
     def at(self, gamma: float) -> _Solved:
-        from lbt_synth.lmi import hinf_lmi
+        from lbt_synth.linear.lmi.hinf import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 

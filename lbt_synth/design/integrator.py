@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.certify import certify_loop
+from lbt_synth.design.certificate import certify_loop
 from lbt_synth.design.result import IntegratorDesign, SolverReport, loop_certificate
 from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,
     ResidualBudget,
@@ -18,10 +19,7 @@ from lbt_synth.loop import (
     residual_budget,
     stable_sensor_gains,
 )
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.plant import TipTiltPlant
-from lbt_synth.models.truth import Truth
-from lbt_synth.statespace import Controller
+from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.validation import frozen, instance, number
 
 _TRIALS = 32
@@ -98,7 +96,7 @@ def integrator_gain_limit(delay_frames: float) -> float:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> [round(lbt.integrator_gain_limit(d), 3) for d in (2, 3, 4)]
+    >>> [round(lbt.design.integrator_gain_limit(d), 3) for d in (2, 3, 4)]
     [1.0, 0.618, 0.445]
     """
     hardware = LoopHardware(frame_rate_hz=1.0, delay_frames=delay_frames, modes=1)
@@ -152,8 +150,8 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     --------
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> slow = lbt.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> design = lbt.optimal_integrator(path, lbt.Truth(turbulence=slow, noise_nm=20.0))
+    >>> slow = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
+    >>> design = lbt.design.optimal_integrator(path, lbt.Truth(turbulence=slow, noise_nm=20.0))
     >>> 0.2 < design.gain < 0.6
     True
     """
@@ -186,11 +184,11 @@ def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> slow = lbt.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
+    >>> slow = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
     >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0)
     >>> truth = lbt.Truth(turbulence=slow, noise_nm=20.0)
-    >>> same = lbt.optimal_integrator(plant.hardware, truth)
-    >>> bool(abs(lbt.model_integrator(plant).gain / same.gain - 1) < 1e-6)
+    >>> same = lbt.design.optimal_integrator(plant.hardware, truth)
+    >>> bool(abs(lbt.design.model_integrator(plant).gain / same.gain - 1) < 1e-6)
     True
     """
     instance(plant, TipTiltPlant)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
-from lbt_synth.models.problem import EstimationProblem, require_problem
-from lbt_synth.riccati import kalman_riccati
+from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.validation import choice
 
 
@@ -62,7 +63,7 @@ def kalman(
                 route="riccati", status=solution.status, iterations=solution.iterations
             ),
         )
-    from lbt_synth.lmi import kalman_sdp
+    from lbt_synth.linear.lmi.kalman import kalman_sdp
 
     scale = error_scale(problem, solution.P)
     programme = kalman_sdp(problem, coordinates=solution.P, scale=scale)

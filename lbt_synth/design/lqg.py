@@ -19,14 +19,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lbt_synth.certify import Certificate
-from lbt_synth.design.lqg_result import LqgDesign, estimation_plant, lqg_controller
+from lbt_synth.design.certificate import Certificate
+from lbt_synth.design.lqg_design import LqgDesign, estimation_plant, lqg_controller
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import DimensionError, InfeasibleError, ProblemError
-from lbt_synth.lyapunov import stationary_covariance
-from lbt_synth.models.lifting import Response
-from lbt_synth.models.plant import TipTiltPlant
-from lbt_synth.riccati import kalman_riccati, solve_dare
+from lbt_synth.linear import solve_dare
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.models import TipTiltPlant
+from lbt_synth.models.lifted_mirror import Response
 from lbt_synth.validation import FloatArray, frozen, number
 
 _ON_CIRCLE = 1e-6  # a zero this close to the unit circle leaves no stable regulator
@@ -84,11 +85,13 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5,
-    ...                                       bandwidth_hz=100)
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5, modes=1,
-    ...                            mirror=shell)
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=100
+    ... )
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, noise_nm=15.5, modes=1, mirror=shell
+    ... )
     >>> design = lbt.lqg(plant)
     >>> loop = lbt.close_loop(plant.hardware, design.controller)
     >>> budget = lbt.residual_budget(loop, lbt.Truth(turbulence=slow, noise_nm=15.5))
@@ -146,9 +149,12 @@ def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regu
     weight = d**2 + rho
     if core.n_states == 0:
         return Regulator(
-            gain_state=d / weight * L, gain_mirror=np.zeros(0), weight=weight,
-            status="settled", iterations=0,
-        )  # fmt: skip
+            gain_state=d / weight * L,
+            gain_mirror=np.zeros(0),
+            weight=weight,
+            status="settled",
+            iterations=0,
+        )
     X, status, iterations = np.zeros_like(F), "inverted", 0
     zeros = np.abs(core.zeros)
     if rho == 0 and np.any(np.abs(zeros - 1) < _ON_CIRCLE):
@@ -166,9 +172,12 @@ def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regu
     crossed = _stein(closed.T, A, (gain_mirror * d - h)[None, :, None] * L[:, None, :])
     gain_state = (d * L - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
     return Regulator(
-        gain_state=gain_state, gain_mirror=gain_mirror, weight=total, status=status,
+        gain_state=gain_state,
+        gain_mirror=gain_mirror,
+        weight=total,
+        status=status,
         iterations=iterations,
-    )  # fmt: skip
+    )
 
 
 def _stein(left: FloatArray, right: FloatArray, drive: FloatArray) -> FloatArray:

@@ -13,15 +13,20 @@ from lbt_synth.design.hinf import Gains, hinf, require_reachable
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
-from lbt_synth.models.problem import EstimationProblem, require_problem
-from lbt_synth.norms import hinf_norm, largest_singular_values
-from lbt_synth.riccati import kalman_riccati
-from lbt_synth.statespace import StateSpace
+from lbt_synth.linear import (
+    EstimationProblem,
+    StateSpace,
+    Witness,
+    hinf_norm,
+    infeasible_level,
+    largest_singular_values,
+)
+from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.validation import FloatArray, frozen, integer, number
-from lbt_synth.witness import Witness, infeasible_level
 
 if TYPE_CHECKING:
-    from lbt_synth.lmi import InnovationProgramme
+    from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
 _Answer: TypeAlias = tuple[FloatArray, float, str]  # taps, level, the solver's word
 
@@ -89,8 +94,13 @@ def mixed(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> line = lbt.EstimationProblem(A=[[1.9, -0.99], [1.0, 0.0]], B=[[1.0, 0.0], [0.0, 0.0]],
-    ...                              C=[[0.0, 1.0]], D=[[0.0, 3.0]], L=[[1.0, 0.0]])
+    >>> line = lbt.EstimationProblem(
+    ...     A=[[1.9, -0.99], [1.0, 0.0]],
+    ...     B=[[1.0, 0.0], [0.0, 0.0]],
+    ...     C=[[0.0, 1.0]],
+    ...     D=[[0.0, 3.0]],
+    ...     L=[[1.0, 0.0]],
+    ... )
     >>> central = lbt.hinf(line, gamma_ratio=1.1, method="riccati")
     >>> best = lbt.mixed(line, gamma=central.gamma)
     >>> best.gamma <= central.gamma * (1 + 1e-6) and best.rms < central.rms
@@ -142,13 +152,7 @@ def mixed(
 
 
 def require_taps(taps: int) -> int:
-    """Return a length of the impulse response that is fit for use.
-
-    Raises
-    ------
-    ProblemError
-        If it is none.
-    """
+    """Return a length of the impulse response that is fit for use."""
     length = integer(taps, "taps", at_least=1)
     if length > _MOST_TAPS:
         raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {length}.")
@@ -171,7 +175,7 @@ def _completed(
     solve: Callable[[InnovationProgramme, FloatArray], _Answer],
 ) -> _Completed:
     """Solve on a set of frequencies, and add to it until the norm holds between them."""
-    from lbt_synth.lmi import InnovationProgramme
+    from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
     programme = InnovationProgramme.of(problem, base.gain_predictor, taps=length)
     grid = _first_grid(programme.error)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.certify import (
+from lbt_synth.design.certificate import (
     NORM_TOLERANCE,
     Certificate,
     Check,
@@ -17,12 +17,11 @@ from lbt_synth.certify import (
 )
 from lbt_synth.design.result import EstimatorDesign, SolverReport
 from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
+from lbt_synth.linear import Controller, EstimationProblem, StateSpace
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import youla_controller
-from lbt_synth.models.interval import FrequencyInterval, error_system
-from lbt_synth.models.plant import TipTiltPlant, tip_tilt_plant
-from lbt_synth.models.problem import EstimationProblem
-from lbt_synth.riccati import kalman_riccati
-from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.models import TipTiltPlant, tip_tilt_plant
+from lbt_synth.models.frequency_interval import FrequencyInterval, error_system
 from lbt_synth.validation import ComplexArray, FloatArray, choice
 
 _NORMS = ("hinf", "h2")
@@ -139,11 +138,12 @@ def polytopic(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
     >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
-    ...                            noise_nm=15.5, modes=1)
-    >>> design = lbt.polytopic(plant, half_width_hz=0.5)
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5, modes=1
+    ... )
+    >>> design = lbt.design.polytopic(plant, half_width_hz=0.5)
     >>> design.worst_achieved <= design.bound_guaranteed <= 1.001 * design.worst_achieved
     True
     """
@@ -249,7 +249,7 @@ def _certified(design: PolytopicDesign) -> Certificate:
 
 def _synthesised(interval: FrequencyInterval, norm: str) -> tuple[Controller, float, SolverReport]:
     """Filter of all axes; those that nothing couples are designed one by one."""
-    from lbt_synth.lmi import SegmentFilter, segment_filter
+    from lbt_synth.linear.lmi.polytopic import SegmentFilter, segment_filter
 
     plant = interval.plant
     made: list[SegmentFilter] = []

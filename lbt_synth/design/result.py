@@ -8,7 +8,7 @@ from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
-from lbt_synth.certify import (
+from lbt_synth.design.certificate import (
     INFEASIBLE_TOLERANCE,
     NORM_TOLERANCE,
     Certificate,
@@ -17,14 +17,10 @@ from lbt_synth.certify import (
     certify_infeasible,
     certify_loop,
 )
+from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
 from lbt_synth.loop import close_loop
-from lbt_synth.models.full_plant import FullStatePlant
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.plant import TipTiltPlant
-from lbt_synth.models.problem import EstimationProblem
-from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
 from lbt_synth.validation import ComplexArray, FloatArray
-from lbt_synth.witness import Witness
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,20 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from lbt_synth.design.shape import shape
-from lbt_synth.design.shaped import ShapedDesign, noise_of_modes
+from lbt_synth.design.shaped_design import ShapedDesign, noise_of_modes
+from lbt_synth.design.shaping.bounds import ModulusMargin
+from lbt_synth.design.shaping.demand_types import Demand
+from lbt_synth.design.shaping.objectives import ResidualVariance, Term, Total, VibrationBand
+from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.design.shaping.uncertainty import SensorGainRange
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.plant import TipTiltPlant
-from lbt_synth.models.truth import Spectrum
-from lbt_synth.shaping import (
-    Demand,
-    ModulusMargin,
-    ResidualVariance,
-    SensorGainRange,
-    Specification,
-    Term,
-    Total,
-    VibrationBand,
-)
+from lbt_synth.models import Spectrum, TipTiltPlant
 from lbt_synth.validation import number, sequence
 
 
@@ -81,11 +75,11 @@ def robust(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
     >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0, modes=1)
-    >>> line = lbt.VibrationBand(low_hz=18, high_hz=22, rms_nm=100)
+    >>> line = lbt.design.shaping.VibrationBand(low_hz=18, high_hz=22, rms_nm=100)
     >>> design = lbt.robust(plant, bands=[line], sensor_gain=(0.5, 1.2), functions=16, states=None)
-    >>> low, high = lbt.stable_sensor_gains(plant.hardware, design.controller)
+    >>> low, high = lbt.loop.stable_sensor_gains(plant.hardware, design.controller)
     >>> low < 0.5 and high > 1.2
     True
     """

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.certify import Certificate
+from lbt_synth.design.certificate import Certificate
 from lbt_synth.design.result import SolverReport
-from lbt_synth.design.shaped import ShapedDesign, assembled, require_separable
+from lbt_synth.design.shaped_design import ShapedDesign, assembled, require_separable
+from lbt_synth.design.shaping.basis import laguerre_basis
+from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.exact_evaluation import mode_hardware
+from lbt_synth.design.shaping.reduction import Solved, reduced, solved
+from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.shaping import Specification
-from lbt_synth.shaping.basis import laguerre_basis
-from lbt_synth.shaping.channel import Channel
-from lbt_synth.shaping.measured import mode_hardware
-from lbt_synth.shaping.reduction import Solved, reduced, solved
-from lbt_synth.statespace import Controller
+from lbt_synth.linear import Controller
+from lbt_synth.models import LoopHardware
 from lbt_synth.validation import integer, number
 
 _MOST_FUNCTIONS = 400
@@ -81,11 +81,12 @@ def shape(
     --------
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    >>> spec = lbt.Specification(
-    ...     objective=lbt.ResidualVariance(turbulence=slow, noise_nm=20.0),
-    ...     demands=[lbt.ModulusMargin(at_least=0.6)])
-    >>> design = lbt.shape(path, spec, functions=12, states=None)
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    >>> spec = lbt.design.shaping.Specification(
+    ...     objective=lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0),
+    ...     demands=[lbt.design.shaping.ModulusMargin(at_least=0.6)],
+    ... )
+    >>> design = lbt.design.shape(path, spec, functions=12, states=None)
     >>> loop = lbt.close_loop(path, design.controller)
     >>> lbt.loop_margins(loop).modulus > 0.6
     True

@@ -14,10 +14,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.lyapunov import stationary_covariance
-from lbt_synth.models.interval import FrequencyInterval
-from lbt_synth.norms import band_norm, hinf_norm
-from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.norms import band_norm
+from lbt_synth.models.frequency_interval import FrequencyInterval
 
 _GRID = 33
 _GAP = 1e-4  # of the variance, between what is guaranteed and what was found
@@ -35,17 +35,7 @@ def error_size(error: StateSpace, norm: str) -> float:
 def worst_found(
     interval: FrequencyInterval, estimator: Controller, norm: str
 ) -> tuple[float, float]:
-    """Worst error on a grid of frequencies, refined, and where it is [Hz].
-
-    Parameters
-    ----------
-    interval : FrequencyInterval
-        The plants.
-    estimator : Controller
-        Stable estimator.
-    norm : {"hinf", "h2"}
-        What is measured.
-    """
+    """Worst error on a grid of frequencies, refined, and where it is [Hz]."""
 
     def size(frequency_hz: float) -> float:
         a1 = interval.coefficient(frequency_hz)
@@ -66,22 +56,7 @@ def worst_found(
 
 
 def worst_guaranteed(interval: FrequencyInterval, estimator: Controller, norm: str) -> float:
-    """Bound of the error on all of the interval.
-
-    Parameters
-    ----------
-    interval : FrequencyInterval
-        The plants.
-    estimator : Controller
-        Stable estimator.
-    norm : {"hinf", "h2"}
-        What is bounded.
-
-    Raises
-    ------
-    NumericalError
-        If the branch and bound does not close.
-    """
+    """Bound of the error on all of the interval."""
     if norm == "hinf":
         ends = [hinf_norm(interval.error_system(a, estimator)) for a in interval.coefficients]
         system, low_hz, high_hz = interval.envelope(estimator)

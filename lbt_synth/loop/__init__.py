@@ -1,26 +1,13 @@
-"""The closed loop: transfer functions, margins, exact residual, Strehl ratio."""
+"""The closed loop: stability, margins, exact residual and Strehl ratio.
 
-from lbt_synth.loop.budget import ResidualBudget, residual_budget
-from lbt_synth.loop.closed_loop import ClosedLoop, close_loop
-from lbt_synth.loop.margins import LoopMargins, loop_margins, stable_sensor_gains
-from lbt_synth.loop.model import model_budget
-from lbt_synth.loop.settling import settling_error
-from lbt_synth.loop.strehl import Imaging, jitter_strehl, strehl, strehl_of_series
-from lbt_synth.loop.youla import youla_controller
+A controller, designed here or elsewhere, is closed around the sensor, the delay and the mirror.
+Residuals are exact integrals over spectra, not averages over a simulation.
+The least residual of any linear controller stands beside them.
+"""
 
-__all__ = [
-    "ClosedLoop",
-    "Imaging",
-    "LoopMargins",
-    "ResidualBudget",
-    "close_loop",
-    "jitter_strehl",
-    "loop_margins",
-    "model_budget",
-    "residual_budget",
-    "settling_error",
-    "stable_sensor_gains",
-    "strehl",
-    "strehl_of_series",
-    "youla_controller",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# A function that shares its module's name hides the module, whichever is imported first.
+from lbt_synth.loop.strehl import strehl as strehl  # noqa: E402

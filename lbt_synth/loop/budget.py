@@ -12,18 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.closed_loop import ClosedLoop
-from lbt_synth.lyapunov import stationary_covariance
-from lbt_synth.models.ar import ARModel
-from lbt_synth.models.truth import (
-    Spectrum,
-    Truth,
-    breakpoints_below,
-    fitted_direction,
-    stationary_vibrations,
-)
-from lbt_synth.models.vibration import Vibration
-from lbt_synth.quadrature import adaptive_integral
+from lbt_synth.models import ARModel, Spectrum, Truth, Vibration
+from lbt_synth.models.truth import breakpoints_below, fitted_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
 
 
@@ -115,9 +108,10 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
     >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
-    >>> budget = lbt.residual_budget(lbt.close_loop(path, lazy),
-    ...                              lbt.Truth(turbulence=None, noise_nm=3.0))
-    >>> round(budget.noise_nm ** 2, 9)
+    >>> budget = lbt.residual_budget(
+    ...     lbt.close_loop(path, lazy), lbt.Truth(turbulence=None, noise_nm=3.0)
+    ... )
+    >>> round(budget.noise_nm**2, 9)
     3.0
     """
     loop.require_stable()

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.lifting import Response
-from lbt_synth.statespace import Controller, StateSpace
+from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.lifted_mirror import Response
 from lbt_synth.validation import ComplexArray, FloatArray, number
 
 # A loop whose slowest pole is closer to the unit circle than this is called marginal.
@@ -225,20 +225,7 @@ def loop_matrices(
 ) -> tuple[FloatArray, ...]:
     """Close the loop around a controller in the textbook form, or around each of a stack.
 
-    Parameters
-    ----------
-    A, B, C, D : (..., s, s), (..., s, q), (..., m, s), (..., m, q) ndarray
-        The controllers.
-    mirror : Response
-        From a command to its position averaged over the exposure, the same for all commands.
-    sensor, influence : (q, n), (n, m) ndarray
-        Sensor and mirror response to the modes, the same for all controllers.
-
-    Returns
-    -------
-    tuple of ndarray
-        ``A0, A1, B, C0, C1, D`` of the loops: with a sensor gain g, ``A = A0 + g A1`` and
-        ``C = C0 + g C1``. The outputs are residual, command and measurement.
+    Shapes: sensor, influence (q, n).
     """
     lead, order = A.shape[:-2], A.shape[-1]
     (q, n), m = sensor.shape, influence.shape[1]

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
+from lbt_synth.linear import Controller, hinf_norm
+from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, spectral_radii
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.norms import hinf_norm
-from lbt_synth.quadrature import gauss_panels
-from lbt_synth.statespace import Controller
+from lbt_synth.models import LoopHardware
 from lbt_synth.validation import number
 
 _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
@@ -128,8 +127,8 @@ def stable_sensor_gains(
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=3, modes=1)
     >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
-    >>> low, high = lbt.stable_sensor_gains(path, lazy)
-    >>> low, round(high, 6)                             # 0.618034 / 0.5
+    >>> low, high = lbt.loop.stable_sensor_gains(path, lazy)
+    >>> low, round(high, 6)  # 0.618034 / 0.5
     (0.0, 1.236068)
     """
     centre = number(nominal, "nominal", above=0)

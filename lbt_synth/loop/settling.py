@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from lbt_synth.linear import StateSpace
 from lbt_synth.loop.budget import ResidualBudget, residual_budget
 from lbt_synth.loop.closed_loop import ClosedLoop
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.truth import Truth
-from lbt_synth.statespace import StateSpace
+from lbt_synth.models import LoopHardware, Truth
 
 
 def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
@@ -42,13 +41,19 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> shell = lbt.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5,
-    ...                                       bandwidth_hz=500)
+    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
+    ... )
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell)
-    >>> shake = lbt.Truth(turbulence=None, noise_nm=1.0, vibrations=(
-    ...     lbt.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),))
+    >>> shake = lbt.Truth(
+    ...     turbulence=None,
+    ...     noise_nm=1.0,
+    ...     vibrations=(
+    ...         lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),
+    ...     ),
+    ... )
     >>> loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
-    >>> missed = lbt.settling_error(loop, shake)
+    >>> missed = lbt.loop.settling_error(loop, shake)
     >>> 0 < missed.rms_nm < lbt.residual_budget(loop, shake).rms_nm
     True
     """

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.special import j0
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import ResidualBudget
-from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -112,8 +112,9 @@ def strehl(budget: ResidualBudget, imaging: Imaging) -> float:
     --------
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> quiet = lbt.Controller(A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[0.0] * 2] * 2,
-    ...                        dt_s=1 / 800)
+    >>> quiet = lbt.Controller(
+    ...     A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[0.0] * 2] * 2, dt_s=1 / 800
+    ... )
     >>> still = lbt.residual_budget(lbt.close_loop(path, quiet), lbt.Truth(turbulence=None))
     >>> round(lbt.strehl(still, lbt.Imaging(diameter_m=8.22, other_modes=0.84)), 12)
     0.84
@@ -150,7 +151,7 @@ def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: 
     --------
     >>> import lbt_synth as lbt
     >>> camera = lbt.Imaging(diameter_m=8.22)
-    >>> round(lbt.jitter_strehl([[300**2, 0], [0, 300**2]], imaging=camera), 3)
+    >>> round(lbt.loop.jitter_strehl([[300**2, 0], [0, 300**2]], imaging=camera), 3)
     0.379
     """
     covariance = matrix(covariance_nm2, "covariance_nm2")
@@ -162,33 +163,16 @@ def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: 
 def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any) -> FloatArray:
     """Strehl ratios of many jitters.
 
-    Parameters
-    ----------
-    covariance_nm2 : (p, n, n) array_like
-        Covariance of the Gaussian jitter on n = 1 or 2 axes [nm^2 rms wavefront]. Points
-        that share one are quicker.
-    imaging : Imaging
-        The camera.
-    line_amplitudes_nm : (p, s, n) complex array_like
-        Amplitude and phase of each sinusoid on each axis [nm].
-
-    Returns
-    -------
-    (p,) ndarray
-        Strehl ratios in [0, 1], the other modes included.
-
-    Raises
-    ------
-    ProblemError
-        If a value is not finite, a covariance is indefinite, or sizes clash.
+    Shapes: covariance_nm2 (p, n, n), line_amplitudes_nm (p, s, n) -> (p,).
 
     Examples
     --------
     >>> import lbt_synth as lbt, numpy as np
     >>> from lbt_synth.loop.strehl import jitter_strehls
     >>> jitters = np.array([0.0, 300.0])[:, None, None] ** 2 * np.eye(2)
-    >>> jitter_strehls(jitters, imaging=lbt.Imaging(diameter_m=8.22),
-    ...                line_amplitudes_nm=np.zeros((2, 0, 2))).round(3).tolist()
+    >>> jitter_strehls(
+    ...     jitters, imaging=lbt.Imaging(diameter_m=8.22), line_amplitudes_nm=np.zeros((2, 0, 2))
+    ... ).round(3).tolist()
     [1.0, 0.379]
     """
     covariance = semidefinite(covariance_nm2, "covariance_nm2", stacked=True)
@@ -311,7 +295,7 @@ def strehl_of_series(residual_nm: Any, imaging: Imaging) -> float:
     --------
     >>> import lbt_synth as lbt
     >>> camera = lbt.Imaging(diameter_m=8.22, other_modes=0.9)
-    >>> round(lbt.strehl_of_series([[5.0, 1.0]] * 10, camera), 12)
+    >>> round(lbt.loop.strehl_of_series([[5.0, 1.0]] * 10, camera), 12)
     0.9
     """
     series = real_array(residual_nm, "residual_nm")

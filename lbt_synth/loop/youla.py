@@ -17,8 +17,8 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.errors import DimensionError
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.statespace import Controller
+from lbt_synth.linear import Controller
+from lbt_synth.models import LoopHardware
 
 
 def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controller:
@@ -45,8 +45,8 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
     --------
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> last = lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800)   # u(k) = ybar(k)
-    >>> controller = lbt.youla_controller(path, last)
+    >>> last = lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800)  # u(k) = ybar(k)
+    >>> controller = lbt.loop.youla_controller(path, last)
     >>> bool(lbt.close_loop(path, controller).spectral_radius < 1e-3)
     True
     """

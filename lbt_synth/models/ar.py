@@ -32,7 +32,7 @@ class ARModel:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> ar1 = lbt.ARModel(coefficients=[0.6], driving_rms_nm=8.0, frame_rate_hz=1000)
+    >>> ar1 = lbt.models.ARModel(coefficients=[0.6], driving_rms_nm=8.0, frame_rate_hz=1000)
     >>> round(ar1.rms_nm, 6)
     10.0
     """
@@ -99,7 +99,7 @@ class ARModel:
         Examples
         --------
         >>> import lbt_synth as lbt
-        >>> white = lbt.ARModel(coefficients=[0.0], driving_rms_nm=3.0, frame_rate_hz=900)
+        >>> white = lbt.models.ARModel(coefficients=[0.0], driving_rms_nm=3.0, frame_rate_hz=900)
         >>> float(white.psd(100.0) * 450)
         9.0
         """

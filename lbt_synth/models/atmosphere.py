@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.quadrature import gauss_panels
+from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray, number, real_array
 
 ARCSEC_RAD = np.pi / 180 / 3600
@@ -53,8 +53,9 @@ class Atmosphere:
     The Large Binocular Telescope of Agapito et al. 2008, Table I:
 
     >>> import lbt_synth as lbt
-    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
-    ...                      diameter_m=8.22)
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
     >>> round(air.tilt_rms_nm, 1)
     591.6
     """
@@ -118,8 +119,9 @@ class Atmosphere:
         Examples
         --------
         >>> import lbt_synth as lbt
-        >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
-        ...                      diameter_m=8.22)
+        >>> air = lbt.Atmosphere(
+        ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+        ... )
         >>> slow, fast = air.psd([0.1, 100.0])
         >>> bool(slow > 1e9 * fast)
         True
@@ -209,9 +211,12 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
     from scipy.interpolate import CubicSpline  # slow to import
 
     frequency = np.concatenate(
-        [np.geomspace(LOWEST, 0.3, 120, endpoint=False), np.linspace(0.3, 12, 480, endpoint=False),
-         np.linspace(12, 120, 400)]
-    )  # fmt: skip
+        [
+            np.geomspace(LOWEST, 0.3, 120, endpoint=False),
+            np.linspace(0.3, 12, 480, endpoint=False),
+            np.linspace(12, 120, 400),
+        ]
+    )
     fy, wy = _spatial_panels()
     density = [
         4 * np.sum(wy * _filtered_spectrum(scale_ratio, obstruction, np.hypot(f, fy)))

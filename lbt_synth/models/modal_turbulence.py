@@ -46,8 +46,9 @@ class ModalTurbulence:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> air = lbt.ModalTurbulence(coefficients=[[0.99], [0.98]], driving_rms_nm=[10.0, 5.0],
-    ...                           frame_rate_hz=800)
+    >>> air = lbt.models.ModalTurbulence(
+    ...     coefficients=[[0.99], [0.98]], driving_rms_nm=[10.0, 5.0], frame_rate_hz=800
+    ... )
     >>> air.n_modes, air.rms_nm.round(2).tolist()
     (2, [70.89, 25.13])
     """
@@ -105,8 +106,8 @@ class ModalTurbulence:
         Examples
         --------
         >>> import lbt_synth as lbt
-        >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
-        >>> lbt.ModalTurbulence.of([slow, slow]).n_modes
+        >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+        >>> lbt.models.ModalTurbulence.of([slow, slow]).n_modes
         2
         """
         each = (models,) if isinstance(models, ARModel) else sequence(models, "models")
@@ -236,9 +237,10 @@ def modal_turbulence(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
-    ...                      diameter_m=8.22)
-    >>> modes = lbt.modal_turbulence(air, modes=672, frame_rate_hz=800)
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
+    >>> modes = lbt.models.modal_turbulence(air, modes=672, frame_rate_hz=800)
     >>> modes.rms_nm[[0, 2, 671]].round(1).tolist()
     [591.6, 308.8, 3.0]
     >>> modes.coefficients[[0, 2, 671], 0].round(4).tolist()

@@ -20,19 +20,19 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.linear import Controller, EstimationProblem
+from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
 from lbt_synth.models.ar import ARModel
-from lbt_synth.models.full_plant import FullStatePlant
-from lbt_synth.models.hardware import LoopHardware
-from lbt_synth.models.local_loop import PositionLoop
-from lbt_synth.models.parts import (
+from lbt_synth.models.full_state_plant import FullStatePlant
+from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.models.mirror import PositionLoop
+from lbt_synth.models.plant_checks import (
     checked_vibrations,
     measurement_gains,
     noise_factor,
     per_mode,
 )
-from lbt_synth.models.problem import LONGEST_HORIZON, EstimationProblem
 from lbt_synth.models.vibration import Vibration
-from lbt_synth.statespace import Controller
 from lbt_synth.validation import FloatArray, frozen, integer, number
 
 
@@ -69,10 +69,11 @@ class TipTiltPlant(EstimationProblem):
         --------
         >>> import lbt_synth as lbt
         >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
-        >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-        >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
-        ...                            noise_nm=15.5)
-        >>> plant.full().A.shape            # 2 p + 2 n + m = 2 + 4 + 2
+        >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+        >>> plant = lbt.tip_tilt_plant(
+        ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
+        ... )
+        >>> plant.full().A.shape  # 2 p + 2 n + m = 2 + 4 + 2
         (8, 8)
         """
         hw = self.hardware
@@ -164,7 +165,7 @@ class TipTiltPlant(EstimationProblem):
         Examples
         --------
         >>> import lbt_synth as lbt
-        >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+        >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
         >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
         >>> [plant.ahead(frames).hardware.delay_frames for frames in (0, 1, 2)]
         [1.0, 2.0, 3.0]
@@ -255,10 +256,11 @@ def tip_tilt_plant(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
     >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
-    ...                            noise_nm=15.5, modes=1)
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5, modes=1
+    ... )
     >>> plant.A.shape
     (4, 4)
     """
@@ -319,19 +321,20 @@ def tip_tilt_plant(
     L[:, tur : tur + n] = (1 - late) * np.eye(n)
     L[:, tot : tot + n] += late * np.eye(n)
     return TipTiltPlant(
-        A=A, B=B, C=C, D=D, L=L, dt_s=hardware.dt_s,
-        hardware=hardware, turbulence=models, vibrations=lines,
-    )  # fmt: skip
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        L=L,
+        dt_s=hardware.dt_s,
+        hardware=hardware,
+        turbulence=models,
+        vibrations=lines,
+    )
 
 
 def require_no_memory(plant: TipTiltPlant) -> None:
-    """Refuse a plant that holds the past innovations of a filter: it cannot be assembled anew.
-
-    Raises
-    ------
-    ProblemError
-        If it has more states than its parts.
-    """
+    """Refuse a plant that holds the past innovations of a filter: it cannot be assembled anew."""
     hw = plant.hardware
     order = max(model.order for model in plant.turbulence)
     chain = max(int(np.ceil(hw.delay_frames)), 2) - 1
@@ -367,11 +370,12 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> slow = lbt.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
     >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=[line],
-    ...                            noise_nm=15.5)
-    >>> lbt.retuned_plant(plant, -3.5).vibrations[0].frequency_hz
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
+    ... )
+    >>> lbt.models.retuned_plant(plant, -3.5).vibrations[0].frequency_hz
     16.5
     """
     shift = number(shift_hz, "shift_hz")
@@ -386,13 +390,7 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
 
 
 def with_vibrations(plant: TipTiltPlant, vibrations: Sequence[Vibration]) -> TipTiltPlant:
-    """Return a plant with other vibrations, all else being the same.
-
-    Raises
-    ------
-    ProblemError
-        If a vibration does not fit the loop, or the plant cannot be assembled anew.
-    """
+    """Return a plant with other vibrations, all else being the same."""
     require_no_memory(plant)
     hw = plant.hardware
     return tip_tilt_plant(

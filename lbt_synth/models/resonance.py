@@ -21,22 +21,7 @@ PARAMETERS = 3  # of a component: log frequency, log damping, log variance
 
 
 def recursion(frequency: float, damping: float) -> tuple[float, float, FloatArray]:
-    """Return b, 1 - q and their derivatives.
-
-    Parameters
-    ----------
-    frequency : float
-        Natural frequency, as an angle a frame (2 pi f / f_s).
-    damping : float
-        Damping ratio, above 0.
-
-    Returns
-    -------
-    b, p : float
-        ``1 - a1 - a2`` and ``1 + a2``.
-    jacobian : (2, 2) ndarray
-        Derivatives of b and p by log frequency and log damping.
-    """
+    """Return b, 1 - q and their derivatives. Shapes: returns jacobian (2, 2)."""
     w, decay = frequency, damping * frequency
     rho = np.exp(-decay)
     p = -np.expm1(-2 * decay)
@@ -77,12 +62,7 @@ def coefficients(frequency: float, damping: float) -> tuple[float, float, float]
 def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     """Coefficients a1 and a2 of many sampled resonances, (p, 2).
 
-    Parameters
-    ----------
-    frequency : (p,) ndarray
-        Natural frequencies, as angles a frame.
-    damping : (p,) ndarray
-        Damping ratios, between 0 and 1.
+    Shapes: frequency (p,), damping (p,).
     """
     decay = np.exp(-damping * frequency)
     turn = frequency * np.sqrt((1 - damping) * (1 + damping))
@@ -94,20 +74,7 @@ def log_density(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Logarithm of the spectrum of unit variance, and its derivatives.
 
-    Parameters
-    ----------
-    frequency : float
-        Natural frequency, as an angle a frame.
-    damping : float
-        Damping ratio.
-    s : (f,) ndarray
-        ``4 sin^2`` of half the angle a frame of each frequency.
-
-    Returns
-    -------
-    value, by_frequency, by_damping : (f,) ndarray
-        Logarithm of ``var v / |1 - a1 z^-1 - a2 z^-2|^2``, its derivatives by log frequency
-        and log damping.
+    Shapes: s (f,) -> value, by_frequency, by_damping (f,).
     """
     b, p, jacobian = recursion(frequency, damping)
     q = 1 - p
@@ -129,17 +96,7 @@ def log_density(
 def log_roll_off(corner: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Logarithm of a first-order low pass's power response, and its derivative.
 
-    Parameters
-    ----------
-    corner : float
-        Corner frequency, as an angle a frame; the pole is ``exp(-corner)``.
-    s : (f,) ndarray
-        ``4 sin^2`` of half the angle a frame of each frequency.
-
-    Returns
-    -------
-    value, by_corner : (f,) ndarray
-        Logarithm of ``(1 - p)^2 / |1 - p z^-1|^2``, its derivative by the log corner.
+    Shapes: s (f,) -> value, by_corner (f,).
     """
     gap, pole = -np.expm1(-corner), np.exp(-corner)
     size = gap**2 + pole * s

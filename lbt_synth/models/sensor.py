@@ -32,7 +32,7 @@ def illuminated_subapertures(across: float, obstruction: float = 0.0) -> float:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> round(lbt.illuminated_subapertures(30, 0.11))
+    >>> round(lbt.models.illuminated_subapertures(30, 0.11))
     698
     """
     n = number(across, "across", at_least=1)
@@ -85,9 +85,17 @@ def pyramid_tilt_noise_nm(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> round(lbt.pyramid_tilt_noise_nm(photons=50, read_noise_electrons=8,
-    ...     modulation_lambda_over_d=4, subapertures=704, wavelength_um=0.75,
-    ...     diameter_m=8.22), 1)
+    >>> round(
+    ...     lbt.models.pyramid_tilt_noise_nm(
+    ...         photons=50,
+    ...         read_noise_electrons=8,
+    ...         modulation_lambda_over_d=4,
+    ...         subapertures=704,
+    ...         wavelength_um=0.75,
+    ...         diameter_m=8.22,
+    ...     ),
+    ...     1,
+    ... )
     15.5
     """
     n = number(photons, "photons", above=0)
@@ -135,7 +143,7 @@ def pyramid_modal_noise_nm(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> noise = lbt.pyramid_modal_noise_nm(15.5, modes=100, modulation_lambda_over_d=4)
+    >>> noise = lbt.models.pyramid_modal_noise_nm(15.5, modes=100, modulation_lambda_over_d=4)
     >>> noise[[0, 2, 5, 99]].round(2).tolist()
     [15.5, 10.33, 7.75, 3.88]
     """

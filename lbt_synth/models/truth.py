@@ -10,8 +10,8 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar import ARModel
-from lbt_synth.models.drift import DriftingVibration
-from lbt_synth.models.hardware import LoopHardware
+from lbt_synth.models.drifting_vibration import DriftingVibration
+from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, frozen, number, real_array, sequence
 
@@ -44,7 +44,7 @@ class TabulatedSpectrum:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> flat = lbt.TabulatedSpectrum(frequency_hz=[10, 20], density_nm2_hz=[4, 4])
+    >>> flat = lbt.models.TabulatedSpectrum(frequency_hz=[10, 20], density_nm2_hz=[4, 4])
     >>> [float(v) for v in flat.psd([5, 15, 25])]
     [0.0, 4.0, 0.0]
     """
@@ -97,10 +97,9 @@ class SumSpectrum:
     A measured spectrum upon turbulence that it does not hold:
 
     >>> import lbt_synth as lbt
-    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=10,
-    ...                      diameter_m=8)
-    >>> hum = lbt.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])
-    >>> [float(v) for v in lbt.SumSpectrum(parts=[air, hum]).psd([50.0]).round(1)]
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=10, diameter_m=8)
+    >>> hum = lbt.models.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])
+    >>> [float(v) for v in lbt.models.SumSpectrum(parts=[air, hum]).psd([50.0]).round(1)]
     [100.0]
     """
 
@@ -153,7 +152,7 @@ class SinusoidalVibration:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> round(lbt.SinusoidalVibration(frequency_hz=20, rms_nm=797).amplitude_nm, 1)
+    >>> round(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797).amplitude_nm, 1)
     1127.1
     """
 
@@ -188,15 +187,7 @@ def breakpoints_below(spectrum: Spectrum, limit_hz: float) -> FloatArray:
 
 
 def fitted_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
-    """Return the direction (n,) of a vibration that fits a loop.
-
-    Raises
-    ------
-    DimensionError
-        If it has another number of modes.
-    ProblemError
-        If it does not lie below the Nyquist frequency.
-    """
+    """Return the direction (n,) of a vibration that fits a loop."""
     if isinstance(vibration, DriftingVibration):
         frequency_hz = vibration.highest_hz
     else:
@@ -218,13 +209,7 @@ def fitted_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatA
 def stationary_vibrations(
     vibrations: Iterable[TrueVibration],
 ) -> tuple[Vibration | SinusoidalVibration, ...]:
-    """Return vibrations, none of which drifts.
-
-    Raises
-    ------
-    ProblemError
-        If one drifts.
-    """
+    """Return vibrations, none of which drifts."""
     still = []
     for vibration in vibrations:
         if isinstance(vibration, DriftingVibration):
@@ -272,7 +257,7 @@ class Truth:
 
     Tip and tilt that differ:
 
-    >>> slow = lbt.ARModel(coefficients=[0.99], driving_rms_nm=40, frame_rate_hz=800)
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40, frame_rate_hz=800)
     >>> uneven = lbt.Truth(turbulence=[slow, None], noise_nm=[15.5, 12.0])
     >>> [modes for _, modes in uneven.turbulence_groups(2)]
     [(0,)]
@@ -400,8 +385,10 @@ def spectrum_key(spectrum: Spectrum | None) -> object:
     """Return what two equal spectra share: the numbers of an AR model, else which object it is."""
     if isinstance(spectrum, ARModel):
         return (
-            spectrum.coefficients.tobytes(), repr(spectrum.driving_rms_nm), spectrum.frame_rate_hz,
-        )  # fmt: skip
+            spectrum.coefficients.tobytes(),
+            repr(spectrum.driving_rms_nm),
+            spectrum.frame_rate_hz,
+        )
     return id(spectrum)
 
 

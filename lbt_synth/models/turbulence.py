@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from lbt_synth.errors import NumericalError
 from lbt_synth.models.ar import ARModel
 from lbt_synth.models.atmosphere import Atmosphere
-from lbt_synth.models.flows import FrozenFlows
+from lbt_synth.models.frozen_flows import FrozenFlows
 from lbt_synth.models.resonance import coefficients, log_density
 from lbt_synth.validation import FloatArray, frozen, integer, number
 
@@ -50,7 +50,7 @@ def le_roux_pole(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> round(lbt.le_roux_pole(wind_speed_m_s=20, diameter_m=8.22, frame_rate_hz=800), 5)
+    >>> round(lbt.models.le_roux_pole(wind_speed_m_s=20, diameter_m=8.22, frame_rate_hz=800), 5)
     0.9886
     """
     order = integer(radial_order, "radial_order", at_least=1)
@@ -87,9 +87,10 @@ def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
-    ...                      diameter_m=8.22)
-    >>> model = lbt.ar1_turbulence(air, frame_rate_hz=800)
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
+    >>> model = lbt.models.ar1_turbulence(air, frame_rate_hz=800)
     >>> round(float(model.coefficients[0]), 5), round(model.rms_nm, 1)
     (0.9886, 591.6)
     """
@@ -107,27 +108,16 @@ def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
 def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, FloatArray]:
     """AR1 models of many frozen flows, as :func:`ar1_turbulence` makes them one by one.
 
-    Parameters
-    ----------
-    flows : FrozenFlows
-        The flows, p of them.
-    frame_rate_hz : float
-        Sampling frequency [Hz].
-
-    Returns
-    -------
-    coefficients : (p, 1) ndarray
-        Poles.
-    driving_rms_nm : (p,) ndarray
-        Standard deviations of their driving noises [nm].
+    Shapes: returns coefficients (p, 1), driving_rms_nm (p,).
 
     Examples
     --------
     >>> import lbt_synth as lbt
     >>> from lbt_synth.models.turbulence import ar1_flows
-    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
-    ...                      diameter_m=8.22)
-    >>> poles, driving = ar1_flows(lbt.FrozenFlows(atmosphere=air), frame_rate_hz=800)
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
+    >>> poles, driving = ar1_flows(lbt.models.FrozenFlows(atmosphere=air), frame_rate_hz=800)
     >>> poles.round(4).tolist(), driving.round(2).tolist()
     ([[0.9886]], [89.08])
     """
@@ -167,9 +157,10 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
-    ...                      diameter_m=8.22)
-    >>> model = lbt.ar2_turbulence(air, frame_rate_hz=800, noise_nm=15.5)
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
+    >>> model = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=15.5)
     >>> [round(float(a), 4) for a in model.coefficients]
     [1.9975, -0.9976]
     """
@@ -194,9 +185,11 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     corner = 0.5 * atmosphere.wind_speed_m_s / atmosphere.diameter_m
     start = np.array([np.log(corner), np.log(0.25), np.log(atmosphere.tilt_rms_nm)])
     fit = minimize(
-        contrast, start, method="Nelder-Mead",
+        contrast,
+        start,
+        method="Nelder-Mead",
         options={"xatol": 1e-9, "fatol": 1e-14, "maxiter": 4000, "maxfev": 4000},
-    )  # fmt: skip
+    )
     if not fit.success:
         raise NumericalError(
             f"the AR2 fit to the turbulence spectrum did not converge: {fit.message} "

@@ -29,7 +29,7 @@ def nm_per_mas(diameter_m: float) -> float:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> round(lbt.nm_per_mas(8.22), 3)
+    >>> round(lbt.models.nm_per_mas(8.22), 3)
     9.963
     """
     diameter = number(diameter_m, "diameter_m", above=0)

@@ -168,17 +168,7 @@ def sampled_lines(
 ) -> tuple[FloatArray, FloatArray]:
     """Coefficients (p, 2) and driving noise (p,) [nm] of many vibrations at a frame rate.
 
-    Parameters
-    ----------
-    frequency_hz, damping, rms_nm : (p,) ndarray
-        Frequencies below Nyquist [Hz], damping ratios in (0, 1), standard deviations [nm].
-    frame_rate_hz : float
-        Sampling frequency [Hz].
-
-    Raises
-    ------
-    ProblemError
-        If a line is not below the Nyquist frequency.
+    Shapes: frequency_hz, damping, rms_nm (p,).
     """
     highest = float(np.max(frequency_hz, initial=0.0))
     if not highest < frame_rate_hz / 2:

@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import jv
 
+from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models.atmosphere import Atmosphere, kolmogorov_constant_nm2
-from lbt_synth.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray, IntArray, frozen, integer
 
 _FURTHEST = 30  # times the order plus 2: where the integral goes over to its tail
@@ -38,7 +38,7 @@ def noll_orders(modes: int) -> tuple[IntArray, IntArray]:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> radial, azimuthal = lbt.noll_orders(10)
+    >>> radial, azimuthal = lbt.models.noll_orders(10)
     >>> radial.tolist(), azimuthal.tolist()
     ([1, 1, 2, 2, 2, 3, 3, 3, 3, 4], [1, 1, 0, 2, 2, 1, 1, 3, 3, 0])
     """
@@ -67,8 +67,9 @@ def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
     --------
     >>> import lbt_synth as lbt
     >>> from lbt_synth.models.zernike import zernike_variances
-    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20,
-    ...                      diameter_m=8.22)
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
     >>> (zernike_variances(air, 3) ** 0.5).round(1).tolist()
     [591.6, 308.8, 183.7]
     """

@@ -1,14 +1,10 @@
-"""Contents of the pages that people read: designs, studies."""
+"""Figures and pages that people read.
 
-from lbt_synth.report.designs import DesignReport, design_report
-from lbt_synth.report.designs_assessment import DesignAssessment
-from lbt_synth.report.designs_page import write_report
-from lbt_synth.report.study_files import write_study_page
+Figures are drawn by matplotlib for papers.
+Pages are single HTML files with interactive charts, and PDF on request.
+Every number on a page comes from a study or a design, never from the page.
+"""
 
-__all__ = [
-    "DesignAssessment",
-    "DesignReport",
-    "design_report",
-    "write_report",
-    "write_study_page",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

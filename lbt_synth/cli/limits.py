@@ -1,0 +1,126 @@
+"""The command limits: designs beside the least residual of any linear controller."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import asdict
+from typing import Any
+
+from lbt_synth.cli.output import Report, TableText, fixed, working
+from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.simulate import foreign_notes, named_designs
+from lbt_synth.config import Config, load_config
+from lbt_synth.design import Design, hinf, kalman, optimal_integrator
+from lbt_synth.report.figures import limits_figure
+from lbt_synth.studies import LimitStudy, limit_study
+
+
+def limits(arguments: Namespace) -> Report:
+    """Compare designs with the limits of performance."""
+    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
+    config = load_config(arguments.config)
+    given = named_designs(arguments.gains)
+    with working("comparing", quiet=arguments.json):
+        designs = _made(config)
+        designs |= {f"{name} (file)" if name in designs else name: d for name, d in given.items()}
+        study = limit_study(
+            designs,
+            config.hardware,
+            config.truth,
+            config.imaging,
+            errors_hz=config.settings.robustness.errors_hz,
+        )
+    banded = study.band is not None
+    records = [_record(row, banded=banded) for row in map(asdict, study.rows)]
+    headings = ["design", "residual [nm]", "Strehl [%]", "above the limit [%]"]
+    if study.shift_hz.size:
+        headings.append("worst residual [nm]")
+    if banded:
+        headings.append("above the band limit [%]")
+    report = Report(
+        data=_data(study, records),
+        tables=[
+            TableText(
+                title="Distance to the limits of any linear controller",
+                headings=headings,
+                rows=[_cells(record)[: len(headings)] for record in records],
+            )
+        ],
+        notes=[*_notes(study), *_design_notes(config, designs, study)],
+    )
+    write_outputs(report, arguments.output, records=records, figure=lambda: limits_figure(study))
+    return report
+
+
+def _made(config: Config) -> dict[str, Design]:
+    return {
+        "integrator": optimal_integrator(config.hardware, config.truth),
+        "kalman": kalman(config.plant),
+        "hinf": hinf(
+            config.plant, gamma_ratio=config.settings.design.gamma_ratio, method="riccati"
+        ),
+    }
+
+
+def _record(row: dict[str, Any], *, banded: bool) -> dict[str, Any]:
+    return {k: v for k, v in row.items() if banded or k != "above_band_limit_percent"}
+
+
+def _cells(record: dict[str, Any]) -> list[str]:
+    return [
+        record["design"],
+        fixed(record["residual_nm"], 2) if record["stable"] else "unstable",
+        fixed(100 * record["strehl"], 2),
+        fixed(record["above_limit_percent"], 2),
+        fixed(record["worst_nm"], 2),
+        fixed(record.get("above_band_limit_percent", float("nan")), 2),
+    ]
+
+
+def _data(study: LimitStudy, records: list[dict[str, Any]]) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "rows": records,
+        "limit_nm": None if study.limit is None else study.limit.rms_nm,
+    }
+    if study.band is not None:
+        data |= {
+            "band_hz": study.band_hz,
+            "band_limit_nm": study.band.rms_nm,
+            "band_achieved_nm": study.band.achieved_nm,
+        }
+    return data
+
+
+def _notes(study: LimitStudy) -> list[str]:
+    if study.limit is None:
+        return [
+            "note: the limit of this loop cannot be computed; its modes have to decouple, with "
+            "vibrations along principal axes of the sensor's noise."
+        ]
+    notes = [
+        f"least residual of any linear controller: {study.limit.rms_nm:.6g} nm rms"
+        + (" (sinusoids of known frequency cost nothing)" if study.band is not None else "")
+    ]
+    if study.band is not None and study.band_hz is not None:
+        low, high = study.band_hz
+        notes.append(
+            f"least worst residual with the vibration anywhere from {low:g} to {high:g} Hz: "
+            f"{study.band.rms_nm:.6g} nm rms (a filter of infinite order achieves "
+            f"{study.band.achieved_nm:.6g})"
+        )
+    return notes
+
+
+def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy) -> list[str]:
+    """Say what makes a row another comparison than it seems."""
+    notes = []
+    if config.truth.vibrations and not config.plant.vibrations:
+        notes.append(
+            "note: kalman and hinf are designed without a vibration, as model.vibrations is "
+            "missing; the truth has one."
+        )
+    if study.band is None and len(config.truth.vibrations) > 1:
+        notes.append("note: the limit over a range of frequencies is that of a single sinusoid.")
+    for name, design in designs.items():
+        notes += [f"{note[:-1]} ({name})." for note in foreign_notes(config, design)]
+    return notes

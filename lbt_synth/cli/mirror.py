@@ -1,0 +1,99 @@
+"""The command mirror: the mirror's local loop, and what ignoring it costs."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import asdict
+
+from lbt_synth.cli.output import Report, TableText, fixed, working
+from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.config import load_config
+from lbt_synth.errors import ConfigError
+from lbt_synth.loop import least_residual
+from lbt_synth.report.figures import mirror_figure
+from lbt_synth.studies import mirror_study
+from lbt_synth.studies.limits import limit_or_nan
+
+_FEW = 8
+
+
+def mirror(arguments: Namespace) -> Report:
+    """Look at the mirror of a configuration."""
+    require_outputs(arguments.output, inputs=[arguments.config])
+    config = load_config(arguments.config)
+    hardware, shell = config.hardware, config.hardware.mirror
+    if shell is None:
+        key = "mirror.local_loop"
+        raise ConfigError(
+            f"{config.source}: the key {key} is missing: without it the mirror settles at once. "
+            "Try examples/lbt_slow_mirror.yaml.",
+            path=key,
+        )
+    step = shell.step_response(arguments.tolerance)
+    with working("designing", quiet=arguments.json):
+        rows = mirror_study(
+            config.plant,
+            config.truth,
+            config.imaging,
+            command_weight=config.settings.design.command_weight,
+        )
+    limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
+    records = [asdict(row) for row in rows]
+    taps = hardware.mirror_taps
+    shown = ", ".join(f"{tap:.4f}" for tap in taps[:_FEW]) + (", ..." if taps.size > _FEW else "")
+    report = Report(
+        data={
+            "rise_s": step.rise_s,
+            "overshoot": step.overshoot,
+            "settling_s": step.settling_s,
+            "tolerance": step.tolerance,
+            "bandwidth_hz": shell.bandwidth_hz,
+            "frame_s": hardware.dt_s,
+            "taps": taps,
+            "rows": records,
+            "limit_nm": limit_nm,
+        },
+        tables=[
+            TableText(
+                title="The mirror after a step of its command",
+                headings=("quantity", "value", "unit"),
+                rows=[
+                    ("rise, 10 % to 90 %", 1e3 * step.rise_s, "ms"),
+                    ("overshoot", 100 * step.overshoot, "%"),
+                    (f"settling time, to {100 * step.tolerance:g} %", 1e3 * step.settling_s, "ms"),
+                    ("  in frames", step.settling_s / hardware.dt_s, "frames"),
+                    ("bandwidth, -3 dB", shell.bandwidth_hz, "Hz"),
+                    ("one frame", 1e3 * hardware.dt_s, "ms"),
+                ],
+            ),
+            TableText(
+                title="Designs on this mirror",
+                headings=(
+                    "design",
+                    "residual [nm]",
+                    "Strehl [%]",
+                    "settled less real position [nm]",
+                ),
+                rows=[
+                    (
+                        row.design,
+                        fixed(row.residual_nm, 2) if row.stable else "unstable",
+                        fixed(100 * row.strehl, 2),
+                        fixed(row.unsettled_nm, 2),
+                    )
+                    for row in rows
+                ],
+            ),
+        ],
+        notes=[
+            f"weights of u(k), u(k-1), ... in exposure k: {shown}",
+            f"least residual of any linear controller: {fixed(limit_nm, 2)} nm rms",
+        ],
+    )
+    write_outputs(
+        report,
+        arguments.output,
+        records=records,
+        figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
+    )
+    return report

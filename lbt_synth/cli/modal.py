@@ -1,0 +1,209 @@
+"""The command modal: integrators and filters of all modes of the mirror, under modal models."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from lbt_synth.cli.output import Report, TableText, fixed, working
+from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.config import Config, load_config
+from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
+from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.models import Vibration, modal_turbulence, noll_orders, pyramid_modal_noise_nm
+from lbt_synth.report.figures import modal_figure
+from lbt_synth.validation import FloatArray, integer
+
+_MOST_MODES = 20_000
+
+
+def modal(arguments: Namespace) -> Report:
+    """Compare integrators, optimised gains and Kalman filters, mode by mode."""
+    require_outputs(arguments.output, inputs=[arguments.config])
+    config = load_config(arguments.config)
+    count = _count(arguments.modes, config)
+    atmosphere = config.air("the turbulence of hundreds of modes is computed from it")
+    noise, assumed = _noise(config, count)
+    with working("designing", quiet=arguments.json):
+        air = modal_turbulence(atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz)
+        lines = _vibrations(config, count)
+        path: dict[str, Any] = {
+            "delay_frames": config.hardware.delay_frames,
+            "sensor_gain": config.sensor_gain,
+            "mirror": config.hardware.mirror,
+        }
+        known: dict[str, Any] = {"noise_nm": noise, "vibrations": lines, **path}
+        gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **known)
+        filters = modal_filters(air, **known)
+
+        def integrators(one: float) -> FloatArray:
+            control = MixedController.integrators(np.full(count, one))
+            loop = modal_loop(control, frame_rate_hz=air.frame_rate_hz, **path)
+            return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
+
+        best = minimize_scalar(
+            lambda one: _total(integrators(one)),
+            bounds=(1e-3 * gains.limit.min(), gains.limit.min()),
+            method="bounded",
+        )
+    residuals = {
+        f"integrators, gain {best.x:.2f}": integrators(float(best.x)),
+        "integrators, optimised gains": gains.rms_nm,
+        "Kalman filters": filters.rms_nm,
+    }
+    records = _records(count, air.rms_nm, noise, gains.gains, list(residuals.values()))
+    whole = {name: _total(rms) for name, rms in residuals.items()}
+    report = Report(
+        data={
+            "modes": count,
+            "uniform_gain": float(best.x),
+            "rows": records,
+            "residual_nm": whole,
+            "turbulence_nm": _total(air.rms_nm),
+        },
+        tables=[_totals(whole, _total(air.rms_nm)), _orders(records)],
+        notes=[
+            "turbulence: AR1 models, von Karman variances, poles by radial order.",
+            "vibrations: those of the model, on tip and tilt.",
+            assumed,
+            *_mirror_notes(config),
+            "the modes are those of Zernike, independent; nothing leaks from one to another.",
+        ],
+    )
+    write_outputs(
+        report,
+        arguments.output,
+        records=records,
+        figure=lambda: modal_figure(residuals, gains=gains.gains, turbulence_nm=air.rms_nm),
+    )
+    return report
+
+
+def _count(asked: int | None, config: Config) -> int:
+    if asked is None:
+        asked = config.settings.mirror.modes
+        if asked is None:
+            raise ConfigError(
+                f"{config.source}: the key mirror.modes is missing; give it, or --modes.",
+                path="mirror.modes",
+            )
+    count = integer(asked, "modes", at_least=2)
+    if count > _MOST_MODES:
+        raise ProblemError(f"modes must be at most {_MOST_MODES}; got {count}.")
+    return count
+
+
+def _noise(config: Config, count: int) -> tuple[FloatArray, str]:
+    """Noise of each mode, and what it was taken for."""
+    settings = config.settings
+    for section, key in ((settings.sensor, "noise_nm"), (settings.model, "sensor_gain")):
+        if isinstance(getattr(section, key), list):
+            path = f"{'sensor' if section is settings.sensor else 'model'}.{key}"
+            raise ConfigError(
+                f"{config.source}: {path} must be one number for hundreds of modes; got one an "
+                "axis.",
+                path=path,
+            )
+    pyramid, one = settings.sensor.pyramid, float(config.noise_nm)
+    if pyramid is None:
+        return np.full(count, one), f"noise: {one:.6g} nm on every mode (assumed)."
+    modulation = pyramid.modulation_lambda_over_d
+    noise = pyramid_modal_noise_nm(one, modes=count, modulation_lambda_over_d=modulation)
+    return noise, (
+        f"noise: {one:.6g} nm on tip and tilt, less on modes of higher order, down to "
+        f"{noise[-1]:.6g} nm (assumed, of a pyramid with a modulation of {modulation:g} lambda/D)."
+    )
+
+
+def _vibrations(config: Config, count: int) -> dict[int, list[Vibration]]:
+    """Vibrations of the model on tip and on tilt, each axis by itself."""
+    found: dict[int, list[Vibration]] = {}
+    for line in config.plant.vibrations:
+        for axis, part in enumerate(line.direction):
+            size = abs(part) * line.rms_nm
+            if axis < count and size > 1e-9 * line.rms_nm:
+                own = Vibration(
+                    frequency_hz=line.frequency_hz,
+                    damping=line.damping,
+                    rms_nm=size,
+                    direction=(1.0,),
+                )
+                found.setdefault(axis, []).append(own)
+    return found
+
+
+def _mirror_notes(config: Config) -> list[str]:
+    """Say what the controllers know of a mirror with dynamics."""
+    if config.hardware.mirror is None:
+        return []
+    return [
+        "mirror: its local loop on every mode; the Kalman filters know its real positions, but "
+        "command their estimates as if it were there at once (lbt-synth mirror, design lqg: tip "
+        "and tilt without this lag)."
+    ]
+
+
+def _total(rms: FloatArray) -> float:
+    return float(np.sqrt(np.sum(rms**2)))
+
+
+def _records(
+    count: int,
+    turbulence: FloatArray,
+    noise: FloatArray,
+    gains: FloatArray,
+    residuals: list[FloatArray],
+) -> list[dict[str, Any]]:
+    """One row a radial order: its first mode's gain, and sums over its modes."""
+    radial, _ = noll_orders(count)
+    rows = []
+    for order in range(1, int(radial[-1]) + 1):
+        which = radial == order
+        uniform, optimised, filtered = (_total(rms[which]) for rms in residuals)
+        rows.append(
+            {
+                "radial_order": order,
+                "modes": int(which.sum()),
+                "turbulence_nm": _total(turbulence[which]),
+                "noise_nm": float(noise[which][0]),
+                "gain": float(gains[which].mean()),
+                "uniform_nm": uniform,
+                "optimised_nm": optimised,
+                "kalman_nm": filtered,
+            }
+        )
+    return rows
+
+
+def _totals(whole: dict[str, float], turbulence: float) -> TableText:
+    rows = [["none, turbulence alone", fixed(turbulence, 1)]]
+    rows += [[name, fixed(value, 1)] for name, value in whole.items()]
+    return TableText(title="All modes", headings=["controller", "residual [nm]"], rows=rows)
+
+
+def _orders(records: list[dict[str, Any]]) -> TableText:
+    digits = {"noise_nm": 2, "gain": 3}
+    rows = [
+        [
+            str(value) if isinstance(value, int) else fixed(value, digits.get(key, 1))
+            for key, value in record.items()
+        ]
+        for record in records
+    ]
+    return TableText(
+        title="By radial order, residuals over its modes",
+        headings=[
+            "radial order",
+            "modes",
+            "turbulence [nm]",
+            "noise a mode [nm]",
+            "mean gain",
+            "one gain [nm]",
+            "optimised gains [nm]",
+            "Kalman [nm]",
+        ],
+        rows=rows,
+    )

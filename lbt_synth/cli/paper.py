@@ -1,0 +1,84 @@
+"""The command that sets the paper's tables beside ours."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from typing import Any
+
+from lbt_synth.cli.output import Report, TableText, progress
+from lbt_synth.cli.output_files import made_directory
+from lbt_synth.report.paper import PaperResult, write_paper
+from lbt_synth.studies.paper.parameters import PARAMETERS
+from lbt_synth.studies.paper.published import TABLE_III
+from lbt_synth.studies.paper.tables import Comparison, rms_difference, table_iii
+
+_NAMES = {"classical": "classical", "kalman": "mixed Kalman", "hinf": "mixed H-inf"}
+
+
+def paper(arguments: Namespace) -> Report:
+    """Compute and write the tables and figures of the paper."""
+    folder = made_directory(arguments.output)
+    rows = list(
+        progress(table_iii(), total=2 * len(TABLE_III), what="Table III", quiet=arguments.json)
+    )
+    result = write_paper(folder, rows)
+    columns = {
+        method: rms_difference([e for e in result.table_iii if e.method == method])
+        for method in ("kalman", "hinf")
+    }
+    return Report(
+        data={
+            "table_ii": [_entry(e) for e in result.table_ii],
+            "table_iii": [_entry(e) for e in result.table_iii],
+            "table_iii_rms_points": columns,
+            "hinf_gamma_ratio": _gamma_ratio(result),
+            "parameters": [parameter._asdict() for parameter in PARAMETERS],
+            "files": [str(path) for path in result.files],
+        },
+        tables=[
+            TableText(
+                title="Parameters", headings=("parameter", "value", "origin"), rows=PARAMETERS
+            ),
+            _comparison("Table II: Strehl ratio [%] at 2.2 um", result.table_ii),
+            _comparison("Table III: Strehl ratio [%] at 2.2 um", result.table_iii),
+        ],
+        notes=[
+            f"Table III, rms difference: Kalman {columns['kalman']:.2f} points, "
+            f"H-infinity {columns['hinf']:.2f} points",
+            f"H-infinity: bound at {_gamma_ratio(result):.3f} times the least at 20 Hz",
+            *(f"written: {path}" for path in result.files),
+        ],
+    )
+
+
+def _gamma_ratio(result: PaperResult) -> float:
+    design = result.hinf
+    assert design.gamma_requested is not None
+    assert design.gamma_least is not None
+    return design.gamma_requested / design.gamma_least
+
+
+def _entry(entry: Comparison) -> dict[str, Any]:
+    return {
+        "row": entry.label,
+        "method": entry.method,
+        "strehl_percent": entry.ours,
+        "paper_strehl_percent": entry.paper,
+        "difference_points": entry.difference,
+    }
+
+
+def _comparison(title: str, entries: list[Comparison]) -> TableText:
+    methods = list(dict.fromkeys(e.method for e in entries))
+    cells = {(e.label, e.method): e for e in entries}
+    headings = ["row"]
+    for method in methods:
+        headings += [f"{_NAMES[method]}, ours", "paper", "difference"]
+    rows = []
+    for label in dict.fromkeys(e.label for e in entries):
+        row = [label]
+        for method in methods:
+            entry = cells[label, method]
+            row += [f"{entry.ours:.1f}", f"{entry.paper:.1f}", f"{entry.difference:+.1f}"]
+        rows.append(row)
+    return TableText(title=title, headings=headings, rows=rows)

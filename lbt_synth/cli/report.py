@@ -1,0 +1,115 @@
+"""The command report: designs side by side, on a page."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import asdict
+from typing import Any
+
+from lbt_synth.cli.output import Report, TableText, counting, fixed
+from lbt_synth.cli.simulate import named_designs
+from lbt_synth.config import load_config
+from lbt_synth.errors import ProblemError
+from lbt_synth.report import DesignAssessment, DesignReport, design_report, write_report
+from lbt_synth.report.designs.report import steps_of
+from lbt_synth.report.designs.verdict import good_range, verdict
+from lbt_synth.report.page.page_files import require_page_names
+from lbt_synth.report.provenance import require_letters, time_text
+from lbt_synth.studies import LimitRow
+
+
+def report_command(arguments: Namespace) -> Report:
+    """Examine designs in the loop of a configuration, and write what was found."""
+    inputs = (arguments.config, *arguments.gains)
+    require_page_names(arguments.output, arguments.pdf, inputs=inputs)
+    if arguments.title is not None and not arguments.title.strip():
+        raise ProblemError("--title must hold at least one letter; got an empty text.")
+    require_letters(arguments.title or "", "--title")
+    config = load_config(arguments.config)
+    designs = named_designs(arguments.gains)
+    files = dict(zip(designs, arguments.gains, strict=True))
+    total = steps_of(len(designs)) + 1
+    with counting(total=total, what="report", quiet=arguments.json) as count:
+        found = design_report(config, designs, gain_files=files, advance=count)
+        written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
+        count(1)
+    return Report(
+        data={
+            "designs": {one.name: _numbers(found, one, row) for one, row in found.rows},
+            "verdict": verdict(found),
+            "limit_nm": None if found.limits.limit is None else found.limits.limit.rms_nm,
+            "sensor_gain": found.real_gain,
+            "sha256": {file.name: file.sha256 for file in found.files},
+            "made": time_text(found.made),
+            "files": [str(path) for path in written],
+        },
+        tables=[
+            TableText(
+                title=f"Designs in the loop of {config.source.name}",
+                headings=(
+                    "design",
+                    "method",
+                    "stable",
+                    "certified",
+                    "residual [nm]",
+                    "Strehl [%]",
+                    "worst Strehl [%]",
+                    "modulus margin",
+                ),
+                rows=[
+                    (
+                        one.name,
+                        one.design.method,
+                        one.stable,
+                        one.certified,
+                        fixed(one.residual_nm, 2),
+                        fixed(100 * one.strehl, 2),
+                        fixed(100 * _worst(one), 2),
+                        None if one.margins is None else fixed(one.margins.modulus, 3),
+                    )
+                    for one in found.assessments
+                ],
+            )
+        ],
+        notes=[
+            verdict(found).replace("\u00a0", " "),
+            *(f"note: {one.name}: {note}" for one in found.assessments for note in one.notes),
+            *(f"written: {path}" for path in written),
+        ],
+    )
+
+
+def _numbers(found: DesignReport, one: DesignAssessment, row: LimitRow) -> dict[str, Any]:
+    """Return the numbers of the summary of one design."""
+    run = found.simulations.get(one.name)
+    budget = one.budget
+    good = good_range(one)
+    return {
+        "method": one.design.method,
+        "route": one.design.solver.route,
+        "n_states": one.design.controller.n_states,
+        "gamma": one.gamma,
+        "estimation_rms": one.estimation_rms,
+        "stable": one.stable,
+        "spectral_radius": one.spectral_radius,
+        "certified": one.certified,
+        "checks": [asdict(check) | {"passed": check.passed} for check in one.checks],
+        "residual_nm": one.residual_nm,
+        "turbulence_nm": None if budget is None else budget.turbulence_nm,
+        "vibration_nm": None if budget is None else budget.vibration_nm,
+        "noise_nm": None if budget is None else budget.noise_nm,
+        "strehl": one.strehl,
+        "strehl_simulated": None if run is None else run.strehl,
+        "worst_strehl": _worst(one),
+        "good_errors_hz": None if good is None else [good.low_hz, good.high_hz],
+        "above_limit_percent": row.above_limit_percent,
+        "worst_nm": row.worst_nm,
+        "above_band_limit_percent": row.above_band_limit_percent,
+        "margins": None if one.margins is None else asdict(one.margins),
+        "stable_sensor_gains": one.sensor_gains,
+        "multiplications": one.cost.multiplications,
+    }
+
+
+def _worst(one: DesignAssessment) -> float:
+    return float(one.curve.strehl.min()) if one.stable else float("nan")

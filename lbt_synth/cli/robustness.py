@@ -1,0 +1,309 @@
+"""The command robustness: filters designed anew at each error, or maps of fixed designs."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.cli.output import Report, TableText, counting, fixed, progress
+from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.simulate import named_designs, real_truth
+from lbt_synth.config import Config, load_config
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.loop import stable_sensor_gains
+from lbt_synth.models.loop_hardware import same_mirror
+from lbt_synth.report.figures import map_figure, robustness_figure
+from lbt_synth.studies import StrehlMap, frequency_robustness, strehl_map
+from lbt_synth.studies.robustness import METHODS
+from lbt_synth.validation import FloatArray, frozen, number
+
+_MOST_VALUES = 2001  # of one axis
+_FEW = 8  # sensor gains that are all listed
+
+
+def robustness(arguments: Namespace) -> Report:
+    """Strehl ratio over an error of the vibration frequency."""
+    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
+    _require_matching_options(arguments)
+    config = load_config(arguments.config)
+    return _maps(config, arguments) if arguments.gains else _designed_anew(config, arguments)
+
+
+def _require_matching_options(arguments: Namespace) -> None:
+    """Refuse options of designing anew beside gain files, and those of maps without."""
+    anew = {"--sensor-gain": arguments.sensor_gain, "--gamma-ratio": arguments.gamma_ratio}
+    fixed = {
+        "--errors-hz": arguments.errors_hz,
+        "--sensor-gains": arguments.sensor_gains,
+        "--delay-errors": arguments.delay_errors,
+    }
+    if arguments.gains:
+        wrong = anew
+        reason = "is for designing anew, without gain files; the options of these are "
+        reason += ", ".join(fixed)
+    else:
+        wrong, reason = fixed, "goes with gain files, whose designs stay as they are; name some"
+    for option, value in wrong.items():
+        if value is not None:
+            raise ProblemError(f"{option} {reason}.")
+
+
+def _designed_anew(config: Config, arguments: Namespace) -> Report:
+    settings = config.settings
+    ratio = arguments.gamma_ratio
+    errors = settings.robustness.errors_hz
+    rows = list(
+        progress(
+            frequency_robustness(
+                config.plant,
+                real_truth(config, arguments),
+                config.imaging,
+                errors_hz=errors,
+                gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
+                hold=settings.robustness.hold,
+            ),
+            total=len(errors) * len(METHODS),
+            what="designs",
+            quiet=arguments.json,
+        )
+    )
+    report = Report(
+        data={"rows": [asdict(row) for row in rows]},
+        tables=[
+            TableText(
+                title="Robustness to the vibration frequency",
+                headings=(
+                    "error [Hz]",
+                    "method",
+                    "Strehl [%]",
+                    "residual [nm]",
+                    "vibration [nm]",
+                    "turbulence [nm]",
+                    "noise [nm]",
+                    "stable",
+                ),
+                rows=[
+                    (
+                        f"{row.error_hz:+.2f}",
+                        row.method,
+                        fixed(100 * row.strehl, 2),
+                        fixed(row.residual_nm, 1),
+                        fixed(row.vibration_nm, 1),
+                        fixed(row.turbulence_nm, 1),
+                        fixed(row.noise_nm, 1),
+                        row.stable,
+                    )
+                    for row in rows
+                ],
+            )
+        ],
+    )
+    write_outputs(
+        report,
+        arguments.output,
+        records=[asdict(row) for row in rows],
+        figure=lambda: robustness_figure(rows),
+    )
+    return report
+
+
+def _maps(config: Config, arguments: Namespace) -> Report:
+    """Strehl ratio of the designs of gain files over error, sensor gain and delay error."""
+    settings = config.settings.robustness
+    errors = _values(arguments.errors_hz, "--errors-hz", _refined(settings.errors_hz))
+    gains = _values(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
+    delays = arguments.delay_errors or settings.delay_errors_frames
+    for gain in gains:
+        number(gain, "--sensor-gains", above=0)
+    designs = named_designs(arguments.gains)
+    believed = {name: _believed_gain(name, d, config) for name, d in designs.items()}
+    maps = {}
+    total = len(designs) * errors.size * gains.size * len(delays)
+    with counting(total=total, what="points", quiet=arguments.json) as count:
+        for name, design in designs.items():
+            found = strehl_map(
+                design,
+                config.truth,
+                config.imaging,
+                errors_hz=errors,
+                sensor_gains=gains / believed[name],
+                delay_errors_frames=delays,
+                advance=count,
+            )
+            maps[name] = replace(found, sensor_gains=frozen(gains))  # the real ones again
+    intervals = {name: _intervals(designs[name], maps[name], believed[name]) for name in designs}
+    report = Report(
+        data={
+            "maps": {
+                name: asdict(found) | {"stable_sensor_gains": intervals[name]}
+                for name, found in maps.items()
+            }
+        },
+        tables=[_summary(name, found) for name, found in maps.items()],
+        notes=_map_notes(config, designs, maps, intervals),
+    )
+    write_outputs(
+        report,
+        arguments.output,
+        records=[record for name, found in maps.items() for record in _records(name, found)],
+        figure=lambda: map_figure(maps),
+    )
+    return report
+
+
+def _refined(values: Sequence[float]) -> FloatArray:
+    """Return values in increasing order, with three more between any two of them."""
+    known = np.unique(values)
+    places = np.arange(4 * known.size - 3) / 4
+    return np.asarray(np.interp(places, np.arange(known.size), known))
+
+
+def _values(
+    given: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
+) -> FloatArray:
+    """Values of one axis: LOW HIGH COUNT of the command line, or those of the configuration."""
+    if given is None:
+        return np.array(default)
+    low, high, count = (number(value, option) for value in given)
+    if not (low < high and count.is_integer() and 2 <= count <= _MOST_VALUES):
+        raise ProblemError(
+            f"{option} must be LOW HIGH COUNT with LOW below HIGH and a COUNT of 2 to "
+            f"{_MOST_VALUES}; got {low:g} {high:g} {count:g}."
+        )
+    return np.linspace(low, high, int(count))
+
+
+def _believed_gain(name: str, design: Design, config: Config) -> float:
+    """Sensor gain that a design assumes, relative to the configuration's ``sensor.matrix``."""
+    own, here = design.hardware, config.hardware
+    if own is None:
+        raise ProblemError(f"{name} is a filter of a bare estimation problem; a map needs a loop.")
+    if own.modes != here.modes:
+        raise ProblemError(
+            f"{name} must be for the configuration's {here.modes} modes; got {own.modes}."
+        )
+    if not np.isclose(own.frame_rate_hz, here.frame_rate_hz, rtol=1e-9):
+        raise ProblemError(
+            f"{name} must run at the configuration's {here.frame_rate_hz:g} Hz; got a design for "
+            f"{own.frame_rate_hz:g} Hz."
+        )
+    unit = here.sensor / config.sensor_gain
+    gain = 0.0
+    if own.sensor.shape == unit.shape:
+        gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
+    if not (gain > 0 and _alike(own.sensor, gain * unit) and _alike(own.influence, here.influence)):
+        raise ProblemError(
+            f"{name} must have the configuration's sensor and influence matrices, up to a sensor "
+            "gain; it has others. Design it for this configuration."
+        )
+    return gain
+
+
+def _alike(one: FloatArray, other: FloatArray) -> bool:
+    size = float(np.max(np.abs(other)))
+    return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, atol=1e-12 * size)
+
+
+def _intervals(design: Design, found: StrehlMap, believed: float) -> list[tuple[float, float]]:
+    """Interval of stable real sensor gains at each delay error, nan if none is found."""
+    assert design.hardware is not None  # _believed_gain has refused the others
+    out = []
+    for delay, stable in zip(found.delay_errors_frames, found.stable, strict=True):
+        real = replace(design.hardware, delay_frames=design.hardware.delay_frames + delay)
+        # around the gain that the design assumes, if the loop is stable there
+        starts = [believed, *found.sensor_gains[stable]]
+        low = high = float("nan")
+        for start in starts:
+            low, high = stable_sensor_gains(real, design.controller, nominal=start / believed)
+            if not np.isnan(low):
+                break
+        out.append((low * believed, high * believed))
+    return out
+
+
+def _summary(name: str, found: StrehlMap) -> TableText:
+    gains = found.sensor_gains
+    if gains.size <= _FEW:
+        shown = np.arange(gains.size)
+    else:  # some from end to end, and the one that is nearest to 1
+        some = np.linspace(0, gains.size - 1, _FEW - 1).round().astype(int)
+        shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
+    centre = np.nonzero(found.errors_hz == 0)[0]
+    rows = []
+    for i, delay in enumerate(found.delay_errors_frames):
+        for j in shown:
+            strehls = 100 * found.strehl[i, j]
+            stable = bool(found.stable[i, j])
+            worst = int(np.argmin(strehls)) if stable else 0
+            rows.append(
+                (
+                    f"{gains[j]:.3f}",
+                    f"{delay:+g}",
+                    stable,
+                    fixed(strehls[centre[0]], 2) if centre.size else None,
+                    fixed(strehls[worst], 2),
+                    f"{found.errors_hz[worst]:+.2f}" if stable else None,
+                )
+            )
+    return TableText(
+        title=f"{name}: Strehl ratio over frequency errors of {np.min(found.errors_hz):+g} to "
+        f"{np.max(found.errors_hz):+g} Hz",
+        headings=(
+            "sensor gain",
+            "delay error",
+            "stable",
+            "Strehl at 0 Hz [%]",
+            "worst Strehl [%]",
+            "at [Hz]",
+        ),
+        rows=rows,
+    )
+
+
+def _map_notes(
+    config: Config,
+    designs: dict[str, Design],
+    maps: dict[str, StrehlMap],
+    intervals: dict[str, list[tuple[float, float]]],
+) -> list[str]:
+    notes = []
+    for name, found in maps.items():
+        for delay, (low, high) in zip(found.delay_errors_frames, intervals[name], strict=True):
+            late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
+            ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
+            notes.append(f"{name}: stable sensor gains{late}: {ends}")
+        own = designs[name].hardware
+        assert own is not None
+        if own.delay_frames != config.hardware.delay_frames:
+            notes.append(
+                f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
+                f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
+            )
+        if not same_mirror(own, config.hardware):
+            notes.append(
+                f"note: {name} was designed for another mirror than the configuration's, and its "
+                "map is that of its own."
+            )
+    return notes
+
+
+def _records(name: str, found: StrehlMap) -> list[dict[str, Any]]:
+    return [
+        {
+            "file": name,
+            "delay_error_frames": float(delay),
+            "sensor_gain": float(gain),
+            "error_hz": float(error),
+            "strehl": float(found.strehl[i, j, k]),
+            "residual_nm": float(found.residual_nm[i, j, k]),
+            "stable": bool(found.stable[i, j]),
+        }
+        for i, delay in enumerate(found.delay_errors_frames)
+        for j, gain in enumerate(found.sensor_gains)
+        for k, error in enumerate(found.errors_hz)
+    ]

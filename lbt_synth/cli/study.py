@@ -1,0 +1,274 @@
+"""Command ``study``: run, dry run, replay of a row."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.cli.output import Report, TableText, counting, working
+from lbt_synth.cli.output_files import made_directory
+from lbt_synth.errors import ProblemError
+from lbt_synth.report import write_study_page
+from lbt_synth.storage.atomic_files import refuse_replacing
+from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.studies import (
+    Failure,
+    Study,
+    StudyStatistics,
+    estimate_study,
+    load_study,
+    replay_row,
+    run_study,
+    study_statistics,
+    summary_tables,
+)
+from lbt_synth.studies.study.cluster import connected
+from lbt_synth.studies.study.output_files import read_failures
+from lbt_synth.studies.study.run import Whole, written_files
+from lbt_synth.studies.study.store import PAGE, PRINT
+from lbt_synth.studies.study.summary import worst_table
+
+_WORST = 3  # rows of each controller that are printed; the page has more
+
+
+def study(arguments: Namespace) -> Report:
+    """Run a study, say what it will cost, or replay one of its rows."""
+    if arguments.jobs < 1:
+        raise ProblemError(f"--jobs must be at least 1; got {arguments.jobs}.")
+    folder = Path(arguments.output)
+    with working("reading the study, designing", quiet=arguments.json):
+        loaded = load_study(arguments.study, directory=folder)
+    refuse_replacing(written_files(folder, loaded), loaded.inputs)
+    if arguments.dry_run:
+        return _dry_run(loaded, arguments)
+    if arguments.row is not None:
+        return _replay(loaded, folder, arguments)
+    return _run(loaded, folder, arguments)
+
+
+# ---------------------------------------------------------------- run
+def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
+    found: list[tuple[StudyStatistics, bool]] = []
+    files = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
+    with _engine(arguments) as (executor, workers):
+        made_directory(folder)
+        with counting(
+            total=loaded.samples, what="samples", quiet=arguments.json, rate=True
+        ) as count:
+            try:
+                run = run_study(
+                    loaded,
+                    folder,
+                    executor=executor,
+                    jobs=arguments.jobs,
+                    workers=workers,
+                    progress=count,
+                    whole=lambda results: found.append(
+                        (_summarised(loaded, files, results), results.new)
+                    ),
+                )
+            except KeyboardInterrupt:
+                kept = f"lbt-synth: what is finished is kept in {folder}; start again, it goes on"
+                print(kept, file=sys.stderr)
+                raise
+    report = Report(
+        data={
+            "samples": run.samples,
+            "computed": run.computed,
+            "failures": run.failures,
+            "retry": run.retry,
+            "computing_seconds": run.computing_s,
+            "seconds": run.seconds,
+            "files": [str(path) for path in (run.results, run.failed, *files)],
+        }
+    )
+    [(statistics, new)] = found
+    varying = [p.name for p in loaded.parameters if p.distribution.varies]
+    report.data["statistics"] = asdict(statistics)
+    report.tables = [_text_of(table) for table in summary_tables(statistics)]
+    report.tables += [
+        _text_of(worst_table(each, varying), rows=_WORST) for each in statistics.controllers
+    ]
+    report.notes.append(
+        f"{run.computed} of {run.samples} samples computed in {_duration(run.computing_s)}; with "
+        f"tables and page {_duration(run.seconds)}."
+        if new
+        else f"{folder} is finished: {run.samples} samples in {run.results.name}; none computed."
+    )
+    report.notes += _sampling_notes(loaded)
+    if run.failures:
+        report.notes.append(
+            f"note: {run.failures} results failed, see {run.failed}."
+            + (
+                " Those that ended their process are tried again if it is started again."
+                if run.retry
+                else ""
+            )
+        )
+    words = "written" if new else "there"
+    report.notes += [f"{words}: {path}" for path in report.data["files"]]
+    return report
+
+
+@contextlib.contextmanager
+def _engine(arguments: Namespace) -> Iterator[tuple[Executor | None, int | None]]:
+    """Give the executor of ``--dask`` and its workers, or none for ``--jobs``."""
+    if arguments.dask is None:
+        yield None, None
+        return
+    with connected(arguments.dask) as cluster:
+        yield cluster.executor, cluster.workers
+
+
+def _summarised(loaded: Study, files: Sequence[Path], results: Whole) -> StudyStatistics:
+    """Compute the statistics of a whole study, and write its page if it is not there."""
+    page, *pdf = files
+    statistics = study_statistics(
+        results.columns,
+        loaded.parameter_names,
+        [controller.name for controller in loaded.controllers],
+    )
+    if results.new or not all(path.exists() for path in files):
+        write_study_page(
+            loaded,
+            results.columns,
+            page,
+            statistics=statistics,
+            failures=[
+                Failure(row=row, controller=name, error=error)
+                for row, name, error in read_failures(page.parent)
+            ],
+            computing_s=results.computing_s,
+            pdf=pdf[0] if pdf else None,
+        )
+    return statistics
+
+
+def _text_of(table: Table, rows: int | None = None) -> TableText:
+    cells = [
+        [cell.text if isinstance(cell, Cell) else cell for cell in row] for row in table.rows[:rows]
+    ]
+    width = len(table.headings)
+    return TableText(
+        title=table.caption,
+        headings=table.headings,
+        rows=[row + [""] * (width - len(row)) for row in cells],
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.3g} s"
+    if seconds < 6000:
+        return f"{seconds / 60:.3g} min"
+    hours = seconds / 3600
+    return f"{hours:.3g} h" if hours < 100 else f"{hours / 24:.3g} days"
+
+
+def _sampling_notes(loaded: Study) -> list[str]:
+    if loaded.settings.sampling != "sobol" or loaded.samples & (loaded.samples - 1) == 0:
+        return []
+    return [
+        "note: Sobol's points are balanced best when their number is a power of two; "
+        f"{loaded.samples} is none."
+    ]
+
+
+# ---------------------------------------------------------------- dry run
+def _dry_run(loaded: Study, arguments: Namespace) -> Report:
+    with _engine(arguments) as (_, workers):
+        count = workers or arguments.jobs
+    with working("measuring a batch", quiet=arguments.json):
+        cost = estimate_study(loaded, workers=count, local=workers is None)
+    where = f"{count} {'process' if count == 1 else 'processes'}"
+    if workers is not None:
+        where = f"{count} threads of {arguments.dask}, as quick as this one"
+    settings = loaded.settings
+    return Report(
+        data={
+            "samples": loaded.samples,
+            "sampling": settings.sampling,
+            "evaluation": settings.evaluation,
+            "parameters": {p.name: p.distribution.text for p in loaded.parameters},
+            "controllers": {c.name: c.origin for c in loaded.controllers},
+            "workers": count,
+            **asdict(cost),
+        },
+        tables=[
+            TableText(
+                title=f"Study {loaded.source}",
+                headings=("quantity", "value", "unit"),
+                rows=[
+                    ("samples", str(loaded.samples), ""),
+                    (
+                        "sampling",
+                        f"{settings.sampling.replace('_', ' ')}, seed {settings.seed}",
+                        "",
+                    ),
+                    ("evaluation", settings.evaluation, ""),
+                    (
+                        f"time of {cost.measured_rows} samples, measured in one process",
+                        f"{cost.measured_s:.3g}",
+                        "s",
+                    ),
+                    (f"time of the whole, on {where}", f"about {_duration(cost.seconds)}", ""),
+                    ("space on the disk", f"about {cost.disk_bytes / 1e6:.3g}", "MB"),
+                ],
+            ),
+            TableText(
+                title="Parameters",
+                headings=("parameter", "distribution"),
+                rows=[(p.name, p.distribution.text) for p in loaded.parameters],
+            ),
+            TableText(
+                title="Controllers",
+                headings=("controller", "what"),
+                rows=[(c.name, c.origin) for c in loaded.controllers],
+            ),
+        ],
+        notes=[*_sampling_notes(loaded), "nothing was written."],
+    )
+
+
+# ---------------------------------------------------------------- replay
+def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
+    if 0 <= arguments.row < loaded.samples:  # else it is refused
+        made_directory(folder)
+    with working("replaying", quiet=arguments.json):
+        again = replay_row(loaded, folder, arguments.row)
+    names = loaded.result_columns
+    data: dict[str, Any] = {
+        "row": again.row,
+        "parameters": again.parameters,
+        "stored": again.stored,
+        "fresh": again.fresh,
+        "failures": [asdict(failure) for failure in again.failures],
+        "files": [str(path) for path in again.files],
+    }
+    return Report(
+        data=data,
+        tables=[
+            TableText(
+                title=f"Row {again.row}",
+                headings=("parameter", "value"),
+                rows=list(again.parameters.items()),
+            ),
+            TableText(
+                title="Results",
+                headings=("result", "stored", "now"),
+                rows=[(name, again.stored.get(name), again.fresh.get(name)) for name in names],
+            ),
+        ],
+        notes=[
+            *([] if again.stored else ["note: the study has no result of this row yet."]),
+            *(f"failed: {failure.controller}: {failure.error}" for failure in again.failures),
+            *([f"note: {again.unwritten}"] if again.unwritten else []),
+            *(f"written: {path}" for path in again.files),
+        ],
+    )

@@ -1,0 +1,76 @@
+"""The command tradeoff: variance, norm and tolerated sensor gain."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import fields
+from typing import Any
+
+from lbt_synth.cli.output import Report, TableText, progress
+from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.config import load_config
+from lbt_synth.report.figures import tradeoff_figure
+from lbt_synth.studies import TradeoffPoint, tradeoff
+from lbt_synth.studies.tradeoff import FAMILIES
+from lbt_synth.validation import integer
+
+
+def tradeoff_command(arguments: Namespace) -> Report:
+    """Make filters from the least norm to the least variance."""
+    require_outputs(arguments.output, inputs=[arguments.config])
+    count = integer(arguments.points, "--points", at_least=2)
+    taps = integer(arguments.taps, "--taps", at_least=1)
+    config = load_config(arguments.config)
+    points = list(
+        progress(
+            tradeoff(config.plant, points=count, taps=taps),
+            total=count * len(FAMILIES),
+            what="filters",
+            quiet=arguments.json,
+        )
+    )
+    records = [_record(point) for point in points]
+    least = points[0].design
+    report = Report(
+        data={
+            "points": records,
+            "gamma_least": least.gamma_least,
+            "gamma_infeasible": least.gamma_infeasible,
+        },
+        tables=[
+            TableText(
+                title="Trade-off of variance, norm and sensor gain",
+                headings=(
+                    "filter",
+                    "norm [nm]",
+                    "norm / least",
+                    "rms [nm]",
+                    "gain from",
+                    "gain to",
+                    "modulus",
+                ),
+                rows=[
+                    (
+                        r["family"],
+                        f"{r['gamma']:.2f}",
+                        f"{r['gamma_ratio']:.4f}",
+                        f"{r['rms']:.2f}",
+                        f"{r['gain_low']:.3f}",
+                        f"{r['gain_high']:.3f}",
+                        f"{r['modulus']:.3f}",
+                    )
+                    for r in records
+                ],
+            )
+        ],
+        notes=[
+            f"the least norm of any filter lies between {least.gamma_infeasible:.9g} and "
+            f"{least.gamma_least:.9g} nm"
+        ],
+    )
+    write_outputs(report, arguments.output, records=records, figure=lambda: tradeoff_figure(points))
+    return report
+
+
+def _record(point: TradeoffPoint) -> dict[str, Any]:
+    return {f.name: getattr(point, f.name) for f in fields(point) if f.name != "design"}

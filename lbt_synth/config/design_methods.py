@@ -1,0 +1,108 @@
+"""Designs by the names of their methods, with what a configuration says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lbt_synth.config.load import Config
+from lbt_synth.config.robust import robust_design
+from lbt_synth.design import (
+    Design,
+    hinf,
+    integrator,
+    kalman,
+    lqg,
+    mixed,
+    optimal_integrator,
+    polytopic,
+)
+
+ROUTES: Mapping[str, tuple[str, ...]] = {
+    "kalman": ("riccati", "sdp"),
+    "hinf": ("lmi", "riccati"),
+    "mixed": (),
+    "lqg": (),
+    "polytopic": (),
+    "integrator": (),
+    "robust": (),
+}
+OWNERS: Mapping[str, tuple[str, ...]] = {  # methods that an option goes with
+    "gamma": ("hinf", "mixed"),
+    "gamma_ratio": ("hinf", "mixed"),
+    "rms": ("mixed",),
+    "taps": ("mixed",),
+    "norm": ("polytopic",),
+    "half_width_hz": ("polytopic",),
+    "gain": ("integrator",),
+    "command_weight": ("lqg",),
+}
+WITHOUT_HORIZON = ("integrator", "robust", "lqg")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DesignRequest:
+    """A method of synthesis and its options; what is not given is the configuration's."""
+
+    method: str  # One of ``ROUTES``
+    # Those of ``OWNERS``, ``route`` and ``horizon``; none of them None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def text(self) -> str:
+        """Description for people."""
+        given = ", ".join(f"{name} {value}" for name, value in self.options.items())
+        return f"{self.method} ({given})" if given else self.method
+
+
+def designed(config: Config, request: DesignRequest) -> Design:
+    """Design for a configuration as it stands.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.config.design_methods import DesignRequest, designed
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> designed(config, DesignRequest(method="integrator", options={"gain": 0.4})).gain
+    0.4
+    """
+    method, options = request.method, request.options
+    defaults, horizon = config.settings.design, options.get("horizon", 1)
+    if method == "kalman":
+        return kalman(config.plant, horizon=horizon, method=options.get("route", "riccati"))
+    if method == "integrator":
+        if "gain" in options:
+            return integrator(config.hardware, gain=options["gain"])
+        return optimal_integrator(config.hardware, config.truth)
+    if method == "robust":
+        return robust_design(config)
+    if method == "lqg":
+        weight = options.get("command_weight", defaults.command_weight)
+        return lqg(config.plant, command_weight=weight)
+    if method == "polytopic":
+        return polytopic(
+            config.plant,
+            half_width_hz=options["half_width_hz"],
+            norm=options.get("norm", "hinf"),
+            horizon=horizon,
+        )
+    gamma, ratio, rms = (options.get(name) for name in ("gamma", "gamma_ratio", "rms"))
+    if gamma is None and ratio is None and rms is None:
+        ratio = defaults.gamma_ratio
+    if method == "mixed":
+        return mixed(
+            config.plant,
+            gamma=gamma,
+            gamma_ratio=ratio,
+            rms=rms,
+            taps=options.get("taps", 16),
+            horizon=horizon,
+        )
+    return hinf(
+        config.plant,
+        gamma=gamma,
+        gamma_ratio=ratio,
+        horizon=horizon,
+        method=options.get("route"),
+    )

@@ -1,0 +1,160 @@
+"""The configuration of an identified system."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from pydantic import ValidationError
+
+from lbt_synth.config.schema import FileSection
+from lbt_synth.config.schema_errors import described
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
+from lbt_synth.models import ARModel
+from lbt_synth.validation import number
+
+_AXES = ("tip", "tilt")
+
+
+def identified_config(
+    model: IdentifiedModel,
+    *,
+    diameter_m: float | None = None,
+    obstruction: float | None = None,
+    wavelength_um: float = 2.2,
+    other_modes_strehl: float = 1.0,
+    title: str = "An identified system.",
+) -> tuple[FileSection, dict[str, str]]:
+    """Return the configuration of an identified system, the truth being the model.
+
+    Parameters
+    ----------
+    model : IdentifiedModel
+        What was identified, of one or two axes.
+    diameter_m : float, optional
+        Telescope diameter [m]. Nothing of the system depends on it.
+    obstruction : float, optional
+        Diameter of the central obstruction as a fraction of ``diameter_m``.
+    wavelength_um : float, optional
+        Imaging wavelength [um] of Strehl ratios.
+    other_modes_strehl : float, optional
+        Strehl ratio that all other modes leave.
+    title : str, optional
+        First lines of the file.
+
+    Returns
+    -------
+    settings : FileSection
+        The configuration, for :func:`save_config`.
+    comments : dict of str to str
+        Standard errors by the paths of the keys, for :func:`save_config`.
+
+    Raises
+    ------
+    ProblemError
+        If the model has another number of axes, or a value that no configuration can have.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> noise = 3 * np.random.default_rng(0).standard_normal((8192, 1))
+    >>> record = lbt.identification.loop_record(noise, frame_rate_hz=800, unit="nm")
+    >>> settings, comments = lbt.config.identified_config(lbt.identify(record))
+    >>> [round(value) for value in settings.sensor.noise_nm], comments["sensor.noise_nm"]
+    ([3], 'standard error 0.024 nm')
+    """
+    axes = tuple(model.axes)
+    if len(axes) not in (1, 2):
+        raise ProblemError(f"a configuration has one or two axes; got a model of {len(axes)}.")
+    if obstruction is not None and diameter_m is None:
+        raise ProblemError(
+            "obstruction is a fraction of diameter_m, which is missing. Give both, or neither."
+        )
+    comments = {"": title, "sensor.noise_nm": _errors("nm", [axis.noise_error_nm for axis in axes])}
+    content: dict[str, Any] = {"version": 1}
+    if diameter_m is not None:
+        content["telescope"] = {"diameter_m": diameter_m}
+        if obstruction is not None:
+            content["telescope"]["obstruction"] = obstruction
+    content["sensor"] = {"noise_nm": [float(axis.noise_nm) for axis in axes]}
+    if model.mirror is not None:
+        content["mirror"] = {"local_loop": asdict(model.mirror)}
+    content["loop"] = {"axes": len(axes)} if len(axes) == 1 else {}
+    content["loop"] |= {
+        "frame_rate_hz": number(model.frame_rate_hz, "frame_rate_hz", above=0),
+        "delay_frames": number(model.delay_frames, "delay_frames", at_least=1),
+    }
+    lines = _vibrations(axes, comments)
+    content["model"] = {"turbulence": [_turbulence(axis.turbulence) for axis in axes]}
+    for index, axis in enumerate(axes):
+        rms = f"rms {axis.turbulence.rms_nm:.4g} nm"
+        comments[f"model.turbulence[{index}]"] = f"{_AXES[index]}, {rms}"
+    content["truth"] = {"turbulence": "model"}
+    if lines:
+        content["model"]["vibrations"] = lines
+        content["truth"]["vibrations"] = "model"
+    gains = [float(axis.sensor_gain) for axis in axes]
+    if any(gain != 1 for gain in gains):
+        content["model"]["sensor_gain"] = content["truth"]["sensor_gain"] = gains
+        comments["model.sensor_gain"] = _errors(
+            "", [axis.sensor_gain_error or 0.0 for axis in axes]
+        )
+    content["imaging"] = {"wavelength_um": wavelength_um}
+    if other_modes_strehl != 1:
+        content["imaging"]["other_modes_strehl"] = other_modes_strehl
+    try:
+        settings = FileSection.model_validate(content)
+    except ValidationError as error:
+        raise ProblemError(
+            f"the model cannot be written as a configuration: {described(error)[0]}"
+        ) from error
+    return settings, {key: text for key, text in comments.items() if text}
+
+
+def _turbulence(model: ARModel) -> dict[str, Any]:
+    return {
+        "kind": "ar",
+        "coefficients": model.coefficients.tolist(),
+        "driving_rms_nm": model.driving_rms_nm,
+    }
+
+
+def _vibrations(axes: Sequence[IdentifiedAxis], comments: dict[str, str]) -> list[dict[str, Any]]:
+    """Return the lines of all axes, tip first, and comment on their errors."""
+    out: list[dict[str, Any]] = []
+    for name, axis in zip(_AXES, axes, strict=False):
+        for line in axis.parts:
+            path = f"model.vibrations[{len(out)}]"
+            comments[f"{path}.frequency_hz"] = _of_kind(line.kind) + _errors(
+                "Hz", [line.frequency_error_hz]
+            )
+            comments[f"{path}.damping"] = _errors("", [line.damping_error])
+            comments[f"{path}.rms_nm"] = _errors("nm", [line.rms_error_nm])
+            entry: dict[str, Any] = {} if len(axes) == 1 else {"axis": name}
+            out.append(
+                entry
+                | {
+                    "frequency_hz": float(line.frequency_hz),
+                    "damping": float(line.damping),
+                    "rms_nm": float(line.rms_nm),
+                }
+            )
+    return out
+
+
+def _of_kind(kind: str) -> str:
+    """Return what a resonance that is no narrow line is."""
+    return {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}[kind]
+
+
+def _errors(unit: str, errors: Sequence[float]) -> str:
+    """Return standard errors as a comment, nothing where none is known."""
+    known = [math.isfinite(error) and error > 0 for error in errors]
+    if not any(known):
+        return ""
+    texts = [f"{e:.2g}" if ok else "not known" for e, ok in zip(errors, known, strict=True)]
+    return f"standard error {', '.join(texts)} {unit}".rstrip()

@@ -1,0 +1,43 @@
+"""Sections that a configuration may leave out, and what cannot do without them."""
+
+from __future__ import annotations
+
+from lbt_synth.config.schema import AtmosphereSection, FileSection, TelescopeSection
+from lbt_synth.errors import ConfigError
+from lbt_synth.models import Atmosphere, nm_per_mas
+
+
+def needed_telescope(settings: FileSection, reason: str) -> TelescopeSection:
+    """Return the section ``telescope``."""
+    if settings.telescope is None:
+        raise ConfigError(f"the key telescope is missing: {reason}.", path="telescope")
+    return settings.telescope
+
+
+def needed_atmosphere(settings: FileSection, reason: str) -> AtmosphereSection:
+    """Return the section ``atmosphere``."""
+    if settings.atmosphere is None:
+        raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
+    return settings.atmosphere
+
+
+def nm_of_mas(settings: FileSection, mas: float, key: str) -> float:
+    """Convert an angle of the file [mas] to a wavefront [nm rms]."""
+    reason = f"{key} is in mas, and a wavefront in nm needs telescope.diameter_m"
+    telescope = needed_telescope(settings, f"{reason}. Give it, or the value in nm")
+    return mas * nm_per_mas(telescope.diameter_m)
+
+
+def atmosphere_of(settings: FileSection) -> Atmosphere | None:
+    """Build the atmosphere of a file, None if it has none."""
+    air = settings.atmosphere
+    if air is None:
+        return None
+    telescope = needed_telescope(settings, "the turbulence of atmosphere is that over its diameter")
+    return Atmosphere(
+        seeing_arcsec=air.seeing_arcsec,
+        seeing_wavelength_um=air.seeing_wavelength_um,
+        outer_scale_m=air.outer_scale_m,
+        wind_speed_m_s=air.wind_speed_m_s,
+        diameter_m=telescope.diameter_m,
+    )

@@ -1,0 +1,350 @@
+"""Certificates: checks of a design that know nothing of the solver that made it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.errors import CertificateError, DimensionError, ProblemError
+from lbt_synth.linear import (
+    Controller,
+    EstimationProblem,
+    HinfNorm,
+    StateSpace,
+    Witness,
+    hinf_norm,
+    infeasible_level,
+    largest_singular_values,
+)
+from lbt_synth.linear.lyapunov import lyapunov_residual, stationary_covariance
+from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.loop import close_loop
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, frozen, number
+
+GAIN_TOLERANCE = 1e-6
+NORM_TOLERANCE = 1e-6
+RESIDUAL_TOLERANCE = 1e-8
+INFEASIBLE_TOLERANCE = 1e-9
+VARIANCE_TOLERANCE = 1e-6
+_GRID = 513
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One check: passed when ``value < limit``.
+
+    Attributes
+    ----------
+    name : str
+        What was checked.
+    value, limit : float
+        What was measured, and what it must stay below.
+    method : str
+        How it was measured.
+    """
+
+    name: str
+    value: float
+    limit: float
+    method: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value is below its limit; NaN is not."""
+        return bool(self.value < self.limit)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Certificate:
+    """Evidence that a design is what it says, computed from its matrices alone.
+
+    Attributes
+    ----------
+    checks : tuple of Check
+        All checks; a design leaves the library only if each one passed.
+    gamma : float
+        H-infinity norm of the estimation error, recomputed (nan for an integrator).
+    rms_per_output : (l,) ndarray
+        Standard deviation of each estimated signal's error, by a Lyapunov
+        equation (empty for an integrator).
+    """
+
+    checks: tuple[Check, ...]
+    gamma: float
+    rms_per_output: FloatArray
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)
+
+    @property
+    def rms(self) -> float:
+        """Root of the summed variances of the estimation error."""
+        return float(np.sqrt(np.sum(self.rms_per_output**2)))
+
+    def require(self, hint: str = "") -> Certificate:
+        """Return the certificate itself, or raise if a check failed.
+
+        Parameters
+        ----------
+        hint : str, optional
+            What to try; ends the message.
+
+        Raises
+        ------
+        CertificateError
+            With the names of the failed checks.
+        """
+        failed = [check for check in self.checks if not check.passed]
+        if failed:
+            listing = "; ".join(f"{c.name} {c.value:.12g}, limit {c.limit:.12g}" for c in failed)
+            raise CertificateError(
+                f"the design failed its certificate and is not returned: {listing}. {hint}".strip(),
+                failed=tuple(check.name for check in failed),
+            )
+        return self
+
+
+def certify_filter(
+    problem: EstimationProblem,
+    gain_predictor: FloatArray,
+    *,
+    gamma: float | None = None,
+    least_variance: bool = False,
+) -> Certificate:
+    """Check a predictor gain against its problem.
+
+    The spectral radius by eigenvalues, the variance by a Lyapunov equation, the
+    norm by level sets and again on a frequency grid. With ``gamma``, the norm
+    has to stay below it. With ``least_variance``, the covariance of the Lyapunov
+    equation has to reproduce the gain, which proves that it is the Kalman gain.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    gain_predictor : (n, q) ndarray
+        Predictor gain.
+    gamma : float, optional
+        Level that the error norm must not exceed.
+    least_variance : bool, optional
+        Whether the design claims the least variance.
+
+    Returns
+    -------
+    Certificate
+        Passed or not; call ``require()`` on it.
+
+    Raises
+    ------
+    DimensionError
+        If the gain does not fit the problem.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> lbt.design.certify_filter(p, [[0.618033988749895]], least_variance=True).passed
+    True
+    >>> lbt.design.certify_filter(p, [[0.7]], least_variance=True).passed
+    False
+    """
+    certificate, norm, P = _examined(problem.error_system(gain_predictor))
+    if norm is None or P is None:
+        return certificate
+    gain = np.asarray(gain_predictor)
+    checks = list(certificate.checks)
+    if gamma is not None:
+        checks.append(
+            Check(
+                name="norm of the estimation error",
+                value=norm.upper,
+                limit=gamma * (1 + NORM_TOLERANCE),
+                method="level sets on the symplectic pencil",
+            )
+        )
+    if least_variance:
+        innovation = problem.R + problem.C @ P @ problem.C.T
+        optimal = np.linalg.solve(innovation, (problem.A @ P @ problem.C.T + problem.S).T).T
+        size = float(np.linalg.norm(optimal, 2))
+        checks.append(
+            Check(
+                name="distance from the least-variance gain",
+                value=float(np.linalg.norm(gain - optimal, 2)) / size if size > 0 else 0.0,
+                limit=GAIN_TOLERANCE,
+                method="gain recomputed from the Lyapunov covariance",
+            )
+        )
+    return replace(certificate, checks=tuple(checks))
+
+
+def certify_error(
+    error: StateSpace, *, stability: str = "spectral radius of the filter"
+) -> Certificate:
+    """Certificate of an estimation error: stability, its variance both ways, its norm both ways."""
+    return _examined(error, stability)[0]
+
+
+def _examined(
+    error: StateSpace, stability: str = "spectral radius of the filter"
+) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
+    """Certificate of an error, with its norm and covariance if it is stable."""
+    radius = error.spectral_radius
+    checks = [_stability(stability, radius)]
+    if not checks[0].passed:
+        infinite = frozen(np.full(len(error.C), np.inf))
+        return Certificate(checks=tuple(checks), gamma=np.inf, rms_per_output=infinite), None, None
+    drive = error.B @ error.B.T
+    P = stationary_covariance(error.A, drive)
+    checks.append(
+        Check(
+            name="residual of the Lyapunov equation",
+            value=lyapunov_residual(error.A, drive, P),
+            limit=RESIDUAL_TOLERANCE,
+            method="relative, 1-norm",
+        )
+    )
+    variances = np.diag(error.C @ P @ error.C.T)
+    checks.append(_variance_both_ways(error, float(variances.sum())))
+    norm = hinf_norm(error)
+    grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
+    excess = float(np.max(largest_singular_values(error, grid))) / max(norm.upper, 1e-300) - 1
+    checks.append(
+        Check(
+            name="singular values above the norm",
+            value=excess,
+            limit=NORM_TOLERANCE,
+            method=f"{_GRID} frequencies against level sets",
+        )
+    )
+    certificate = Certificate(
+        checks=tuple(checks),
+        gamma=norm.value,
+        rms_per_output=frozen(np.sqrt(np.maximum(variances, 0))),
+    )
+    return certificate, norm, P
+
+
+def _variance_both_ways(error: StateSpace, variance: float) -> Check:
+    """Compare the variance with that of the adjoint equation, which sums it in another order."""
+    weight = stationary_covariance(error.A.T, error.C.T @ error.C)
+    adjoint = float(np.trace(error.B.T @ weight @ error.B))
+    size = max(abs(variance), abs(adjoint))
+    return Check(
+        name="variance, against its adjoint equation",
+        value=abs(variance - adjoint) / size if size > 0 else 0.0,
+        limit=VARIANCE_TOLERANCE,
+        method="relative, two Lyapunov equations",
+    )
+
+
+def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
+    """Check that a witness proves what is claimed of it: no filter below a level of gamma.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    level : float
+        Level that is claimed infeasible.
+    witness : Witness
+        Disturbances that no measurement shows.
+
+    Returns
+    -------
+    Check
+        Passed if the level does not exceed what the witness proves, but for 1e-9 of it.
+
+    Raises
+    ------
+    DimensionError
+        If the witness does not fit the problem.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> p = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> push = lbt.linear.Witness(states=np.zeros((1, 1)), disturbances=np.array([[1.0], [0.0]]))
+    >>> (
+    ...     lbt.design.certify_infeasible(p, 1.0, push).passed,
+    ...     lbt.design.certify_infeasible(p, 1.1, push).passed,
+    ... )
+    (True, False)
+    """
+    if not isinstance(witness, Witness):
+        raise ProblemError(
+            "expected a Witness, such as that of an H-infinity design; got "
+            f"{type(witness).__name__}."
+        )
+    x, w = witness.states, witness.disturbances
+    if x.shape[:1] != (problem.n_states,) or w.shape != (problem.B.shape[1], *x.shape[1:]):
+        raise DimensionError(
+            f"a witness must have {problem.n_states} rows of states, {problem.B.shape[1]} rows of "
+            f"disturbances and as many columns in both; got {x.shape} and {w.shape}."
+        )
+    claimed = number(level, "level", above=0)
+    proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
+    return Check(
+        name="infeasible level over the level proved, less 1",
+        value=claimed / max(proved, 1e-300) - 1,
+        limit=INFEASIBLE_TOLERANCE,
+        method="disturbances that no measurement shows",
+    )
+
+
+def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
+    """Check that the loop closed around a controller is stable at the nominal sensor gain.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Sensor, mirror and delay.
+    controller : Controller
+        The controller.
+
+    Returns
+    -------
+    Check
+        Passed if the spectral radius is below 1 by more than 1e-9.
+
+    Raises
+    ------
+    ProblemError
+        If the controller does not fit the loop.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> lbt.design.certify_loop(
+    ...     path, lbt.Controller(A=1.0, B=1.5, C=1.0, D=0.0, dt_s=1 / 800)
+    ... ).passed
+    False
+    """
+    radius = close_loop(hardware, controller).spectral_radius
+    return _stability("spectral radius of the closed loop", radius)
+
+
+def _stability(name: str, radius: float) -> Check:
+    return Check(name=name, value=radius, limit=1 - STABILITY_MARGIN, method="eigenvalues")
+
+
+def controller_distance(one: Controller, other: Controller) -> float:
+    """Largest difference of two controllers' matrices, over the largest entry of each.
+
+    Infinite where their sizes differ.
+    """
+    worst = 0.0
+    for name in "ABCD":
+        a, b = getattr(one, name), getattr(other, name)
+        if a.shape != b.shape:
+            return float("inf")
+        size = float(np.max(np.abs(b), initial=0.0))
+        difference = float(np.max(np.abs(a - b), initial=0.0))
+        worst = max(worst, difference / size if size > 0 else difference)
+    return worst

@@ -1,0 +1,12 @@
+from .filters import ModalFilters as ModalFilters
+from .filters import modal_filters as modal_filters
+from .gains import ModalGains as ModalGains
+from .gains import modal_gains as modal_gains
+from .loop import ModalLoop as ModalLoop
+from .loop import ModalRun as ModalRun
+from .loop import modal_loop as modal_loop
+from .mixed import MixedController as MixedController
+from .reconstructor import Reconstructor as Reconstructor
+from .reconstructor import project_out as project_out
+from .reconstructor import reconstructor as reconstructor
+from .telemetry_gains import modal_gains_from_telemetry as modal_gains_from_telemetry

@@ -1,0 +1,131 @@
+"""Checks of the filters of many modes, by other means than the Riccati equation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.design.certificate import (
+    GAIN_TOLERANCE,
+    RESIDUAL_TOLERANCE,
+    VARIANCE_TOLERANCE,
+    Certificate,
+    Check,
+)
+from lbt_synth.design.modal.closed_loops import spectral_radii
+from lbt_synth.design.modal.plants import PlantStack
+from lbt_synth.design.modal.reconstructor import modes_named
+from lbt_synth.linear import DareSolution
+from lbt_synth.linear.batched import norms, transposed
+from lbt_synth.linear.lyapunov import stationary_covariances
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.validation import FloatArray, frozen
+
+
+class Examined:
+    """What was measured of every mode, by other means than the Riccati equation."""
+
+    def __init__(self, modes: int) -> None:
+        self.radius, self.loop_radius = np.full((2, modes), np.nan)
+        self.riccati, self.lyapunov, self.loop_lyapunov, self.rounding = np.full((4, modes), np.nan)
+        self.estimation, self.residual = np.full((2, modes), np.nan)  # variances
+        self.variance, self.gain = np.full((2, modes), np.nan)  # relative distances
+
+    def filters(self, stack: PlantStack, gains: FloatArray, solution: DareSolution) -> None:
+        """Take the estimation errors: stability, variance against Riccati's, gain from it."""
+        modes = stack.modes
+        A, drive = stack.errors(gains)
+        self.radius[modes] = spectral_radii(A)
+        self.riccati[modes] = solution.residuals
+        P, self.lyapunov[modes] = stationary_covariances(A, drive)
+        lyapunov = (stack.L @ P @ transposed(stack.L))[:, 0, 0]
+        riccati = (stack.L @ solution.X @ transposed(stack.L))[:, 0, 0]
+        self.estimation[modes] = lyapunov
+        self.variance[modes] = np.abs(lyapunov - riccati) / riccati
+        seen = P @ transposed(stack.C)
+        optimal = stack.A @ seen / (stack.R + stack.C @ seen)
+        size = norms(optimal)
+        self.gain[modes] = norms(gains - optimal) / np.where(size > 0, size, 1.0)
+
+    def loops(
+        self,
+        modes: np.ndarray,
+        radii: FloatArray,
+        variances: FloatArray,
+        residuals: FloatArray,
+        rounding: FloatArray,
+    ) -> None:
+        """Take the closed loops: stability, variance of the residual."""
+        self.loop_radius[modes], self.loop_lyapunov[modes] = radii, residuals
+        self.residual[modes], self.rounding[modes] = variances[:, 0], rounding
+
+    def certificate(self, *, applied: bool) -> Certificate:
+        """Return the checks, each of its worst mode; one that fails names all modes that do.
+
+        ``applied``: the loop applies the estimate itself, at once and a whole delay later.
+        """
+        stable = 1 - STABILITY_MARGIN
+        equation = "relative, by squaring"
+        checks = [
+            _worst("spectral radius of the filter", self.radius, stable, "eigenvalues"),
+            _worst("spectral radius of the closed loop", self.loop_radius, stable, "eigenvalues"),
+            _worst(
+                "residual of the Riccati equation",
+                self.riccati,
+                RESIDUAL_TOLERANCE,
+                "relative, in extended precision",
+            ),
+            _worst(
+                "residual of the Lyapunov equation", self.lyapunov, RESIDUAL_TOLERANCE, equation
+            ),
+            _worst(
+                "variance, against the Riccati equation",
+                self.variance,
+                VARIANCE_TOLERANCE,
+                "relative, Lyapunov equation",
+            ),
+            _worst(
+                "distance from the least-variance gain",
+                self.gain,
+                GAIN_TOLERANCE,
+                "gain recomputed from the Lyapunov covariance",
+            ),
+            _worst(
+                "residual of the loop's Lyapunov equation",
+                self.loop_lyapunov,
+                RESIDUAL_TOLERANCE,
+                equation,
+            ),
+        ]
+        if applied:  # the residual is the estimation error
+            apart = np.abs(self.residual - self.estimation) / self.estimation
+            checks.append(
+                _worst(
+                    "residual of the closed loop, against the estimation error",
+                    apart,
+                    VARIANCE_TOLERANCE,
+                    "relative, two Lyapunov equations",
+                )
+            )
+        else:
+            checks.append(
+                _worst(
+                    "rounding in the residual of the closed loop",
+                    self.rounding,
+                    VARIANCE_TOLERANCE,
+                    "relative, sizes of the terms of its variance",
+                )
+            )
+        return Certificate(
+            checks=tuple(checks),
+            gamma=np.nan,
+            rms_per_output=frozen(np.sqrt(np.maximum(self.estimation, 0))),
+        )
+
+
+def _worst(name: str, values: FloatArray, limit: float, method: str) -> Check:
+    """Check of the worst of all modes."""
+    failing = np.flatnonzero(~(values < limit))
+    value = float(np.max(values)) if not np.isnan(values).any() else float("nan")
+    if failing.size:
+        name = f"{name} ({modes_named(failing)})"
+    return Check(name=name, value=value, limit=limit, method=method)

@@ -1,0 +1,359 @@
+"""Optimised modal gains: for every mode the integrator gain of least residual.
+
+E. Gendron, P. Lena, Astron. Astrophys. 291, 337 (1994). All modes see the same delay, so with
+the loop gain ``h = sensor_gain * gain`` they have the same transfer functions: the residual of
+every mode at every loop gain of a grid is one product of matrices, spectra by rejections. Between
+the grid's points the residual, times its distance from the stability limit, is a polynomial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
+from lbt_synth.design.modal.plants import Lines, lines_per_mode, per_mode_number
+from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.loop.budget import distinct_edges, pole_edges
+from lbt_synth.models import (
+    ARModel,
+    LoopHardware,
+    ModalTurbulence,
+    PositionLoop,
+    Spectrum,
+    Vibration,
+)
+from lbt_synth.models.truth import breakpoints_below
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen, number
+
+Density = Callable[[FloatArray], FloatArray]
+
+_GRID = 161  # loop gains
+_HIGHEST = 0.9999  # of the stability limit: end of the grid
+_RESONANT = (0.3, 0.6, 0.8, 0.9, 0.97, 0.99, 0.999)  # of the limit: resonances that are resolved
+_WINDOW = 10  # points of a polynomial
+_GOLDEN = (np.sqrt(5) - 1) / 2
+_STEPS = 45  # golden sections: 1e-9 of the bracket
+_NODES = 6  # a panel
+_HALVINGS = 8
+_SETTLED = 1e-6  # change of variances by the last halving
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModalGains:
+    """Integrator gains of least residual.
+
+    Attributes
+    ----------
+    gains : (n,) ndarray
+        Integrator gain of each mode. 1e-4 of the stability limit is the least that is tried: a
+        mode that has it is better left alone.
+    rms_nm : (n,) ndarray
+        Residual that they leave [nm rms].
+    limit : (n,) ndarray
+        Largest gain that was allowed: the margin below the stability limit, at unit sensor gain
+        and at the mode's own.
+    limited : (n,) bool ndarray
+        Whether the gain is at that limit.
+    noise_nm : (n,) ndarray
+        Measurement noise that was given or found [nm].
+    delay_frames : float
+        Total delay [frames].
+    mirror : PositionLoop or None
+        Dynamics of the mirror; None: it settles at once.
+    """
+
+    gains: FloatArray
+    rms_nm: FloatArray
+    limit: FloatArray
+    limited: BoolArray
+    noise_nm: FloatArray
+    delay_frames: float
+    mirror: PositionLoop | None
+
+
+def modal_gains(
+    spectra: ModalTurbulence | Sequence[Spectrum],
+    *,
+    noise_nm: Any,
+    frame_rate_hz: float,
+    vibrations: Mapping[int, Vibration | Sequence[Vibration]] | None = None,
+    delay_frames: float = 2.0,
+    sensor_gain: Any = 1.0,
+    margin: float = 0.001,
+    mirror: PositionLoop | None = None,
+) -> ModalGains:
+    """Find the integrator gain of least residual for every mode, from spectra.
+
+    Parameters
+    ----------
+    spectra : ModalTurbulence or sequence of Spectrum
+        Spectrum of each mode's phase: models, an Atmosphere, tables.
+    noise_nm : float or (n,) array_like
+        Measurement noise of each mode per frame [nm], at least 0.
+    frame_rate_hz : float
+        Frame rate [Hz].
+    vibrations : mapping of int to Vibration or list of them, optional
+        Vibrations of some modes; their directions play no part.
+    delay_frames : float, optional
+        Total delay [frames], at least 1, fractions allowed.
+    sensor_gain : float or (n,) array_like, optional
+        Sensor (optical) gain of each mode, known.
+    margin : float, optional
+        Distance from the stability limit as a part of it: gains are at most ``(1 - margin)``
+        times :func:`integrator_gain_limit` (or the limit with the mirror's dynamics), and that
+        over a sensor gain above 1.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror, the same for all modes; one that settles at once by default.
+
+    Returns
+    -------
+    ModalGains
+        The gains, and what they leave.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range or sizes clash.
+    NumericalError
+        If the integral over a spectrum does not settle.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
+    >>> modes = lbt.models.modal_turbulence(air, modes=100, frame_rate_hz=800)
+    >>> found = lbt.design.modal.modal_gains(modes, noise_nm=15.5, frame_rate_hz=800)
+    >>> found.gains[[0, 50, 99]].round(3).tolist()
+    [0.456, 0.304, 0.212]
+    """
+    path = LoopHardware(
+        frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
+    )
+    rate = path.frame_rate_hz
+    densities, count = _densities(spectra, rate)
+    lines = lines_per_mode(vibrations, count)
+    edges = _own_edges(spectra, lines, rate)
+
+    def density(frequency: FloatArray) -> FloatArray:
+        out = densities(frequency)
+        for mode, own in enumerate(lines):
+            for line in own:
+                out[mode] += line.ar_model(rate).psd(frequency)
+        return out
+
+    return least_residuals(
+        density,
+        edges,
+        path,
+        noise=per_mode_number(noise_nm, "noise_nm", count, zero=True),
+        gain=per_mode_number(sensor_gain, "sensor_gain", count),
+        margin=margin,
+    )
+
+
+def _densities(spectra: ModalTurbulence | Sequence[Spectrum], rate: float) -> tuple[Density, int]:
+    """Return the function from frequencies (f,) to all spectra (n, f), and n."""
+    if isinstance(spectra, ModalTurbulence):
+        _require_rate(spectra.frame_rate_hz, rate)
+        return spectra.psd, spectra.n_modes
+    each = tuple(spectra) if isinstance(spectra, Sequence) else ()
+    if not each or not all(isinstance(spectrum, Spectrum) for spectrum in each):
+        raise ProblemError(
+            "spectra must be ModalTurbulence, or a list with one spectrum a mode (objects with "
+            f"psd(frequency_hz)); got {type(spectra).__name__}."
+        )
+    for spectrum in each:
+        if isinstance(spectrum, ARModel):
+            _require_rate(spectrum.frame_rate_hz, rate)
+
+    distinct = {id(spectrum): spectrum for spectrum in each}
+
+    def evaluated(frequency: FloatArray) -> FloatArray:
+        known = {i: np.asarray(one.psd(frequency), np.float64) for i, one in distinct.items()}
+        return np.stack([known[id(one)] for one in each])
+
+    return evaluated, len(each)
+
+
+def _require_rate(own: float, rate: float) -> None:
+    if not np.isclose(own, rate, rtol=1e-9):
+        raise ProblemError(
+            f"a model must be sampled at the frame rate {rate:.6g} Hz; got {own:.6g} Hz."
+        )
+
+
+def _own_edges(
+    spectra: ModalTurbulence | Sequence[Spectrum], lines: Lines, rate: float
+) -> FloatArray:
+    """Edges of panels where spectra have peaks or kinks, in units of the Nyquist frequency."""
+    models = [line.ar_model(rate) for own in lines for line in own]
+    if isinstance(spectra, ModalTurbulence):
+        edges = [pole_edges(_distinct(np.linalg.eigvals(spectra.companions).ravel()))]
+    else:
+        distinct = {id(spectrum): spectrum for spectrum in spectra}.values()
+        models += [spectrum for spectrum in distinct if isinstance(spectrum, ARModel)]
+        edges = [breakpoints_below(spectrum, rate / 2) * 2 / rate for spectrum in distinct]
+    for model in models:
+        edges.append(pole_edges(np.linalg.eigvals(model.companion).astype(np.complex128)))
+    return np.concatenate(edges)
+
+
+def _distinct(poles: Any) -> ComplexArray:
+    """Leave out poles that have the place and the distance from the circle of another one.
+
+    Both to a quarter of that distance, which is the width of the peak: panels fit all of them.
+    """
+    inside = poles[np.abs(poles) < 1]
+    steps = np.round(np.log(1 - np.abs(inside)) * 4)
+    places = np.round(np.abs(np.angle(inside)) / np.exp(steps / 4) * 4)
+    _, kept = np.unique(np.stack([steps, places]), axis=1, return_index=True)
+    return np.asarray(inside[kept], dtype=np.complex128)
+
+
+def least_residuals(
+    density: Density,
+    own_edges: FloatArray,
+    path: LoopHardware,
+    *,
+    noise: FloatArray,
+    gain: FloatArray,
+    margin: float,
+    differenced: bool = False,
+) -> ModalGains:
+    """Find the gains on finer and finer panels, until residuals and gains stand still.
+
+    Shapes: own_edges (e,), noise, gain (n,).
+    """
+    rate, taps = path.frame_rate_hz, path.mirror_taps
+    limit = hardware_gain_limit(path)
+    least, most = TRIED_GAINS
+    distance = number(margin, "margin", at_least=round(1 - most, 9), below=1)
+    loop_gains = np.geomspace(least, _HIGHEST, _GRID) * limit
+    highest = (1 - distance) * limit * np.minimum(gain, 1.0)
+    if np.any(highest < loop_gains[_WINDOW]):
+        raise ProblemError(
+            "margin and sensor_gain must leave room for a gain; got gains of at most "
+            f"{np.min(highest / gain):.3g} at a sensor gain of {np.min(gain):.3g}."
+        )
+    poles = [np.roots(_characteristic(taps, part * limit)) for part in _RESONANT]
+    edges = distinct_edges(
+        np.concatenate([[0.0], np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), own_edges])
+    )
+    last: tuple[FloatArray, FloatArray] | None = None
+    for _ in range(_HALVINGS):
+        nodes, weights = gauss_panels(edges * rate / 2, _NODES)
+        spectra = density(nodes)
+        sound = np.isfinite(spectra) & ((spectra >= 0) | differenced)
+        wrong = np.flatnonzero(~sound.all(axis=1))
+        if wrong.size:
+            raise ProblemError(
+                f"every spectrum must be finite and at least 0; that of mode {wrong[0]} is not."
+            )
+        rejection, propagation = _transfers(nodes / rate, taps, loop_gains, differenced)
+        variances = (spectra * weights) @ rejection.T
+        propagated = propagation @ weights * 2 / rate
+        variances += np.outer((noise / gain) ** 2, propagated)
+        if np.any(variances[:, 0] == 0):
+            raise ProblemError(
+                "every mode must have turbulence, vibration or noise; got none in mode "
+                f"{int(np.argmin(variances[:, 0]))}."
+            )
+        found = _minimised(loop_gains, variances, limit, highest)
+        if differenced:
+            floor = (noise / gain) ** 2 * np.interp(found[0], loop_gains, propagated)
+            found = found[0], np.maximum(found[1], floor)
+        if last is not None and _alike(found, last):
+            allowed = highest / gain
+            gains = np.minimum(found[0] / gain, allowed)
+            limited = gains > allowed * (1 - 1e-6)
+            limited.setflags(write=False)
+            return ModalGains(
+                gains=frozen(gains),
+                rms_nm=frozen(np.sqrt(found[1])),
+                limit=frozen(allowed),
+                limited=limited,
+                noise_nm=noise,
+                delay_frames=path.delay_frames,
+                mirror=path.mirror,
+            )
+        last = found
+        edges = np.union1d(edges, (edges[1:] + edges[:-1]) / 2)
+    raise NumericalError(
+        "the integral over a spectrum did not settle: residuals change still after "
+        f"{_HALVINGS} halvings of all panels. Check that no spectrum is a set of lines; give a "
+        "table its own frequencies.",
+        status="quadrature",
+    )
+
+
+def _alike(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> bool:
+    """Whether gains and variances are the same to what is asked."""
+    variance = np.max(np.abs(one[1] / other[1] - 1))
+    return bool(variance < _SETTLED and np.max(np.abs(one[0] / other[0] - 1)) < 1e-4)
+
+
+def _characteristic(taps: FloatArray, loop_gain: float) -> FloatArray:
+    """Coefficients of ``1 - z^-1 + h z^-1 M(z)`` in powers of z^-1."""
+    out = np.zeros(len(taps) + 1)
+    out[:2] = 1, -1
+    out[1:] += loop_gain * taps
+    return out
+
+
+def _transfers(
+    turns: FloatArray, taps: FloatArray, loop_gains: FloatArray, differenced: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Squared moduli (gains, f) of phase and of noise over sensor gain to the residual.
+
+    The phase is replaced by its difference of two frames, if that is wanted.
+    """
+    delay = np.exp(-2j * np.pi * turns)
+    mirror: ComplexArray = np.polynomial.polynomial.polyval(delay, np.asarray(taps))
+    difference = 1 - delay
+    power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
+    rejection = (1.0 if differenced else np.abs(difference) ** 2) / power
+    return rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power
+
+
+def _minimised(
+    loop_gains: FloatArray, variances: FloatArray, limit: float, highest: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Loop gain of least variance of each mode, up to the highest one, and that variance."""
+    count = len(variances)
+    step = np.log(loop_gains[1] / loop_gains[0])
+    top = np.log(highest / loop_gains[0]) / step  # place on the grid, a fraction
+    allowed = np.arange(loop_gains.size) <= top[:, None] + 1e-9
+    best = np.argmin(np.where(allowed, variances, np.inf), axis=1)
+    first = np.clip(best - _WINDOW // 2, 0, loop_gains.size - _WINDOW)
+    rows = np.arange(count)[:, None]
+    smooth = (variances * (1 - loop_gains / limit))[rows, first[:, None] + np.arange(_WINDOW)]
+    factors = np.array([1.0])
+    for i in range(1, _WINDOW):  # binomial coefficients with alternating signs
+        factors = np.append(factors, -factors[-1] * (_WINDOW - i) / i)
+
+    def variance(place: FloatArray) -> FloatArray:
+        apart = (place - first)[:, None] - np.arange(_WINDOW)
+        apart = np.where(np.abs(apart) < 1e-12, 1e-12, apart)
+        weight = factors / apart
+        value = np.sum(weight * smooth, axis=1) / np.sum(weight, axis=1)
+        return np.asarray(value / (1 - loop_gains[0] * np.exp(step * place) / limit))
+
+    low, high = np.maximum(best - 1.0, 0.0), np.minimum(best + 1.0, top)
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = variance(left), variance(right)
+    for _ in range(_STEPS):
+        lower = at_left < at_right
+        low, high = np.where(lower, low, left), np.where(lower, right, high)
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        at_left, at_right = variance(left), variance(right)
+    place = (low + high) / 2
+    end = variance(top) <= variance(place)
+    place = np.where(end & (top <= best + 1.0), top, place)
+    return loop_gains[0] * np.exp(step * place), variance(place)

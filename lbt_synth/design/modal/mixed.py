@@ -1,0 +1,336 @@
+"""Mixed modal control: a filter for some modes, an integrator for each of the others.
+
+Agapito et al. (2008), section III: tip and tilt, where telescopes shake, go to an optimal
+filter; every other mode keeps the integrator of classical modal control.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from lbt_synth.design.modal.banks import Bank, RunningBanks
+from lbt_synth.design.modal.filters import ModalFilters
+from lbt_synth.design.modal.reconstructor import Reconstructor, mode_indices
+from lbt_synth.design.result import Design
+from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.linear import Controller, RunningController
+from lbt_synth.loop.simulation.run import SteppedController
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, float_array, frozen, instance, real_array
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class MixedController:
+    """Controller of n modes with a state: ``step(y) -> u`` once a frame, and ``reset()``.
+
+    A mode that is not filtered has its own integrator, ``u(k) = leak u(k-1) + gain y(k)``
+    with y the modal coefficient of the residual. The modes of ``filtered``, in that
+    order, are the measurements and the commands of the filter.
+
+    Parameters
+    ----------
+    filter : Design, Controller, ModalFilters, object with ``step(y)`` and ``reset()``, or None
+        Controller of the filtered modes, such as a Kalman design of a tip/tilt plant. An
+        object with a state is stepped as it is. None: all modes have integrators.
+    gains : (n,) array_like
+        Integrator gain of each mode, at least 0; those of filtered modes play no part.
+    filtered : sequence of int, optional
+        Modes of the filter; they play no part if there is none.
+    leak : float or (n,) array_like, optional
+        Leak of the integrators, 0 to 1; 1 for pure integrators.
+    reconstructor : Reconstructor, optional
+        From slopes to modes; by default the measurements are modal coefficients.
+
+    Raises
+    ------
+    DimensionError
+        If sizes clash.
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
+    >>> control = lbt.design.modal.MixedController(
+    ...     filter=lbt.kalman(plant), gains=[0.0, 0.0, 0.5, 0.3]
+    ... )
+    >>> [float(u.round(3)) for u in control.step([0.0, 0.0, 10.0, 10.0])]
+    [0.0, 0.0, 5.0, 3.0]
+    >>> [float(u.round(3)) for u in control.step([0.0, 0.0, 10.0, 10.0])]
+    [0.0, 0.0, 10.0, 6.0]
+    """
+
+    filter: Any
+    gains: FloatArray
+    filtered: Sequence[int] = (0, 1)
+    leak: Any = 1.0
+    reconstructor: Reconstructor | None = None
+    _running: SteppedController | None = field(init=False, repr=False)
+    _modes: np.ndarray = field(init=False, repr=False)
+    _gain: FloatArray = field(init=False, repr=False)
+    _leak: FloatArray = field(init=False, repr=False)
+    _command: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        gains = real_array(self.gains, "gains")
+        if gains.ndim != 1 or gains.size == 0:
+            raise DimensionError(
+                f"gains must be a list, one number a mode; got shape {gains.shape}."
+            )
+        n = gains.size
+        leak = real_array(self.leak, "leak")
+        if leak.shape not in ((), (n,)):
+            raise DimensionError(f"leak must be one number, or one a mode ({n}); got {leak.shape}.")
+        if np.any(gains < 0):
+            raise ProblemError(f"gains must be at least 0; got {gains.min():.6g}.")
+        if np.any(leak < 0) or np.any(leak > 1):
+            raise ProblemError(
+                f"leak must be from 0 to 1; got {leak.min():.6g} to {leak.max():.6g}."
+            )
+        if self.reconstructor is not None:
+            instance(self.reconstructor, Reconstructor)
+            if self.reconstructor.n_modes != n:
+                raise DimensionError(
+                    f"gains must be one a mode of the reconstructor, {self.reconstructor.n_modes}; "
+                    f"got {n}."
+                )
+        self.gains, self.leak = gains, frozen(np.broadcast_to(leak, (n,)))
+        self._gain, self._leak = np.array(self.gains), np.array(self.leak)
+        self._modes, self._running = np.zeros(0, dtype=np.intp), None
+        if self.filter is not None:
+            self._modes = mode_indices(self.filtered, "filtered", n)
+            if self._modes.size == 0:
+                raise ProblemError("filtered must name at least one mode; got none.")
+            self._running = _started(self.filter, self._modes.size)
+            self._gain[self._modes] = self._leak[self._modes] = 0.0
+        self.filtered = tuple(int(i) for i in self._modes)
+        self.reset()
+
+    @classmethod
+    def integrators(
+        cls, gains: Any, *, leak: Any = 1.0, reconstructor: Reconstructor | None = None
+    ) -> MixedController:
+        """Return the classical controller: an integrator for every mode.
+
+        Parameters
+        ----------
+        gains : (n,) array_like
+            Integrator gain of each mode.
+        leak : float or (n,) array_like, optional
+            Leak of the integrators.
+        reconstructor : Reconstructor, optional
+            From slopes to modes.
+
+        Returns
+        -------
+        MixedController
+            A controller without a filter.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> classical = lbt.design.modal.MixedController.integrators([0.5, 0.3, 0.2])
+        >>> [float(u) for u in classical.step([1.0, 1.0, 1.0])]
+        [0.5, 0.3, 0.2]
+        """
+        return cls(filter=None, gains=gains, leak=leak, reconstructor=reconstructor)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes n."""
+        return int(self.gains.size)
+
+    @property
+    def dt_s(self) -> float | None:
+        """Sampling period of the filter [s]; None where nothing says it."""
+        if isinstance(self.filter, ModalFilters):
+            return self.filter.dt_s
+        if isinstance(self._running, RunningController):
+            return self._running.controller.dt_s
+        return None
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the filter is designed for, of any number of modes; None if it says none."""
+        if isinstance(self.filter, ModalFilters):
+            return self.filter.hardware
+        return self.filter.hardware if isinstance(self.filter, Design) else None
+
+    @property
+    def n_measurements(self) -> int:
+        """Number of measurements: slopes with a reconstructor, modes without."""
+        return self.n_modes if self.reconstructor is None else self.reconstructor.n_slopes
+
+    def reset(self) -> None:
+        """Set all integrators and the filter to zero."""
+        self._command = np.zeros(self.gains.size)
+        if self._running is not None:
+            self._running.reset()
+
+    def step(self, y: Any) -> FloatArray:
+        """Take the measurements y(k) and return the modal commands u(k), (n,).
+
+        Parameters
+        ----------
+        y : (n_measurements,) array_like
+            Slopes, or modal coefficients where there is no reconstructor.
+
+        Returns
+        -------
+        (n,) ndarray
+            Commands.
+
+        Raises
+        ------
+        DimensionError
+            If y has another size.
+            The same for the commands of a filter that is an object of your own.
+        NonFiniteError
+            If a measurement is not finite; the state is then as before. Or if a command of
+            the filter is not: the integrators are then as before, the filter has stepped.
+        ProblemError
+            If y or the commands of the filter are no real numbers.
+        """
+        measured = float_array(y, "y")
+        if measured.shape != (self.n_measurements,):
+            raise DimensionError(
+                f"y must have shape ({self.n_measurements},); got {measured.shape}."
+            )
+        if self.reconstructor is not None:
+            measured = self.reconstructor.matrix @ measured
+        if not np.isfinite(measured).all():
+            raise NonFiniteError(
+                "y must be finite; got NaN or an infinite value. The state is as before: hold the "
+                "last command, or reset()."
+            )
+        command = self._leak * self._command
+        command += self._gain * measured
+        if self._running is not None:
+            own = float_array(self._running.step(measured[self._modes]), "the filter's commands")
+            if own.shape != self._modes.shape:
+                raise DimensionError(
+                    f"the filter's commands must have shape {self._modes.shape}, one a filtered "
+                    f"mode; got {own.shape}."
+                )
+            if not np.isfinite(own).all():
+                raise NonFiniteError(
+                    "the filter's commands must be finite; got NaN or an infinite value. The "
+                    "integrators are as before, the filter has stepped: reset()."
+                )
+            command[self._modes] = own
+        self._command = command
+        return command.copy()
+
+    def banks(self) -> tuple[Bank, ...]:
+        """Return the controllers of single modes and the filter as banks, without a reconstructor.
+
+        Raises
+        ------
+        ProblemError
+            If the filter is no linear controller of this package.
+        """
+        kept = np.setdiff1d(np.arange(self.n_modes), self._modes)
+        one = np.ones((kept.size, 1, 1))
+        leak, gain = self._leak[kept, None, None], self._gain[kept, None, None]
+        own = Bank(modes=kept[:, None], A=leak, B=gain, C=one, D=np.zeros_like(one))
+        out = [own] if kept.size else []
+        if isinstance(self._running, RunningBanks):
+            out += [bank.of_modes(self._modes) for bank in self._running.banks]
+        elif isinstance(self._running, RunningController):
+            k = self._running.controller
+            out.append(
+                Bank(modes=self._modes[None], A=k.A[None], B=k.B[None], C=k.C[None], D=k.D[None])
+            )
+        elif self._running is not None:
+            raise ProblemError(
+                "only a filter with matrices (a design or a Controller) makes a linear "
+                f"controller; got {type(self._running).__name__}."
+            )
+        return tuple(out)
+
+    def as_controller(self, dt_s: float | None = None) -> Controller:
+        """Return the same map as one linear controller, for exact analysis.
+
+        Parameters
+        ----------
+        dt_s : float, optional
+            Sampling period [s]; by default that of the filter, 1 where there is none.
+
+        Returns
+        -------
+        Controller
+            From y to u, its states those of the filter and one an integrator.
+
+        Raises
+        ------
+        ProblemError
+            If the filter is no linear controller of this package, or has another period.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> classical = lbt.design.modal.MixedController.integrators([0.5, 0.3])
+        >>> path = lbt.LoopHardware(frame_rate_hz=800)
+        >>> lbt.close_loop(path, classical.as_controller(path.dt_s)).is_stable
+        True
+        """
+        n, banks = self.n_modes, self.banks()
+        own = self.dt_s
+        period = own if dt_s is None else dt_s
+        if own is not None and period is not None and not np.isclose(period, own, rtol=1e-9):
+            raise ProblemError(
+                f"dt_s must be that of the filter, {own:.9g} s; got {period:.9g} s. Design the "
+                "filter for this frame rate."
+            )
+        A: list[FloatArray] = []
+        inputs: list[FloatArray] = []
+        outputs: list[FloatArray] = []
+        direct = np.zeros((n, n))
+        for bank in banks:
+            for modes, *parts in zip(bank.modes, bank.A, bank.B, bank.C, bank.D, strict=True):
+                chosen = np.eye(n)[modes]
+                A.append(parts[0])
+                inputs.append(parts[1] @ chosen)
+                outputs.append(chosen.T @ parts[2])
+                direct += chosen.T @ parts[3] @ chosen
+        B = np.vstack(inputs)
+        if self.reconstructor is not None:
+            B, direct = B @ self.reconstructor.matrix, direct @ self.reconstructor.matrix
+        return Controller(
+            A=block_diag(*A),
+            B=B,
+            C=np.hstack(outputs),
+            D=direct,
+            dt_s=1.0 if period is None else period,
+        )
+
+
+def _started(given: Any, modes: int) -> SteppedController:
+    """Return the filter as an object to step, of as many inputs and outputs as modes."""
+    if isinstance(given, Design):
+        given = given.controller
+    running = given.start() if isinstance(given, Controller | ModalFilters) else given
+    if not isinstance(running, SteppedController):
+        raise ProblemError(
+            "filter must be a design, a Controller, an object with step(y) and reset(), or None; "
+            f"got {type(given).__name__}."
+        )
+    if isinstance(running, RunningBanks) and running.n_modes != modes:
+        raise DimensionError(
+            f"the filters must be for the {modes} filtered modes; got {running.n_modes}."
+        )
+    if isinstance(running, RunningController):
+        D = running.controller.D
+        if D.shape != (modes, modes):
+            raise DimensionError(
+                f"the filter must map the {modes} filtered modes to as many commands; got "
+                f"{D.shape[1]} measurements and {D.shape[0]} commands."
+            )
+    return running

@@ -1,0 +1,175 @@
+"""Stacks of plants, one mode each: what :func:`tip_tilt_plant` assembles for a single mode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear.batched import transposed
+from lbt_synth.models import ARModel, ModalTurbulence, Vibration
+from lbt_synth.models.lifted_mirror import Response
+from lbt_synth.models.vibration import sampled_lines
+from lbt_synth.validation import FloatArray, frozen, integer, real_array
+
+Lines = tuple[tuple[Vibration, ...], ...]
+
+
+def per_mode_number(
+    value: Any, name: str, modes: int, *, zero: bool = False, at_most: float = np.inf
+) -> FloatArray:
+    """Return one positive number a mode, (n,), from one for all or one each."""
+    given = real_array(value, name)
+    if given.shape not in ((), (modes,)):
+        raise DimensionError(
+            f"{name} must be one number, or one a mode ({modes}); got shape {given.shape}."
+        )
+    low = float(np.min(given, initial=np.inf))
+    if low < 0 or (low == 0 and not zero):
+        raise ProblemError(f"{name} must be {'at least' if zero else 'above'} 0; got {low:.6g}.")
+    if np.any(given > at_most):
+        raise ProblemError(f"{name} must be at most {at_most:g}; got {given.max():.6g}.")
+    return frozen(np.broadcast_to(given, (modes,)))
+
+
+def turbulence_of(
+    turbulence: ModalTurbulence | Sequence[ARModel], modes: int | None = None
+) -> ModalTurbulence:
+    """Return the turbulence as arrays, of a given number of modes."""
+    air = turbulence if isinstance(turbulence, ModalTurbulence) else ModalTurbulence.of(turbulence)
+    if modes is not None and air.n_modes != modes:
+        raise DimensionError(f"turbulence must have {modes} modes; got {air.n_modes}.")
+    return air
+
+
+def lines_per_mode(
+    vibrations: Mapping[int, Vibration | Sequence[Vibration]] | None, modes: int
+) -> Lines:
+    """Return the vibrations of each mode, from a mapping of some modes."""
+    lines: list[tuple[Vibration, ...]] = [()] * modes
+    if vibrations is None:
+        return tuple(lines)
+    if not isinstance(vibrations, Mapping):
+        raise ProblemError(
+            "vibrations must be a mapping from mode numbers to vibrations, such as {0: [line]}; "
+            f"got {type(vibrations).__name__}."
+        )
+    for mode, given in vibrations.items():
+        i = integer(mode, "a mode of vibrations", at_least=0)
+        if i >= modes:
+            raise ProblemError(f"a mode of vibrations must be from 0 to {modes - 1}; got {i}.")
+        each = (given,) if isinstance(given, Vibration) else given
+        if not isinstance(each, list | tuple) or not all(
+            isinstance(line, Vibration) for line in each
+        ):
+            raise ProblemError(f"mode {i} must have a list of Vibration; got {given!r}.")
+        lines[i] = tuple(each)
+    return tuple(lines)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Disturbances:
+    """Total phase of some modes as linear systems: ``x+ = A x + B v``, ``phi_tot = row x``."""
+
+    A: FloatArray  # (N, k, k): state matrices: vibrations now and before, turbulence
+    B: FloatArray  # (N, k, p + 1): from white noise of unit variance
+    row: FloatArray  # (N, k): to the newest sample of the phase
+
+
+def disturbances(turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray) -> Disturbances:
+    """Systems of some modes, all of the size of the one with the most vibrations."""
+    count, order = len(modes), turbulence.order
+    p = max((len(lines[i]) for i in modes), default=0)
+    size = 2 * p + order
+    A, B, row = (
+        np.zeros((count, size, size)),
+        np.zeros((count, size, p + 1)),
+        np.zeros((count, size)),
+    )
+    now, before, tur = np.arange(p), np.arange(p, 2 * p), 2 * p
+    each = [(i, j, line) for i, mode in enumerate(modes) for j, line in enumerate(lines[mode])]
+    if each:
+        i, j = np.array([place[:2] for place in each]).T
+        numbers = np.array([[line.frequency_hz, line.damping, line.rms_nm] for *_, line in each])
+        frequency, damping, rms = numbers.T
+        coefficients, driving = sampled_lines(frequency, damping, rms, turbulence.frame_rate_hz)
+        A[i, j, j], A[i, j, p + j] = coefficients.T
+        B[i, j, j] = driving
+    A[:, before, now] = 1
+    A[:, tur:, tur:] = turbulence.companions[modes]
+    B[:, tur, p] = turbulence.driving_rms_nm[modes]
+    row[:, :p] = row[:, tur] = 1
+    return Disturbances(A=A, B=B, row=row)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlantStack:
+    """Estimation problems of modes that have the same number of states."""
+
+    modes: np.ndarray  # (N,): numbers of the modes
+    # A, Q (N, s, s): state matrices and covariances of the process noise
+    A: FloatArray
+    Q: FloatArray
+    # C, L (N, 1, s): to the measurement, and to the signal that is estimated
+    C: FloatArray
+    L: FloatArray
+    R: FloatArray  # (N, 1, 1): variance of the measurement noise
+
+    def controllers(self, gains: FloatArray, mirror: Response) -> tuple[FloatArray, ...]:
+        """Return controllers ``A, B, C, D`` of predictor gains (N, s, 1), in new-state form.
+
+        As :meth:`FullStatePlant.controller` for one mode: the filters, and the mirror's states.
+        """
+        count, s = self.A.shape[:2]
+        size = s + mirror.n_states
+        sensor = self.C[:, :, -1:]  # the measurement is of the oldest phase
+        A, C, L = (
+            np.zeros((count, size, size)),
+            np.zeros((count, 1, size)),
+            np.zeros((count, 1, size)),
+        )
+        A[:, :s, :s], C[..., :s], L[..., :s] = self.A, self.C, self.L
+        A[:, s:, s:], C[..., s:] = mirror.A, -sensor * mirror.C
+        B, known = np.zeros((2, count, size, 1))
+        B[:, :s] = gains
+        known[:, s:] = mirror.B[:, None]
+        A += (known + mirror.D * B * sensor) @ L - B @ C
+        return A, B, L, np.zeros((count, 1, 1))
+
+    def errors(self, gains: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """State matrices and driving covariances of the estimation errors."""
+        A = self.A - gains @ self.C
+        return A, self.Q + gains @ self.R @ transposed(gains)
+
+
+def plant_stacks(
+    turbulence: ModalTurbulence,
+    lines: Lines,
+    *,
+    noise_nm: FloatArray,
+    delay_frames: float,
+    sensor_gain: FloatArray,
+) -> list[PlantStack]:
+    """Plants of all modes, one stack for each number of vibrations."""
+    counts = np.array([len(each) for each in lines])
+    steps = max(int(np.ceil(delay_frames)), 2)
+    late, chain = steps - delay_frames, steps - 1
+    stacks = []
+    for lines_each in np.unique(counts):
+        modes = np.flatnonzero(counts == lines_each)
+        d = disturbances(turbulence, lines, modes)
+        count, k = d.row.shape
+        s = k + chain
+        A, Q = np.zeros((2, count, s, s))
+        A[:, :k, :k], A[:, k, :k] = d.A, d.row
+        A[:, k + 1 :, k : s - 1] = np.eye(chain - 1)
+        Q[:, :k, :k] = d.B @ transposed(d.B)
+        C, L = np.zeros((2, count, 1, s))
+        C[:, 0, -1] = sensor_gain[modes]
+        L[:, 0, :k], L[:, 0, k] = (1 - late) * d.row, late
+        R = noise_nm[modes, None, None] ** 2
+        stacks.append(PlantStack(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
+    return stacks

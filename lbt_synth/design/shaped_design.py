@@ -1,0 +1,233 @@
+"""What a shaped design is, and its certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.design.certificate import Certificate, Check, certify_loop, controller_distance
+from lbt_synth.design.result import Design
+from lbt_synth.design.shaping.exact_evaluation import mode_loop
+from lbt_synth.design.shaping.objectives import leaves
+from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.errors import DimensionError, UnstableLoopError
+from lbt_synth.linear import Controller
+from lbt_synth.loop import close_loop, youla_controller
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import ComplexArray, FloatArray, frozen
+
+_SAME = 1e-9
+_RMS_TOLERANCE = 1e-6
+_TEST_HZ = (0.0, 0.003, 0.02, 0.11, 0.37)  # parts of the frame rate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class ShapedDesign(Design):
+    """A controller shaped in the closed loop, mode by mode.
+
+    Attributes
+    ----------
+    loop_hardware : LoopHardware
+        The loop.
+    specifications : tuple of Specification
+        One a mode.
+    parameters : tuple of Controller
+        Youla parameter of each mode, from its pseudo-open-loop measurement to its command.
+    objective_nm : tuple of float
+        Root of the objective of each mode that is claimed [nm].
+    long_objective_nm : tuple of float
+        The same of the long parameter, before it was reduced [nm].
+    long_functions : int
+        Functions of the long parameter.
+    """
+
+    loop_hardware: LoopHardware
+    specifications: tuple[Specification, ...]
+    parameters: tuple[Controller, ...]
+    objective_nm: tuple[float, ...]
+    long_objective_nm: tuple[float, ...]
+    long_functions: int
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the design is for."""
+        return self.loop_hardware
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles of the closed loop: those of the parameters, and the delays."""
+        parts = [np.linalg.eigvals(p.A) for p in self.parameters]
+        return np.concatenate(parts).astype(np.complex128)
+
+    @property
+    def states_per_mode(self) -> int:
+        """Largest number of states of one mode's controller, its past commands included."""
+        return max(mode_loop(self.loop_hardware, p).controller.n_states for p in self.parameters)
+
+    @property
+    def loss(self) -> float:
+        """Largest relative increase of a mode's objective by the reduction, of its root."""
+        pairs = zip(self.objective_nm, self.long_objective_nm, strict=True)
+        return max(short / long - 1 for short, long in pairs)
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether the parameters have fewer poles than the long one."""
+        return any(p.n_states < self.long_functions for p in self.parameters)
+
+    def demanded(self) -> tuple[tuple[int, str], ...]:
+        """Demands in words: mode, demand."""
+        return tuple(
+            (mode, demand.label)
+            for mode, spec in enumerate(self.specifications)
+            for demand in spec.demands
+        )
+
+    def __repr__(self) -> str:
+        """Return one line: what it is, not its matrices."""
+        return (
+            f"ShapedDesign(method={self.method!r}, modes={len(self.parameters)}, "
+            f"states_per_mode={self.states_per_mode}, objective_nm={self.objective_nm}, "
+            f"passed={self.certificate.passed})"
+        )
+
+    def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
+        """Residual of each term in the real loop: mode, what it is, [nm rms]."""
+        out = []
+        for mode, (spec, parameter) in enumerate(
+            zip(self.specifications, self.parameters, strict=True)
+        ):
+            loop = mode_loop(self.loop_hardware, parameter)
+            out += [
+                (mode, leaf.label, float(np.sqrt(leaf.measured_nm2(loop))))
+                for leaf in leaves(spec.objective)
+            ]
+        return tuple(out)
+
+    def recertified(self) -> Certificate:
+        """Compute the certificate anew from the matrices.
+
+        Returns
+        -------
+        Certificate
+            Passed or not.
+        """
+        hardware = self.loop_hardware
+        checks: list[Check] = []
+        seen: list[tuple[Specification, Controller, float]] = []
+        for mode, (spec, parameter) in enumerate(
+            zip(self.specifications, self.parameters, strict=True)
+        ):
+            claimed = self.objective_nm[mode]
+            if any(spec is s and parameter is p and claimed == c for s, p, c in seen):
+                continue
+            seen.append((spec, parameter, claimed))
+            one_of_many = len(self.specifications) > 1
+            prefix = f"mode {mode + 1}: " if one_of_many else ""
+            checks += [
+                replace(check, name=prefix + check.name)
+                for check in _mode_checks(hardware, spec, parameter, claimed)
+            ]
+        whole = assembled(hardware, self.parameters)
+        checks += [
+            Check(
+                name="controller against its parameters",
+                value=controller_distance(self.controller, whole),
+                limit=_SAME,
+                method="matrices assembled anew",
+            ),
+            certify_loop(hardware, self.controller),
+        ]
+        if checks[-1].passed:
+            checks.append(self._decoupled())
+        return Certificate(checks=tuple(checks), gamma=np.nan, rms_per_output=frozen(np.zeros(0)))
+
+    def _decoupled(self) -> Check:
+        """Check that the whole loop rejects what the loops of the single modes reject."""
+        f = np.array(_TEST_HZ) * self.loop_hardware.frame_rate_hz
+        whole = close_loop(self.loop_hardware, self.controller).sensitivity(f)
+        single = np.zeros_like(whole)
+        for mode, parameter in enumerate(self.parameters):
+            loop = mode_loop(self.loop_hardware, parameter).at(1.0)
+            single[:, mode, mode] = loop.sensitivity(f)[:, 0, 0]
+        return Check(
+            name="whole loop against its modes",
+            value=float(np.max(np.abs(whole - single))),
+            limit=1e-6,
+            method=f"sensitivity at {f.size} frequencies",
+        )
+
+
+def _mode_checks(
+    hardware: LoopHardware, spec: Specification, parameter: Controller, objective_nm: float
+) -> list[Check]:
+    radius = parameter.to_statespace().spectral_radius
+    checks = [
+        Check(
+            name="spectral radius of the parameter",
+            value=radius,
+            limit=1 - 1e-9,
+            method="eigenvalues",
+        )
+    ]
+    if not checks[0].passed:
+        return checks
+    loop = mode_loop(hardware, parameter)
+    checks += spec.checks(loop)
+    try:
+        found = float(np.sqrt(spec.objective.measured_nm2(loop)))
+    except UnstableLoopError:
+        found = np.inf
+    checks.append(
+        Check(
+            name="root of the objective, against the one claimed [nm]",
+            value=found,
+            limit=objective_nm * (1 + _RMS_TOLERANCE),
+            method="closed loops in state space",
+        )
+    )
+    return checks
+
+
+def require_separable(hardware: LoopHardware) -> None:
+    """Refuse a loop whose modes cannot be controlled one by one."""
+    n = hardware.modes
+    for name, response in (
+        ("sensor_matrix", hardware.sensor),
+        ("influence_matrix", hardware.influence),
+    ):
+        if np.linalg.matrix_rank(response) < n:
+            raise DimensionError(
+                f"{name} must have rank {n}, one for each mode, for a loop that is shaped mode by "
+                f"mode; got {response.shape} of rank {np.linalg.matrix_rank(response)}."
+            )
+
+
+def assembled(hardware: LoopHardware, parameters: tuple[Controller, ...]) -> Controller:
+    """Return the controller of the whole loop: the modes' parameters side by side."""
+    back = np.linalg.pinv(hardware.sensor)
+    sizes = [p.n_states for p in parameters]
+    n, modes = sum(sizes), len(parameters)
+    A, B, C = np.zeros((n, n)), np.zeros((n, modes)), np.zeros((modes, n))
+    D = np.zeros((modes, modes))
+    at = 0
+    for mode, (p, size) in enumerate(zip(parameters, sizes, strict=True)):
+        part = slice(at, at + size)
+        A[part, part], B[part, mode], C[mode, part] = p.A, p.B[:, 0], p.C[0]
+        D[mode, mode] = p.D[0, 0]
+        at += size
+    whole = Controller(
+        A=A,
+        B=B @ back,
+        C=hardware.projector @ C,
+        D=hardware.projector @ D @ back,
+        dt_s=hardware.dt_s,
+    )
+    return youla_controller(hardware, whole)
+
+
+def noise_of_modes(hardware: LoopHardware, covariance: FloatArray) -> FloatArray:
+    """Return the deviation of each mode's noise, (n,), from the covariance of the measurements."""
+    back = np.linalg.pinv(hardware.sensor)
+    return np.asarray(np.sqrt(np.diag(back @ covariance @ back.T)))

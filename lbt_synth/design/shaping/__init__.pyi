@@ -1,0 +1,12 @@
+from .bounds import Attenuation as Attenuation
+from .bounds import CommandRms as CommandRms
+from .bounds import ModulusMargin as ModulusMargin
+from .bounds import NoisePeak as NoisePeak
+from .objectives import ResidualVariance as ResidualVariance
+from .objectives import Total as Total
+from .objectives import VibrationBand as VibrationBand
+from .objectives import Worst as Worst
+from .specification import Specification as Specification
+from .uncertainty import DelayError as DelayError
+from .uncertainty import MirrorUncertainty as MirrorUncertainty
+from .uncertainty import SensorGainRange as SensorGainRange

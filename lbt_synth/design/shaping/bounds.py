@@ -1,0 +1,296 @@
+"""Bounds on the closed loop: margin, noise, rejection, commands.
+
+Each demand turns into convex constraints at given frequencies, drawn in by a little room,
+and into checks of the real loop over all frequencies that know nothing of the programme.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.design.certificate import Check
+from lbt_synth.design.shaping.band import Band
+from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.exact_evaluation import MeasuredLoop
+from lbt_synth.design.shaping.frequency_grid import Grid, spectrum_edges
+from lbt_synth.design.shaping.grid_tightening import LEVEL_SETS, ROOM, discs
+from lbt_synth.design.shaping.objectives import ResidualVariance
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import hinf_norm
+from lbt_synth.linear.convex_functions import Bounded, Constraint, Fractions
+from lbt_synth.linear.norms import band_norm
+from lbt_synth.linear.quadrature import adaptive_integral
+from lbt_synth.loop.budget import resonance_edges
+from lbt_synth.models import Spectrum
+from lbt_synth.validation import FloatArray, number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModulusMargin:
+    """Least distance of the loop from instability, ``1 / max |S|``, at unit sensor gain.
+
+    Parameters
+    ----------
+    at_least : float
+        The margin, in (0, 1).
+
+    Raises
+    ------
+    ProblemError
+        If it is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.ModulusMargin(at_least=0.45).label
+    'modulus margin of at least 0.45'
+    """
+
+    at_least: float
+
+    def __post_init__(self) -> None:
+        margin = number(self.at_least, "at_least", above=0, below=1)
+        object.__setattr__(self, "at_least", margin)
+
+    @property
+    def label(self) -> str:
+        """What a message calls it."""
+        return f"modulus margin of at least {self.at_least:g}"
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints at the points of a grid."""
+        f = grid.points_hz
+        rows = channel.complementary_rows(f)
+        return (discs(f, -rows, np.ones(len(rows)), (1 - ROOM) / self.at_least),)
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check the real loop."""
+        return (
+            Check(
+                name="peak of the sensitivity",
+                value=hinf_norm(loop.sensitivity).upper,
+                limit=1 / self.at_least,
+                method=LEVEL_SETS,
+            ),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoisePeak:
+    """Largest amplification of measurement noise into the residual, at any frequency.
+
+    Parameters
+    ----------
+    at_most : float
+        The amplification at unit sensor gain.
+
+    Raises
+    ------
+    ProblemError
+        If it is not positive.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.NoisePeak(at_most=2).at_most
+    2.0
+    """
+
+    at_most: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "at_most", number(self.at_most, "at_most", above=0))
+
+    @property
+    def label(self) -> str:
+        """What a message calls it."""
+        return f"noise amplified by at most {self.at_most:g}"
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints at the points of a grid."""
+        f = grid.points_hz
+        rows = channel.noise_rows(f)
+        return (discs(f, rows, np.zeros(len(rows)), (1 - ROOM) * self.at_most),)
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check the real loop."""
+        return (
+            Check(
+                name="peak of the noise transfer",
+                value=hinf_norm(loop.at(1.0).noise_propagation()).upper,
+                limit=self.at_most,
+                method=LEVEL_SETS,
+            ),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attenuation(Band):
+    """Bound on the rejection over a band: one step of a mask.
+
+    Exact at any sensor gain g: ``|1 - T| <= a |1 - (1 - g) T|`` is a disc of T for
+    ``a |1 - g| < 1``.
+
+    Parameters
+    ----------
+    low_hz, high_hz : float
+        Ends of the band [Hz].
+    at_most : float
+        Largest residual for a unit disturbance.
+    sensor_gain : float, optional
+        Sensor gain at which it holds.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range, or the bound is too loose to be convex at this gain.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.Attenuation(low_hz=0, high_hz=2, at_most=0.01).label
+    'attenuation to 0.01 in 0-2 Hz at sensor gain 1'
+    """
+
+    at_most: float
+    sensor_gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        Band.__post_init__(self)
+        set_ = object.__setattr__
+        set_(self, "at_most", number(self.at_most, "at_most", above=0))
+        set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+        if not self.at_most * abs(1 - self.sensor_gain) < 1:
+            raise ProblemError(
+                f"at_most must be below {1 / abs(1 - self.sensor_gain):.6g} at sensor gain "
+                f"{self.sensor_gain:g}, where it is no convex bound; got {self.at_most:g}."
+            )
+
+    @property
+    def label(self) -> str:
+        """What a message calls it."""
+        return (
+            f"attenuation to {self.at_most:g} in {self.band_text} "
+            f"at sensor gain {self.sensor_gain:g}"
+        )
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints at the points of a grid."""
+        f = grid.within(self.low_hz, self.high_hz)
+        rows = channel.complementary_rows(f)
+        rest = 1 - self.sensor_gain
+        # near the edge of convexity a small part of the disc's radius is a large one of the bound
+        stretch = (1 + self.at_most * abs(rest)) / (1 - self.at_most * abs(rest))
+        a = (1 - min(ROOM * stretch, 0.05)) * self.at_most
+        curvature = 1 - (a * rest) ** 2
+        centre = (1 - a**2 * rest) / curvature
+        return (discs(f, -rows, np.full(f.size, centre), a * self.sensor_gain / curvature),)
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check the real loop."""
+        rejection = loop.at(self.sensor_gain).rejection()
+        return (
+            Check(
+                name=f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}",
+                value=band_norm(rejection, self.low_hz, self.high_hz).upper,
+                limit=self.at_most,
+                method="level sets, all of the band",
+            ),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CommandRms:
+    """Bound on the stroke or on the step of the commands, under turbulence and noise.
+
+    Parameters
+    ----------
+    at_most_nm : float
+        Standard deviation of u(k), or of ``u(k) - u(k-1)`` [nm].
+    turbulence : Atmosphere, ARModel, TabulatedSpectrum or None
+        Spectrum of the mode.
+    noise_nm : float
+        Measurement noise of the mode, per frame [nm].
+    rate : bool, optional
+        Bound the step from frame to frame instead of the stroke.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> step = lbt.design.shaping.CommandRms(
+    ...     at_most_nm=30, turbulence=None, noise_nm=15.5, rate=True
+    ... )
+    >>> step.label
+    'command step of at most 30 nm rms'
+    """
+
+    at_most_nm: float
+    turbulence: Spectrum | None
+    noise_nm: float
+    rate: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "at_most_nm", number(self.at_most_nm, "at_most_nm", above=0))
+        if not isinstance(self.rate, bool):
+            raise ProblemError(f"rate must be True or False; got {self.rate!r}.")
+        # the same disturbances as those of a variance
+        disturbance = ResidualVariance(turbulence=self.turbulence, noise_nm=self.noise_nm)
+        object.__setattr__(self, "noise_nm", disturbance.noise_nm)
+
+    @property
+    def label(self) -> str:
+        """What a message calls it."""
+        what = "step" if self.rate else "stroke"
+        return f"command {what} of at most {self.at_most_nm:g} nm rms"
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints over the nodes of a grid."""
+        f, w = grid.nodes_hz, grid.weights_hz
+        density = self._density(f, channel.nyquist_hz, channel.hardware.dt_s)
+        rows = np.sqrt(w * density)[:, None, None] * channel.command_rows(f)[:, None, :]
+        function = Fractions(
+            frequency_hz=f,
+            rows=rows,
+            centres=np.zeros((f.size, 1), np.complex128),
+            steering=None,
+            worst=False,
+        )
+        return (Bounded(function=function, limit=((1 - ROOM) * self.at_most_nm) ** 2),)
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check the real loop."""
+        nyquist, dt_s = loop.hardware.frame_rate_hz / 2, loop.hardware.dt_s
+        parameter = loop.parameter
+
+        def power(f: FloatArray) -> FloatArray:
+            response = np.abs(parameter.frequency_response(f)[:, 0, 0]) ** 2
+            return np.asarray((response * self._density(f, nyquist, dt_s))[:, None, None])
+
+        edges = [
+            np.asarray(resonance_edges(loop.at(1.0))),
+            spectrum_edges(self.turbulence, nyquist),
+        ]
+        edges_hz = np.unique(np.concatenate(edges))
+        variance = float(adaptive_integral(power, edges_hz)[0, 0])
+        return (
+            Check(
+                name=f"command {'step' if self.rate else 'stroke'} [nm rms]",
+                value=float(np.sqrt(variance)),
+                limit=self.at_most_nm,
+                method="adaptive quadrature",
+            ),
+        )
+
+    def _density(self, f: FloatArray, nyquist_hz: float, dt_s: float) -> FloatArray:
+        """Spectrum of what drives Q, and of its steps where those are bounded [nm^2/Hz]."""
+        density = np.full(f.size, self.noise_nm**2 / nyquist_hz)
+        if self.turbulence is not None:
+            density = density + self.turbulence.psd(f)
+        return density * (4 * np.sin(np.pi * f * dt_s) ** 2 if self.rate else 1.0)

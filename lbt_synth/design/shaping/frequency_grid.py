@@ -1,0 +1,106 @@
+"""Frequencies at which a specification becomes a finite programme."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.models import ARModel, Spectrum
+from lbt_synth.models.truth import breakpoints_below
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_ORDER = 5
+_BAND_POINTS = 15
+_MOST_EDGES = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Grid:
+    """Nodes of the variances' quadrature, and points of the bounds."""
+
+    # nodes_hz, weights_hz (F,): quadrature over 0 to the Nyquist frequency
+    nodes_hz: FloatArray
+    weights_hz: FloatArray
+    # (P,): where bounds over frequency are imposed; added to until they hold between
+    points_hz: FloatArray
+
+    def within(self, low_hz: float, high_hz: float) -> FloatArray:
+        """Points of a band, its ends and some more included."""
+        inside = self.points_hz[(self.points_hz > low_hz) & (self.points_hz < high_hz)]
+        return np.unique(np.concatenate([inside, np.linspace(low_hz, high_hz, _BAND_POINTS)]))
+
+    def with_points(self, frequency_hz: FloatArray) -> Grid:
+        """Return the grid with further points."""
+        return replace(self, points_hz=np.unique(np.concatenate([self.points_hz, frequency_hz])))
+
+
+def first_grid(
+    frame_rate_hz: float,
+    *,
+    bands_hz: tuple[tuple[float, float], ...],
+    poles: ComplexArray,
+    breakpoints_hz: FloatArray,
+    fineness: int = 1,
+) -> Grid:
+    """Panels that are geometric at low frequencies, finer in the bands and at slow poles.
+
+    Shapes: bands_hz list of (low, high), poles (n,), breakpoints_hz (b,).
+    """
+    nyquist = frame_rate_hz / 2
+    edges = [
+        np.array([0.0]),
+        np.geomspace(6e-5, 0.01, 13 * fineness + 1) * frame_rate_hz,
+        np.geomspace(0.0125, 0.5, 24 * fineness + 1) * frame_rate_hz,
+    ]
+    edges.append(breakpoints_hz)
+    for low, high in bands_hz:
+        width = high - low
+        edges.append(
+            np.linspace(max(low - width, 0), min(high + width, nyquist), 12 * fineness + 1)
+        )
+    for pole in poles:
+        centre, width = abs(np.angle(pole)), 1 - abs(pole)
+        if width < 0.05:
+            offsets = np.array([-4.0, -1.0, 1.0, 4.0]) * width
+            edges.append((centre + offsets) / (2 * np.pi) * frame_rate_hz)
+    every = np.unique(np.clip(np.concatenate(edges), 0, nyquist))
+    every = every[np.concatenate([[True], np.diff(every) > 1e-8 * nyquist])]
+    nodes, weights = gauss_panels(every, _ORDER)
+    points = np.unique(np.concatenate([np.linspace(0, nyquist, 128 * fineness), every]))
+    return Grid(nodes_hz=nodes, weights_hz=weights, points_hz=points)
+
+
+def fine_frequencies(frame_rate_hz: float, poles: ComplexArray, count: int) -> FloatArray:
+    """Frequencies at which the bounds are watched between the points [Hz]."""
+    even = np.linspace(0, 0.5, count)
+    low = np.geomspace(1e-5, 0.1, count // 2)
+    centres, widths = np.abs(np.angle(poles)) / (2 * np.pi), (1 - np.abs(poles)) / (2 * np.pi)
+    offsets = np.linspace(-3, 3, 13)
+    near = (centres[:, None] + widths[:, None] * offsets).ravel()
+    return np.unique(np.clip(np.concatenate([even, low, near]), 0, 0.5)) * frame_rate_hz
+
+
+def spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
+    """Frequencies at which a spectrum has kinks or lines, for panels of a quadrature [Hz]."""
+    if spectrum is None:
+        return np.zeros(0)
+    if isinstance(spectrum, ARModel):
+        poles = np.linalg.eigvals(spectrum.companion)
+        centres, widths = np.abs(np.angle(poles)), 1 - np.abs(poles)
+        offsets = np.array([-16.0, -4.0, -1.0, 0.0, 1.0, 4.0, 16.0])
+        angles = (centres[:, None] + widths[:, None] * offsets).ravel()
+        return np.asarray(np.clip(angles * spectrum.frame_rate_hz / (2 * np.pi), 0, nyquist_hz))
+    return breakpoints_below(spectrum, nyquist_hz)
+
+
+def thinned(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
+    """Return these edges, but not more than a programme can carry: the highest of many [Hz]."""
+    edges = spectrum_edges(spectrum, nyquist_hz)
+    if spectrum is None or edges.size <= _MOST_EDGES:
+        return edges
+    power = np.asarray(spectrum.psd(edges)) * np.gradient(edges)
+    high = np.argsort(power)[-_MOST_EDGES // 2 :]
+    even = np.arange(0, edges.size, max(edges.size // (_MOST_EDGES // 2), 1))
+    return np.asarray(edges[np.unique(np.concatenate([high, even]))])

@@ -1,0 +1,51 @@
+"""Specifications as plain metadata, and back."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.design.shaping.demand_types import DEMANDS
+from lbt_synth.design.shaping.objectives import ResidualVariance, Total, VibrationBand, Worst
+from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.models import ARModel, Atmosphere, TabulatedSpectrum
+
+_KINDS: dict[str, type[Any]] = {
+    kind.__name__: kind
+    for kind in (
+        *DEMANDS,
+        Specification,
+        ResidualVariance,
+        VibrationBand,
+        Total,
+        Worst,
+        Atmosphere,
+        ARModel,
+        TabulatedSpectrum,
+    )
+}
+
+
+def packed(value: Any) -> Any:
+    """Return a specification, or a part of it, as what JSON knows."""
+    name = type(value).__name__
+    if name in _KINDS:
+        return {"kind": name, **{f.name: packed(getattr(value, f.name)) for f in fields(value)}}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [packed(v) for v in value]
+    return value
+
+
+def unpacked(data: Any) -> Any:
+    """Rebuild what :func:`packed` wrote; an unknown kind raises KeyError, a bad value its own."""
+    if isinstance(data, dict):
+        values = dict(data)
+        kind = _KINDS[values.pop("kind")]
+        return kind(**{key: unpacked(v) for key, v in values.items()})
+    if isinstance(data, list):
+        return tuple(unpacked(v) for v in data)
+    return data

@@ -1,0 +1,309 @@
+"""What a shaped loop minimises: variances and worst vibrations, their sum or their largest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+
+from lbt_synth.design.shaping.band import Band
+from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.exact_evaluation import MeasuredLoop
+from lbt_synth.design.shaping.frequency_grid import Grid
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear.convex_functions import Combined, Fractions, Function
+from lbt_synth.linear.norms import band_norm
+from lbt_synth.loop import residual_budget
+from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth
+from lbt_synth.validation import ComplexArray, FloatArray, number, sequence
+
+
+def checked_spectrum(value: object, name: str) -> None:
+    """Refuse a spectrum that cannot be written into a gain file."""
+    if value is not None and not isinstance(value, ARModel | Atmosphere | TabulatedSpectrum):
+        raise ProblemError(
+            f"{name} must be an Atmosphere, an ARModel, a TabulatedSpectrum or None; got "
+            f"{type(value).__name__}. Sample it into a TabulatedSpectrum."
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualVariance:
+    """Variance of turbulence and noise in the residual of one mode.
+
+    Parameters
+    ----------
+    turbulence : Atmosphere, ARModel, TabulatedSpectrum or None
+        Spectrum of the mode.
+    noise_nm : float
+        Measurement noise of the mode, per frame [nm].
+    sensor_gain : float, optional
+        Sensor gain at which the loop runs, relative to the one it is designed for.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range, or there is neither turbulence nor noise.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.ResidualVariance(turbulence=None, noise_nm=15.5).sensor_gain
+    1.0
+    """
+
+    turbulence: Spectrum | None
+    noise_nm: float
+    sensor_gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        checked_spectrum(self.turbulence, "turbulence")
+        set_ = object.__setattr__
+        set_(self, "noise_nm", number(self.noise_nm, "noise_nm", at_least=0))
+        set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+        if self.turbulence is None and self.noise_nm == 0:
+            raise ProblemError("a variance needs turbulence or noise; got neither.")
+
+    @property
+    def label(self) -> str:
+        """What a table calls it."""
+        return f"turbulence and noise at sensor gain {self.sensor_gain:g}"
+
+    @property
+    def bands_hz(self) -> tuple[tuple[float, float], ...]:
+        """Bands that the grid should resolve."""
+        return ()
+
+    def function(self, channel: Channel, grid: Grid) -> Fractions:
+        """Return the variance over a grid as a function of the coefficients [nm^2]."""
+        f, w = grid.nodes_hz, grid.weights_hz
+        complementary = channel.complementary_rows(f)
+        density = np.zeros(f.size) if self.turbulence is None else self.turbulence.psd(f)
+        size = np.sqrt(w * density)
+        noise = self.noise_nm * np.sqrt(w / channel.nyquist_hz)
+        rows = np.stack(
+            [-size[:, None] * complementary, noise[:, None] * channel.noise_rows(f)], axis=1
+        )
+        centres = np.stack([size, np.zeros(f.size)], axis=1).astype(np.complex128)
+        return Fractions(
+            frequency_hz=f,
+            rows=rows,
+            centres=centres,
+            steering=_steering(complementary, self.sensor_gain),
+            worst=False,
+        )
+
+    def measured_nm2(self, loop: MeasuredLoop) -> float:
+        """Return the variance in the real loop, exactly."""
+        truth = Truth(
+            turbulence=self.turbulence, noise_nm=self.noise_nm, sensor_gain=self.sensor_gain
+        )
+        return residual_budget(loop.at(self.sensor_gain), truth).rms_nm ** 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VibrationBand(Band):
+    """Worst residual of a vibration that may be anywhere in a band of frequencies.
+
+    Parameters
+    ----------
+    low_hz, high_hz : float
+        Ends of the band [Hz].
+    rms_nm : float
+        Standard deviation of the vibration, a sinusoid [nm rms wavefront].
+    sensor_gain : float, optional
+        Sensor gain at which the loop runs, relative to the one it is designed for.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797).bands_hz
+    ((16.5, 23.5),)
+    """
+
+    rms_nm: float
+    sensor_gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        Band.__post_init__(self)
+        set_ = object.__setattr__
+        set_(self, "rms_nm", number(self.rms_nm, "rms_nm", above=0))
+        set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+
+    @property
+    def label(self) -> str:
+        """What a table calls it."""
+        return f"vibration in {self.band_text} at sensor gain {self.sensor_gain:g}"
+
+    @property
+    def bands_hz(self) -> tuple[tuple[float, float], ...]:
+        """Bands that the grid should resolve."""
+        return ((self.low_hz, self.high_hz),)
+
+    def function(self, channel: Channel, grid: Grid) -> Fractions:
+        """Return the worst variance over a grid as a function of the coefficients [nm^2]."""
+        f = grid.within(self.low_hz, self.high_hz)
+        complementary = channel.complementary_rows(f)
+        return Fractions(
+            frequency_hz=f,
+            rows=-self.rms_nm * complementary[:, None, :],
+            centres=np.full((f.size, 1), self.rms_nm, dtype=np.complex128),
+            steering=_steering(complementary, self.sensor_gain),
+            worst=True,
+        )
+
+    def measured_nm2(self, loop: MeasuredLoop) -> float:
+        """Return the worst variance in the real loop, by level sets."""
+        rejection = loop.at(self.sensor_gain).rejection()
+        return (self.rms_nm * band_norm(rejection, self.low_hz, self.high_hz).upper) ** 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Several:
+    largest: ClassVar[bool] = False  # of the terms, instead of their sum
+
+    terms: tuple[Term, ...]
+    weights: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        terms = sequence(self.terms, "terms")
+        for term in terms:
+            require_term(term)
+        if not terms:
+            raise ProblemError("an objective needs at least one term; got none.")
+        given = (1.0,) * len(terms) if self.weights is None else sequence(self.weights, "weights")
+        if len(given) != len(terms):
+            raise ProblemError(f"weights must be one a term, {len(terms)}; got {len(given)}.")
+        object.__setattr__(self, "terms", terms)
+        object.__setattr__(self, "weights", tuple(number(w, "weights", above=0) for w in given))
+
+    @property
+    def factors(self) -> tuple[float, ...]:
+        """Weights of the terms."""
+        assert self.weights is not None  # set by __post_init__
+        return self.weights
+
+    @property
+    def bands_hz(self) -> tuple[tuple[float, float], ...]:
+        """Bands that the grid should resolve."""
+        return tuple(band for term in self.terms for band in term.bands_hz)
+
+    def function(self, channel: Channel, grid: Grid) -> Function:
+        """Return the objective over a grid as a function of the coefficients [nm^2]."""
+        return Combined(
+            parts=tuple(term.function(channel, grid) for term in self.terms),
+            weights=self.factors,
+            worst=self.largest,
+        )
+
+    def measured_nm2(self, loop: MeasuredLoop) -> float:
+        """Return the objective of the real loop [nm^2]."""
+        values = [
+            weight * term.measured_nm2(loop)
+            for weight, term in zip(self.factors, self.terms, strict=True)
+        ]
+        return max(values) if self.largest else sum(values)
+
+
+class Total(_Several):
+    """Weighted sum of terms.
+
+    Parameters
+    ----------
+    terms : sequence of ResidualVariance, VibrationBand, Total or Worst
+        What is added up.
+    weights : sequence of float, optional
+        One a term; 1 by default.
+
+    Raises
+    ------
+    ProblemError
+        If there is no term, or the weights do not fit.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> noise = lbt.design.shaping.ResidualVariance(turbulence=None, noise_nm=15.5)
+    >>> line = lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797)
+    >>> lbt.design.shaping.Total(terms=(noise, line)).factors
+    (1.0, 1.0)
+    """
+
+    __slots__ = ()
+
+
+class Worst(_Several):
+    """Largest of weighted terms.
+
+    Parameters
+    ----------
+    terms : sequence of ResidualVariance, VibrationBand, Total or Worst
+        What is compared.
+    weights : sequence of float, optional
+        One a term; 1 by default.
+
+    Raises
+    ------
+    ProblemError
+        If there is no term, or the weights do not fit.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> low = lbt.design.shaping.VibrationBand(low_hz=10, high_hz=12, rms_nm=100)
+    >>> high = lbt.design.shaping.VibrationBand(low_hz=40, high_hz=45, rms_nm=100)
+    >>> lbt.design.shaping.Worst(terms=(low, high), weights=(1, 2)).factors
+    (1.0, 2.0)
+    """
+
+    __slots__ = ()
+    largest = True
+
+
+Leaf: TypeAlias = ResidualVariance | VibrationBand
+Term: TypeAlias = ResidualVariance | VibrationBand | _Several
+
+
+def require_term(term: object) -> None:
+    """Refuse anything that is not a term of an objective."""
+    if not isinstance(term, ResidualVariance | VibrationBand | _Several):
+        raise ProblemError(
+            "an objective is made of ResidualVariance, VibrationBand, Total and Worst; got "
+            f"{type(term).__name__}."
+        )
+
+
+def leaves(term: Term) -> tuple[Leaf, ...]:
+    """Variances and vibrations of an objective, in order."""
+    if isinstance(term, _Several):
+        return tuple(leaf for part in term.terms for leaf in leaves(part))
+    return (term,)
+
+
+def _steering(complementary: ComplexArray, sensor_gain: float) -> ComplexArray | None:
+    return None if sensor_gain == 1 else (1 - sensor_gain) * complementary
+
+
+def spread_weights(term: Term, frequency_hz: FloatArray) -> FloatArray:
+    """How much an error of T costs at each frequency, up to a factor: spectra and bands."""
+    cost = np.zeros(frequency_hz.size)
+    for leaf in leaves(term):
+        if isinstance(leaf, VibrationBand):
+            inside = (frequency_hz >= leaf.low_hz) & (frequency_hz <= leaf.high_hz)
+            cost += np.where(inside, 3 * leaf.rms_nm**2 / (leaf.high_hz - leaf.low_hz), 0.0)
+        elif leaf.turbulence is not None:
+            cost += leaf.turbulence.psd(frequency_hz)
+    return cost
+
+
+def noise_level(term: Term) -> float:
+    """Largest noise of an objective [nm]."""
+    return max(
+        (leaf.noise_nm for leaf in leaves(term) if isinstance(leaf, ResidualVariance)), default=0.0
+    )

@@ -1,0 +1,141 @@
+"""From a long Youla parameter to one of few poles, with the programme solved anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.design.shaping.basis import orthonormal_basis
+from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.exact_evaluation import mode_loop
+from lbt_synth.design.shaping.objectives import noise_level, spread_weights
+from lbt_synth.design.shaping.pole_fit import (
+    first_poles,
+    fitted_poles,
+    leaving_out,
+    without_least_pair,
+)
+from lbt_synth.design.shaping.sequence import SequenceResult, solve_sequence
+from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.errors import InfeasibleError, NumericalError
+from lbt_synth.linear import Controller
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_FLAT = 0.3  # weight of the whole response in the fit of poles, beside the spectra
+_INTEGRAL = 2e-3  # by which the objective over the grid may miss that of the real loop
+_SLOW_HZ = (0.002, 0.004, 0.008)  # where turbulence meets the noise, of the frame rate: starts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solved:
+    """A solved specification in one basis."""
+
+    sequence: SequenceResult  # How it was solved
+    objective_nm: float  # Root of the objective in the real loop [nm]
+
+    @property
+    def parameter(self) -> Controller:
+        """The Youla parameter."""
+        return self.sequence.channel.basis.parameter(self.sequence.coefficients)
+
+
+def solved(spec: Specification, channel: Channel, *, start: FloatArray | None = None) -> Solved:
+    """Solve in a basis, on a grid that is fine enough for the objective."""
+    miss = np.inf
+    for fineness in (1, 2, 4):
+        sequence = solve_sequence(spec, channel, start=start, fineness=fineness)
+        parameter = channel.basis.parameter(sequence.coefficients)
+        loop = mode_loop(channel.hardware, parameter)
+        exact = spec.objective.measured_nm2(loop)
+        miss = abs(sequence.objective_nm2 / exact - 1)
+        if miss < _INTEGRAL and all(check.passed for check in spec.checks(loop)):
+            return Solved(sequence=sequence, objective_nm=float(np.sqrt(exact)))
+    raise NumericalError(
+        f"the objective over the frequencies of the programme misses that of the real loop by "
+        f"{miss:.2g}, expected {_INTEGRAL:g}, or a bound is exceeded between them. Try "
+        "fewer functions, a smoother spectrum, or wider bands.",
+        status="quadrature",
+    )
+
+
+def reduced(
+    spec: Specification, long: Solved, order: int, tolerance: float, *, fewest: bool = True
+) -> Solved:
+    """Fewest poles whose programme keeps the objective within a tolerance."""
+    sequence = long.sequence
+    hardware, f = sequence.channel.hardware, sequence.grid.nodes_hz
+    angles = 2 * np.pi * f * hardware.dt_s
+    target = sequence.channel.command_rows(f) @ sequence.coefficients
+    weight = _fit_weight(spec, sequence)
+    bands = tuple(
+        (2 * np.pi * low * hardware.dt_s, 2 * np.pi * high * hardware.dt_s)
+        for low, high in spec.objective.bands_hz
+    )
+    starts = [
+        fitted_poles(
+            angles,
+            target,
+            weight,
+            first_poles(order, bands=tuple(dict.fromkeys(bands)), noise_rad=2 * np.pi * slow),
+        )
+        for slow in _SLOW_HZ
+    ]
+    candidates = [min(starts, key=lambda start: start[1])[0]]
+    while fewest and candidates[-1].size > 2 and np.any(candidates[-1].imag):
+        fewer = without_least_pair(
+            candidates[-1], leaving_out(angles, target, weight, candidates[-1])
+        )
+        candidates.append(fitted_poles(angles, target, weight, fewer)[0])
+
+    def attempt(index: int) -> tuple[Solved | None, float]:
+        found = _with_poles(spec, sequence, candidates[index], target, weight)
+        return found, np.inf if found is None else found.objective_nm / long.objective_nm - 1
+
+    accepted, loss = attempt(0)
+    if accepted is None or loss > tolerance:
+        best = f"the best lost {100 * loss:.3g} %" if np.isfinite(loss) else "none was feasible"
+        raise InfeasibleError(
+            f"no controller of {order + hardware.mirror_system.whole.n_states} states a mode came "
+            f"within {100 * tolerance:.3g} % of the long parameter's {long.objective_nm:.4g} nm "
+            f"(root of the whole objective): {best}. Allow more states or a larger loss."
+        )
+    kept, failed = 0, len(candidates)
+    while failed - kept > 1:  # fewer poles lose more: halve what is not decided
+        middle = (kept + failed) // 2
+        found, loss = attempt(middle)
+        if found is not None and loss <= tolerance:
+            kept, accepted = middle, found
+        else:
+            failed = middle
+    return accepted
+
+
+def _with_poles(
+    spec: Specification,
+    long: SequenceResult,
+    poles: ComplexArray,
+    target: ComplexArray,
+    weight: FloatArray,
+) -> Solved | None:
+    """Solve the specification with given poles; None if that cannot be done."""
+    hardware = long.channel.hardware
+    channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
+    # start from the fit of the long response
+    rows = weight[:, None] * channel.command_rows(long.grid.nodes_hz)
+    goal = weight * target
+    start = np.linalg.lstsq(
+        np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
+    )[0]
+    try:
+        return solved(spec, channel, start=start)
+    except (InfeasibleError, NumericalError):
+        return None
+
+
+def _fit_weight(spec: Specification, sequence: SequenceResult) -> FloatArray:
+    """Weight of an error of the parameter at the nodes: spectra, and some everywhere."""
+    f, w = sequence.grid.nodes_hz, sequence.grid.weights_hz
+    nyquist = sequence.channel.nyquist_hz
+    cost = w * (spread_weights(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
+    return np.asarray(np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist))

@@ -1,0 +1,226 @@
+"""Stability against what is not known: sensor gain, delay, mirror."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.design.certificate import Check
+from lbt_synth.design.shaping.band import Band
+from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.exact_evaluation import MeasuredLoop, through_taps
+from lbt_synth.design.shaping.frequency_grid import Grid
+from lbt_synth.design.shaping.grid_tightening import LEVEL_SETS, ROOM, discs
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import StateSpace, hinf_norm
+from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
+from lbt_synth.linear.norms import band_norm, largest_real_part
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorGainRange:
+    """Guaranteed stability for every sensor gain of an interval.
+
+    The loop is stable at g while ``1 - (1 - g) T`` does not vanish: the real part of T is
+    kept below ``1 / (1 - low)`` and above ``-1 / (high - 1)``, which is convex.
+
+    Parameters
+    ----------
+    low, high : float
+        Ends of the interval, around 1 (the gain that is designed for).
+
+    Raises
+    ------
+    ProblemError
+        If the interval does not hold 1, or is not positive.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.SensorGainRange(low=0.25, high=1.3).label
+    'stability for sensor gains 0.25 to 1.3'
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        hint = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
+        set_ = object.__setattr__
+        set_(self, "low", number(self.low, "low", above=0, at_most=1, hint=hint))
+        set_(self, "high", number(self.high, "high", at_least=1, hint=hint))
+
+    @property
+    def label(self) -> str:
+        """What a message calls it."""
+        return f"stability for sensor gains {self.low:g} to {self.high:g}"
+
+    def _bounds(self) -> tuple[tuple[float, float], ...]:
+        """Signs and bounds of the real part of T."""
+        ends = ((1.0, 1 - self.low), (-1.0, self.high - 1))
+        return tuple((sign, 1 / change) for sign, change in ends if change > 0)
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints at the points of a grid."""
+        f = grid.points_hz
+        rows = channel.complementary_rows(f).real
+        return tuple(
+            HalfPlanes(frequency_hz=f, rows=sign * rows, bounds=np.full(f.size, (1 - ROOM) * bound))
+            for sign, bound in self._bounds()
+        )
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check the real loop."""
+        T = loop.complementary
+        return tuple(
+            Check(
+                name="real part of the complementary sensitivity, "
+                + ("largest" if sign > 0 else "least, negated"),
+                value=largest_real_part(
+                    StateSpace(A=T.A, B=T.B, C=sign * T.C, D=sign * T.D, dt_s=T.dt_s)
+                ),
+                limit=bound,
+                method=LEVEL_SETS,
+            )
+            for sign, bound in self._bounds()
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DelayError:
+    """Guaranteed stability for every error of the delay up to a bound, late or early.
+
+    Delays, fractions included, are those of :class:`LoopHardware`: with the mirror's response
+    ``M_d`` at a delay d, the loop stays stable at ``d + e`` while
+    ``|M_(d+e) - M_d| |Q| < 1``. The response is piecewise linear in e, so the ends of the
+    interval and the whole delays within it stand for all of it. A delay below one frame does
+    not occur.
+
+    Parameters
+    ----------
+    frames : float
+        Largest error [frames], at most 1.
+
+    Raises
+    ------
+    ProblemError
+        If it is out of its range; in a design, if the mirror has dynamics.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.DelayError(frames=0.25).frames
+    0.25
+    """
+
+    frames: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frames", number(self.frames, "frames", above=0, at_most=1))
+
+    @property
+    def label(self) -> str:
+        """What a message calls it."""
+        return f"stability for delay errors up to {self.frames:g} frames"
+
+    def _differences(self, hardware: LoopHardware) -> list[tuple[float, FloatArray]]:
+        """Delays that stand for all, and the taps of ``M_(d+e) - M_d``."""
+        if hardware.mirror is not None:
+            raise ProblemError(
+                "a bound for all delay errors needs a mirror that settles at once, whose response "
+                "is piecewise linear in the delay; got one with dynamics. Try MirrorUncertainty, "
+                "or a design for mirror=None and its map at delay errors."
+            )
+        d = hardware.delay_frames
+        low, high = max(d - self.frames, 1.0), d + self.frames
+        whole = np.arange(np.ceil(low), np.floor(high) + 1)
+        out = []
+        for other in np.unique(np.concatenate([[low, high], whole])):
+            if other != d:
+                there = replace(hardware, delay_frames=float(other)).mirror_taps
+                taps = np.zeros(max(there.size, hardware.mirror_taps.size))
+                taps[: there.size] += there
+                taps[: hardware.mirror_taps.size] -= hardware.mirror_taps
+                out.append((float(other), taps))
+        return out
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints at the points of a grid."""
+        f = grid.points_hz
+        rows = channel.command_rows(f)
+        powers = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None] ** np.arange(102)
+        return tuple(
+            discs(f, (powers[:, : taps.size] @ taps)[:, None] * rows, np.zeros(f.size), 1 - ROOM)
+            for _, taps in self._differences(channel.hardware)
+        )
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check the real loop."""
+        return tuple(
+            Check(
+                name=f"loop change by a delay of {other:g} frames",
+                value=hinf_norm(through_taps(loop.parameter, taps)).upper,
+                limit=1.0,
+                method=LEVEL_SETS,
+            )
+            for other, taps in self._differences(loop.hardware)
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MirrorUncertainty(Band):
+    """Guaranteed stability for any unmodelled mirror dynamics below a relative size.
+
+    The mirror's response is ``M (1 + delta)`` with ``|delta| <= relative`` in the band (and
+    stable): the loop stays stable while ``relative |T| < 1`` there. Give one for each band.
+
+    Parameters
+    ----------
+    relative : float
+        Largest relative error of the response.
+    low_hz, high_hz : float
+        Ends of the band [Hz]; up to the Nyquist frequency for all that lies above.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.MirrorUncertainty(relative=0.5, low_hz=150, high_hz=400).relative
+    0.5
+    """
+
+    relative: float
+
+    def __post_init__(self) -> None:
+        Band.__post_init__(self)
+        object.__setattr__(self, "relative", number(self.relative, "relative", above=0))
+
+    @property
+    def label(self) -> str:
+        """What a message calls it."""
+        return f"stability for mirror errors of {self.relative:g} in {self.band_text}"
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints at the points of a grid."""
+        f = grid.within(self.low_hz, self.high_hz)
+        rows = channel.complementary_rows(f)
+        return (discs(f, rows, np.zeros(f.size), (1 - ROOM) / self.relative),)
+
+    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+        """Check the real loop."""
+        return (
+            Check(
+                name=f"|T| in {self.band_text} times the mirror's error",
+                value=self.relative
+                * band_norm(loop.complementary, self.low_hz, self.high_hz).upper,
+                limit=1.0,
+                method="level sets, all of the band",
+            ),
+        )

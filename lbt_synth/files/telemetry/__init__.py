@@ -1,0 +1,1 @@
+"""Telemetry of a loop: a record, its files, and those of the AOT standard."""

@@ -1,0 +1,373 @@
+"""Telemetry in the layout of the Adaptive Optics Telemetry standard, through ``aotpy``.
+
+Standard: T. Gomes et al., A&A (2024), DOI 10.1051/0004-6361/202348486; version 2.0.0.
+It wants commands in metres, has no field for the true phase, and describes a controller by a
+control matrix and one transfer function a mode, not by a state space. What of a telemetry
+is lost, :func:`losses` tells.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lbt_synth.errors import OutputError, TelemetryError
+from lbt_synth.files.telemetry.layout import with_same_taps
+from lbt_synth.files.telemetry.record import Telemetry
+from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
+from lbt_synth.models import PositionLoop
+from lbt_synth.storage.array_file import reason
+from lbt_synth.storage.fits import has_card
+from lbt_synth.validation import FloatArray
+
+_CARD_OF_OURS = "LBTSYNTH"  # one card with what the standard has no field for, JSON
+_IN_OURS = ("seed", "name", "controller_name", "controller_digest", "metadata")
+_NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
+_RAD_PER_MAS = np.pi / 180 / 3600e3
+_FOREIGN = "that of another program: which exposure a row is of, the AOT standard does not say"
+_UNSAFE = "'&/"  # signs that a FITS text over several cards does not keep in every place
+_INSTALL = 'it needs aotpy: pip install "lbt-synth[aot]"'
+
+
+def is_aot(content: bytes) -> bool:
+    """Whether the first header of a FITS file says that it is of the standard."""
+    return has_card(content, "AOT-VERS")
+
+
+def losses(telemetry: Telemetry) -> tuple[str, ...]:
+    """Fields that are set in a telemetry, and that the standard does not hold."""
+    without = ["residual_nm", "total_nm", "controller"]
+    if telemetry.diameter_m is None:
+        without.append("obstruction")  # it is a diameter there
+    return tuple(name for name in without if getattr(telemetry, name) is not None)
+
+
+def _aotpy() -> Any:
+    import aotpy
+
+    return aotpy
+
+
+def require_aotpy(target: Path) -> Any:
+    """Return the module; refuse to write a file where it is missing."""
+    try:
+        return _aotpy()
+    except ImportError as error:
+        raise OutputError(f"cannot write {target}: {_INSTALL}.", path=target) from error
+
+
+def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
+    """Return the file."""
+    from astropy.io import fits
+
+    aotpy = require_aotpy(target)
+    plain, checked = io.BytesIO(), io.BytesIO()
+    aotpy.AOTFITSWriter(_system(aotpy, telemetry, precision)).get_hdulist().writeto(plain)
+    # astropy's checksum of a table is right only once the table has been in a file
+    with fits.open(io.BytesIO(plain.getvalue()), memmap=False) as units:
+        for unit in units:
+            unit.add_checksum(when="of this unit")
+        units.writeto(checked)
+    return checked.getvalue()
+
+
+def _system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
+    """Describe telemetry as a system of aotpy."""
+    telescope = aotpy.MainTelescope(
+        "Telescope",
+        enclosing_diameter=seen.diameter_m,
+        inscribed_diameter=seen.diameter_m,
+        obstruction_diameter=(
+            None
+            if seen.diameter_m is None or seen.obstruction is None
+            else seen.diameter_m * seen.obstruction
+        ),
+    )
+    star = aotpy.NaturalGuideStar("Guide star")
+    clock = aotpy.Time("Frames", frame_numbers=list(map(float, range(seen.frames))))
+    if seen.times_s is not None:
+        clock.timestamps = seen.times_s.tolist()
+
+    def image(
+        name: str, data: npt.NDArray[Any] | None, unit: str = "", *, timed: bool = False
+    ) -> Any:
+        if data is None:
+            return None
+        stored = data.astype(np.float32 if timed and precision == "float32" else np.float64)
+        return aotpy.Image(name, stored, unit=unit or None, time=clock if timed else None)
+
+    axes, subapertures = seen.subaperture_axes, seen.sensed.shape[1] // seen.subaperture_axes
+    slopes = seen.slopes is not None
+    sensed_unit = seen.slope_unit if slopes else seen.measurement_unit
+    sensor = aotpy.Pyramid(
+        "Pyramid",
+        source=star,
+        dimensions=axes,
+        n_valid_subapertures=subapertures,
+        n_sides=4,
+        measurements=image(
+            "MEASUREMENTS",
+            seen.sensed.reshape(seen.frames, axes, subapertures),
+            sensed_unit,
+            timed=True,
+        ),
+        optical_gain=image(
+            "OPTICAL GAIN", None if seen.sensor_gain is None else np.array([seen.sensor_gain])
+        ),
+    )
+    m = seen.commands.shape[1]
+    if m == 2:
+        mirror = aotpy.TipTiltMirror("Mirror", telescope=telescope)
+    else:
+        mirror = aotpy.DeformableMirror("Mirror", telescope=telescope, n_valid_actuators=m)
+    metres, command_unit = (1e-9, "m") if seen.command_unit == "nm" else (1.0, seen.command_unit)
+    filters = _filters(seen)
+    matrix = None if filters is None else filters.matrix
+    if matrix is not None and slopes:
+        matrix = None if seen.reconstructor is None else matrix @ seen.reconstructor
+    response = seen.interaction_matrix  # (s, n) to (s_v, d, n)
+    loop = aotpy.ControlLoop(
+        "Control loop",
+        input_sensor=sensor,
+        commanded_corrector=mirror,
+        time=clock,
+        commands=image("COMMANDS", metres * seen.commands, command_unit, timed=True),
+        framerate=seen.frame_rate_hz,
+        delay=seen.delay_frames,
+        time_filter_num=image("TIME FILTER NUM", None if filters is None else filters.numerators),
+        time_filter_den=image("TIME FILTER DEN", None if filters is None else filters.denominators),
+        modes=image("MODES", seen.mode_maps),
+        modal_coefficients=image(
+            "MODAL COEFFICIENTS",
+            seen.measurements if slopes else None,
+            seen.measurement_unit,
+            timed=True,
+        ),
+        control_matrix=image("CONTROL MATRIX", _by_subaperture(matrix, axes)),
+        residual_commands=image(
+            "RESIDUAL COMMANDS",
+            None if filters is None else metres * seen.measurements @ filters.matrix.T,
+            command_unit,
+            timed=True,
+        ),
+        measurements_to_modes=image(
+            "MEASUREMENTS TO MODES", _by_subaperture(seen.reconstructor, axes)
+        ),
+        modes_to_measurements=image(
+            "MODES TO MEASUREMENTS",
+            None
+            if response is None
+            else response.reshape(axes, subapertures, -1).transpose(1, 0, 2),
+        ),
+        commands_to_modes=image("COMMANDS TO MODES", seen.influence_matrix),
+    )
+    cameras = []
+    if seen.psf is not None:
+        pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
+        detector = aotpy.Detector(
+            "Camera detector",
+            pixel_intensities=image("PSF", seen.psf[None]),
+            pixel_scale=pixel,
+        )
+        cameras.append(aotpy.ScoringCamera("Camera", detector=detector, wavelength=_metres(seen)))
+    return aotpy.AOSystem(
+        ao_mode="SCAO",
+        name=_ascii(seen.name) or None,
+        strehl_ratio=seen.strehl,
+        config=seen.convention
+        + " Time filters: sum b_i z^i / sum a_i z^i, after the control matrix.",
+        main_telescope=telescope,
+        sources=[star],
+        scoring_cameras=cameras,
+        wavefront_sensors=[sensor],
+        wavefront_correctors=[mirror],
+        loops=[loop],
+        metadata=_cards(aotpy, seen),
+    )
+
+
+def _cards(aotpy: Any, seen: Telemetry) -> list[Any]:
+    """Cards of the primary header that the tables have no place for."""
+    ours = {name: getattr(seen, name) for name in _IN_OURS} | {"metadata": dict(seen.metadata)}
+    gains = seen.integrator_gains
+    ours["integrator_gains"] = None if gains is None else gains.tolist()
+    ours["psf_pixel_mas"] = seen.psf_pixel_mas if seen.psf is None else None
+    if seen.mirror is not None and seen.mirror_taps is not None:
+        # the standard's TFZ_NUM and TFZ_DEN of a corrector: of what, and with which delay, it
+        # does not say
+        ours["mirror"], ours["mirror_taps"] = asdict(seen.mirror), seen.mirror_taps.tolist()
+    if seen.controller is not None:
+        ours["controller_states"] = seen.controller.n_states
+    text = json.dumps(ours, allow_nan=False)
+    for sign in _UNSAFE:  # they are in texts only, where JSON may write them by their number
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    cards = [aotpy.Metadatum(_CARD_OF_OURS, text)]
+    if (wavelength := _metres(seen)) is not None:
+        # aotpy 3.2.1 writes its strehl_wavelength over the Strehl ratio
+        cards.append(aotpy.Metadatum("STREHL-L", wavelength))
+    return cards
+
+
+def _filters(seen: Telemetry) -> TimeFilters | None:
+    if seen.controller is not None:
+        return time_filters(seen.controller)
+    gains, (m, q) = seen.integrator_gains, (seen.commands.shape[1], seen.measurements.shape[1])
+    if gains is None or m != q:
+        return None
+    return TimeFilters(
+        matrix=np.eye(m),
+        numerators=np.outer(gains, [0.0, 1.0]),
+        denominators=np.tile([-1.0, 1.0], (m, 1)),
+    )
+
+
+def _by_subaperture(matrix: FloatArray | None, axes: int) -> FloatArray | None:
+    """Reshape (rows, s) to (rows, d, s_v)."""
+    return None if matrix is None else matrix.reshape(len(matrix), axes, -1)
+
+
+def _metres(seen: Telemetry) -> float | None:
+    wavelength = seen.imaging_wavelength_um
+    return None if wavelength is None else wavelength * 1e-6
+
+
+def _ascii(text: str) -> str:
+    safe = (c if c.isascii() and c.isprintable() and c not in _UNSAFE else "?" for c in text)
+    return "".join(safe).strip()
+
+
+def from_bytes(content: bytes, source: Path) -> Telemetry:
+    """Read what the standard carries of a telemetry: the first control loop that has series."""
+    try:
+        aotpy = _aotpy()
+    except ImportError as error:
+        raise TelemetryError(f"cannot read {source}: {_INSTALL}.", path=source) from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # foreign files deviate in many small ways
+        try:
+            # files and addresses that a file refers to are not opened
+            warnings.filterwarnings("error", message=".*verification failed")  # of a checksum
+            reader = aotpy.AOTFITSReader(
+                io.BytesIO(content), externals="disallow", memmap=False, checksum=True
+            )
+            system = reader.get_system()
+        except Exception as error:  # damage and deviations, in whatever way they show
+            raise TelemetryError(
+                f"{source} is no file of the AOT standard, or it is damaged: {reason(error)}.",
+                path=source,
+            ) from error
+    loops = [
+        loop
+        for loop in system.loops
+        if getattr(loop, "input_sensor", None) is not None
+        and loop.commands is not None
+        and loop.input_sensor.measurements is not None
+    ]
+    if not loops:
+        raise TelemetryError(
+            f"{source} has no control loop with commands and measurements.", path=source
+        )
+    fields = _series(loops[0]) | _facts(system)
+    if len(loops) > 1:
+        fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
+    taps = fields.pop("mirror_taps", None)
+    return with_same_taps(Telemetry(**fields), taps)
+
+
+def _facts(system: Any) -> dict[str, Any]:
+    """Fields that belong to the whole system."""
+    facts: dict[str, Any] = {"name": system.name or "", "strehl": system.strehl_ratio}
+    facts["metadata"] = {"timing": _FOREIGN}
+    for datum in system.metadata:
+        if datum.key == _CARD_OF_OURS:
+            ours = json.loads(datum.value)
+            facts |= {name: ours[name] for name in (*_IN_OURS, "integrator_gains", "psf_pixel_mas")}
+            if "mirror" in ours:
+                facts["mirror"] = PositionLoop(**ours["mirror"])
+                facts["mirror_taps"] = ours["mirror_taps"]
+    telescope = system.main_telescope
+    if telescope is not None:
+        facts["diameter_m"] = telescope.enclosing_diameter or telescope.inscribed_diameter
+        if facts["diameter_m"] and telescope.obstruction_diameter is not None:
+            facts["obstruction"] = telescope.obstruction_diameter / facts["diameter_m"]
+    wavelength = system.strehl_wavelength
+    for camera in system.scoring_cameras[:1]:
+        wavelength = camera.wavelength if wavelength is None else wavelength
+        detector = camera.detector
+        if detector is not None and detector.pixel_intensities is not None:
+            frames = np.asarray(detector.pixel_intensities.data, dtype=np.float64)
+            facts["psf"] = frames.mean(axis=0) if frames.ndim == 3 else frames
+            if detector.pixel_scale is not None:
+                facts["psf_pixel_mas"] = detector.pixel_scale / _RAD_PER_MAS
+    facts["imaging_wavelength_um"] = None if wavelength is None else wavelength * 1e6
+    return facts
+
+
+def _series(loop: Any) -> dict[str, Any]:
+    """Fields that belong to a loop and its sensor."""
+    sensor = loop.input_sensor
+    measured, unit = _data(sensor.measurements), sensor.measurements.unit
+    commands, command_unit = _in_nm(_data(loop.commands), loop.commands.unit or "m")
+    fields: dict[str, Any] = {
+        "commands": commands,
+        "command_unit": command_unit,
+        "delay_frames": loop.delay,
+        "subaperture_axes": measured.shape[1] if measured.ndim == 3 else 1,
+        "influence_matrix": _data(loop.commands_to_modes),
+        "mode_maps": _data(loop.modes),
+    }
+    flat = measured.reshape(len(measured), -1)
+    if loop.modal_coefficients is not None:
+        modal = loop.modal_coefficients
+        fields["slopes"], fields["slope_unit"] = flat, unit or ""
+        fields["measurements"], fields["measurement_unit"] = _in_nm(_data(modal), modal.unit or "")
+    else:
+        fields["measurements"], fields["measurement_unit"] = _in_nm(flat, unit or "")
+    back = _data(loop.measurements_to_modes)
+    fields["reconstructor"] = None if back is None else back.reshape(len(back), -1)
+    response = _data(loop.modes_to_measurements)
+    if response is not None:
+        if response.ndim == 3:  # (s_v, d, n) to (d s_v, n)
+            response = response.transpose(1, 0, 2).reshape(-1, response.shape[2])
+        fields["interaction_matrix"] = response
+    if sensor.optical_gain is not None:
+        fields["sensor_gain"] = float(np.mean(_data(sensor.optical_gain)))
+    clock = loop.time or loop.commands.time
+    if clock is not None and clock.timestamps:
+        fields["times_s"] = clock.timestamps
+    fields["frame_rate_hz"] = _rate(loop, fields.get("times_s"))
+    if loop.time_filter_num is not None and loop.time_filter_den is not None:
+        pair = (np.atleast_2d(_data(f)) for f in (loop.time_filter_num, loop.time_filter_den))
+        gains = integrator_gains(*pair)
+        m = commands.shape[-1]
+        if gains is not None and len(gains) in (1, m):  # one row is for all
+            fields["integrator_gains"] = np.broadcast_to(gains, (m,))
+    return fields
+
+
+def _rate(loop: Any, times: list[float] | None) -> float:
+    if loop.framerate is not None:
+        return float(loop.framerate)
+    detector = loop.input_sensor.detector
+    if detector is not None and detector.frame_rate is not None:
+        return float(detector.frame_rate)
+    if times is not None and len(times) > 1 and times[-1] > times[0]:
+        return float((len(times) - 1) / (times[-1] - times[0]))
+    raise KeyError("the frame rate")
+
+
+def _data(image: Any) -> Any:
+    return None if image is None else np.asarray(image.data, dtype=np.float64)
+
+
+def _in_nm(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
+    """Return lengths in nm; other units stay."""
+    factor = _NM.get(unit)
+    return (values, unit) if factor is None else (factor * values, "nm")

@@ -1,0 +1,211 @@
+"""Our own layout: telemetry as named arrays and plain metadata, and back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import lbt_synth
+from lbt_synth.errors import ProblemError
+from lbt_synth.files.telemetry.record import Telemetry
+from lbt_synth.linear import Controller
+from lbt_synth.models import PositionLoop
+from lbt_synth.storage.array_file import Cards
+from lbt_synth.validation import FloatArray
+
+SCHEMA = "lbt_synth telemetry"
+SCHEMA_VERSION = 1
+PRECISIONS = ("float64", "float32")
+Arrays = dict[str, npt.NDArray[Any]]
+Meta = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layer:
+    """One array of the file: its field, its axes in numpy's order, and its unit.
+
+    A unit that begins with an underscore is read from the field of that name.
+    """
+
+    field: str
+    axes: str
+    unit: str = ""
+    meaning: str = ""
+
+    @property
+    def series(self) -> bool:
+        """Whether it has one row a frame."""
+        return self.axes.startswith("frame")
+
+    def unit_of(self, telemetry: Telemetry) -> str:
+        """Return the unit, in this telemetry."""
+        return str(getattr(telemetry, self.unit[1:])) if self.unit[:1] == "_" else self.unit
+
+
+LAYERS = {
+    "COMMANDS": Layer(
+        field="commands", axes="frame, command", unit="_command_unit", meaning="u(k)"
+    ),
+    "MEASURE": Layer(
+        field="measurements",
+        axes="frame, measurement",
+        unit="_measurement_unit",
+        meaning="y(k), of the exposure of frame k-1",
+    ),
+    "RESIDUAL": Layer(
+        field="residual_nm", axes="frame, mode", unit="nm", meaning="phi_res(k), corrected phase"
+    ),
+    "TOTAL": Layer(
+        field="total_nm", axes="frame, mode", unit="nm", meaning="phi_tot(k), before correction"
+    ),
+    "SLOPES": Layer(
+        field="slopes", axes="frame, slope", unit="_slope_unit", meaning="what the sensor gave"
+    ),
+    "TIMES": Layer(field="times_s", axes="frame", unit="s", meaning="time of each frame"),
+    "INTERACT": Layer(field="interaction_matrix", axes="sensed, mode", meaning="S"),
+    "RECONST": Layer(field="reconstructor", axes="mode, slope", meaning="slopes to modes"),
+    "INFLUENC": Layer(field="influence_matrix", axes="mode, command", meaning="N"),
+    "MODES": Layer(field="mode_maps", axes="mode, row, column", meaning="modes, of rms 1"),
+    "PSF": Layer(field="psf", axes="row, column", meaning="image of the camera"),
+    "INTGAINS": Layer(field="integrator_gains", axes="command", meaning="integrator gains"),
+    "MIRROR_TAPS": Layer(
+        field="mirror_taps", axes="age", meaning="c: phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...)"
+    ),
+}
+_SAME_TAPS = 1e-9  # what is read beside what the mirror of the file has
+_FACTS = (
+    "frame_rate_hz",
+    "delay_frames",
+    "sensor_gain",
+    "strehl",
+    "imaging_wavelength_um",
+    "psf_pixel_mas",
+    "diameter_m",
+    "obstruction",
+    "seed",
+    "subaperture_axes",
+    "name",
+    "command_unit",
+    "measurement_unit",
+    "slope_unit",
+    "controller_name",
+    "controller_digest",
+)
+_CARDS = {
+    "RATE_HZ": ("frame_rate_hz", "[Hz] frame rate"),
+    "DELAY": ("delay_frames", "[frames] total delay"),
+    "SENSGAIN": ("sensor_gain", "sensor gain over the interaction matrix"),
+    "STREHL": ("strehl", "Strehl ratio"),
+    "WAVELEN": ("imaging_wavelength_um", "[um] of the image and the Strehl ratio"),
+    "PSFPIX": ("psf_pixel_mas", "[mas] pixel of the image"),
+    "DIAMETER": ("diameter_m", "[m] telescope"),
+    "OBSTRUCT": ("obstruction", "central obstruction over the diameter"),
+    "SEED": ("seed", "of the simulation"),
+}
+_LARGEST_CARD = 2**63 - 1
+
+
+def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
+    """Return the arrays and the metadata; ``precision`` is that of the series."""
+    arrays: Arrays = {}
+    for name, layer in LAYERS.items():
+        if (value := getattr(telemetry, layer.field)) is None:
+            continue
+        exact = not layer.series or layer.field == "times_s"  # times need their digits
+        arrays[name] = value if exact else _rounded(value, precision, layer.field)
+    meta: Meta = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "library_version": lbt_synth.__version__,
+        "convention": telemetry.convention,
+        **{name: getattr(telemetry, name) for name in _FACTS},
+        "metadata": dict(telemetry.metadata),
+    }
+    if (k := telemetry.controller) is not None:
+        arrays |= {f"CTRL_{name}": getattr(k, name) for name in "ABCD"}
+        meta["controller_dt_s"] = k.dt_s
+    if telemetry.mirror is not None:
+        meta["mirror"] = asdict(telemetry.mirror)
+    return arrays, meta
+
+
+def _rounded(series: FloatArray, precision: str, name: str) -> npt.NDArray[Any]:
+    if precision == "float64":
+        return series
+    with np.errstate(over="ignore"):
+        short = series.astype(np.float32)
+    if not np.all(np.isfinite(short)):
+        raise ProblemError(f"{name} has values beyond the range of float32; write float64.")
+    return short
+
+
+def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
+    """Rebuild telemetry; missing keys raise KeyError, what does not fit a ProblemError."""
+    left = dict(arrays)
+    fields: dict[str, Any] = {
+        layer.field: left.pop(name) for name, layer in LAYERS.items() if name in left
+    }
+    for name in ("COMMANDS", "MEASURE"):
+        if LAYERS[name].field not in fields:
+            raise KeyError(name)
+    if "controller_dt_s" in meta:
+        fields["controller"] = Controller(
+            **{name: left.pop(f"CTRL_{name}") for name in "ABCD"}, dt_s=meta["controller_dt_s"]
+        )
+    if left:
+        raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(left))}")
+    taps = fields.pop("mirror_taps", None)
+    if "mirror" in meta:  # files of a mirror that settles at once have none
+        fields["mirror"] = PositionLoop(**meta["mirror"])
+    return with_same_taps(
+        Telemetry(
+            **fields, **{name: meta[name] for name in _FACTS}, metadata=dict(meta["metadata"])
+        ),
+        taps,
+    )
+
+
+def with_same_taps(telemetry: Telemetry, taps: npt.ArrayLike | None) -> Telemetry:
+    """Return telemetry whose mirror has the taps that stand in its file."""
+    own = telemetry.mirror_taps
+    if (own is None) != (taps is None):
+        raise ValueError("a mirror and its taps go together; it has one of them")
+    if own is not None and taps is not None:
+        found = np.asarray(taps, dtype=np.float64)
+        size = max(own.size, found.size)
+        one, other = (np.pad(each.ravel(), (0, size - each.size)) for each in (own, found))
+        if not np.allclose(one, other, rtol=0, atol=_SAME_TAPS):
+            raise ValueError("its taps are not those of its mirror")
+    return telemetry
+
+
+def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]]:
+    """Cards for people who look at the header; META is what is read back."""
+    cards: dict[str, tuple[Any, str]] = {
+        "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
+        "LBTTELEM": (SCHEMA_VERSION, "version of the lbt_synth telemetry layout"),
+    }
+    for key, (name, comment) in _CARDS.items():
+        value = getattr(telemetry, name)
+        if value is not None and not (isinstance(value, int) and value > _LARGEST_CARD):
+            cards[key] = (value, comment)
+    cards["TIMING"] = (telemetry.convention, "")
+    cards["SHA256"] = (meta["digest"], "")
+    return cards
+
+
+def layer_cards(telemetry: Telemetry) -> dict[str, Cards]:
+    """Cards of each array: unit, meaning, axes."""
+    out: dict[str, Cards] = {}
+    for name, layer in LAYERS.items():
+        cards: dict[str, tuple[Any, str]] = {}
+        if unit := layer.unit_of(telemetry):
+            cards["BUNIT"] = (unit, "rms of wavefront" if unit == "nm" else "")
+        cards["CONTENT"] = (layer.meaning, "")
+        for number, axis in enumerate(reversed(layer.axes.split(", ")), start=1):
+            cards[f"CTYPE{number}"] = (axis.upper(), "")  # FITS counts axes from the fastest
+        out[name] = cards
+    return out

@@ -1,0 +1,193 @@
+"""Save and load telemetry; what is loaded has been checked."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from lbt_synth.errors import OutputError, ProblemError, TelemetryError
+from lbt_synth.files.telemetry import aot
+from lbt_synth.files.telemetry.layout import (
+    PRECISIONS,
+    SCHEMA,
+    SCHEMA_VERSION,
+    layer_cards,
+    pack,
+    primary_cards,
+    unpack,
+)
+from lbt_synth.files.telemetry.record import Telemetry
+from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz, reason
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.validation import choice
+
+FORMATS = ("fits", "npz", "aot")
+_ENDINGS = ".fits, .npz or .aot.fits"
+
+
+def require_telemetry_name(path: str | os.PathLike[str], format: str | None = None) -> str:  # noqa: A002
+    """Return the format of a file that is to be written."""
+    target = Path(path)
+    ending = target.suffix.lower()
+    if ending not in (".fits", ".npz"):
+        raise OutputError(f"telemetry must end in {_ENDINGS}; got {target.name!r}.", path=target)
+    by_name = "aot" if target.name.lower().endswith(".aot.fits") else ending[1:]
+    kind = by_name if format is None else format
+    if kind not in FORMATS:
+        raise OutputError(
+            f"the format of telemetry must be one of {', '.join(FORMATS)}; got {format!r}.",
+            path=target,
+        )
+    if (kind == "npz") != (ending == ".npz") or (by_name == "aot" and kind != "aot"):
+        raise OutputError(
+            f"the name {target.name!r} does not fit the format {format!r}: fits ends in .fits, "
+            "npz in .npz, aot in .aot.fits or .fits.",
+            path=target,
+        )
+    if kind == "aot":
+        aot.require_aotpy(target)
+    return kind
+
+
+def save_telemetry(
+    path: str | os.PathLike[str],
+    telemetry: Telemetry,
+    *,
+    format: str | None = None,  # noqa: A002 - the word of the command line
+    precision: str = "float64",
+) -> Path:
+    """Write telemetry to a file, whole or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write; the ending chooses the format: ``.fits`` or ``.npz`` in the layout of
+        this package, ``.aot.fits`` in that of the Adaptive Optics Telemetry standard (which
+        needs the extra ``aot`` and does not hold everything).
+    telemetry : Telemetry
+        The telemetry.
+    format : {"fits", "npz", "aot"}, optional
+        The format, where the ending does not say it.
+    precision : {"float64", "float32"}, optional
+        Of the series; matrices, images and times are float64.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        If the name is none of these, the file cannot be written, or the extra is missing.
+    ProblemError
+        If a value does not fit into the precision.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, tempfile, pathlib
+    >>> seen = lbt.files.Telemetry(
+    ...     frame_rate_hz=800, commands=[[0.0], [1.5]], measurements=[[3.0], [2.0]]
+    ... )
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = lbt.files.save_telemetry(pathlib.Path(folder) / "night.fits", seen)
+    ...     lbt.files.load_telemetry(file).commands.ravel().tolist()
+    [0.0, 1.5]
+    """
+    target = Path(path)
+    kind = require_telemetry_name(target, format)
+    if not isinstance(telemetry, Telemetry):
+        raise OutputError(
+            f"a telemetry file holds a Telemetry; got {type(telemetry).__name__}.", path=target
+        )
+    choice(precision, "precision", PRECISIONS)
+    arrays, meta = pack(telemetry, precision)
+    if kind == "aot":
+        return write_atomically(target, aot.to_bytes(telemetry, precision, target))
+    meta["digest"] = digest(arrays, meta)
+    text = json.dumps(meta, allow_nan=False)
+    if kind == "npz":
+        return write_atomically(target, npz_bytes(arrays, text))
+    content = fits_bytes(arrays, text, primary_cards(telemetry, meta), layer_cards(telemetry))
+    return write_atomically(target, content)
+
+
+def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
+    """Read a telemetry file and check it: schema, digest, shapes, finiteness.
+
+    Parameters
+    ----------
+    path : path-like
+        File in the layout of this package (``.fits``, ``.npz``) or of the Adaptive Optics
+        Telemetry standard (``.fits``); which of the two a FITS file is, its header tells.
+
+    Returns
+    -------
+    Telemetry
+        The telemetry.
+
+    Raises
+    ------
+    TelemetryError
+        If the file is missing, damaged, foreign, of a later layout, or the extra ``aot`` is
+        needed and missing.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.files.load_telemetry("nowhere.fits")
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.TelemetryError: cannot read nowhere.fits: No such file or directory.
+    """
+    source = Path(path)
+    if source.suffix.lower() not in (".fits", ".npz"):
+        raise TelemetryError(f"telemetry must end in {_ENDINGS}; got {source.name!r}.", path=source)
+    try:
+        content = source.read_bytes()
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise TelemetryError(f"cannot read {source}: {why}.", path=source) from error
+    if source.suffix.lower() == ".fits" and aot.is_aot(content):
+        return _checked(lambda: aot.from_bytes(content, source), source)
+    read = read_npz if source.suffix.lower() == ".npz" else read_fits
+    try:
+        arrays, text = read(content)
+        meta = json.loads(text)
+        found = digest(arrays, meta) if isinstance(meta, dict) else ""
+    except Exception as error:  # foreign bytes: the decoders raise whatever they like
+        raise TelemetryError(
+            f"{source} is no telemetry file, or it is damaged: {reason(error)}.", path=source
+        ) from error
+    if not isinstance(meta, dict) or meta.get("schema") != SCHEMA:
+        raise TelemetryError(f"{source} is not a telemetry file of lbt_synth.", path=source)
+    if meta.get("schema_version") != SCHEMA_VERSION:
+        raise TelemetryError(
+            f"{source} has layout version {meta.get('schema_version')!r}; this lbt_synth reads "
+            f"{SCHEMA_VERSION}. Read it with the version that wrote it.",
+            path=source,
+        )
+    if meta.get("digest") != found:
+        raise TelemetryError(
+            f"{source} is damaged: its content does not match its digest.", path=source
+        )
+    return _checked(lambda: unpack(arrays, meta), source)
+
+
+def _checked(rebuild: Callable[[], Telemetry], source: Path) -> Telemetry:
+    """Rebuild telemetry from what was read; what does not fit is the file's fault."""
+    try:
+        return rebuild()
+    except TelemetryError:
+        raise
+    except (
+        ProblemError,
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+    ) as error:
+        raise TelemetryError(f"{source} is inconsistent: {reason(error)}.", path=source) from error

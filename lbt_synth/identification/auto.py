@@ -1,0 +1,212 @@
+"""From a record to a certified controller, with a test on data that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from lbt_synth.design import Design, hinf, kalman, lqg
+from lbt_synth.errors import CertificateError, ProblemError
+from lbt_synth.identification.fit.both_axes import identify
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.prediction.rows import PredictionTable
+from lbt_synth.identification.prediction.stretches import split_halves
+from lbt_synth.identification.prediction.table import prediction_against_data
+from lbt_synth.identification.records.build import require_length
+from lbt_synth.identification.records.line_priors import LinePrior
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.loop import Imaging, close_loop
+from lbt_synth.models import TipTiltPlant
+from lbt_synth.validation import choice, instance, number
+
+_GAMMA_RATIO = 1.2
+_APART = 3.0  # standard errors
+_NAMES = {"kalman": "Kalman filter", "hinf": "H-infinity filter", "lqg": "LQG controller"}
+METHODS = tuple(_NAMES)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordedDesign:
+    """A controller designed from a record.
+
+    Attributes
+    ----------
+    model : IdentifiedModel
+        Identified from all usable frames.
+    design : Design
+        The certified design for it.
+    half_model : IdentifiedModel
+        Identified from the first half of the usable frames.
+    held_out : PredictionTable
+        Residuals on the second half: of the loop that ran, of a design from the first half by
+        the same method, of the best integrator and of a predictor by least squares.
+    name : str
+        Row of the design in ``held_out``.
+    notes : tuple of str
+        What speaks against the design.
+    """
+
+    model: IdentifiedModel
+    design: Design
+    half_model: IdentifiedModel
+    held_out: PredictionTable
+    name: str
+    notes: tuple[str, ...]
+
+
+def design_from_record(
+    record: LoopRecord,
+    *,
+    method: Literal["kalman", "hinf", "lqg"] = "kalman",
+    gamma_ratio: float = _GAMMA_RATIO,
+    sensor_gain: float | Sequence[float] | None = None,
+    assumed_gain: float = 1.0,
+    announced: Sequence[LinePrior] = (),
+    imaging: Imaging | None = None,
+    taps: int = 32,
+    progress: Callable[[int], None] | None = None,
+    **options: Any,
+) -> RecordedDesign:
+    """Identify a loop from its record, design a controller, and test it on unseen data.
+
+    The test is honest and conservative: a model of the first half of the usable frames gives a
+    design, and that is replayed on the second half. The design that is returned is made the
+    same way from all frames.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        What the loop recorded; the delay must be known.
+    method : {"kalman", "hinf", "lqg"}, optional
+        How the controller is designed.
+    gamma_ratio : float, optional
+        For "hinf": the norm as a multiple of the least one.
+    sensor_gain, assumed_gain, announced
+        As for :func:`identify`.
+    imaging : Imaging, optional
+        The camera, for Strehl ratios; 2.2 um by default.
+    taps : int, optional
+        Coefficients of the predictor by least squares.
+    progress : callable, optional
+        Called with 1 after each of 3 steps.
+    **options
+        ``lowest_line_hz`` and ``most_lines`` of :func:`identify`.
+
+    Returns
+    -------
+    RecordedDesign
+        The design, the models and the test.
+
+    Raises
+    ------
+    ProblemError
+        If the record is too short, its delay is missing, or a value is out of range.
+    NumericalError, CertificateError
+        If a fit fails; or if a design does not pass its checks, or its loop is unstable at one
+        of the sensor gains that were found.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.Vibration(frequency_hz=40, damping=0.005, rms_nm=50)
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=500)
+    >>> truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500)
+    >>> run = lbt.simulate(
+    ...     lbt.integrator(path, gain=0.3).controller, truth, hardware=path, frames=20_000
+    ... )
+    >>> record = lbt.identification.loop_record(
+    ...     run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
+    ... )
+    >>> made = lbt.design_from_record(record)
+    >>> table = made.held_out
+    >>> bool(table[made.name].replayed_nm < 0.5 * table["what ran"].replayed_nm)
+    True
+    """
+    instance(record, LoopRecord)
+    choice(method, "method", METHODS)
+    number(
+        gamma_ratio,
+        "gamma_ratio",
+        at_least=1,
+        hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
+    )
+    if record.delay_frames is None:
+        raise ProblemError(
+            "a design needs the delay of the loop; got a record without one. Try "
+            "record.with_delay(...)."
+        )
+    require_length(record)
+
+    def step() -> None:
+        if progress is not None:
+            progress(1)
+
+    found: dict[str, Any] = {
+        "sensor_gain": sensor_gain,
+        "assumed_gain": assumed_gain,
+        "announced": announced,
+        **options,
+    }
+    fit, test = split_halves(record.stretches(), record.frames)
+    half = identify(record, stretches=fit, **found)
+    step()
+    plant = half.plant()
+    name = _NAMES[method]
+    held_out = prediction_against_data(
+        plant,
+        record.pseudo_open_loop(half.sensor_gains),
+        {name: _designed(plant, method, gamma_ratio)},
+        fit=fit,
+        test=test,
+        measurements=None if record.commands is None else record.measurements,
+        noise_error_nm=[axis.noise_error_nm for axis in half.axes],
+        imaging=Imaging() if imaging is None else imaging,
+        taps=taps,
+    )
+    step()
+    model = identify(record, start=half, **found)
+    design = _designed(model.plant(), method, gamma_ratio)
+    step()
+    return RecordedDesign(
+        model=model,
+        design=design,
+        half_model=half,
+        held_out=held_out,
+        name=name,
+        notes=_doubts(model, half, design),
+    )
+
+
+def _doubts(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:
+    """Return warnings of sensor gains that do not agree; refuse loops that would not hold."""
+    out = []
+    for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
+        if whole.sensor_gain_error is None or first.sensor_gain_error is None:
+            continue
+        apart = abs(whole.sensor_gain - first.sensor_gain)
+        if apart > _APART * float(np.hypot(whole.sensor_gain_error, first.sensor_gain_error)):
+            out.append(
+                f"warning: axis {i} has a sensor gain of {first.sensor_gain:.3f} in the first half "
+                f"of the record, and of {whole.sensor_gain:.3f} in all of it"
+            )
+    for gain in sorted({*half.sensor_gains, *model.sensor_gains}):
+        path = replace(model.hardware, sensor_matrix=gain * np.eye(len(model.axes)))
+        if not close_loop(path, design.controller).is_stable:
+            raise CertificateError(
+                f"the loop of the design is unstable at the sensor gain {gain:.3f}, which was "
+                "found as well, in a half of the record or on the other axis. Look for jumps in "
+                "the record, and for commands that do not belong to it, or give the sensor gain."
+            )
+    return tuple(out)
+
+
+def _designed(plant: TipTiltPlant, method: str, gamma_ratio: float) -> Design:
+    if method == "kalman":
+        return kalman(plant)
+    if method == "hinf":
+        return hinf(plant, gamma_ratio=gamma_ratio)
+    return lqg(plant)

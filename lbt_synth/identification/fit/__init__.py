@@ -1,0 +1,1 @@
+"""From a record to a model of turbulence, vibrations, noise and sensor."""

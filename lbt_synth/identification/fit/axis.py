@@ -1,0 +1,328 @@
+"""From recorded series to turbulence, lines, noise and sensor gain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.fit.description import WIDE_DAMPING, covariance_of, described
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis
+from lbt_synth.identification.fit.order_search import Rules, grow, other_gain
+from lbt_synth.identification.fit.periodogram import (
+    SHORTEST_SEGMENT,
+    LoopPeriodogram,
+    loop_periodogram,
+)
+from lbt_synth.identification.fit.whittle import GAIN
+from lbt_synth.validation import FloatArray, instance, integer, number, real_array
+
+LOWEST_LINE_HZ = 3.0
+MOST_LINES = 20
+GAIN_ERROR = 0.3  # relative; a gain that is known worse is not identifiable
+_POOR_GAIN = 0.1  # is said to be known poorly
+_APART = 3.0  # standard errors
+_GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}
+_MOST_AVERAGES = 1000.0
+
+
+def identify_axis(
+    measurement: Any,
+    correction: Any = None,
+    *,
+    frame_rate_hz: float,
+    stretches: Sequence[tuple[int, int]] | None = None,
+    sensor_gain: float | None = None,
+    sensor_gain_error: float = 0.0,
+    assumed_gain: float = 1.0,
+    announced: Sequence[tuple[float, float]] = (),
+    lowest_line_hz: float = LOWEST_LINE_HZ,
+    most_lines: int = MOST_LINES,
+    start: IdentifiedAxis | None = None,
+) -> IdentifiedAxis:
+    """Identify one axis of a loop.
+
+    The pseudo-open-loop measurement ``y(k) + g c(k)``, with c(k) the correction that y(k)
+    contains and g the sensor gain, is g times the phase plus the noise. Its spectrum is that of
+    turbulence (a second-order process, behind a first-order low pass where the data ask for
+    it), of resonances, and of white noise; its Whittle likelihood chooses all parameters, the
+    sensor gain among them, and a penalised criterion the number of resonances.
+
+    Parameters
+    ----------
+    measurement : (frames,) array_like
+        Measurement y(k) [nm].
+    correction : (frames,) array_like, optional
+        Correction c(k) contained in y(k) [nm]; none for an open loop.
+    frame_rate_hz : float
+        Frame rate [Hz].
+    stretches : sequence of (start, stop), optional
+        Frames to use; all by default.
+    sensor_gain : float, optional
+        Sensor gain, if it is known; found from the data of a closed loop otherwise.
+    sensor_gain_error : float, optional
+        Standard error of a gain that is given: it is in the errors of all that it moves.
+    assumed_gain : float, optional
+        What to take where it can not be found.
+    announced : sequence of (frequency, error), optional
+        Frequencies of lines that are known beforehand, with their standard errors [Hz].
+    lowest_line_hz : float, optional
+        A resonance below is a part of the turbulence [Hz].
+    most_lines : int, optional
+        Number of resonances above it, at most.
+    start : IdentifiedAxis, optional
+        A result to begin with, for instance that of a moment ago.
+
+    Returns
+    -------
+    IdentifiedAxis
+        Parameters with standard errors, tests and spectra.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range or not finite, sizes clash, or there are less than 512 frames
+        in one stretch.
+    NumericalError
+        If the fit fails.
+
+    Notes
+    -----
+    Standard errors are those of the likelihood: of what the model leaves open, not of what it
+    cannot describe.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> line = lbt.Vibration(frequency_hz=40, damping=0.005, rms_nm=30, direction=(1.0,))
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=2.0, frame_rate_hz=500)
+    >>> truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    >>> loop = lbt.integrator(path, gain=0.4)
+    >>> run = lbt.simulate(loop.controller, truth, hardware=path, frames=20_000)
+    >>> y, u = run.measurements[0, :, 0], run.commands[0, :, 0]
+    >>> found = lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=500)
+    >>> [round(line.frequency_hz) for line in found.lines], round(found.noise_nm)
+    ([40], 5)
+    """
+    y = real_array(measurement, "measurement")
+    if y.ndim != 1:
+        raise DimensionError(f"measurement must be a series (frames,); got shape {y.shape}.")
+    c = None
+    if correction is not None:
+        c = real_array(correction, "correction")
+        if c.shape != y.shape:
+            raise DimensionError(
+                f"correction must have shape {y.shape} like measurement; got {c.shape}."
+            )
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    pieces = [(0, y.size)] if stretches is None else [(int(a), int(b)) for a, b in stretches]
+    for begin, stop in pieces:
+        if not 0 <= begin < stop <= y.size:
+            raise ProblemError(
+                f"stretches must lie within the {y.size} frames; got ({begin}, {stop})."
+            )
+    longest = max((stop - begin for begin, stop in pieces), default=0)
+    if longest < 2 * SHORTEST_SEGMENT:
+        raise ProblemError(
+            f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "
+            f"longest has {longest}. Record more, or bridge short gaps."
+        )
+    if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
+        raise ProblemError("the measurement is constant: there is nothing to identify.")
+    with np.errstate(over="ignore", invalid="ignore"):
+        data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
+        power = data.power(1.0)
+    if not (np.all(np.isfinite(power)) and np.min(data.measured) > 0):
+        raise ProblemError(
+            "the spectrum of the series overflows or vanishes; got values up to "
+            f"{np.max(np.abs(y)):.6g} nm. Check the units."
+        )
+    return identify_periodogram(
+        data,
+        sensor_gain=sensor_gain,
+        sensor_gain_error=sensor_gain_error,
+        assumed_gain=assumed_gain,
+        announced=announced,
+        lowest_line_hz=lowest_line_hz,
+        most_lines=most_lines,
+        start=start,
+    )
+
+
+def identify_spectrum(
+    frequency_hz: Any,
+    density_nm2_hz: Any,
+    *,
+    frame_rate_hz: float,
+    averages: float | None = None,
+    **options: Any,
+) -> IdentifiedAxis:
+    """Identify one axis from its power spectrum.
+
+    Parameters
+    ----------
+    frequency_hz : (f,) array_like
+        Increasing frequencies above 0 and below half the frame rate [Hz], evenly spaced.
+    density_nm2_hz : (f,) array_like
+        One-sided density of the phase [nm^2/Hz], above 0.
+    frame_rate_hz : float
+        Frame rate of the loop to come [Hz].
+    averages : float, optional
+        Number of independent periodograms that the density is the mean of; by default found
+        from its scatter. One that scatters less than the mean of 1000 was smoothed, interpolated
+        or computed: its scatter tells nothing, and it is taken for one periodogram.
+    **options
+        ``announced``, ``lowest_line_hz`` and ``most_lines`` of :func:`identify_axis`.
+
+    Returns
+    -------
+    IdentifiedAxis
+        As from a series; the sensor gain is 1.
+
+    Raises
+    ------
+    ProblemError
+        If the table is no spectrum.
+    NumericalError
+        If the fit fails.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> f = np.arange(1, 400) * 1.0
+    >>> line = lbt.Vibration(frequency_hz=50, damping=0.05, rms_nm=30).ar_model(1000)
+    >>> chance = np.random.default_rng(0).gamma(8.0, 1 / 8.0, f.size)
+    >>> found = lbt.identification.identify_spectrum(
+    ...     f, (line.psd(f) + 1.0) * chance, frame_rate_hz=1000
+    ... )
+    >>> [round(line.frequency_hz) for line in found.lines]
+    [50]
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    f = real_array(frequency_hz, "frequency_hz")
+    density = real_array(density_nm2_hz, "density_nm2_hz")
+    if f.ndim != 1 or f.shape != density.shape or f.size < 32:
+        raise DimensionError(
+            "frequency_hz and density_nm2_hz must be lists of the same length, at least 32; got "
+            f"{f.shape} and {density.shape}."
+        )
+    steps = np.diff(f)
+    if np.any(steps <= 0) or f[0] <= 0 or f[-1] >= rate / 2:
+        raise ProblemError(
+            f"frequency_hz must increase from above 0 to below {rate / 2:.6g}; got {f[0]:.6g} to "
+            f"{f[-1]:.6g}. Leave the mean out, and what lies above the Nyquist frequency."
+        )
+    if np.max(steps) > 1.01 * np.min(steps):
+        raise ProblemError(
+            f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
+            f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
+        )
+    if np.any(density <= 0):
+        raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density):.6g}.")
+    if averages is None:
+        many = scattered(density) or 1.0
+    else:
+        many = number(averages, "averages", above=0)
+    zero = np.zeros_like(f)
+    data = LoopPeriodogram(
+        frequency_hz=f,
+        measured=density,
+        crossed=zero,
+        corrected=zero,
+        count=np.full(f.size, many),
+        frame_rate_hz=rate,
+        resolution_hz=float(np.median(steps)),
+    )
+    return identify_periodogram(data, sensor_gain=1.0, **options)
+
+
+def scattered(density: FloatArray) -> float | None:
+    """Shape of the gamma distribution that a density scatters with about a smooth curve.
+
+    None if it is above what anybody averages: whatever the model leaves would count as evidence
+    for one more line, and standard errors would vanish.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import polygamma
+
+    log = np.log(density)
+    # a second difference at a distance hardly sees a curve, and not what neighbours share
+    bend = log[6:] - 2 * log[3:-3] + log[:-6]
+    scatter = (np.median(np.abs(bend - np.median(bend))) / 0.6745) ** 2 / 6
+    low, high = 0.25, _MOST_AVERAGES
+    if scatter < polygamma(1, high):
+        return None
+    scatter = float(min(scatter, polygamma(1, low)))
+    return float(
+        np.exp(
+            brentq(
+                lambda x: float(polygamma(1, np.exp(x))) - scatter,
+                np.log(low) - 1e-6,
+                np.log(high) + 1e-6,
+            )
+        )
+    )
+
+
+def identify_periodogram(
+    data: LoopPeriodogram,
+    *,
+    sensor_gain: float | None = None,
+    sensor_gain_error: float = 0.0,
+    assumed_gain: float = 1.0,
+    announced: Sequence[tuple[float, float]] = (),
+    lowest_line_hz: float = LOWEST_LINE_HZ,
+    most_lines: int = MOST_LINES,
+    start: IdentifiedAxis | None = None,
+) -> IdentifiedAxis:
+    """Identify one axis from its periodogram; the arguments are those of :func:`identify_axis`."""
+    if sensor_gain is not None:
+        sensor_gain = number(sensor_gain, "sensor_gain", **_GAINS)
+    given_error = number(sensor_gain_error, "sensor_gain_error", at_least=0)
+    assumed = number(assumed_gain, "assumed_gain", **_GAINS)
+    if start is not None:
+        instance(start, IdentifiedAxis)
+    nyquist = data.frame_rate_hz / 2
+    for frequency, error in announced:
+        number(frequency, "an announced frequency", above=0, below=nyquist)
+        number(error, "the error of an announced frequency", at_least=0)
+    rules = Rules(
+        gain=sensor_gain,
+        lowest_line_hz=number(lowest_line_hz, "lowest_line_hz", at_least=0, below=nyquist),
+        most_lines=integer(most_lines, "most_lines", at_least=0),
+        announced=tuple(announced),
+    )
+    grown = grow(data, rules, None if start is None else start.grown)
+    if sensor_gain is not None:
+        relative = given_error / sensor_gain
+        note = "given" if data.closed else "given: the series is divided by it"
+        if data.duration_s is None:
+            note = "1: of a spectrum it has no meaning"
+        return described(data, rules, grown, relative or None, note, known=relative)
+    if not data.closed:
+        note = "1: of an open loop it has no meaning"
+        return described(data, rules, grown, None, note, known=0.0)
+    variance = float(covariance_of(grown)[GAIN, GAIN])
+    error = float(np.sqrt(variance)) if variance > 0 else float("inf")
+    narrow = grown.narrow(WIDE_DAMPING)
+    if len(narrow.parts) < len(grown.parts) and error <= GAIN_ERROR:
+        # such a model may stand for another gain
+        away = other_gain(data, rules, grown)
+        if away > _APART * error:
+            error = away
+    if error <= GAIN_ERROR:
+        poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
+        return described(data, rules, grown, error, f"found in the closed loop's data{poor}")
+    rules = replace(rules, gain=assumed)
+    by = f" by {100 * error:.0f} %" if error < 1 else ""
+    note = (
+        f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
+        "hardly acts where the noise shows). Give it, or record with a higher loop gain"
+    )
+    return described(data, rules, grow(data, rules, grown), None, note, known=0.0)

@@ -1,0 +1,254 @@
+"""What the identification found, with standard errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lbt_synth.identification.fit.parameters import Grown
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.whiteness import Whiteness
+from lbt_synth.models import (
+    ARModel,
+    LoopHardware,
+    PositionLoop,
+    TipTiltPlant,
+    Truth,
+    Vibration,
+    tip_tilt_plant,
+)
+from lbt_synth.validation import FloatArray
+
+Kind = Literal["line", "broad", "turbulence"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IdentifiedLine:
+    """A resonance found in a spectrum.
+
+    Attributes
+    ----------
+    kind : {"line", "broad", "turbulence"}
+        A narrow line; a resonance that is wide (damping ratio of 0.1 and more) or drowns in the
+        rest of the spectrum; a part of the turbulence, below the lowest frequency of lines.
+    frequency_hz, frequency_error_hz : float
+        Natural frequency and its standard error [Hz].
+    damping, damping_error : float
+        Damping ratio and its standard error. Where the line is not resolved, both are the
+        largest damping that the record does not tell from none.
+    resolved : bool
+        Whether the record is long enough to see the line's width.
+    rms_nm, rms_error_nm : float
+        Standard deviation of the displacement and its standard error [nm rms wavefront].
+    prominence : float
+        Density at its frequency over that of all the rest.
+    evidence : float
+        What it adds to the logarithm of the likelihood.
+    announced : bool
+        Whether its frequency was given beforehand.
+    """
+
+    kind: Kind
+    frequency_hz: float
+    frequency_error_hz: float
+    damping: float
+    damping_error: float
+    resolved: bool
+    rms_nm: float
+    rms_error_nm: float
+    prominence: float
+    evidence: float
+    announced: bool
+
+    def vibration(self, direction: tuple[float, ...] = (1.0, 0.0)) -> Vibration:
+        """Return the resonance as a part of a plant.
+
+        Parameters
+        ----------
+        direction : tuple of float, optional
+            Direction over the modes.
+
+        Returns
+        -------
+        Vibration
+            With its frequency, damping and rms.
+        """
+        return Vibration(
+            frequency_hz=self.frequency_hz,
+            damping=self.damping,
+            rms_nm=self.rms_nm,
+            direction=direction,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IdentifiedTurbulence:
+    """The slow part of a spectrum: a resonance with a low pass, or without.
+
+    Attributes
+    ----------
+    frequency_hz, frequency_error_hz : float
+        Natural frequency of the second-order process and its standard error [Hz].
+    damping, damping_error : float
+        Its damping ratio (1 and more: two real poles) and the standard error.
+    corner_hz, corner_error_hz : float or None
+        Corner of a first-order low pass behind it, and its standard error [Hz]; None for none.
+    rms_nm, rms_error_nm : float
+        Standard deviation and its standard error [nm].
+    """
+
+    frequency_hz: float
+    frequency_error_hz: float
+    damping: float
+    damping_error: float
+    corner_hz: float | None
+    corner_error_hz: float | None
+    rms_nm: float
+    rms_error_nm: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IdentifiedAxis:
+    """One axis: turbulence, lines, noise and sensor gain.
+
+    Attributes
+    ----------
+    turbulence : ARModel
+        The turbulence as a process of order 2 or 3.
+    turbulence_fit : IdentifiedTurbulence
+        Its parameters with standard errors.
+    parts : tuple of IdentifiedLine
+        All other resonances, by frequency.
+    noise_nm, noise_error_nm : float
+        Measurement noise per frame, as it is on y, and its standard error [nm]; at least a
+        hundredth of the innovations' deviation.
+    sensor_gain : float
+        Sensor gain: found, given or assumed.
+    sensor_gain_error : float or None
+        Its standard error; None if it was not found from the data.
+    sensor_gain_note : str
+        Where it comes from, or why it could not be found.
+    whiteness : Whiteness
+        Tests of the innovations.
+    frequency_hz, density_nm2_hz, fitted_nm2_hz, background_nm2_hz : (f,) ndarray
+        One-sided density [nm^2/Hz] of the pseudo-open-loop measurement: periodogram, model,
+        and model without its narrow lines.
+    frame_rate_hz : float
+        Frame rate [Hz].
+    resolution_hz : float
+        Resolution of the periodogram [Hz].
+    grown : Grown
+        The fit itself, for another one to begin with.
+    """
+
+    turbulence: ARModel
+    turbulence_fit: IdentifiedTurbulence
+    parts: tuple[IdentifiedLine, ...]
+    noise_nm: float
+    noise_error_nm: float
+    sensor_gain: float
+    sensor_gain_error: float | None
+    sensor_gain_note: str
+    whiteness: Whiteness
+    frequency_hz: FloatArray
+    density_nm2_hz: FloatArray
+    fitted_nm2_hz: FloatArray
+    background_nm2_hz: FloatArray
+    frame_rate_hz: float
+    resolution_hz: float
+    grown: Grown
+    data: LoopPeriodogram
+
+    @property
+    def lines(self) -> tuple[IdentifiedLine, ...]:
+        """The narrow lines."""
+        return tuple(part for part in self.parts if part.kind == "line")
+
+    @property
+    def rms_nm(self) -> float:
+        """Deviation of the whole disturbance [nm]."""
+        return float(
+            np.sqrt(self.turbulence.rms_nm**2 + sum(part.rms_nm**2 for part in self.parts))
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IdentifiedModel:
+    """The axes of a loop as they were identified.
+
+    Attributes
+    ----------
+    axes : tuple of IdentifiedAxis
+        One an axis: tip, or tip and tilt.
+    frame_rate_hz : float
+        Frame rate [Hz].
+    delay_frames : float
+        Total delay of the loop [frames].
+    mirror : PositionLoop or None
+        Dynamics of the mirror.
+    notes : tuple of str
+        What the user has to know.
+    """
+
+    axes: tuple[IdentifiedAxis, ...]
+    frame_rate_hz: float
+    delay_frames: float
+    mirror: PositionLoop | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sensor_gains(self) -> tuple[float, ...]:
+        """Sensor gain of each axis."""
+        return tuple(axis.sensor_gain for axis in self.axes)
+
+    @property
+    def hardware(self) -> LoopHardware:
+        """The loop, with the sensor gains in its sensor matrix."""
+        return LoopHardware(
+            frame_rate_hz=self.frame_rate_hz,
+            delay_frames=self.delay_frames,
+            sensor_matrix=np.diag(self.sensor_gains),
+            mirror=self.mirror,
+        )
+
+    def _vibrations(self) -> list[Vibration]:
+        count = len(self.axes)
+        return [
+            part.vibration(tuple(float(i == j) for j in range(count)))
+            for i, axis in enumerate(self.axes)
+            for part in axis.parts
+        ]
+
+    def plant(self) -> TipTiltPlant:
+        """Return the plant of a design.
+
+        Returns
+        -------
+        TipTiltPlant
+            Turbulence and resonances of each axis, independent of the other's.
+        """
+        return tip_tilt_plant(
+            frame_rate_hz=self.frame_rate_hz,
+            delay_frames=self.delay_frames,
+            turbulence=[axis.turbulence for axis in self.axes],
+            vibrations=self._vibrations() or None,
+            noise_nm=np.diag([axis.noise_nm**2 for axis in self.axes]),
+            sensor_matrix=np.diag(self.sensor_gains),
+            mirror=self.mirror,
+        )
+
+    def truth(self) -> Truth:
+        """Return the same as the truth of an analysis, for :attr:`hardware`.
+
+        Returns
+        -------
+        Truth
+            Turbulence, resonances and noise of each axis.
+        """
+        return Truth(
+            turbulence=tuple(axis.turbulence for axis in self.axes),
+            vibrations=tuple(self._vibrations()),
+            noise_nm=np.array([axis.noise_nm for axis in self.axes]),
+        )

@@ -1,0 +1,141 @@
+"""Periodograms of a running loop, as functions of the sensor gain.
+
+``y(k) + g c(k)``, with c the correction that the measurement y contains and g the sensor gain,
+does not depend on what the loop did. Its periodogram is quadratic in g::
+
+    I(g) = |Y|^2 + 2 g Re(Y C*) + g^2 |C|^2
+
+Turbulence falls so steeply that a plain periodogram leaks. The series are differenced, tapered
+at both ends, and the power divided by that of the difference, ``|1 - z^-1|^2``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.identification.fit.window import tukey
+from lbt_synth.validation import FloatArray, IntArray
+
+_FLOOR = 1e-12  # of the mean density: below, there is nothing but rounding
+LONGEST_SEGMENT = 1 << 16
+SHORTEST_SEGMENT = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopPeriodogram:
+    """One-sided densities over frequency, of the measurement and of the correction in it."""
+
+    frequency_hz: FloatArray  # (f,): frequencies, increasing
+    # measured, crossed, corrected (f,): ``|Y|^2``, ``Re(Y C*)`` and ``|C|^2`` [nm^2/Hz]; zeros
+    # without corrections
+    measured: FloatArray
+    crossed: FloatArray
+    corrected: FloatArray
+    count: FloatArray  # (f,): number of independent periodograms that each value is the mean of
+    frame_rate_hz: float  # Frame rate [Hz]
+    resolution_hz: float  # Width of a frequency bin of the transform [Hz]
+    # Duration of the tapered segments [s]; None if it is not known how the density was made
+    duration_s: float | None = None
+
+    @property
+    def closed(self) -> bool:
+        """Whether there are corrections."""
+        return bool(np.any(self.corrected > 0))
+
+    def power(self, gain: float) -> FloatArray:
+        """Density of ``y + gain c`` [nm^2/Hz], (f,)."""
+        return np.asarray(self.measured + gain * (2 * self.crossed + gain * self.corrected))
+
+    def merged(self, starts: IntArray) -> LoopPeriodogram:
+        """Means over groups of neighbours that begin at these indices."""
+        size = np.diff(np.append(starts, len(self.frequency_hz)))
+
+        def mean(values: FloatArray) -> FloatArray:
+            return np.asarray(np.add.reduceat(values, starts) / size)
+
+        return LoopPeriodogram(
+            frequency_hz=mean(self.frequency_hz),
+            measured=mean(self.measured),
+            crossed=mean(self.crossed),
+            corrected=mean(self.corrected),
+            count=np.add.reduceat(self.count, starts),
+            frame_rate_hz=self.frame_rate_hz,
+            resolution_hz=self.resolution_hz,
+            duration_s=self.duration_s,
+        )
+
+
+def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:
+    """``4 sin^2(pi f / f_s)``, the power of the difference of two frames."""
+    return np.asarray(4 * np.sin(np.pi * frequency_hz / frame_rate_hz) ** 2)
+
+
+def loop_periodogram(
+    measurement: FloatArray,
+    correction: FloatArray | None,
+    *,
+    frame_rate_hz: float,
+    stretches: Sequence[tuple[int, int]],
+) -> LoopPeriodogram:
+    """Periodogram of one axis over its usable stretches.
+
+    Segments of one length are cut from all stretches; that length leaves most of the data in use,
+    and is the whole stretch where there is one of at most 2^16 frames. Shapes: measurement,
+    correction (frames,), stretches list of (start, stop).
+    """
+    from scipy.fft import next_fast_len, rfft
+
+    length = _segment_length([stop - start for start, stop in stretches])
+    starts: list[int] = []
+    for start, stop in stretches:
+        many = (stop - start) // length
+        if many:
+            spare = stop - start - many * length
+            starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
+    rows = np.array(starts)[:, None] + np.arange(length)[None, :]
+    taper = tukey(length - 1)
+    size = int(next_fast_len(length - 1, real=True))
+    frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
+    scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
+
+    def transform(series: FloatArray) -> FloatArray:
+        tapered = taper * np.diff(series[rows], axis=1)
+        return np.asarray(rfft(tapered, size, axis=1)[:, 1 : (size + 1) // 2])
+
+    y = transform(measurement)
+    c = None if correction is None else transform(correction)
+    zero = np.zeros(frequency.size)
+    measured = scale * np.mean(np.abs(y) ** 2, axis=0)
+    measured += _FLOOR * np.mean(measured)
+    # neighbours of a padded or tapered transform are not independent
+    independent = len(starts) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
+    return LoopPeriodogram(
+        frequency_hz=frequency,
+        measured=measured,
+        crossed=zero if c is None else scale * np.mean((y * c.conj()).real, axis=0),
+        corrected=zero if c is None else scale * np.mean(np.abs(c) ** 2, axis=0),
+        count=np.full(frequency.size, independent),
+        frame_rate_hz=frame_rate_hz,
+        resolution_hz=frame_rate_hz / length,
+        duration_s=(length - 1) / frame_rate_hz,
+    )
+
+
+def _segment_length(lengths: list[int]) -> int:
+    """Length of segment that uses most frames; of equals the longest."""
+    candidates = sorted(
+        {length // part for length in lengths for part in range(1, 9)} | {LONGEST_SEGMENT}
+    )
+    candidates = [c for c in candidates if SHORTEST_SEGMENT <= c <= LONGEST_SEGMENT]
+    if not candidates:
+        return max(lengths)
+    used = [sum(length // c * c for length in lengths) for c in candidates]
+    most = max(used)
+    # a tenth of the data is a fair price for a resolution twice as fine
+    worth = [
+        u / most + 0.1 * np.log2(c / LONGEST_SEGMENT) for u, c in zip(used, candidates, strict=True)
+    ]
+    return candidates[int(np.argmax(worth))]

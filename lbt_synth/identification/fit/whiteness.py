@@ -1,0 +1,86 @@
+"""Tests whether the innovations of a fitted spectrum are white."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.validation import FloatArray, frozen
+
+LAGS = 100
+_LOWEST = 3  # bins, in which the ends of the taper show
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Whiteness:
+    """Tests of the innovations, the prediction errors of the fitted model.
+
+    Their spectrum is the ratio of periodogram to model, and their autocorrelation its
+    transform.
+
+    Attributes
+    ----------
+    deviation : float
+        Largest distance of the cumulative periodogram of the innovations from the diagonal, as
+        a part of their power.
+    p_value : float
+        Probability of a larger one if the innovations were white (M. S. Bartlett, An
+        Introduction to Stochastic Processes, 1955; Kolmogorov's distribution).
+    autocorrelation : (lags,) ndarray
+        From lag 1.
+    correlation_p_value : float
+        Of Box and Pierce's sum of squares over these lags (doi:10.1080/01621459.1970.10481180).
+    frequency_hz, cumulative : (f,) ndarray
+        The cumulative periodogram, from 0 to 1.
+    effective : float
+        Number of independent values.
+    """
+
+    deviation: float
+    p_value: float
+    autocorrelation: FloatArray
+    correlation_p_value: float
+    frequency_hz: FloatArray
+    cumulative: FloatArray
+    effective: float
+
+    @property
+    def white(self) -> bool:
+        """Whether neither test refuses whiteness at 1 %."""
+        return self.p_value > 0.01 and self.correlation_p_value > 0.01
+
+
+def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Whiteness:
+    """Test the innovations of a model. Shapes: power, model (f,)."""
+    from scipy.special import chdtrc, kolmogorov
+
+    ratio = power / model
+    effective = float(np.sum(data.count))
+    cumulative = np.cumsum(ratio) / np.sum(ratio)
+    even = np.arange(1, ratio.size + 1) / ratio.size
+    deviation = float(np.max(np.abs(cumulative - even)))
+    # a periodogram of n frames has n / 2 values; bins count as they are independent
+    size = 2 * (ratio.size + 1)
+    whole = data.frequency_hz.size / data.frequency_hz[-1] * data.frame_rate_hz / 2
+    complete = ratio.size > 0.95 * whole  # up to the Nyquist frequency
+    lags = min(LAGS, ratio.size // 16)
+    if complete:
+        filled = np.zeros(size // 2 + 1)  # from 0 to the Nyquist frequency
+        filled[1:-1] = ratio - np.mean(ratio[_LOWEST:])
+        filled[: 1 + _LOWEST] = 0
+        correlation = np.fft.irfft(filled, size)[1 : lags + 1] * size / (2 * np.sum(ratio))
+        statistic = 2 * effective * float(np.sum(correlation**2))
+        p_value = float(chdtrc(lags, statistic))
+    else:
+        correlation, p_value = np.zeros(0), float("nan")
+    return Whiteness(
+        deviation=deviation,
+        p_value=float(kolmogorov(deviation * np.sqrt(effective))),
+        autocorrelation=frozen(correlation),
+        correlation_p_value=p_value,
+        frequency_hz=data.frequency_hz,
+        cumulative=frozen(cumulative),
+        effective=effective,
+    )

@@ -1,0 +1,229 @@
+"""Residual variance from a measured residual: its noise taken out, with a standard error.
+
+For Gaussian series the covariance of two mean squares over K frames is ``2 / K`` times the sum
+of the squared cross-covariances over all lags (M. S. Bartlett, J. Roy. Stat. Soc. Suppl. 8, 27
+(1946), doi:10.2307/2983611), which is the mean of the squared cross-spectrum. A periodogram I has
+``E I^2 = 2 S^2``: no spectrum needs to be smoothed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import rfft
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.prediction.stretches import Stretches
+from lbt_synth.loop import Imaging, jitter_strehl
+from lbt_synth.validation import FloatArray, frozen
+
+_FEWEST = 100  # frames of which a mean square is worth a standard error
+_TOO_FAR = 4.0  # standard errors below zero that are no chance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualEstimate:
+    """Residual of a loop, estimated from the measured residual ``phi_res(k-1) + noise``.
+
+    The variance of the noise is subtracted: an estimate may be negative within its error, and is
+    then shown as such; its rms is nan, and :attr:`upper_nm` says what it is below. One that is
+    negative by more than that refutes the noise that was subtracted (:attr:`refuted`).
+
+    Attributes
+    ----------
+    measured_nm : (frames, n) ndarray
+        Measured residual e(k) of the frames that count [nm].
+    stretches : tuple of (start, stop)
+        Where in the record they are.
+    noise_nm2 : (n, n) ndarray
+        Covariance of the noise in e [nm^2].
+    covariance_nm2 : (n, n) ndarray
+        Covariance of the residual: mean of ``e e'`` less that of the noise [nm^2].
+    error_nm4 : (n, n) ndarray
+        Covariance of the errors of the axes' variances [nm^4].
+    """
+
+    measured_nm: FloatArray
+    stretches: Stretches
+    noise_nm2: FloatArray
+    covariance_nm2: FloatArray
+    error_nm4: FloatArray
+
+    @property
+    def variance_nm2(self) -> FloatArray:
+        """Residual variance of each axis, (n,) [nm^2]; may be negative within its error."""
+        return frozen(np.diag(self.covariance_nm2))
+
+    @property
+    def variance_error_nm2(self) -> FloatArray:
+        """Standard error of each axis' variance, (n,) [nm^2]."""
+        return frozen(np.sqrt(np.diag(self.error_nm4)))
+
+    @property
+    def total_nm2(self) -> float:
+        """Residual variance over all axes [nm^2]."""
+        return float(np.sum(self.variance_nm2))
+
+    @property
+    def total_error_nm2(self) -> float:
+        """Standard error of the variance over all axes [nm^2]."""
+        return float(np.sqrt(max(float(np.sum(self.error_nm4)), 0.0)))
+
+    @property
+    def axis_rms_nm(self) -> FloatArray:
+        """Residual of each axis, (n,) [nm rms]; nan where the variance is negative."""
+        return frozen(_roots(self.variance_nm2))
+
+    @property
+    def axis_rms_error_nm(self) -> FloatArray:
+        """Standard error of each axis' rms, (n,) [nm]; nan where the variance is negative."""
+        with np.errstate(divide="ignore"):
+            return frozen(self.variance_error_nm2 / (2 * self.axis_rms_nm))
+
+    @property
+    def rms_nm(self) -> float:
+        """Residual over all axes [nm rms]; nan where the variance is negative."""
+        return float(_roots(np.array(self.total_nm2)))
+
+    @property
+    def rms_error_nm(self) -> float:
+        """Standard error of the rms [nm]; nan where the variance is negative."""
+        return self.total_error_nm2 / (2 * self.rms_nm) if self.total_nm2 > 0 else float("nan")
+
+    @property
+    def errors_below_zero(self) -> float:
+        """Standard errors by which the variance, over all axes or of one, is below zero."""
+        below = -np.append(self.variance_nm2, self.total_nm2)
+        error = np.append(self.variance_error_nm2, self.total_error_nm2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.max(np.where(below > 0, below / error, 0.0)))
+
+    @property
+    def refuted(self) -> bool:
+        """Whether more noise was subtracted than there is, by more than four standard errors."""
+        return self.errors_below_zero > _TOO_FAR
+
+    @property
+    def upper_nm(self) -> float:
+        """Root of the variance plus two standard errors, at least 0 [nm rms]; nan if refuted."""
+        if self.refuted:
+            return float("nan")
+        return float(np.sqrt(max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)))
+
+    def above(self, other: ResidualEstimate) -> tuple[float, float]:
+        """Variance of this residual less that of another on the same frames, and its error.
+
+        What both share, the noise and most of the disturbance, cancels: the error is smaller
+        than that of either.
+
+        Parameters
+        ----------
+        other : ResidualEstimate
+            Another loop's residual, of the same frames and noise.
+
+        Returns
+        -------
+        tuple of float
+            Difference and standard error [nm^2].
+
+        Raises
+        ------
+        ProblemError
+            If the frames are others.
+        """
+        if self.stretches != other.stretches or self.measured_nm.shape != other.measured_nm.shape:
+            raise ProblemError("two residuals can be compared on the same frames only; got others.")
+        covariance = _mean_covariance(
+            self.measured_nm - other.measured_nm,
+            self.measured_nm + other.measured_nm,
+            self.stretches,
+        )
+        error = float(np.sqrt(max(float(np.sum(covariance)), 0.0)))
+        return self.total_nm2 - other.total_nm2, error
+
+    def strehl(self, imaging: Imaging) -> float:
+        """Strehl ratio of a Gaussian residual of this covariance.
+
+        Parameters
+        ----------
+        imaging : Imaging
+            The camera.
+
+        Returns
+        -------
+        float
+            Long-exposure Strehl ratio, in [0, 1]; nan where the covariance is not positive
+            semidefinite within its error: the residual is then lost in the noise.
+        """
+        if np.linalg.eigvalsh(self.covariance_nm2)[0] < 0:
+            return float("nan")
+        return jitter_strehl(self.covariance_nm2, imaging=imaging)
+
+
+def _roots(variance: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.where(variance >= 0, variance, np.nan)), dtype=np.float64)
+
+
+def residual_estimate(
+    measured: FloatArray,
+    stretches: Stretches,
+    *,
+    noise_nm2: FloatArray,
+    noise_error_nm4: FloatArray,
+) -> ResidualEstimate:
+    """Estimate a residual from the measured residual of some stretches.
+
+    Shapes: measured (frames, n), stretches list of (start, stop), noise_nm2 (n, n), noise_error_nm4
+    (n, n).
+    """
+    if len(measured) < _FEWEST:
+        raise ProblemError(
+            f"a residual needs at least {_FEWEST} frames after settling; got {len(measured)}. "
+            "Give longer stretches, or lower settle_frames."
+        )
+    error = _mean_covariance(measured, measured, stretches) + noise_error_nm4
+    return ResidualEstimate(
+        measured_nm=frozen(measured),
+        stretches=stretches,
+        noise_nm2=frozen(noise_nm2),
+        covariance_nm2=frozen(measured.T @ measured / len(measured) - noise_nm2),
+        error_nm4=frozen(error),
+    )
+
+
+def _mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) -> FloatArray:
+    """Covariance over the axes of the mean products of two Gaussian series, (n, n).
+
+    ``cov(x_i y_i, x_j y_j)`` over all lags is the mean over the frequencies of ``S(x_i, x_j)
+    conj S(y_i, y_j) + S(x_i, y_j) conj S(y_i, x_j)``. On the diagonal the product of the two
+    periodograms has that mean for x = y, and at least that otherwise; off it, the two factors
+    are taken at neighbouring frequencies, which are independent.
+    """
+    frames, n = one.shape
+    total, start = np.zeros((n, n)), 0
+    for begin, end in stretches:
+        length = end - begin
+        x, y = (
+            rfft(one[start : start + length], axis=0),
+            rfft(other[start : start + length], axis=0),
+        )
+        weight = np.full(len(x), 2.0)  # a frequency and its negative
+        weight[0] = 1.0
+        weight[-1] = 2.0 if length % 2 else 1.0
+        weight /= length**2
+        total += np.diag(weight @ (np.abs(x) ** 2 * np.abs(y) ** 2))
+        for i in range(n):
+            for j in range(i):
+                pairs = ((x[:, i], x[:, j], y[:, i], y[:, j]), (x[:, i], y[:, j], y[:, i], x[:, j]))
+                part = sum(
+                    float(weight @ np.real(a * b.conj() * np.roll(c.conj() * d, 1)))
+                    for a, b, c, d in pairs
+                )
+                total[i, j] += part
+                total[j, i] += part
+        start += length
+    total /= frames**2
+    # a covariance is at most the product of the deviations
+    most = np.sqrt(np.outer(np.diag(total), np.diag(total)))
+    return np.asarray(np.clip(total, -most, most))

@@ -1,0 +1,199 @@
+"""The best FIR predictor of a record, by least squares: no model of turbulence or vibrations.
+
+With the mirror's taps c, the filtered series ``zf(k) = c[0] z(k) + c[1] z(k-1) + ...`` and
+commands ``u(k) = a[0] z(k) + a[1] z(k-1) + ...``, the measured residual is ``e(k) = z(k) -
+a[0] zf(k-1) - a[1] zf(k-2) - ...``: a linear regression whose sum of squares is the one that a
+replay measures, for fractional delays and mirrors that move as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.linalg import qr
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.prediction.residual import inverse_sensor, usable_series
+from lbt_synth.linear import Controller
+from lbt_synth.loop import youla_controller
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, frozen, instance, integer, number
+
+_MOST_TAPS = 1000
+_ROWS_A_TAP = 4  # frames to fit for each coefficient, at least
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LeastSquaresPredictor:
+    """A predictor fitted to a record, as a controller.
+
+    Attributes
+    ----------
+    coefficients : (n, n, taps) ndarray
+        ``a[i, j, l]``: what z_j(k-l) adds to the correction of mode i that u(k) commands.
+    fitted_nm2 : (n,) ndarray
+        Mean square of the measured residual of each mode in the fit, noise included [nm^2]; less
+        than on other data.
+    frames : int
+        Frames that were fitted.
+    controller : Controller
+        From y(k) to u(k), stable in the loop for the sensor gain of the fit.
+    """
+
+    coefficients: FloatArray
+    fitted_nm2: FloatArray
+    frames: int
+    controller: Controller
+
+
+def least_squares_predictor(
+    open_loop: Any,
+    hardware: LoopHardware,
+    *,
+    taps: int = 32,
+    sensor_gain: float = 1.0,
+    stretches: Sequence[tuple[int, int]] | None = None,
+    coupled: bool = False,
+    ridge: float = 0.0,
+) -> LeastSquaresPredictor:
+    """Fit the FIR predictor of least residual to a record, and make it a controller.
+
+    Parameters
+    ----------
+    open_loop : (frames, n) array_like
+        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + w(k) / g`` [nm].
+    hardware : LoopHardware
+        The loop: delay, mirror, sensor and influence matrix, both square and invertible.
+    taps : int, optional
+        Coefficients a mode, at most 1000.
+    sensor_gain : float, optional
+        Sensor gain g that formed z, relative to the sensor matrix; the controller needs it.
+    stretches : sequence of (start, stop), optional
+        Contiguous usable frames to fit; by default the whole record.
+    coupled : bool, optional
+        Predict each mode from all modes, instead of from itself.
+    ridge : float, optional
+        Added to the mean squares of the regressors, relative to their mean. 0, the default, is
+        plain least squares; of regressors that depend on each other, the coefficients of least
+        norm are taken.
+
+    Returns
+    -------
+    LeastSquaresPredictor
+        Coefficients and controller. The filter of the pseudo-open-loop measurement is its Youla
+        parameter (:func:`youla_controller`): the loop is stable whatever the coefficients.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range, sizes clash, or the stretches hold fewer than four
+        frames a coefficient.
+
+    Examples
+    --------
+    Two frames ahead, an AR1 process without noise is predicted by the square of its pole:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
+    >>> slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=10.0, frame_rate_hz=800)
+    >>> idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / 800)
+    >>> run = lbt.simulate(idle, lbt.Truth(turbulence=slow), hardware=path, frames=20_000)
+    >>> fit = lbt.identification.least_squares_predictor(run.total_nm[0], path, taps=1)
+    >>> bool(abs(fit.coefficients[0, 0, 0] - 0.81) < 0.02)
+    True
+    """
+    instance(hardware, LoopHardware)
+    count = integer(taps, "taps", at_least=1)
+    if count > _MOST_TAPS:
+        raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {count}.")
+    gain = number(sensor_gain, "sensor_gain", above=0)
+    share = number(ridge, "ridge", at_least=0)
+    back = inverse_sensor(hardware) / gain
+    N, n = hardware.influence, hardware.modes
+    if N.shape[0] != N.shape[1] or np.linalg.matrix_rank(N) < n:
+        raise ProblemError(
+            "a predictor needs a command for every mode, and an influence matrix that can be "
+            f"inverted; got {N.shape} of rank {np.linalg.matrix_rank(N)}."
+        )
+    series, parts = usable_series(open_loop, n, stretches)
+    blocks = [_regression(series[a:b], hardware.mirror_taps, count) for a, b in parts]
+    X = np.concatenate([block[0] for block in blocks])  # (rows, n, taps)
+    Z = np.concatenate([block[1] for block in blocks])  # (rows, n)
+    unknowns = count * (n if coupled else 1)
+    if len(X) < _ROWS_A_TAP * unknowns:
+        raise ProblemError(
+            f"a predictor of {unknowns} coefficients needs at least {_ROWS_A_TAP * unknowns} "
+            f"frames to fit, beside {count} and the mirror's at the beginning of each stretch; got "
+            f"{len(X)}. Record more, or lower taps."
+        )
+    coefficients, fitted = np.zeros((n, n, count)), np.zeros(n)
+    for i in range(n):
+        seen = slice(None) if coupled else slice(i, i + 1)
+        found, fitted[i] = _least_squares(X[:, seen].reshape(len(X), -1), Z[:, i], share)
+        coefficients[i, seen] = found.reshape(-1, count)
+    return LeastSquaresPredictor(
+        coefficients=frozen(coefficients),
+        fitted_nm2=frozen(fitted),
+        frames=len(X),
+        controller=_controller(hardware, coefficients, back, gain),
+    )
+
+
+def _regression(
+    part: FloatArray, mirror_taps: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Regressors ``zf(k-1), zf(k-2), ...`` (rows, n, taps) and targets z(k) (rows, n)."""
+    frames, n = part.shape
+    m = len(mirror_taps)
+    rows = frames - (m - 1) - count  # the first needs zf(k-taps), which needs m values of z
+    if rows < 1:
+        return np.zeros((0, n, count)), np.zeros((0, n))
+    filtered = sliding_window_view(part, m, axis=0) @ mirror_taps[::-1]
+    late = sliding_window_view(filtered, count, axis=0)[:rows, :, ::-1]
+    return np.asarray(late), part[m - 1 + count :]
+
+
+def _least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[FloatArray, float]:
+    """Coefficients of least squares, of least norm, and the mean square that is left."""
+    unknowns = X.shape[1]
+    together = np.column_stack([X, z])
+    # the triangle of the data has their squares, and no digit is lost by squaring
+    triangle = qr(together, mode="r", overwrite_a=True, check_finite=False)[0][: unknowns + 1]
+    left, right = triangle[:, :unknowns], triangle[:, unknowns]
+    if share > 0:
+        weight = np.sqrt(share * np.mean(np.sum(left**2, axis=0)))
+        left = np.vstack([left, weight * np.eye(unknowns)])
+        right = np.concatenate([right, np.zeros(unknowns)])
+    found = np.linalg.lstsq(left, right, rcond=None)[0]
+    rest = triangle[:, unknowns] - triangle[:, :unknowns] @ found
+    return np.asarray(found), float(rest @ rest / len(X))
+
+
+def _controller(
+    hardware: LoopHardware, coefficients: FloatArray, back: FloatArray, gain: float
+) -> Controller:
+    """Make the controller from y to u of a filter of z: the newest values of z are its states."""
+    n, _, count = coefficients.shape
+    A = np.eye(n * count, k=-n)
+    B = np.zeros((n * count, n))
+    B[:n] = back
+    rows = coefficients.transpose(0, 2, 1).reshape(n, count * n)
+    believed = LoopHardware(
+        frame_rate_hz=hardware.frame_rate_hz,
+        delay_frames=hardware.delay_frames,
+        sensor_matrix=gain * hardware.sensor,
+        influence_matrix=hardware.influence,
+        mirror=hardware.mirror,
+    )
+    parameter = Controller(
+        A=A,
+        B=B,
+        C=np.linalg.inv(hardware.influence) @ rows,
+        D=np.zeros((n, n)),
+        dt_s=hardware.dt_s,
+    )
+    return youla_controller(believed, parameter)

@@ -1,0 +1,218 @@
+"""What a controller would have left of a recorded disturbance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.prediction.estimate import ResidualEstimate, residual_estimate
+from lbt_synth.identification.prediction.stretches import Stretches, checked_stretches
+from lbt_synth.linear import Controller
+from lbt_synth.loop import ClosedLoop, close_loop, filter_series
+from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, float_array, instance, integer, number, real_array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReplayData:
+    """A recorded pseudo-open-loop series that fits a loop, and what is known of its noise."""
+
+    open_loop: FloatArray  # (frames, n): the series z(k) [nm]; finite in the stretches
+    stretches: Stretches  # list of (start, stop): frames that can be used
+    noise_nm2: FloatArray  # (n, n): covariance of the noise in z [nm^2]
+    noise_error_nm4: FloatArray  # (n, n): covariance of the errors of the noise variances [nm^4]
+
+
+def replayed_residual(
+    open_loop: Any,
+    controller: Controller,
+    hardware: LoopHardware,
+    *,
+    noise_nm: Any,
+    noise_error_nm: Any = 0.0,
+    sensor_gain: float = 1.0,
+    stretches: Sequence[tuple[int, int]] | None = None,
+    settle_frames: int | None = None,
+) -> ResidualEstimate:
+    """Residual that a controller would have left of a recorded disturbance.
+
+    The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + w(k) / g`` does not depend on the
+    controller that ran. Fed with ``y(k) = g S (z(k) - c(k))``, with c(k) its own correction, a
+    controller gives exactly the commands that it would have given in that loop, under that
+    disturbance and that noise. Its measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) +
+    w(k) / g``. As c(k) knows the noise up to frame k-1 only, white noise adds its variance to
+    that of the residual, no more and no less, and is subtracted.
+
+    Parameters
+    ----------
+    open_loop : (frames, n) array_like
+        Recorded series z, a row a frame [nm]; what lies outside the stretches is not read.
+    controller : Controller
+        From y(k) to u(k).
+    hardware : LoopHardware
+        The loop: delay, mirror, sensor matrix S (square and invertible).
+    noise_nm : float or (q,) array_like
+        Standard deviation of the white noise w on each measurement, per frame [nm].
+    noise_error_nm : float or (q,) array_like, optional
+        Standard error of that, the errors of different measurements independent [nm].
+    sensor_gain : float, optional
+        Sensor gain g of the recorded loop relative to the sensor matrix, as used to form z.
+    stretches : sequence of (start, stop), optional
+        Contiguous usable frames, in order; by default the whole record.
+    settle_frames : int, optional
+        Frames dropped at the beginning of each stretch, where the controller begins anew from
+        a zero state; by default until the slowest mode of the loop has decayed to 1e-4, and at
+        least as many as the loop has states. A stretch that is no longer is left out.
+
+    Returns
+    -------
+    ResidualEstimate
+        Measured residual, its variance without the noise, and standard errors. They hold the
+        sampling of a Gaussian disturbance and noise and the error of ``noise_nm``, not that of
+        the sensor gain.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range, sizes clash, or too few frames are left.
+    UnstableLoopError
+        If the loop is unstable or marginally stable.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    >>> truth = lbt.Truth(turbulence=slow, noise_nm=5.0)
+    >>> ran, new = (lbt.integrator(path, gain=gain).controller for gain in (0.1, 0.5))
+    >>> night = lbt.simulate(ran, truth, hardware=path, frames=8000)
+    >>> y, u = night.measurements[0], night.commands[0]
+    >>> z = y[2:] + u[:-2]  # a delay of two frames
+    >>> would = lbt.identification.replayed_residual(z, new, path, noise_nm=5.0)
+    >>> exact = lbt.residual_budget(lbt.close_loop(path, new), truth)
+    >>> bool(abs(would.rms_nm - exact.rms_nm) < 3 * would.rms_error_nm)
+    True
+    """
+    instance(hardware, LoopHardware)
+    deviation = _per_measurement(noise_nm, "noise_nm", hardware.n_measurements)
+    data = replay_data(
+        open_loop,
+        hardware,
+        noise_nm2=np.diag(deviation**2),
+        noise_error_nm=noise_error_nm,
+        sensor_gain=sensor_gain,
+        stretches=stretches,
+    )
+    loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
+    loop.require_stable()
+    default = settling(loop)
+    settle = (
+        default if settle_frames is None else integer(settle_frames, "settle_frames", at_least=0)
+    )
+    return replayed(data, loop, settle)
+
+
+def replay_data(
+    open_loop: Any,
+    hardware: LoopHardware,
+    *,
+    noise_nm2: FloatArray,
+    noise_error_nm: Any,
+    sensor_gain: float,
+    stretches: Any,
+) -> ReplayData:
+    """Check a recorded series against a loop, and refer the noise to the modes.
+
+    ``noise_nm2`` is the covariance of the measurements' noise, (q, q). The errors of their
+    standard deviations are independent, and leave its correlations as they are: an error of one
+    measurement is common to all modes that it is seen in.
+    """
+    instance(hardware, LoopHardware)
+    gain = number(sensor_gain, "sensor_gain", above=0)
+    series, parts = usable_series(open_loop, hardware.modes, stretches)
+    back = inverse_sensor(hardware) / gain
+    error = _per_measurement(noise_error_nm, "noise_error_nm", hardware.n_measurements)
+    deviation = np.sqrt(np.diag(noise_nm2))
+    # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2
+    slope = 2 * back * (back @ noise_nm2) / np.where(deviation > 0, deviation, np.inf)
+    return ReplayData(
+        open_loop=series,
+        stretches=parts,
+        noise_nm2=back @ noise_nm2 @ back.T,
+        noise_error_nm4=(slope * error**2) @ slope.T,
+    )
+
+
+def usable_series(
+    open_loop: Any, modes: int, stretches: Any, name: str = "open_loop"
+) -> tuple[FloatArray, Stretches]:
+    """Return a series (frames, modes) that is finite within its stretches, and the stretches."""
+    series = float_array(open_loop, name)
+    if series.ndim != 2 or series.shape[1] != modes or len(series) == 0:
+        raise DimensionError(
+            f"{name} must be (frames, {modes}), a row a frame and a column a mode; got "
+            f"{series.shape}."
+        )
+    parts = checked_stretches(stretches, len(series))
+    for start, stop in parts:
+        if not np.all(np.isfinite(series[start:stop])):
+            real_array(series[start:stop], f"{name}, frames {start} to {stop},")  # says where
+    return series, parts
+
+
+def inverse_sensor(hardware: LoopHardware) -> FloatArray:
+    """Inverse of the sensor matrix, (n, n)."""
+    S = hardware.sensor
+    if S.shape[0] != S.shape[1] or np.linalg.matrix_rank(S) < len(S):
+        raise ProblemError(
+            "a replay needs a measurement for every mode, and a sensor matrix that can be "
+            f"inverted; got {S.shape} of rank {np.linalg.matrix_rank(S)}."
+        )
+    return np.asarray(np.linalg.inv(S))
+
+
+def _per_measurement(value: Any, name: str, count: int) -> FloatArray:
+    out = real_array(value, name)
+    if out.ndim > 1 or (out.ndim == 1 and out.size != count):
+        raise DimensionError(f"{name} must be a number or {count}, one a measurement; got {out}.")
+    if np.any(out < 0):
+        raise ProblemError(f"{name} must be at least 0; got {np.min(out):.6g}.")
+    return np.broadcast_to(out, (count,))
+
+
+def settling(loop: ClosedLoop) -> int:
+    """Frames until a loop has forgotten how it began."""
+    return max(settling_frames(loop.spectral_radius), loop.system.n_states)
+
+
+def replayed(data: ReplayData, loop: ClosedLoop, settle: int) -> ResidualEstimate:
+    """Replay a stable loop on recorded data."""
+    kept = settled_stretches(data.stretches, settle)
+    # z(k) for phi_tot(k-1), and no noise: the residual of frame k-1 is e(k)
+    path = loop.rejection()
+    parts = [
+        filter_series(path, data.open_loop[start - settle : stop])[settle:] for start, stop in kept
+    ]
+    return residual_estimate(
+        np.concatenate(parts),
+        kept,
+        noise_nm2=data.noise_nm2,
+        noise_error_nm4=data.noise_error_nm4,
+    )
+
+
+def settled_stretches(stretches: Stretches, settle: int) -> Stretches:
+    """Return what is left of stretches after settling."""
+    kept = tuple((start + settle, stop) for start, stop in stretches if stop - start > settle)
+    if not kept:
+        longest = max(stop - start for start, stop in stretches)
+        raise ProblemError(
+            f"a stretch must be longer than the {settle} frames in which the loop settles; the "
+            f"longest has {longest}. Give a longer record, or lower settle_frames."
+        )
+    return kept

@@ -1,0 +1,365 @@
+"""Records from arrays: units, the regular grid, faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.records.clock import clock_of, first_per_frame
+from lbt_synth.identification.records.faults import (
+    equal_runs,
+    fill,
+    outliers,
+    runs,
+    saturated,
+    stuck,
+)
+from lbt_synth.identification.records.health import Finding, RecordHealth, joined
+from lbt_synth.identification.records.record import LoopRecord, known_frames
+from lbt_synth.identification.records.units import nm_per
+from lbt_synth.models import PositionLoop
+from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array, integer, number
+
+_LEAST_FRAMES = 4096
+_LEAST_SECONDS = 4.0
+_SHORTEST_STRETCH = 256  # frames of a stretch that counts
+_LARGEST_NM = 1e100  # beyond it a number is none, and its square overflows
+_OPEN_FRAMES = 20  # of zero commands
+_TREND = 2.0
+_LEAST_QUARTER = 64  # pairs of frames, to speak of a trend
+
+Finder = Callable[[FloatArray, BoolArray], BoolArray]
+
+
+def loop_record(
+    measurements: Any,
+    commands: Any = None,
+    *,
+    frame_rate_hz: float | None = None,
+    unit: str,
+    delay_frames: float | None = None,
+    mirror: PositionLoop | None = None,
+    times_s: Any = None,
+    frame_numbers: Any = None,
+    command_unit: str | None = None,
+    diameter_m: float | None = None,
+    obstruction: float | None = None,
+    source: str = "arrays",
+    notes: Sequence[str] = (),
+) -> LoopRecord:
+    """Make a record of series, and find its faults.
+
+    Parameters
+    ----------
+    measurements : (frames, axes) or (frames,) array_like
+        Measurements y(k) of one or two axes; the pseudo-open-loop series, without commands.
+        NaN and infinities are gaps.
+    commands : (frames, axes) or (frames,) array_like, optional
+        Commands u(k), computed from the measurements up to y(k).
+    frame_rate_hz : float, optional
+        Frame rate [Hz]; that of ``times_s`` by default.
+    unit : str
+        Unit of the measurements: nm, um or m rms of wavefront, or mas, arcsec, urad or rad of
+        tilt, for which the diameter is needed.
+    delay_frames : float, optional
+        Total delay [frames], from the middle of an exposure to that of its command.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror; one that settles at once by default.
+    times_s : (frames,) array_like, optional
+        Time of each row [s]; missing frames become holes.
+    frame_numbers : (frames,) array_like, optional
+        Counter of frames of each row; missing frames become holes.
+    command_unit : str, optional
+        Unit of the commands; that of the measurements by default.
+    diameter_m, obstruction : float, optional
+        Telescope diameter [m], and its central obstruction as a fraction of it.
+    source : str, optional
+        Where it is from.
+    notes : sequence of str, optional
+        What is to be said of it in ``health``.
+
+    Returns
+    -------
+    LoopRecord
+        Series in nm on the regular grid, and what was found.
+
+    Raises
+    ------
+    ProblemError
+        If sizes clash, the rate is not known or is contradicted, times run backwards, a unit is
+        unknown, or a value is out of range.
+
+    Notes
+    -----
+    A frame is spoilt where a measurement is missing, not finite, held (a run of equal values
+    longer than chance), at an end of the range that is reached repeatedly, or outlying: a second
+    difference of more than 6.5 standard deviations, by median deviations of the record and of
+    the frames around. A command that is missing, not finite or at a limit spoils the
+    frames whose correction it is part of. Commands that are zero or held, and a scatter that
+    changes by more than 2 between the first quarter and the last, are reported only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> y = np.random.default_rng(0).standard_normal((1000, 2))
+    >>> y[400, 0] = 80.0
+    >>> seen = lbt.identification.loop_record(y, frame_rate_hz=1000, unit="mas", diameter_m=8.22)
+    >>> seen.health.summary()
+    '999 of 1000 frames are usable; 1 outlier (measurements).'
+    >>> round(float(seen.measurements[0, 0] / y[0, 0]), 3)
+    9.963
+    """
+    scale = nm_per(unit, diameter_m=diameter_m)
+    y = _columns(measurements, "measurements", scale)
+    u = None
+    if commands is not None:
+        command_scale = nm_per(
+            unit if command_unit is None else command_unit, diameter_m=diameter_m
+        )
+        u = _columns(commands, "commands", command_scale)
+        if u.shape != y.shape:
+            raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
+    clock = clock_of(
+        len(y), frame_rate_hz=frame_rate_hz, times_s=times_s, frame_numbers=frame_numbers
+    )
+
+    def same(rows: IntArray) -> bool:
+        each = [y[rows]] if u is None else [y[rows], u[rows]]
+        return all(np.array_equal(a, np.broadcast_to(a[0], a.shape), equal_nan=True) for a in each)
+
+    keep, torn, again = first_per_frame(clock, same)
+    at = clock.frame_of_row[keep]
+    frames, findings, said = clock.frames, list[Finding](), list(clock.notes)
+    there = np.zeros(frames, dtype=np.bool_)
+    there[at] = True
+    there[torn] = False
+    missing = np.ones(frames, dtype=np.bool_)
+    missing[at] = False
+    _report(findings, "missing", "frames", None, missing, spoils=True)
+    if again:
+        said.append(f"{again} rows of a time that had been recorded already were left out")
+        if torn.size:
+            contradicted = np.zeros(frames, dtype=np.bool_)
+            contradicted[torn] = True
+            _report(findings, "repeated", "frames", None, contradicted, spoils=True)
+    y = _laid_out(y[keep], at, frames)
+    y, measured = _judged(
+        y,
+        there,
+        "measurements",
+        findings,
+        (("saturated", saturated), ("stuck", stuck), ("outlier", outliers)),
+    )
+    commanded = np.ones(frames, dtype=np.bool_)
+    if u is not None:
+        u = _laid_out(u[keep], at, frames)
+        u, commanded = _judged(u, there, "commands", findings, (("saturated", _clipped),))
+        _held(u, commanded, findings)
+    said += _trends(y, measured)
+    usable = measured
+    if u is not None and delay_frames is not None:
+        path = LoopRecord(  # checks delay and mirror
+            frame_rate_hz=clock.frame_rate_hz,
+            measurements=y,
+            commands=u,
+            delay_frames=delay_frames,
+            mirror=mirror,
+            usable=measured,
+            health=RecordHealth(frames=frames, usable=0),
+        )
+        usable, unknown = known_frames(path.mirror_taps, measured, commanded)
+        if unknown is not None:
+            findings.append(unknown)
+    return LoopRecord(
+        frame_rate_hz=clock.frame_rate_hz,
+        measurements=y,
+        commands=u,
+        delay_frames=delay_frames,
+        mirror=mirror,
+        usable=usable,
+        health=RecordHealth(
+            frames=frames,
+            usable=int(np.sum(usable)),
+            findings=tuple(findings),
+            notes=joined(notes, said),
+        ),
+        diameter_m=diameter_m,
+        obstruction=obstruction,
+        source=source,
+        measured=measured,
+        commanded=commanded,
+    )
+
+
+def require_length(
+    record: LoopRecord,
+    *,
+    frames: int = _LEAST_FRAMES,
+    seconds: float = _LEAST_SECONDS,
+    resolution_hz: float | None = None,
+) -> int:
+    """Refuse a record that is too short to say anything of a model.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record.
+    frames : int, optional
+        Usable frames that are needed, in stretches of at least 256.
+    seconds : float, optional
+        The same as a time [s].
+    resolution_hz : float, optional
+        Frequencies that are to be told apart [Hz]: the longest stretch has to last
+        ``1 / resolution_hz``.
+
+    Returns
+    -------
+    int
+        Usable frames in stretches of at least 256.
+
+    Raises
+    ------
+    ProblemError
+        That says what is there, what is needed, and what was found in the record.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> brief = lbt.identification.loop_record([[1.0], [2.5], [2.0]], frame_rate_hz=800, unit="nm")
+    >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s) ...
+    """
+    rate = record.frame_rate_hz
+    needed = integer(frames, "frames", at_least=1)
+    needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
+    lengths = [stop - start for start, stop in record.stretches()]
+    count = sum(length for length in lengths if length >= _SHORTEST_STRETCH)
+    longest = max(lengths, default=0)
+    if count < needed:
+        raise ProblemError(
+            f"the record needs {needed} usable frames ({needed / rate:.3g} s) in stretches of at "
+            f"least {_SHORTEST_STRETCH}; got {count}, the longest stretch {longest}. "
+            f"{record.health.summary()} Record more, or bridge short holes (record.bridged())."
+        )
+    if resolution_hz is not None:
+        line = int(np.ceil(rate / number(resolution_hz, "resolution_hz", above=0) * (1 - 1e-12)))
+        if longest < line:
+            raise ProblemError(
+                f"to tell frequencies {resolution_hz:g} Hz apart a stretch of {line} frames "
+                f"({line / rate:.3g} s) is needed; the longest has {longest}."
+            )
+    return count
+
+
+def _columns(value: Any, name: str, scale: float) -> FloatArray:
+    """Return a series as (frames, axes) in nm; NaN is what is masked, not finite or absurd."""
+    if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "fiub":
+        value = np.ma.filled(value.astype(np.float64), np.nan)
+    out = float_array(value, name)
+    if out.ndim == 1:
+        out = out[:, None]
+    if out.ndim != 2 or out.size == 0:
+        raise DimensionError(f"{name} must be (frames, axes) and not empty; got {out.shape}.")
+    if out.shape[1] > 2:
+        turn = " Transpose it." if out.shape[0] <= 2 else " Choose tip and tilt."
+        raise DimensionError(f"{name} must have one or two axes; got {out.shape}.{turn}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = scale * out
+        return np.where(np.abs(scaled) < _LARGEST_NM, scaled, np.nan)
+
+
+def _laid_out(rows: FloatArray, at: IntArray, frames: int) -> FloatArray:
+    out = np.full((frames, rows.shape[1]), np.nan)
+    out[at] = rows
+    return out
+
+
+def _judged(
+    series: FloatArray,
+    there: BoolArray,
+    name: str,
+    findings: list[Finding],
+    finders: Sequence[tuple[str, Finder]],
+) -> tuple[FloatArray, BoolArray]:
+    """Return the series with fillers, and the frames that are good on all axes."""
+    out, all_good = np.empty(series.shape), np.ones(len(series), dtype=np.bool_)
+    for axis in range(series.shape[1]):
+        column = series[:, axis]
+        finite = np.isfinite(column)
+        _report(findings, "not finite", name, axis, there & ~finite, spoils=True)
+        good = there & finite
+        for kind, finder in finders:
+            found = finder(np.where(finite, column, 0.0), good)
+            _report(findings, kind, name, axis, found, spoils=True)
+            good = good & ~found
+        out[:, axis] = fill(column, good)
+        all_good &= good
+    return out, all_good
+
+
+def _report(
+    findings: list[Finding],
+    kind: str,
+    series: str,
+    axis: int | None,
+    found: BoolArray,
+    *,
+    spoils: bool,
+) -> None:
+    where = np.flatnonzero(found)
+    if where.size:
+        findings.append(
+            Finding(
+                kind=kind,
+                series=series,
+                axis=axis,
+                count=where.size,
+                first_frame=int(where[0]),
+                fraction=where.size / len(found),
+                spoils=spoils,
+            )
+        )
+
+
+def _clipped(series: FloatArray, good: BoolArray) -> BoolArray:
+    """Find commands at a limit; zero is none, but that of an open loop."""
+    return saturated(series, good & (series != 0))
+
+
+def _held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> None:
+    """Report where the loop was open, and where its commands stood still."""
+    zero = np.all(commands == 0, axis=1) & good
+    is_open = np.zeros(len(zero), dtype=np.bool_)
+    for start, stop in runs(zero):
+        is_open[start:stop] = stop - start >= _OPEN_FRAMES
+    _report(findings, "loop open", "commands", None, is_open, spoils=False)
+    for axis in range(commands.shape[1]):
+        column, held = commands[:, axis], np.zeros(len(zero), dtype=np.bool_)
+        each = equal_runs(column, good)
+        for start, stop in each[each[:, 1] - each[:, 0] >= _OPEN_FRAMES]:
+            held[start:stop] = True
+        _report(findings, "held", "commands", axis, held & ~is_open, spoils=False)
+
+
+def _trends(series: FloatArray, good: BoolArray) -> list[str]:
+    """Say where the scatter from frame to frame changes between the ends of the record."""
+    pairs = np.flatnonzero(good[1:] & good[:-1])
+    quarter = pairs.size // 4
+    said = []
+    for axis in range(series.shape[1] if quarter >= _LEAST_QUARTER else 0):
+        steps = np.diff(series[:, axis])[pairs]
+        first, last = (
+            float(np.sqrt(np.mean(part**2))) for part in (steps[:quarter], steps[-quarter:])
+        )
+        if max(first, last) > _TREND * min(first, last):
+            said.append(
+                f"axis {axis} is not stationary: the rms difference of two frames is {first:.3g} "
+                f"nm in the first quarter and {last:.3g} nm in the last"
+            )
+    return said

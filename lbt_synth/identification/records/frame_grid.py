@@ -1,0 +1,202 @@
+"""Frames of rows by their times: missing frames, repeated rows, rounded times."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.validation import FloatArray, IntArray
+
+MOST_HOLES = 9  # missing frames over those that are there
+_CLEAR = 0.3  # of a frame: how far a step may be from a whole number of frames
+_LEAST_GAP = 0.1  # of a frame, between the latest and the earliest row of a frame
+_COARSE = 0.02  # of a frame: times in smaller steps count as exact
+_WHOLE = 0.02  # of a step, by which times may differ from whole ones
+_EXACT = 0.05  # of a frame over the record: a quantum and a period that do not part
+_ABOVE = 1.05  # quantum over period, from where equal times are of different frames
+_FEW = 3  # steps that are not like the others, to see an order in them
+_DENOMINATOR = 100_000
+_BLOCKS = 16  # of rows, whose mean distance from the grid is compared
+_SEARCH = 60
+
+
+def frames_of_times(times: FloatArray, rate: float | None) -> tuple[IntArray, str]:
+    """Return the frame of each row, from 0, and a note (empty for none).
+
+    Rounded to a quantum q, the times of frames without a hole stay within ``q rate`` of a
+    straight line; a missing frame leaves it by 1. Rows are laid on the grid where only one of
+    the two explains them.
+    """
+    steps = np.diff(times)
+    rising = steps[steps > 0]
+    if rising.size == 0:
+        raise ProblemError("times_s must rise; all rows have the same time.")
+    period = float(np.median(rising)) if rate is None else 1 / rate
+    within_bounds(float(times[-1] - times[0]) / period + 1, len(times))
+    if rising.size == len(steps) and np.ptp(steps) < 2 * _CLEAR * float(np.median(steps)):
+        # no frame is missing, whatever the rate is: that is compared afterwards
+        return np.arange(len(times)), ""
+    quantum = _quantum(times, steps)
+    if rate is None:
+        return _by_steps(times, steps, period, quantum), ""
+    return _by_rate(times, steps, rate, quantum)
+
+
+def within_bounds(frames: float, rows: int) -> None:
+    """Refuse a record that would be nearly all holes."""
+    if frames > (1 + MOST_HOLES) * rows:
+        raise ProblemError(
+            f"{frames - rows:.15g} of {frames:.15g} frames would be missing between the first row "
+            "and the last; cut the record where it was interrupted."
+        )
+
+
+def _quantum(times: FloatArray, steps: FloatArray) -> float:
+    """Return what all steps in time are whole multiples of; 0 if there is nothing such."""
+    noise = 8 * float(np.spacing(np.max(np.abs(times))))
+    levels = np.unique(steps)
+    levels = np.concatenate([levels[:1], levels[1:][np.diff(levels) > noise]])
+    gaps = np.concatenate([levels[levels > noise], np.diff(levels)])
+    least = float(np.min(gaps[gaps > noise], initial=np.inf))
+    if not np.isfinite(least):
+        return 0.0
+    counts = np.round(steps / least)
+    if np.any(np.abs(steps / least - counts) > _WHOLE + noise / least) or not counts.sum():
+        return 0.0
+    return float(times[-1] - times[0]) / float(counts.sum())
+
+
+def _apart(times: FloatArray, rate: float) -> FloatArray:
+    """Return how far rows without a hole are from a grid, (rows,) [frames]."""
+    return np.asarray((times - times[0]) * rate - np.arange(len(times)))
+
+
+def _narrowest(times: FloatArray) -> tuple[float, float]:
+    """Return the rate that all rows without a hole are closest to, and their spread [frames]."""
+    rate = line_rate(times, np.arange(len(times)))
+    low, high = (rate * (1 + sign * 2 / len(times)) for sign in (-1, 1))
+    for _ in range(_SEARCH):  # the spread is convex in the rate
+        one, two = low + (high - low) / 3, high - (high - low) / 3
+        if np.ptp(_apart(times, one)) < np.ptp(_apart(times, two)):
+            high = two
+        else:
+            low = one
+    rate = (low + high) / 2
+    return rate, float(np.ptp(_apart(times, rate)))
+
+
+def _by_steps(times: FloatArray, steps: FloatArray, period: float, quantum: float) -> IntArray:
+    """Lay rows by the steps in time, where the rate is not known."""
+    counts = np.round(steps / period)
+    if np.any(np.abs(steps / period - counts) >= _CLEAR):
+        k = int(np.argmax(np.abs(steps / period - counts)))
+        raise ProblemError(
+            f"times_s lie on no regular grid of {1 / period:.6g} Hz; row {k + 1} comes "
+            f"{steps[k] / period:.3g} frames after the one before. Give frame_rate_hz, a counter "
+            "of frames, or leave the times away."
+        )
+    if quantum > _COARSE * period and int(np.sum(counts != 1)) >= _FEW:
+        rate, spread = _narrowest(times)
+        if spread <= quantum * rate + _WHOLE + _slack(times, rate):
+            raise ProblemError(
+                f"the steps in time, whole multiples of {quantum:.6g} s, are those of missing or "
+                f"repeated frames at {1 / period:.6g} Hz, or of no such frame at {rate:.6g} Hz: "
+                "the times may be rounded. Give frame_rate_hz."
+            )
+    return np.asarray(np.concatenate([[0], np.cumsum(counts)]), dtype=np.int64)
+
+
+def _slack(times: FloatArray, rate: float) -> float:
+    return 1e-6 + 16 * rate * float(np.spacing(np.max(np.abs(times))))
+
+
+def _by_rate(
+    times: FloatArray, steps: FloatArray, rate: float, quantum: float
+) -> tuple[IntArray, str]:
+    """Lay rows on the grid of a known rate."""
+    rows, slack = len(times), _slack(times, rate)
+    step = quantum * rate  # frames
+    placed, gap, second = _nearest(times, steps, rate)
+    coarse = step > _COARSE and abs(1 - step) * rows > _EXACT
+    if coarse:
+        complete = _complete(_apart(times, rate), step, slack)
+        if not complete and gap < _LEAST_GAP:  # a rate that is stated with few digits
+            found, spread = _narrowest(times)
+            complete = abs(found / rate - 1) * rows < 0.5 and spread <= step + slack
+        note = f"times are rounded to {quantum:.6g} s"
+        if complete:
+            alone = step >= _ABOVE or placed is None or np.array_equal(placed, np.arange(rows))
+            if alone and not _hides(_apart(times, rate), step, slack):
+                return np.arange(rows), note
+            raise ProblemError(
+                f"times_s in steps of {quantum:.6g} s cannot tell rounding from missing or "
+                f"repeated frames at {rate:.9g} Hz in {rows} rows. Give a counter of frames, or "
+                "leave the times away."
+            )
+        # the frames begin in the gap that rounding leaves: another one that wide would do, too
+        if placed is None or second >= 1 - step + _finest(step) - slack:
+            raise ProblemError(
+                f"times_s in steps of {quantum:.6g} s leave the grid of {rate:.9g} Hz by up to "
+                f"{np.ptp(_apart(times, rate)):.3g} frames, and cannot tell which frames are "
+                "missing or repeated. Give a counter of frames, or cut the record there."
+            )
+    if placed is not None:
+        return placed, ""
+    return _by_steps(times, steps, 1 / rate, 0.0), ""
+
+
+def _complete(apart: FloatArray, step: float, slack: float) -> bool:
+    """Whether rounding alone explains how far the rows are from the grid."""
+    spread = float(np.ptp(apart))
+    if spread <= step - _finest(step) + slack:
+        return True
+    # ties may be rounded up and down: then both ends are reached, and nothing moves
+    if spread > step + slack or len(apart) < 4 * _BLOCKS:
+        return False
+    means = [float(block.mean()) for block in np.array_split(apart, _BLOCKS)]
+    return max(means) - min(means) < 0.5
+
+
+def _finest(step: float) -> float:
+    """Return what the distances from the grid are multiples of; rounding reaches one end only."""
+    part = Fraction(step).limit_denominator(_DENOMINATOR)
+    return 1 / part.denominator if abs(float(part) - step) < 1e-9 else 0.0
+
+
+def _hides(apart: FloatArray, step: float, slack: float) -> bool:
+    """Whether a frame may be missing and rounding hide it, but for the ends of the record."""
+    high, low = np.maximum.accumulate, np.minimum.accumulate
+    top = np.maximum(high(apart)[:-1], high(apart[::-1])[::-1][1:] - 1)
+    bottom = np.minimum(low(apart)[:-1], low(apart[::-1])[::-1][1:] - 1)
+    end = 1 + len(apart) // _BLOCKS
+    hidden = (top - bottom)[end:-end] <= step - _finest(step) + slack
+    return bool(hidden.any())
+
+
+def _nearest(
+    times: FloatArray, steps: FloatArray, rate: float
+) -> tuple[IntArray | None, float, float]:
+    """Return frames parted in the widest gap (None where it is narrow), and the two widest."""
+    grid = (times - times[0]) * rate
+    parts = np.sort(grid - np.floor(grid))
+    gaps = np.diff(np.append(parts, parts[0] + 1))
+    k = int(np.argmax(gaps))
+    gap = float(gaps[k])
+    second = float(np.max(np.delete(gaps, k), initial=0.0))
+    if gap < _LEAST_GAP:
+        return None, gap, second
+    frame = np.floor(grid - (parts[k] + gap / 2))
+    if np.any(np.diff(frame)[steps > 0] <= 0):
+        return None, gap, second
+    return np.asarray(frame - frame[0], dtype=np.int64), gap, second
+
+
+def line_rate(times: FloatArray, frame: IntArray) -> float:
+    """Return the rate by a straight line through times and frames, to nine digits."""
+    t, n = times - times.mean(), frame - frame.mean()
+    slope = float(n @ t)
+    if not slope > 0:
+        raise ProblemError("times_s must rise; all rows have the same time.")
+    return float(f"{float(n @ n) / slope:.9g}")

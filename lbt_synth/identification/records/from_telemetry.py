@@ -1,0 +1,213 @@
+"""Records from telemetry: tip and tilt out of what a loop recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import Telemetry
+from lbt_synth.identification.records.build import loop_record
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.records.units import unit_word
+from lbt_synth.models import PositionLoop
+from lbt_synth.validation import FloatArray, instance, integer, number, sequence
+
+_FOREIGN = "timing"  # metadatum of telemetry of another program
+_CONDITION = 1e8
+_SAME_RATE = 1e-6
+
+
+def record_of(
+    telemetry: Telemetry,
+    *,
+    modes: Sequence[int] | None = None,
+    frame_rate_hz: float | None = None,
+    delay_frames: float | None = None,
+    mirror: PositionLoop | None = None,
+    unit: str | None = None,
+    command_unit: str | None = None,
+    diameter_m: float | None = None,
+    obstruction: float | None = None,
+    source: str | None = None,
+) -> LoopRecord:
+    """Make a record of tip and tilt from telemetry.
+
+    Measurements become modes by the inverse of the interaction matrix, commands by the
+    influence matrix, where there are such.
+
+    Parameters
+    ----------
+    telemetry : Telemetry
+        What the loop recorded.
+    modes : sequence of int, optional
+        Tip and tilt among the modes, from 0; all, where there are one or two.
+    frame_rate_hz : float, optional
+        Frame rate [Hz]; refused where it is not that of the telemetry.
+    delay_frames : float, optional
+        Total delay [frames], where it is not known, or in place of that of the telemetry.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror; by default as in the telemetry.
+    unit, command_unit : str, optional
+        Units of the modal measurements and of the modal commands, where the telemetry does not
+        tell them.
+    diameter_m, obstruction : float, optional
+        Telescope diameter [m], and its central obstruction as a fraction of it, where they are
+        not known, or in place of those of the telemetry.
+    source : str, optional
+        Where it is from; by default the name of the system.
+
+    Returns
+    -------
+    LoopRecord
+        Series in nm, and what was found in them.
+
+    Raises
+    ------
+    ProblemError
+        If tip and tilt cannot be told among the modes, slopes come without what makes modes of
+        them, or a unit or rate is unknown or contradicted.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> lazy = lbt.integrator(path, gain=0.5)
+    >>> shake = lbt.Truth(
+    ...     turbulence=None,
+    ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
+    ... )
+    >>> run = lbt.simulate(lazy.controller, shake, hardware=path, frames=200)
+    >>> seen = lbt.identification.record_of(lbt.files.telemetry_of(run, path))
+    >>> error = seen.pseudo_open_loop()[3:] - run.total_nm[0, 2:-1]  # no noise
+    >>> bool(abs(error).max() < 1e-9)
+    True
+    """
+    instance(telemetry, Telemetry)
+    notes: list[str] = []
+    if frame_rate_hz is not None:
+        rate, own = number(frame_rate_hz, "frame_rate_hz", above=0), telemetry.frame_rate_hz
+        if abs(rate / own - 1) > _SAME_RATE:
+            raise ProblemError(
+                f"frame_rate_hz must be that of the telemetry, {own:.9g} Hz; got {rate:.9g} Hz."
+            )
+    n, q, m = telemetry.modes, telemetry.measurements.shape[1], telemetry.commands.shape[1]
+    chosen = _chosen(modes, n)
+    y, y_unit = _modal_measurements(telemetry, chosen, unit, notes)
+    u, u_unit = _modal_commands(telemetry, chosen, command_unit or unit, notes)
+    for word, given in (
+        ("delay_frames", delay_frames),
+        ("diameter_m", diameter_m),
+        ("obstruction", obstruction),
+    ):
+        there = getattr(telemetry, word)
+        if given is not None and there is not None and given != there:
+            notes.append(f"{word} {given:g} was given; the telemetry has {there:g}")
+    if n > len(chosen) or max(q, m) > len(chosen):
+        notes.append(f"axes are modes {', '.join(map(str, chosen))} of {n}")
+    if _FOREIGN in telemetry.metadata:
+        notes.append(
+            "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
+        )
+    return loop_record(
+        y,
+        u,
+        frame_rate_hz=telemetry.frame_rate_hz,
+        times_s=telemetry.times_s,
+        unit=y_unit,
+        command_unit=u_unit,
+        delay_frames=telemetry.delay_frames if delay_frames is None else delay_frames,
+        mirror=telemetry.mirror if mirror is None else mirror,
+        diameter_m=telemetry.diameter_m if diameter_m is None else diameter_m,
+        obstruction=telemetry.obstruction if obstruction is None else obstruction,
+        source=(telemetry.name or "telemetry") if source is None else source,
+        notes=notes,
+    )
+
+
+def _chosen(modes: Any, n: int) -> list[int]:
+    if modes is None:
+        if n > 2:
+            raise ProblemError(
+                f"this telemetry has {n} modes; say which are tip and tilt: modes=(0, 1) for the "
+                "first two."
+            )
+        return list(range(n))
+    given = [integer(mode, "modes", at_least=0) for mode in sequence(modes, "modes")]
+    if not 1 <= len(given) <= 2 or len(set(given)) != len(given) or max(given) >= n:
+        raise ProblemError(f"modes must be one or two different modes below {n}; got {modes}.")
+    return given
+
+
+def _modal_measurements(
+    seen: Telemetry, chosen: list[int], unit: str | None, notes: list[str]
+) -> tuple[FloatArray, str]:
+    """Coefficients of the chosen modes, and their unit."""
+    y, n, q = seen.measurements, seen.modes, seen.measurements.shape[1]
+    response = seen.interaction_matrix
+    if seen.slopes is not None and response is not None:
+        response = None if seen.reconstructor is None else seen.reconstructor @ response
+    if response is None:
+        if q != n:
+            raise ProblemError(_slopes(q, n))
+        return y[:, chosen], _stated(seen.measurement_unit, unit, "measurements")
+    if np.array_equal(response, np.eye(n)):
+        return y[:, chosen], _stated(seen.measurement_unit, unit, "measurements")
+    if q > n > 2:
+        raise ProblemError(_slopes(q, n))
+    if q < n or np.linalg.cond(response) > _CONDITION:
+        raise ProblemError(
+            f"the interaction matrix {response.shape} has no inverse: the {q} measurements do not "
+            f"tell {n} modes apart. Give telemetry of tip and tilt alone."
+        )
+    notes.append("measurements: the inverse of the interaction matrix times what was recorded")
+    modal = y @ np.linalg.pinv(response).T
+    own = "nm" if unit_word(seen.measurement_unit) else ""
+    if not own and _FOREIGN not in seen.metadata:
+        own = "nm"  # the modes of our own telemetry are
+    return modal[:, chosen], _stated(own, unit, "modes behind the interaction matrix")
+
+
+def _slopes(q: int, n: int) -> str:
+    many = f"{n} modes" if n != q else "no modes"
+    return (
+        f"this telemetry has {q} measurements and {many}: slopes without modal coefficients. "
+        "Multiply them by the reconstructor of the loop: Telemetry(measurements=slopes @ R.T, "
+        "slopes=slopes, reconstructor=R, ...)."
+    )
+
+
+def _modal_commands(
+    seen: Telemetry, chosen: list[int], unit: str | None, notes: list[str]
+) -> tuple[FloatArray, str]:
+    """Commands as coefficients of the chosen modes, and their unit."""
+    u, n, m = seen.commands, seen.modes, seen.commands.shape[1]
+    influence = seen.influence_matrix
+    if influence is None:
+        if m != n:
+            raise ProblemError(
+                f"this telemetry has {m} commands of {n} modes, and no influence matrix; give it "
+                "to Telemetry(influence_matrix=...), (modes, commands)."
+            )
+        return u[:, chosen], _stated(seen.command_unit, unit, "commands")
+    if np.array_equal(influence, np.eye(n, m)) and m == n:
+        return u[:, chosen], _stated(seen.command_unit, unit, "commands")
+    notes.append("commands: the influence matrix times what was recorded")
+    own = "nm" if unit_word(seen.command_unit) or _FOREIGN not in seen.metadata else ""
+    return (u @ influence.T)[:, chosen], _stated(own, unit, "modes behind the influence matrix")
+
+
+def _stated(own: str, given: str | None, what: str) -> str:
+    """Return the unit that the telemetry has, or the one that was given."""
+    known = unit_word(own)
+    if given is None:
+        if known is None:
+            raise ProblemError(
+                f"the unit of the {what} is {own!r}, which is none of tip and tilt; give unit."
+            )
+        return known
+    if known is not None and unit_word(given) not in (None, known):
+        raise ProblemError(f"unit must be that of the {what}, {known}; got {given!r}.")
+    return given

@@ -1,0 +1,104 @@
+"""What is wrong with a record: findings, and a table of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+HEADINGS = ("finding", "series", "axis", "frames", "%", "first frame", "effect")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One kind of fault in one series.
+
+    Attributes
+    ----------
+    kind : str
+        "missing", "repeated", "not finite", "stuck", "saturated", "outlier", "loop open",
+        "held" or "correction not known".
+    series : str
+        "measurements", "commands" or "frames".
+    axis : int or None
+        Axis from 0; None where it is of all.
+    count : int
+        Frames.
+    first_frame : int
+        The first of them.
+    fraction : float
+        Their part of all frames.
+    spoils : bool
+        Whether these frames are not usable; else they are only reported.
+    """
+
+    kind: str
+    series: str
+    axis: int | None
+    count: int
+    first_frame: int
+    fraction: float
+    spoils: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordHealth:
+    """What was found in a record.
+
+    Attributes
+    ----------
+    frames, usable : int
+        All frames, and those that count as data.
+    findings : tuple of Finding
+        The faults; empty for a clean record.
+    notes : tuple of str
+        What was taken for what, what was repaired, what changes with time.
+    bridged : int
+        Frames that were interpolated.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> seen = lbt.identification.loop_record(
+    ...     [1.0, 3.0, float("nan"), 2.0], frame_rate_hz=500, unit="nm"
+    ... )
+    >>> for row in seen.health.rows():
+    ...     print(row)
+    ('not finite', 'measurements', 0, 1, 25.0, 2, 'spoilt')
+    """
+
+    frames: int
+    usable: int
+    findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
+    bridged: int = 0
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing was found that spoils a frame."""
+        return not any(found.spoils for found in self.findings)
+
+    def rows(self) -> tuple[tuple[str, str, int | None, int, float, int, str], ...]:
+        """Return a row a finding, under the headings ``HEADINGS`` of this module."""
+        return tuple(
+            (
+                found.kind,
+                found.series,
+                found.axis,
+                found.count,
+                round(100 * found.fraction, 4),
+                found.first_frame,
+                "spoilt" if found.spoils else "reported",
+            )
+            for found in self.findings
+        )
+
+    def summary(self) -> str:
+        """Return one line: how many frames are usable, and why the others are not."""
+        text = f"{self.usable} of {self.frames} frames are usable"
+        spoilt = [f"{f.count} {f.kind} ({f.series})" for f in self.findings if f.spoils]
+        return f"{text}; {', '.join(spoilt)}." if spoilt else f"{text}."
+
+
+def joined(*parts: Sequence[str]) -> tuple[str, ...]:
+    """Return notes in their order, each once."""
+    return tuple(dict.fromkeys(note for part in parts for note in part))

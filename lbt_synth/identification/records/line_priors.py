@@ -1,0 +1,340 @@
+"""What is known of vibration lines beforehand: lists, and accelerometers on the structure."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, TelemetryError
+from lbt_synth.identification.records.columns import column
+from lbt_synth.identification.records.contents import read_contents
+from lbt_synth.identification.records.csv_file import read_csv
+from lbt_synth.identification.records.units import hz_per
+from lbt_synth.validation import BoolArray, FloatArray, frozen, integer, number, real_array
+
+_FEWEST_AVERAGES = 8
+_AVERAGES = 32  # that a segment is chosen for
+_FINEST_HZ = 0.25
+_SHORTEST_SEGMENT = 64
+_DIP = 0.5  # of a peak: how far the power falls before the next counts as another
+_ERRORS = (
+    "error",
+    "frequency_error",
+    "freq_error",
+    "f_error",
+    "err",
+    "sigma",
+    "std",
+    "uncertainty",
+)
+_ENDINGS = (".csv", ".tsv", ".txt", ".dat")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinePrior:
+    """A frequency at which a vibration is expected.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Frequency [Hz].
+    frequency_error_hz : float, optional
+        Standard error of it [Hz]; 0 where it is not known.
+    source : str, optional
+        Who says so.
+
+    Raises
+    ------
+    ProblemError
+        If the frequency is not above 0 or the error is negative.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.identification.LinePrior(frequency_hz=20, source="swing arm").frequency_error_hz
+    0.0
+    """
+
+    frequency_hz: float
+    frequency_error_hz: float = 0.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        frequency = number(self.frequency_hz, "frequency_hz", above=0)
+        error = number(self.frequency_error_hz, "frequency_error_hz", at_least=0)
+        object.__setattr__(self, "frequency_hz", frequency)
+        object.__setattr__(self, "frequency_error_hz", error)
+        if not isinstance(self.source, str):
+            raise ProblemError(f"source must be a text; got {self.source!r}.")
+
+
+def load_lines(lines: Any) -> tuple[LinePrior, ...]:
+    """Take vibration lines from a list or from a text file.
+
+    Parameters
+    ----------
+    lines : path-like or sequence
+        A text file (.csv, .tsv, .txt, .dat) with a frequency a row [Hz], and its error in a
+        second column if there is one (or by the headings frequency_hz and error_hz); or a list
+        of frequencies, of pairs of frequency and error, or of LinePrior.
+
+    Returns
+    -------
+    tuple of LinePrior
+        The lines, by rising frequency.
+
+    Raises
+    ------
+    TelemetryError
+        If the file cannot be read or holds something else.
+    ProblemError
+        If an entry of a list is none of these.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> [line.frequency_hz for line in lbt.identification.load_lines([45.5, (16.0, 0.2)])]
+    [16.0, 45.5]
+    """
+    if isinstance(lines, str | os.PathLike):
+        found = _lines_of_file(Path(lines))
+    elif isinstance(lines, list | tuple | np.ndarray):
+        found = [_line(one, "list") for one in lines]
+    else:
+        raise ProblemError(
+            f"lines must be a file or a list of frequencies; got {type(lines).__name__}."
+        )
+    return tuple(sorted(found, key=lambda line: line.frequency_hz))
+
+
+def _line(one: Any, source: str) -> LinePrior:
+    if isinstance(one, LinePrior):
+        return one
+    parts = list(one) if isinstance(one, list | tuple | np.ndarray) else [one]
+    if not 1 <= len(parts) <= 2:
+        raise ProblemError(
+            f"a line must be a frequency, or a pair of frequency and error; got {one!r}."
+        )
+    error = parts[1] if len(parts) == 2 else 0.0
+    return LinePrior(frequency_hz=parts[0], frequency_error_hz=error, source=source)
+
+
+def _lines_of_file(path: Path) -> list[LinePrior]:
+    if path.suffix.lower() not in _ENDINGS:
+        raise TelemetryError(
+            f"a list of lines must end in one of {', '.join(_ENDINGS)}; got {path.name!r}.",
+            path=path,
+        )
+    try:
+        table = read_csv(path.read_text(encoding="utf-8-sig"))
+        if table.values.shape[1] > 2:
+            raise TelemetryError(
+                f"it must have one or two columns, frequency and error; got "
+                f"{table.values.shape[1]}."
+            )
+        at, error = _columns_of_lines(table.names)
+        gaps = np.flatnonzero(np.isnan(table.values[:, at]))
+        if gaps.size:
+            raise TelemetryError(f"row {gaps[0] + 1} of the numbers has no frequency.")
+        rows = table.values[:, [at] if error is None else [at, error]]
+        return [_line([v for v in row if not np.isnan(v)], str(path)) for row in rows]
+    except OSError as error:
+        why = getattr(error, "strerror", None) or error
+        raise TelemetryError(f"cannot read {path}: {why}.", path=path) from error
+    except UnicodeDecodeError as error:
+        raise TelemetryError(f"{path} is no text in UTF-8.", path=path) from error
+    except LbtSynthError as error:
+        raise TelemetryError(f"{path}: {error}", path=path) from error
+
+
+def _columns_of_lines(names: list[str]) -> tuple[int, int | None]:
+    """Return the columns of frequencies and of their errors; by place without a heading."""
+    if not any(names):
+        return 0, 1 if len(names) > 1 else None
+    found: dict[str, int] = {}
+    for i, name in enumerate(names):
+        known = column(name, np.zeros(1))
+        plain = re.sub(r"[\s\-.]*[\[(].*$|_hz$", "", name.strip().lower())
+        word = "error" if re.sub(r"[\s\-.]+", "_", plain) in _ERRORS else known.role
+        if word not in ("frequency", "error") or word in found or hz_per(known.unit) != 1:
+            raise TelemetryError(
+                "its columns must be frequency_hz, and frequency_error_hz or error_hz if there is "
+                f"one; got {', '.join(names)}."
+            )
+        found[word] = i
+    if "frequency" not in found:
+        raise TelemetryError(f"it must have a column frequency_hz; got {', '.join(names)}.")
+    return found["frequency"], found.get("error")
+
+
+def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
+    """Read a column a sensor from a file of any format that records have.
+
+    Shapes: returns (frames, sensors).
+    """
+    source = Path(path)
+    try:
+        content = source.read_bytes()
+    except OSError as error:
+        raise TelemetryError(f"cannot read {source}: {error.strerror}.", path=source) from error
+    found = [
+        each.values
+        for each in read_contents(source, content).columns
+        if each.role not in ("times", "frame_numbers")
+    ]
+    if not found or len({values.size for values in found}) > 1:
+        raise TelemetryError(
+            f"{source} must hold columns of one length, a sensor each; got "
+            f"{len(found)} of {sorted({values.size for values in found})} rows.",
+            path=source,
+        )
+    return frozen(np.stack(found, axis=1))
+
+
+def lines_of_accelerometer(
+    accelerations: Any,
+    measurement: Any,
+    frame_rate_hz: float,
+    *,
+    usable: Any = None,
+    segment_frames: int | None = None,
+    false_alarm: float = 1e-3,
+    lowest_hz: float = 1.0,
+) -> tuple[LinePrior, ...]:
+    """Find the frequencies at which accelerometers and the wavefront move together.
+
+    The magnitude-squared coherence of every sensor with every axis is averaged over segments
+    that do not overlap (Hann's window, on differences of two frames, which leak less). Of K
+    segments of independent series it exceeds t with probability ``(1 - t)^(K-1)``
+    (G. C. Carter, C. H. Knapp, A. H. Nuttall, IEEE Trans. Audio Electroacoust. 21, 337 (1973),
+    doi:10.1109/TAU.1973.1162496); the threshold is
+    that for which no bin of no pair is expected to exceed it but with the probability
+    ``false_alarm``.
+
+    Parameters
+    ----------
+    accelerations : (frames, sensors) or (frames,) array_like
+        What the accelerometers gave, in any unit, at the times of the measurements.
+    measurement : (frames, axes) or (frames,) array_like
+        Pseudo-open-loop measurement.
+    frame_rate_hz : float
+        Frame rate of both [Hz].
+    usable : (frames,) bool array_like, optional
+        Frames that count; a segment that holds another is left out.
+    segment_frames : int, optional
+        Length of a segment [frames], at least 64; by default such that there are 32 of them, but no
+        longer than 4 s.
+    false_alarm : float, optional
+        Probability that independent series give any line at all.
+    lowest_hz : float, optional
+        Frequencies below are left out [Hz].
+
+    Returns
+    -------
+    tuple of LinePrior
+        A line a peak of the coherent power, by rising frequency; the error is that of a peak
+        within a bin, a whole bin over sqrt(12) at least.
+
+    Raises
+    ------
+    ProblemError
+        If the sizes clash, a value is not finite or out of range, or there are fewer than 8
+        segments.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> rng, k = np.random.default_rng(1), np.arange(40_000)
+    >>> shake = np.cos(2 * np.pi * 20.2 * k / 1000)
+    >>> found = lbt.identification.lines_of_accelerometer(
+    ...     shake + rng.standard_normal(k.size), 2 * shake + rng.standard_normal(k.size), 1000
+    ... )
+    >>> [round(line.frequency_hz, 1) for line in found]
+    [20.2]
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    a, z = _series(accelerations, "accelerations"), _series(measurement, "measurement")
+    if len(a) != len(z):
+        raise DimensionError(
+            f"accelerations and measurement must have as many frames; got {len(a)} and {len(z)}."
+        )
+    chance = number(false_alarm, "false_alarm", above=0, below=1)
+    good = np.ones(len(z), dtype=np.bool_) if usable is None else np.asarray(usable)
+    if good.shape != (len(z),) or good.dtype != np.bool_:
+        raise DimensionError(f"usable must be {len(z)} truth values, one a frame.")
+    if segment_frames is None:
+        longest = rate / _FINEST_HZ
+        length = int(min(longest, max((len(z) - 1) / _AVERAGES, _SHORTEST_SEGMENT)))
+    else:
+        length = integer(segment_frames, "segment_frames", at_least=_SHORTEST_SEGMENT)
+    fa, fz = _segments(a, good, length), _segments(z, good, length)
+    count = len(fz)
+    if count < _FEWEST_AVERAGES:
+        raise ProblemError(
+            f"coherence needs at least {_FEWEST_AVERAGES} segments of {length} usable frames; got "
+            f"{count}. Record more, or shorten segment_frames."
+        )
+    power_a, power_z = np.mean(np.abs(fa) ** 2, axis=0), np.mean(np.abs(fz) ** 2, axis=0)
+    cross = np.mean(fa.conj()[:, :, :, None] * fz[:, :, None, :], axis=0)  # (f, sensors, axes)
+    both = power_a[:, :, None] * power_z[:, None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        coherence = np.where(both > 0, np.abs(cross) ** 2 / both, 0.0)
+    frequency = np.arange(len(power_z)) * rate / length
+    inside = (frequency >= max(lowest_hz, rate / length)) & (frequency < rate / 2)
+    tried = max(int(np.sum(inside)) * coherence.shape[1] * coherence.shape[2], 1)
+    threshold = 1 - (chance / tried) ** (1 / (count - 1))
+    significant = inside & np.any(coherence > threshold, axis=(1, 2))
+    # power of the phase (not of its difference) that goes with a sensor
+    steps = 4 * np.sin(np.pi * np.minimum(frequency, rate / 2) / rate) ** 2
+    shared = np.max(coherence * power_z[:, None, :], axis=(1, 2)) / np.where(inside, steps, 1.0)
+    source = f"accelerometers: coherence over {count} segments, false alarm {chance:g}"
+    return _peaks(frequency, np.where(inside, shared, 0.0), significant, source)
+
+
+def _series(value: Any, name: str) -> FloatArray:
+    out = real_array(value, name)
+    out = out[:, None] if out.ndim == 1 else out
+    if out.ndim != 2 or out.size == 0:
+        raise DimensionError(f"{name} must be (frames, columns); got shape {out.shape}.")
+    return out
+
+
+def _segments(series: FloatArray, good: BoolArray, length: int) -> Any:
+    """Return the transforms of the segments in which all is usable, (segments, f, columns)."""
+    steps, fine = np.diff(series, axis=0), good[1:] & good[:-1]
+    count = len(steps) // length
+    whole = fine[: count * length].reshape(count, length).all(axis=1)
+    parts = steps[: count * length].reshape(count, length, -1)[whole]
+    window = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+    return np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window[:, None], axis=1)
+
+
+def _peaks(
+    frequency: FloatArray, power: FloatArray, significant: BoolArray, source: str
+) -> tuple[LinePrior, ...]:
+    """Local maxima among the significant bins, each with a dip to the next."""
+    from scipy.signal import find_peaks
+
+    width = frequency[1]
+    seen = np.where(significant, power, 0.0)
+    at, _ = find_peaks(seen)
+    if not at.size:
+        return ()
+    from scipy.signal import peak_prominences
+
+    prominence = peak_prominences(seen, at)[0]
+    out = []
+    for k in at[prominence >= _DIP * seen[at]]:
+        around = np.arange(k - 1, k + 2)
+        weight = power[around]
+        centre = float(weight @ frequency[around] / weight.sum())
+        spread = float(np.sqrt(weight @ (frequency[around] - centre) ** 2 / weight.sum()))
+        error = max(width / np.sqrt(12), spread / 2)
+        out.append(LinePrior(frequency_hz=centre, frequency_error_hz=error, source=source))
+    return tuple(out)

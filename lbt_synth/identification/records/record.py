@@ -1,0 +1,382 @@
+"""A record of tip and tilt: measurements, commands, and which frames count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.records.faults import runs
+from lbt_synth.identification.records.health import Finding, RecordHealth, joined
+from lbt_synth.models import LoopHardware, PositionLoop
+from lbt_synth.models.loop_hardware import past_corrections
+from lbt_synth.validation import BoolArray, FloatArray, instance, integer, matrix, number
+
+_MOST_AXES = 2
+_BRIDGED_FRAMES = 3
+_BRIDGED_FRACTION = 0.01
+NOT_KNOWN = "correction not known"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopRecord:
+    """What a loop recorded of one or two axes, in nm of wavefront on a regular grid of frames.
+
+    In the convention of :class:`LoopHardware`, with the mirror's taps of delay and dynamics::
+
+        y(k) = gain (phi_tot(k-1) - c(k)) + w(k),   c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...
+
+    :func:`loop_record`, :func:`record_of` and :func:`load_record` make records and find their
+    faults; here what is given is taken as it is.
+
+    Parameters
+    ----------
+    frame_rate_hz : float
+        Frame rate [Hz].
+    measurements : (frames, axes) array_like
+        Measurements y(k) [nm]; the pseudo-open-loop series itself, where there are no commands.
+    commands : (frames, axes) array_like, optional
+        Commands u(k) [nm]; None for an open loop.
+    delay_frames : float, optional
+        Total delay [frames].
+    mirror : PositionLoop, optional
+        Dynamics of the mirror; one that settles at once by default.
+    usable : (frames,) bool array_like
+        False where a frame is missing or spoilt: the values there are finite fillers.
+    health : RecordHealth
+        What was found.
+    diameter_m, obstruction : float, optional
+        Telescope diameter [m], and its central obstruction as a fraction of it.
+    source : str, optional
+        Where it is from.
+    measured, commanded : (frames,) bool array_like, optional
+        Frames whose measurement, and whose command, is good; ``usable`` follows from both and
+        the delay. By default that of ``usable``, and all.
+
+    Raises
+    ------
+    ProblemError
+        If sizes clash, or a value is not finite or out of range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> seen = lbt.identification.loop_record(
+    ...     [[4.0], [3.0], [1.0], [2.0]],
+    ...     [[0.0], [5.0], [6.0], [7.0]],
+    ...     frame_rate_hz=800,
+    ...     delay_frames=2,
+    ...     unit="nm",
+    ... )
+    >>> seen.corrections()[:, 0].tolist()  # u(k-2); the first two are not known
+    [0.0, 0.0, 0.0, 5.0]
+    >>> seen.pseudo_open_loop(sensor_gain=0.5)[:, 0].tolist()
+    [8.0, 6.0, 2.0, 9.0]
+    >>> seen.stretches()
+    ((2, 4),)
+    """
+
+    frame_rate_hz: float
+    measurements: FloatArray
+    commands: FloatArray | None = None
+    delay_frames: float | None = None
+    mirror: PositionLoop | None = None
+    usable: BoolArray
+    health: RecordHealth
+    diameter_m: float | None = None
+    obstruction: float | None = None
+    source: str = ""
+    measured: BoolArray | None = None
+    commanded: BoolArray | None = None
+
+    def __post_init__(self) -> None:
+        instance(self.health, RecordHealth)
+        y = matrix(self.measurements, "measurements")
+        if not 1 <= y.shape[1] <= _MOST_AXES or len(y) == 0:
+            raise DimensionError(
+                f"measurements must be (frames, axes) of one or two axes; got {y.shape}."
+            )
+        self._set("measurements", y)
+        if self.commands is not None:
+            why = f"to match measurements {y.shape}"
+            u = matrix(self.commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
+            self._set("commands", u)
+        self._set("frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0))
+        self._check_numbers()
+        if self.mirror is not None:
+            instance(self.mirror, PositionLoop)
+        for name in ("usable", "measured", "commanded"):
+            if (flags := getattr(self, name)) is not None:
+                self._set(name, _flags(flags, name, len(y)))
+        if self.delay_frames is not None:
+            _ = self.mirror_taps  # a mirror that does not fit the rate is refused
+
+    def _check_numbers(self) -> None:
+        if (delay := self.delay_frames) is not None:
+            self._set("delay_frames", number(delay, "delay_frames", at_least=1, at_most=100))
+        if (diameter := self.diameter_m) is not None:
+            self._set("diameter_m", number(diameter, "diameter_m", above=0))
+        if (part := self.obstruction) is not None:
+            self._set("obstruction", number(part, "obstruction", at_least=0, below=1))
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames, those that are not usable included."""
+        return len(self.measurements)
+
+    @property
+    def axes(self) -> int:
+        """Number of axes, 1 or 2."""
+        return int(self.measurements.shape[1])
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the record [s]."""
+        return self.frames / self.frame_rate_hz
+
+    @property
+    def hardware(self) -> LoopHardware:
+        """The loop: delay and mirror, one measurement and one command an axis.
+
+        Raises
+        ------
+        ProblemError
+            If the delay is not known.
+        """
+        if self.delay_frames is None:
+            raise ProblemError(
+                "the total delay of this loop is not known; give delay_frames, from the middle of "
+                "an exposure to the middle of the command that is computed from it."
+            )
+        return LoopHardware(
+            frame_rate_hz=self.frame_rate_hz,
+            delay_frames=self.delay_frames,
+            modes=self.axes,
+            mirror=self.mirror,
+        )
+
+    @property
+    def mirror_taps(self) -> FloatArray:
+        """Weights of u(k-1), u(k-2), ... in the correction that y(k) sees."""
+        return self.hardware.mirror_taps
+
+    def corrections(self) -> FloatArray:
+        """Return the correction c(k) inside each measurement [nm].
+
+        Returns
+        -------
+        (frames, axes) ndarray
+            ``c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...``; zeros of an open loop. The first
+            ``len(mirror_taps)`` rows are not known, and those frames not usable.
+
+        Raises
+        ------
+        ProblemError
+            If there are commands and the delay is not known.
+        """
+        if self.commands is None:
+            return np.zeros(self.measurements.shape)
+        return past_corrections(self.mirror_taps, self.commands)
+
+    def pseudo_open_loop(self, sensor_gain: Any = 1.0) -> FloatArray:
+        """Return the measurements that an open loop would have given [nm].
+
+        Parameters
+        ----------
+        sensor_gain : float or (axes,) array_like, optional
+            Real gain of the sensor.
+
+        Returns
+        -------
+        (frames, axes) ndarray
+            ``y(k)/gain + c(k) = phi_tot(k-1) + w(k)/gain``.
+
+        Raises
+        ------
+        ProblemError
+            If a gain is not above 0, or the delay of a closed loop is not known.
+        """
+        return np.asarray(self.measurements / self._gains(sensor_gain) + self.corrections())
+
+    def _gains(self, sensor_gain: Any) -> FloatArray:
+        given = np.atleast_1d(np.asarray(sensor_gain, dtype=object))
+        if given.shape not in {(1,), (self.axes,)}:
+            raise DimensionError(
+                f"sensor_gain must be a number, or {self.axes} of them, one an axis; got shape "
+                f"{given.shape}."
+            )
+        return np.array([number(value, "sensor_gain", above=0) for value in given])
+
+    def stretches(self) -> tuple[tuple[int, int], ...]:
+        """Return (start, stop) of each stretch of contiguous usable frames."""
+        return tuple((int(start), int(stop)) for start, stop in runs(self.usable))
+
+    def with_delay(self, delay_frames: float, *, mirror: PositionLoop | None = None) -> LoopRecord:
+        """Return the same record of a loop with another delay.
+
+        Parameters
+        ----------
+        delay_frames : float
+            Total delay [frames], at least 1.
+        mirror : PositionLoop, optional
+            Dynamics of the mirror; those of the record by default.
+
+        Returns
+        -------
+        LoopRecord
+            With the frames that are usable then; bridged ones are not.
+
+        Raises
+        ------
+        ProblemError
+            If the delay is out of range or the mirror does not fit.
+        """
+        mirror = self.mirror if mirror is None else mirror
+        path = LoopHardware(
+            frame_rate_hz=self.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
+        )
+        measured = self.usable if self.measured is None else self.measured
+        commanded = np.ones(self.frames, np.bool_) if self.commanded is None else self.commanded
+        usable, unknown = measured, None
+        if self.commands is not None:
+            usable, unknown = known_frames(path.mirror_taps, measured, commanded)
+        findings = tuple(found for found in self.health.findings if found.kind != NOT_KNOWN)
+        health = replace(
+            self.health,
+            usable=int(np.sum(usable)),
+            findings=findings if unknown is None else (*findings, unknown),
+            bridged=0,
+        )
+        return replace(
+            self,
+            delay_frames=path.delay_frames,
+            mirror=mirror,
+            usable=usable,
+            measured=measured,
+            commanded=commanded,
+            health=health,
+        )
+
+    def bridged(
+        self,
+        most: int = _BRIDGED_FRAMES,
+        *,
+        most_fraction: float = _BRIDGED_FRACTION,
+        sensor_gain: Any = 1.0,
+    ) -> LoopRecord:
+        """Return the record with short holes interpolated.
+
+        The pseudo-open-loop measurement is interpolated through the two frames on either side
+        (a cubic; a straight line where there are not two). Shorter holes come first, until the
+        fraction is used up.
+
+        Parameters
+        ----------
+        most : int, optional
+            Longest hole that is bridged [frames].
+        most_fraction : float, optional
+            Most frames that are bridged, as a fraction of the record.
+        sensor_gain : float or (axes,) array_like, optional
+            Sensor gain for which the pseudo-open-loop measurement is that of the interpolation.
+
+        Returns
+        -------
+        LoopRecord
+            With a note and a count in its health.
+
+        Raises
+        ------
+        ProblemError
+            If a value is out of range, or the delay of a closed loop is not known.
+        """
+        longest = integer(most, "most", at_least=1)
+        part = number(most_fraction, "most_fraction", at_least=0, at_most=1)
+        series, usable = self.pseudo_open_loop(sensor_gain), self.usable.copy()
+        holes = runs(~self.usable)
+        holes = holes[(holes[:, 0] > 0) & (holes[:, 1] < self.frames)]
+        lengths = holes[:, 1] - holes[:, 0]
+        order = np.argsort(lengths, kind="stable")
+        chosen = order[
+            (lengths[order] <= longest) & (np.cumsum(lengths[order]) <= part * self.frames)
+        ]
+        for start, stop in holes[chosen]:
+            series[start:stop] = _across(series, self.usable, int(start), int(stop))
+            usable[start:stop] = True
+        count = int(np.sum(lengths[chosen]))
+        if not count:
+            return self
+        measurements = self.measurements.copy()
+        new = usable & ~self.usable
+        gains = self._gains(sensor_gain)
+        measurements[new] = (gains * (series - self.corrections()))[new]
+        left = int(np.sum(lengths <= longest)) - len(chosen)
+        note = f"{count} frames in {len(chosen)} holes of at most {longest} were interpolated" + (
+            f"; {left} more such holes were left, beyond {100 * part:g} %" if left else ""
+        )
+        health = replace(
+            self.health,
+            usable=int(np.sum(usable)),
+            bridged=self.health.bridged + count,
+            notes=joined(self.health.notes, [note]),
+        )
+        # a measurement that was replaced is none of another delay
+        measured = (self.usable if self.measured is None else self.measured) & ~new
+        return replace(
+            self, measurements=measurements, usable=usable, measured=measured, health=health
+        )
+
+
+def known_frames(
+    taps: FloatArray, measured: BoolArray, commanded: BoolArray
+) -> tuple[BoolArray, Finding | None]:
+    """Frames with a good measurement whose correction is made of good commands.
+
+    Shapes: taps (t,), measured, commanded (frames,).
+    """
+    frames = len(measured)
+    unknown = np.zeros(frames, dtype=np.bool_)
+    unknown[: len(taps)] = True
+    bad = np.flatnonzero(~commanded)
+    for i in np.flatnonzero(taps):
+        hit = bad + 1 + i
+        unknown[hit[hit < frames]] = True
+    where = np.flatnonzero(unknown)
+    found = Finding(
+        kind=NOT_KNOWN,
+        series="frames",
+        axis=None,
+        count=where.size,
+        first_frame=int(where[0]),
+        fraction=where.size / frames,
+        spoils=True,
+    )
+    return measured & ~unknown, found
+
+
+def _across(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
+    """Interpolate a hole by the polynomial through two frames on either side, or one."""
+    known = np.array([start - 1, stop])
+    wide = np.array([start - 2, start - 1, stop, stop + 1])
+    if wide[0] >= 0 and wide[-1] < len(series) and usable[wide].all():
+        known = wide
+    inside = np.arange(start, stop)
+    weights = np.ones((inside.size, known.size))  # Lagrange
+    for i, at in enumerate(known):
+        for other in np.delete(known, i):
+            weights[:, i] *= (inside - other) / (at - other)
+    return np.asarray(weights @ series[known])
+
+
+def _flags(value: Any, name: str, frames: int) -> BoolArray:
+    out = np.array(value)
+    if out.dtype != np.bool_ or out.shape != (frames,):
+        raise DimensionError(
+            f"{name} must be {frames} truth values, one a frame; got {out.dtype} {out.shape}."
+        )
+    out.setflags(write=False)
+    return out

@@ -1,0 +1,284 @@
+"""Which columns of a file are what: by their names, or as they were chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.records.columns import ROLES, Column, rises
+from lbt_synth.identification.records.contents import Contents
+from lbt_synth.validation import choice, integer, sequence
+
+_SPECTRAL = ("frequency", "density", "amplitude")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Series:
+    """Columns that make a record."""
+
+    kind: str  # "closed_loop", "open_loop" or "spectrum"
+    # Measurements, the open-loop series, or densities; one an axis
+    measurements: tuple[Column, ...]
+    commands: tuple[Column, ...] = ()  # Commands, one an axis; none otherwise
+    # times, frame_numbers, frequency: Clocks and frequencies
+    times: Column | None = None
+    frame_numbers: Column | None = None
+    frequency: Column | None = None
+    amplitude: bool = False  # Whether the densities are named as those of an amplitude
+    notes: tuple[str, ...] = ()  # What was taken for what
+
+
+def select(
+    contents: Contents,
+    *,
+    kind: str | None,
+    axes: Sequence[int] | None,
+    columns: Mapping[str, Any] | None,
+) -> Series:
+    """Choose the columns of a record."""
+    if not contents.columns:
+        raise ProblemError("the file holds no series of numbers.")
+    notes: list[str] = []
+    roles = _roles(contents.columns, columns)
+    if not any(roles.values()):
+        roles = _nameless(contents.columns, kind, notes)
+    kind = _kind(roles, contents.columns) if kind is None else kind
+    if kind == "spectrum":
+        role = _either(roles, "density", "amplitude")
+        chosen = {role: _of_axes(roles[role], role, axes)} if role else {}
+        if role is None or not roles["frequency"]:
+            raise ProblemError(
+                "a spectrum needs columns of frequencies and densities"
+                + _choices(contents.columns, "frequency", "density")
+            )
+        series = Series(
+            kind=kind,
+            measurements=chosen[role],
+            frequency=_single(roles, "frequency"),
+            amplitude=role == "amplitude",
+        )
+    else:
+        role = _either(roles, "open_loop", "measurements")
+        if kind == "closed_loop":
+            role = "measurements" if roles["measurements"] else None
+        if role is None or (kind == "closed_loop" and not roles["commands"]):
+            raise ProblemError(
+                f"a record of kind {kind} needs measurements"
+                + (" and commands" if kind == "closed_loop" else "")
+                + _choices(contents.columns, "measurements", "commands")
+            )
+        if kind == "open_loop" and roles["commands"]:
+            notes.append("commands were left out: the record is of an open loop")
+        series = Series(
+            kind=kind,
+            measurements=_of_axes(roles[role], role, axes),
+            commands=(
+                _of_axes(roles["commands"], "commands", axes) if kind == "closed_loop" else ()
+            ),
+            times=_single(roles, "times"),
+            frame_numbers=_single(roles, "frame_numbers"),
+        )
+        _same_axes(series)
+    return _with_notes(series, contents.columns, notes)
+
+
+def _same_axes(series: Series) -> None:
+    """Refuse measurements of one axis with commands of another."""
+    mine, theirs = (
+        [each.axis for each in chosen if each.axis is not None]
+        for chosen in (series.measurements, series.commands)
+    )
+    if len(mine) != len(series.measurements) or len(theirs) != len(series.commands):
+        return
+    from_one = {tuple(mine), tuple(theirs)} == {(0, 1), (1, 2)}  # one counts from 1
+    if len(mine) == len(theirs) and mine != theirs and not from_one:
+        raise ProblemError(
+            f"measurements and commands must be of the same axes; got "
+            f"{_named(series.measurements)} with {_named(series.commands)}. Choose by "
+            "columns={'measurements': ..., 'commands': ...} if they do belong together."
+        )
+
+
+def counted(columns: Sequence[Column]) -> list[Column]:
+    """Columns as axes, in the order in which they stand."""
+    return [replace(each, axis=axis) for axis, each in enumerate(columns)]
+
+
+def _roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> dict[str, list[Column]]:
+    """Columns of each role: those that were chosen, then by names."""
+    out: dict[str, list[Column]] = {role: [] for role in ROLES}
+    if chosen is not None and not isinstance(chosen, Mapping):
+        raise ProblemError(
+            "columns must be a mapping such as {'measurements': ('a', 'b')}; got "
+            f"{type(chosen).__name__}."
+        )
+    taken: list[Column] = []
+    for role, wanted in (chosen or {}).items():
+        choice(role, "a key of columns", tuple(ROLES))
+        for one in (wanted,) if isinstance(wanted, str | int) else sequence(wanted, "columns"):
+            taken += (found := _found(columns, one))
+            out[role] += found
+        out[role] = counted(out[role])
+    used = {id(each.values) for each in taken}
+    if len(used) < len(taken):
+        raise ProblemError("a column was chosen twice in columns.")
+    fixed = set(chosen or {})
+    if fixed & {"density", "amplitude"}:
+        fixed |= {"density", "amplitude"}
+    for each in columns:
+        if each.role is not None and each.role not in fixed and id(each.values) not in used:
+            out[each.role].append(each)
+    return out
+
+
+def _found(columns: Sequence[Column], wanted: Any) -> list[Column]:
+    """Columns of a name (all of an array), or of a number."""
+    if isinstance(wanted, str):
+        hits = [each for each in columns if each.name.strip().lower() == wanted.strip().lower()]
+        whole = wanted.strip().lower() + "["
+        hits = hits or [each for each in columns if each.name.lower().startswith(whole)]
+        if not hits:
+            raise ProblemError(f"there is no column {wanted!r}; got {_named(columns)}.")
+        if len(hits) > 1 and not hits[0].name.endswith("]"):
+            raise ProblemError(f"{len(hits)} columns are named {wanted!r}; choose by numbers.")
+        return hits
+    number = integer(wanted, "a number of columns", at_least=0)
+    if number >= len(columns):
+        raise ProblemError(f"there is no column {number}; the file has {len(columns)}, from 0.")
+    return [columns[number]]
+
+
+def _nameless(
+    columns: Sequence[Column], kind: str | None, notes: list[str]
+) -> dict[str, list[Column]]:
+    """Roles of columns whose names tell nothing, where the kind does."""
+    out: dict[str, list[Column]] = {role: [] for role in ROLES}
+    if kind is None:
+        raise ProblemError(
+            "names do not tell what the columns are"
+            + _choices(columns, "measurements", "commands")
+            + " Or say what kind the record is."
+        )
+    if kind == "spectrum" and len(columns) > 1:
+        out["frequency"], out["density"] = [columns[0]], counted(columns[1:])
+        notes.append("the first column was taken for the frequencies, the others for densities")
+    elif kind == "open_loop":
+        for number, each in enumerate(columns):
+            if rises(each.values):
+                raise ProblemError(
+                    f"column {number} ({_named([each])}) rises from row to row, as a clock does: "
+                    f"choose by columns={{'times': {number}, 'open_loop': ...}}, by names or "
+                    "numbers from 0."
+                )
+        out["open_loop"] = counted(columns)
+        notes.append("all columns were taken for the open-loop series")
+    return out
+
+
+def _kind(roles: Mapping[str, list[Column]], columns: Sequence[Column]) -> str:
+    """Return what kind the names tell."""
+    spectrum = bool(roles["frequency"]) and bool(_either(roles, "density", "amplitude"))
+    found = [
+        name
+        for name, there in (
+            ("spectrum", spectrum),
+            ("open_loop", bool(roles["open_loop"])),
+            ("closed_loop", bool(roles["measurements"]) and bool(roles["commands"])),
+        )
+        if there
+    ]
+    if len(found) > 1:
+        raise ProblemError(f"the file holds more than one record; say kind: {' or '.join(found)}.")
+    if found:
+        return found[0]
+    if roles["measurements"]:
+        raise ProblemError(
+            "the file has measurements and no commands. Residuals of a closed loop need its "
+            "commands: give the file that has them, or choose their columns. If the loop was "
+            "open, or the series is of the pseudo-open loop, say kind open_loop."
+        )
+    raise ProblemError(
+        "names do not tell what the columns are" + _choices(columns, "measurements", "commands")
+    )
+
+
+def _either(roles: Mapping[str, list[Column]], *names: str) -> str | None:
+    return next((name for name in names if roles[name]), None)
+
+
+def _single(roles: Mapping[str, list[Column]], role: str) -> Column | None:
+    found = roles[role]
+    if len(found) > 1:
+        raise ProblemError(
+            f"{_named(found)} are all named as {role}; choose by columns={{'{role}': ...}}."
+        )
+    return found[0] if found else None
+
+
+def _of_axes(found: Sequence[Column], role: str, axes: Sequence[int] | None) -> tuple[Column, ...]:
+    """Columns of the axes, in the order of the axes that their names tell."""
+    known = [each.axis for each in found if each.axis is not None]
+    if len(found) > 1 and (len(known) < len(found) or len(set(known)) < len(known)):
+        raise ProblemError(
+            f"{_named(found)} are all named as {role}, and not each of an axis of its own; choose "
+            f"by columns={{'{role}': ...}}."
+        )
+    ordered = sorted(found, key=lambda each: each.axis or 0)
+    if axes is None:
+        if len(ordered) > 2:
+            raise ProblemError(
+                f"there are {len(ordered)} columns of {role}; say which are tip and tilt: "
+                "axes=(0, 1) for the first two."
+            )
+        return tuple(ordered)
+    given = [integer(axis, "axes", at_least=0) for axis in sequence(axes, "axes")]
+    if not 1 <= len(given) <= 2 or len(set(given)) < len(given) or max(given) >= len(ordered):
+        raise ProblemError(
+            f"axes must be one or two different numbers below {len(ordered)}, the columns of "
+            f"{role}; got {list(axes)}."
+        )
+    return tuple(ordered[axis] for axis in given)
+
+
+def _with_notes(series: Series, columns: Sequence[Column], notes: list[str]) -> Series:
+    """Say which columns were taken for what, and which were not taken."""
+    what = {"closed_loop": "measurements", "open_loop": "the open loop", "spectrum": "densities"}
+    parts = [
+        (what[series.kind], series.measurements),
+        ("commands", series.commands),
+        *(
+            (word, (each,))
+            for word, each in (
+                ("times", series.times),
+                ("frame numbers", series.frame_numbers),
+                ("frequencies", series.frequency),
+            )
+            if each is not None
+        ),
+    ]
+    said = [f"{word}: {_named(chosen)}" for word, chosen in parts if chosen]
+    used = {id(each.values) for _, chosen in parts for each in chosen}
+    left = [each for each in columns if id(each.values) not in used]
+    if left:
+        said.append(f"not used: {_named(left)}")
+    return Series(
+        kind=series.kind,
+        measurements=series.measurements,
+        commands=series.commands,
+        times=series.times,
+        frame_numbers=series.frame_numbers,
+        frequency=series.frequency,
+        amplitude=series.amplitude,
+        notes=(*said, *notes),
+    )
+
+
+def _named(columns: Sequence[Column]) -> str:
+    return ", ".join(each.name or "a column without a name" for each in columns)
+
+
+def _choices(columns: Sequence[Column], *roles: str) -> str:
+    wanted = ", ".join(f"'{role}': ..." for role in roles)
+    return f"; got {_named(columns)}. Choose by columns={{{wanted}}}, by names or numbers from 0."

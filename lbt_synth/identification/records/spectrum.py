@@ -1,0 +1,105 @@
+"""A recorded power spectrum of tip and tilt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models import TabulatedSpectrum
+from lbt_synth.validation import FloatArray, frozen, integer, matrix, number, real_array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SpectrumRecord:
+    """One-sided power spectra of one or two axes.
+
+    Parameters
+    ----------
+    frequency_hz : (f,) array_like
+        Increasing frequencies, at least 0 [Hz].
+    density_nm2_hz : (f, axes) array_like
+        Densities [nm^2/Hz], at least 0, of the disturbance in open loop; integrated over the
+        frequencies above 0 they give the variance.
+    frame_rate_hz : float, optional
+        Frame rate of the series that they were computed from [Hz].
+    averages : int, optional
+        Periodograms that were averaged.
+    diameter_m : float, optional
+        Telescope diameter [m].
+    source : str, optional
+        Where it is from.
+    notes : tuple of str, optional
+        What was taken for what.
+
+    Raises
+    ------
+    ProblemError
+        If frequencies do not increase or lie above half the frame rate, a density is negative,
+        or sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> flat = lbt.identification.SpectrumRecord(
+    ...     frequency_hz=[0, 50, 100], density_nm2_hz=[[4], [4], [4]]
+    ... )
+    >>> flat.rms_nm.tolist(), flat.axes
+    ([20.0], 1)
+    """
+
+    frequency_hz: FloatArray
+    density_nm2_hz: FloatArray
+    frame_rate_hz: float | None = None
+    averages: int | None = None
+    diameter_m: float | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        density: Any = real_array(self.density_nm2_hz, "density_nm2_hz")
+        density = matrix(density[:, None] if density.ndim == 1 else density, "density_nm2_hz")
+        frequency = real_array(self.frequency_hz, "frequency_hz")
+        if frequency.shape != density.shape[:1] or not 1 <= density.shape[1] <= 2:
+            raise DimensionError(
+                "density_nm2_hz must have a row a frequency, and one or two axes; got "
+                f"{density.shape} and {frequency.shape} frequencies."
+            )
+        for column in density.T:
+            TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=column)
+        object.__setattr__(self, "frequency_hz", frequency)
+        object.__setattr__(self, "density_nm2_hz", density)
+        if self.frame_rate_hz is not None:
+            rate = number(self.frame_rate_hz, "frame_rate_hz", above=0)
+            object.__setattr__(self, "frame_rate_hz", rate)
+            if frequency[-1] > rate / 2 * (1 + 1e-9):
+                raise ProblemError(
+                    f"frequencies must lie below half the frame rate, {rate / 2:.6g} Hz; got "
+                    f"{frequency[-1]:.6g} Hz."
+                )
+        if self.averages is not None:
+            object.__setattr__(self, "averages", integer(self.averages, "averages", at_least=1))
+        if self.diameter_m is not None:
+            diameter = number(self.diameter_m, "diameter_m", above=0)
+            object.__setattr__(self, "diameter_m", diameter)
+
+    @property
+    def axes(self) -> int:
+        """Number of axes, 1 or 2."""
+        return int(self.density_nm2_hz.shape[1])
+
+    @property
+    def rms_nm(self) -> FloatArray:
+        """Root of the integral over the frequencies that are there, (axes,) [nm]."""
+        middles = (self.density_nm2_hz[1:] + self.density_nm2_hz[:-1]) / 2
+        return frozen(np.sqrt(np.diff(self.frequency_hz) @ middles))
+
+    @property
+    def spectra(self) -> tuple[TabulatedSpectrum, ...]:
+        """The spectra as disturbances of a :class:`Truth`, one an axis."""
+        return tuple(
+            TabulatedSpectrum(frequency_hz=self.frequency_hz, density_nm2_hz=column)
+            for column in self.density_nm2_hz.T
+        )

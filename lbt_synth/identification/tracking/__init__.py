@@ -1,0 +1,1 @@
+"""Filters that follow vibrations, and filters exchanged in a running loop."""

@@ -1,0 +1,48 @@
+"""Single measurements of a window that cannot be right, and the window without them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.identification.records.faults import fill, outliers, runs
+from lbt_synth.validation import BoolArray, FloatArray
+
+_APART = 10  # frames between two: nearer ones are what a glitch left in a loop of another gain
+
+
+def glitches(open_loop: FloatArray) -> BoolArray:
+    """Return the frames with an outlier in any column of a pseudo-open-loop series.
+
+    What a glitch does to the commands is not in that series, but the glitch itself is: it bends the
+    series as nothing around it does (see ``records.faults.outliers``). Shapes: open_loop (frames,
+    q) -> (frames,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.identification.tracking.glitches import glitches
+    >>> series = np.random.default_rng(0).standard_normal((1000, 1))
+    >>> series[300] = 100
+    >>> np.flatnonzero(glitches(series)).tolist()
+    [300]
+    """
+    every = np.ones(len(open_loop), dtype=np.bool_)
+    found = [outliers(column, every) for column in open_loop.T]
+    return np.asarray(np.any(found, axis=0))
+
+
+def stand_alone(flags: BoolArray, delay_frames: float) -> bool:
+    """Whether glitches are short and far from each other.
+
+    A glitch ends before its own command comes back. Otherwise the sensor does not see the
+    commands as the model believes, and after a glitch the series has what it did to them: to
+    leave out a part of that would be wrong.
+    """
+    each = runs(flags)
+    lengths, gaps = each[:, 1] - each[:, 0], each[1:, 0] - each[:-1, 1]
+    return bool(np.all(lengths <= max(1, int(delay_frames))) and np.all(gaps >= _APART))
+
+
+def bridged(series: FloatArray, flags: BoolArray) -> FloatArray:
+    """Return a series (frames, q) with the frames that are flagged interpolated linearly."""
+    return np.column_stack([fill(column, ~flags) for column in series.T])

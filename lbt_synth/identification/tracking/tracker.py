@@ -1,0 +1,351 @@
+"""A filter that follows vibrations: identified anew, designed anew, exchanged without a bump."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from lbt_synth.design import FilterDesign, kalman
+from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.identification.tracking.glitches import bridged, glitches, stand_alone
+from lbt_synth.identification.tracking.loop_identifier import LoopIdentifier
+from lbt_synth.identification.tracking.switching import SwitchedController, require_same_loop
+from lbt_synth.identification.tracking.trend import LineTrack, matched_tracks
+from lbt_synth.models import LoopHardware, TipTiltPlant, Vibration
+from lbt_synth.models.plant import with_vibrations
+from lbt_synth.validation import FloatArray, instance, number
+
+_MOST_SPOILT = 0.01  # of a window; fillers stand in for the measurements
+_LEAST_FRAMES = 16
+_NARROW = 0.1  # damping ratio; a wide resonance is a part of the background and has no trend
+
+
+@runtime_checkable
+class Identifier(Protocol):
+    """Anything that makes a plant of a window of closed-loop data, or None where it cannot.
+
+    It may also have a method ``reset()``, which is called when the loop is.
+    """
+
+    def __call__(self, measurements: FloatArray, corrections: FloatArray) -> TipTiltPlant | None:
+        """Take y(k), (frames, q), and the corrections c(k) in them, (frames, n) [nm]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackingUpdate:
+    """What was done at one update.
+
+    Attributes
+    ----------
+    time_s : float
+        Time since the reset of the loop [s]; the window ends here.
+    middle_s : float
+        Time of the middle of the window [s].
+    fitted_hz : tuple of float
+        Frequencies in the window [Hz], none if there was no fit.
+    frequencies_hz : tuple of float
+        Frequencies that the filter assumes which runs from now on [Hz].
+    rms_nm : tuple of float
+        Their rms [nm].
+    noise_nm : tuple of float
+        Standard deviation of the noise that it assumes, one a measurement [nm].
+    left_out : int
+        Frames of the window that were left out: not finite, or outliers.
+    switched : bool
+        Whether a new filter was taken.
+    reason : str
+        Why not; empty if one was.
+    identify_s, design_s, switch_s : float
+        Time that the three steps took [s].
+    """
+
+    time_s: float
+    middle_s: float
+    fitted_hz: tuple[float, ...]
+    frequencies_hz: tuple[float, ...]
+    rms_nm: tuple[float, ...]
+    noise_nm: tuple[float, ...]
+    left_out: int
+    switched: bool
+    reason: str
+    identify_s: float
+    design_s: float
+    switch_s: float
+
+
+class _KeptError(Exception):
+    """The running filter is kept, and why."""
+
+
+class TrackingController:
+    """A controller that identifies and redesigns its filter while it runs.
+
+    Every ``update_s`` seconds the last ``window_s`` seconds of measurements and commands are
+    identified, a filter is designed for what was found, and takes over without a bump
+    (:class:`SwitchedController`). A window gives the frequency of its middle, the filter is
+    needed for the middle of the time until the next update: the last fits are extrapolated by
+    their trend, as far as it is significant.
+
+    No update can stop the loop: where a window holds too few good measurements, the fit fails or
+    the design does not pass its certificate, the running filter stays, and :attr:`history` says
+    why. A measurement that is not finite is left out and the command held. A finite one that
+    cannot be right moves the mirror as the filter lets it, but the fit does not see it: single
+    outliers of the pseudo-open-loop series are interpolated, and count like missing ones.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant of the first filter.
+    identifier : Identifier, optional
+        Makes a plant of a window: :class:`LoopIdentifier` by default, which finds the whole
+        model; :class:`LineFollower` is the quickest.
+    window_s : float, optional
+        Length of the window [s], at least 16 frames.
+    update_s : float, optional
+        Time between updates [s], at least a frame.
+    extrapolate : bool, optional
+        Whether the trend is followed; otherwise the frequencies are those of the window.
+    trend_s : float, optional
+        How long fits count for the trend [s]; twice the window by default, and at least five
+        updates.
+    design : callable, optional
+        From plant to :class:`FilterDesign`; :func:`kalman` by default.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range, or the plant or its design of another kind.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5, modes=1
+    ... )
+    >>> tracker = lbt.identification.TrackingController(
+    ...     plant, lbt.identification.LineFollower(plant), window_s=2
+    ... )
+    >>> shake = lbt.models.DriftingVibration(
+    ...     start_hz=20, end_hz=22, duration_s=8, rms_nm=563.6, direction=(1,)
+    ... )
+    >>> truth = lbt.Truth(turbulence=slow, vibrations=(shake,), noise_nm=15.5)
+    >>> run = lbt.simulate(tracker, truth, hardware=plant.hardware, frames=6400)
+    >>> [update.switched for update in tracker.history[:3]]
+    [True, True, True]
+    >>> bool(abs(tracker.history[-1].frequencies_hz[0] - 22) < 0.2)
+    True
+    """
+
+    def __init__(
+        self,
+        plant: TipTiltPlant,
+        identifier: Identifier | None = None,
+        *,
+        window_s: float = 4.0,
+        update_s: float = 1.0,
+        extrapolate: bool = True,
+        trend_s: float | None = None,
+        design: Callable[[TipTiltPlant], FilterDesign] = kalman,
+    ) -> None:
+        instance(plant, TipTiltPlant)
+        if identifier is None:
+            identifier = LoopIdentifier(plant)
+        if not callable(identifier):
+            raise ProblemError(
+                "identifier must be a callable (measurements, corrections) -> plant or None; "
+                f"got {type(identifier).__name__}."
+            )
+        if not callable(design):
+            raise ProblemError(
+                "design must be a callable plant -> FilterDesign, such as kalman; got "
+                f"{type(design).__name__}."
+            )
+        rate = plant.hardware.frame_rate_hz
+        self._window_s = number(window_s, "window_s", at_least=_LEAST_FRAMES / rate)
+        self._update_s = number(update_s, "update_s", at_least=1 / rate)
+        longer = max(2 * self._window_s, 5 * self._update_s)
+        trend = longer if trend_s is None else trend_s
+        self._trend_s = number(trend, "trend_s", at_least=0)
+        self._window, self._every = round(self._window_s * rate), round(self._update_s * rate)
+        self._rate, self._extrapolate = rate, bool(extrapolate)
+        self._identify, self._design = identifier, design
+        self._running = SwitchedController(design(plant), memory_s=self._window / rate)
+        self.reset()
+
+    @property
+    def hardware(self) -> LoopHardware:
+        """The loop."""
+        return self._running.hardware
+
+    @property
+    def design(self) -> FilterDesign:
+        """The filter that runs."""
+        return self._running.design
+
+    @property
+    def history(self) -> tuple[TrackingUpdate, ...]:
+        """Every update since the reset."""
+        return tuple(self._history)
+
+    @property
+    def kept(self) -> int:
+        """Updates since the reset at which the running filter was kept."""
+        return sum(not update.switched for update in self._history)
+
+    @property
+    def spoilt(self) -> int:
+        """Frames since the reset whose measurement was not finite."""
+        return self._running.spoilt
+
+    def reset(self) -> None:
+        """Return to the first filter, and forget everything."""
+        self._running.reset()
+        self._history: list[TrackingUpdate] = []
+        self._tracks: list[LineTrack] = []
+        self._left_out = 0
+        reset = getattr(self._identify, "reset", None)
+        if callable(reset):
+            reset()
+
+    def step(self, y: Any) -> FloatArray:
+        """Take the measurements y(k), (q,), and return the command u(k), (m,).
+
+        Parameters
+        ----------
+        y : (q,) array_like
+            Measurements; where one of them is not finite the command is held.
+
+        Returns
+        -------
+        (m,) ndarray
+            The command.
+
+        Raises
+        ------
+        ProblemError
+            If they are no real numbers.
+        DimensionError
+            If there is another number of measurements.
+        """
+        command = self._running.step(y)
+        frames = self._running.frames
+        if frames >= self._window and (frames - self._window) % self._every == 0:
+            self._update(frames / self._rate)
+        return command
+
+    def _update(self, time_s: float) -> None:
+        fitted_hz: tuple[float, ...] = ()
+        self._left_out = 0
+        reason, clock = "", [time.perf_counter()]
+        try:
+            found = self._identified()
+            fitted_hz = tuple(line.frequency_hz for line in found.vibrations)
+            clock.append(time.perf_counter())
+            designed = self._designed(self._ahead(found, time_s))
+            clock.append(time.perf_counter())
+            self._running.switch(designed)
+        except _KeptError as kept:
+            reason = str(kept)
+        except LbtSynthError as error:
+            reason = f"{type(error).__name__}: {error}"
+        clock += [time.perf_counter()] * (4 - len(clock))
+        identify_s, design_s, switch_s = np.diff(clock)
+        plant = self.design.problem
+        assert isinstance(plant, TipTiltPlant)  # SwitchedController takes no other
+        self._history.append(
+            TrackingUpdate(
+                time_s=time_s,
+                middle_s=time_s - self._window_s / 2,
+                fitted_hz=fitted_hz,
+                frequencies_hz=tuple(line.frequency_hz for line in plant.vibrations),
+                rms_nm=tuple(line.rms_nm for line in plant.vibrations),
+                noise_nm=tuple(float(v) for v in np.sqrt(np.diag(plant.R))),
+                left_out=self._left_out,
+                switched=not reason,
+                reason=reason,
+                identify_s=float(identify_s),
+                design_s=float(design_s),
+                switch_s=float(switch_s),
+            )
+        )
+
+    def _identified(self) -> TipTiltPlant:
+        """Plant of the last window."""
+        window = self._clean_window()
+        try:
+            found = self._identify(*window)
+        except Exception as error:  # whatever a fit trips over, the loop goes on
+            raise _KeptError(f"the fit failed: {type(error).__name__}: {error}") from error
+        if found is None:
+            raise _KeptError("the fit found no plant")
+        if not isinstance(found, TipTiltPlant):
+            raise _KeptError(f"the fit gave a {type(found).__name__}, not a TipTiltPlant")
+        require_same_loop(found, self.hardware)
+        return found
+
+    def _clean_window(self) -> tuple[FloatArray, FloatArray]:
+        """Measurements and corrections of the last window, without outliers."""
+        measurements, corrections = self._running.window(self._window)
+        missing = ~self._running.usable(self._window)
+        plant = self.design.problem
+        assert isinstance(plant, TipTiltPlant)
+        seen = corrections @ plant.hardware.sensor.T  # with the sensor gain found last
+        wrong = glitches(measurements + seen)
+        self._left_out = int(np.count_nonzero(missing | wrong))
+        share = 100 * self._left_out / len(missing)
+        what = "not finite or outliers" if wrong.any() else "not finite"
+        if share > 100 * _MOST_SPOILT:
+            raise _KeptError(f"{share:.3g} % of the window's measurements are {what}")
+        if wrong.any():
+            if not stand_alone(wrong, self.hardware.delay_frames):
+                raise _KeptError(
+                    f"{np.count_nonzero(wrong)} of the window's measurements are outliers that "
+                    "do not stand alone"
+                )
+            measurements = bridged(measurements + seen, wrong) - seen
+        return measurements, corrections
+
+    def _designed(self, plant: TipTiltPlant) -> FilterDesign:
+        """Certified filter of a plant."""
+        try:
+            return self._design(plant)
+        except Exception as error:  # as above
+            raise _KeptError(f"the design failed: {type(error).__name__}: {error}") from error
+
+    def _ahead(self, found: TipTiltPlant, time_s: float) -> TipTiltPlant:
+        """Plant with the frequencies of the middle of the time until the next update."""
+        if not self._extrapolate or not found.vibrations:
+            return found
+        middle_s = time_s - self._window_s / 2
+        tracks = matched_tracks(self._tracks, found.vibrations)
+        for track, line in zip(tracks, found.vibrations, strict=True):
+            track.add(middle_s, line.frequency_hz, since_s=middle_s - self._trend_s)
+        kept = {id(track) for track in tracks}
+        recent = middle_s - self._trend_s
+        self._tracks = tracks + [
+            old for old in self._tracks if id(old) not in kept and old.time_s[-1] >= recent
+        ]
+        overlap = self._window_s / self._update_s
+        ahead_s = time_s + self._update_s / 2
+        return with_vibrations(
+            found,
+            [
+                _moved(line, track.at(ahead_s, overlap=overlap), self._rate)
+                for line, track in zip(found.vibrations, tracks, strict=True)
+            ],
+        )
+
+
+def _moved(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:
+    """Vibration at an extrapolated frequency; a wide one, or where there can be none, as it is."""
+    lowest = line.damping * line.frequency_hz
+    if line.damping > _NARROW:
+        return line
+    return line.moved(frequency_hz) if lowest < frequency_hz < frame_rate_hz / 2 else line

@@ -1,0 +1,100 @@
+"""Where a line is going: a straight line through its last frequencies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lbt_synth.models import Vibration
+from lbt_synth.validation import FloatArray
+
+_LEAST_POINTS = 4
+_OUTLIER = 3 * 1.4826  # median absolute deviations that make three standard deviations
+_GAP_HZ = 2.0  # a line that jumps by more than this is another line
+_ALIGNED = 0.9  # cosine between directions of the same line
+
+
+def extrapolated(
+    time_s: FloatArray, frequency_hz: FloatArray, at_s: float, *, overlap: float = 1.0
+) -> tuple[float, float, float]:
+    """Extrapolate the last of several frequencies along their trend, as far as it is significant.
+
+    The trend is a least-squares line through what is left when outliers from a Theil-Sen line are
+    dropped (P. K. Sen, J. Am. Stat. Assoc. 63, 1379 (1968), doi:10.1080/01621459.1968.10480934).
+    Between the last frequency and the line the answer is weighted with ``slope^2 / (slope^2 +
+    error^2)``: a slope within its error changes little. Shapes: time_s, frequency_hz (k,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.identification.tracking.trend import extrapolated
+    >>> time_s = np.arange(6.0)
+    >>> frequency, slope, error = extrapolated(time_s, 17 + 0.1 * time_s, 8.0)
+    >>> round(frequency, 6), round(slope, 6)
+    (17.8, 0.1)
+    """
+    last = float(frequency_hz[-1])
+    if time_s.size < _LEAST_POINTS:
+        return last, float("nan"), float("nan")
+    one, other = np.triu_indices(time_s.size, 1)
+    steep = np.median((frequency_hz[other] - frequency_hz[one]) / (time_s[other] - time_s[one]))
+    rest = frequency_hz - steep * time_s
+    rest = np.abs(rest - np.median(rest))
+    inside = rest <= max(_OUTLIER * float(np.median(rest)), 1e-9 * abs(last))
+    changed = not inside[-2:].any()  # one frequency may be wrong, two are another trend
+    if changed or np.count_nonzero(inside) < _LEAST_POINTS:
+        return last, float("nan"), float("nan")
+    t, f = time_s[inside], frequency_hz[inside]
+    t_mean, f_mean = float(np.mean(t)), float(np.mean(f))
+    spread = float(np.sum((t - t_mean) ** 2))
+    slope = float(np.sum((t - t_mean) * (f - f_mean))) / spread
+    misfit = float(np.sum((f - f_mean - slope * (t - t_mean)) ** 2)) / (t.size - 2)
+    error = float(np.sqrt(max(1.0, overlap) * misfit / spread))
+    if slope == 0:
+        return last, slope, error
+    on_line = f_mean + slope * (at_s - t_mean)
+    start = last if inside[-1] else f_mean + slope * (float(time_s[-1]) - t_mean)
+    return start + (on_line - start) / (1 + (error / slope) ** 2), slope, error
+
+
+@dataclass(slots=True, eq=False)
+class LineTrack:
+    """What was found of one line, window after window."""
+
+    direction: FloatArray
+    time_s: list[float] = field(default_factory=list)
+    frequency_hz: list[float] = field(default_factory=list)
+
+    def add(self, time_s: float, frequency_hz: float, *, since_s: float) -> None:
+        """Add what a window gave, and forget what is older than a time."""
+        self.time_s.append(time_s)
+        self.frequency_hz.append(frequency_hz)
+        while self.time_s[0] < since_s - 1e-6:  # not for rounding
+            del self.time_s[0], self.frequency_hz[0]
+
+    def at(self, time_s: float, *, overlap: float) -> float:
+        """Return the frequency at a time by the trend [Hz]."""
+        times, frequencies = np.array(self.time_s), np.array(self.frequency_hz)
+        return extrapolated(times, frequencies, time_s, overlap=overlap)[0]
+
+
+def matched_tracks(tracks: list[LineTrack], lines: tuple[Vibration, ...]) -> list[LineTrack]:
+    """Return a track for each line: the one along its direction with the nearest last frequency.
+
+    A line that fits none begins a new track. The closest pairs are matched first.
+    """
+    pairs = sorted(
+        (abs(track.frequency_hz[-1] - line.frequency_hz), i, j)
+        for i, line in enumerate(lines)
+        for j, track in enumerate(tracks)
+        if abs(float(track.direction @ np.array(line.direction))) > _ALIGNED
+    )
+    found: dict[int, int] = {}
+    for gap, i, j in pairs:
+        if gap <= _GAP_HZ and i not in found and j not in found.values():
+            found[i] = j
+    return [
+        tracks[found[i]] if i in found else LineTrack(direction=np.array(line.direction))
+        for i, line in enumerate(lines)
+    ]

@@ -1,0 +1,12 @@
+from .c.source import export_c as export_c
+from .cost import FrameCost as FrameCost
+from .cost import frame_cost as frame_cost
+from .exported import Exported as Exported
+from .iir.transfer_function_file import export_iir as export_iir
+from .matlab.mat_file import export_mat as export_mat
+from .specula.calibration import Calibration as Calibration
+from .specula.calibration import calibrate as calibrate
+from .specula.end_to_end_run import EndToEndRun as EndToEndRun
+from .specula.run import run_end_to_end as run_end_to_end
+from .specula.setup import EndToEndSetup as EndToEndSetup
+from .specula.system import EndToEndSystem as EndToEndSystem

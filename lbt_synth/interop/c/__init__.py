@@ -1,0 +1,1 @@
+"""A controller as C99 source."""

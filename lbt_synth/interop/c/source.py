@@ -1,0 +1,151 @@
+"""A controller as C99 source."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from lbt_synth.design import Design
+from lbt_synth.errors import NumericalError, OutputError, ProblemError
+from lbt_synth.interop.c.text import header_text, source_text
+from lbt_synth.interop.exported import Exported
+from lbt_synth.interop.provenance import provenance, require_sound
+from lbt_synth.interop.rehearsal import FRAMES, WrittenTerms, rehearsed_error
+from lbt_synth.linear import Controller
+from lbt_synth.storage.atomic_files import write_together
+from lbt_synth.validation import choice
+
+_IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
+_SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
+_LONGEST = 25  # with "_reset" 31 characters, what C99 promises to tell apart
+_LARGEST_SINGLE = float(np.finfo(np.float32).max)
+
+
+def export_c(
+    path: str | os.PathLike[str],
+    design: Design,
+    *,
+    precision: str = "double",
+    name: str | None = None,
+    gain_digest: str | None = None,
+) -> Exported:
+    """Write a controller as a C99 source file and its header, both or none.
+
+    The source needs no library, allocates nothing, and has no state of its own: it is passed
+    in. ``<name>_reset(&state)`` sets the state to zero; ``<name>_step(&state, y, u)`` computes
+    ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``, in the same number of operations
+    each frame. Coefficients are exact (hexadecimal). Units are those of the design: nm rms of
+    wavefront for a loop whose sensor and influence matrices are the identity.
+
+    Parameters
+    ----------
+    path : path-like
+        Source file to write, ending in ``.c``; the header, ending in ``.h``, goes beside it.
+    design : Design
+        The design.
+    precision : {"double", "single"}, optional
+        Type of all numbers, ``double`` or ``float``. Coefficients are rounded to it.
+    name : str, optional
+        Prefix of the C names; by default the name of the file without its ending.
+    gain_digest : str, optional
+        SHA-256 of the gain file, for the comment (64 hexadecimal digits).
+
+    Returns
+    -------
+    Exported
+        Source and header, and the error of the chosen precision and of single: the terms
+        added as they stand in the source, by a processor that rounds each of them.
+
+    Raises
+    ------
+    OutputError
+        If the ending is not ``.c``, or a file cannot be written.
+    ProblemError
+        If the name is no C identifier, or a coefficient does not fit single precision.
+    CertificateError
+        If the certificate that the design carries has a failed check.
+    NumericalError
+        If the loop is unstable with the rounded coefficients, or the commands of a frame
+        overflow.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, tempfile, pathlib
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     written = lbt.interop.export_c(pathlib.Path(folder) / "slow.c", slow)
+    ...     [file.name for file in written.files]
+    ['slow.c', 'slow.h']
+    """
+    target = Path(path)
+    if not _SOURCE.fullmatch(target.name):
+        raise OutputError(
+            "C source must end in .c, and its name have letters, digits and . _ + - only; got "
+            f"{target.name!r}.",
+            path=target,
+        )
+    header = target.with_suffix(".h")
+    choice(precision, "precision", ("double", "single"))
+    prefix = require_identifier(target.stem if name is None else name)
+    single = precision == "single"
+    require_sound(design)
+    controller = _rounded(design.controller) if single else design.controller
+    require_sound(design, controller)
+    error_double, error_single = (
+        rehearsed_error(design, WrittenTerms(design.controller, dtype))
+        for dtype in (np.float64, np.float32)
+    )
+    error = error_single if single else error_double
+    if not math.isfinite(error):
+        raise NumericalError(
+            f"the commands must stay finite in {precision} precision; they grew beyond all "
+            f"numbers within {FRAMES} frames. "
+            + ("Try double precision." if single else "Scale the states of the controller."),
+            status="arithmetic",
+            residual=error,
+        )
+    lines = provenance(design, gain_digest)
+    if single:  # the figure in double precision would be that of this machine's products
+        lines.append(("precision", f"single: commands within {error:.1e} of the largest one"))
+    written = write_together(
+        {
+            target: source_text(prefix, header.name, controller, lines, single=single).encode(
+                "ascii"
+            ),
+            header: header_text(
+                prefix, controller, lines, single=single, gain_digest=gain_digest
+            ).encode("ascii"),
+        }
+    )
+    return Exported(files=written, error=error, error_single=error_single)
+
+
+def require_identifier(name: str) -> str:
+    """Return a prefix that makes C and C++ identifiers which no one has reserved."""
+    if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name) or len(name) > _LONGEST:
+        raise ProblemError(
+            f"the prefix of the C names must begin with a letter, hold letters, digits and single "
+            f"underscores between them, and have at most {_LONGEST} characters; got {name!r}. "
+            "Give another name."
+        )
+    return name
+
+
+def _rounded(controller: Controller) -> Controller:
+    """Round to single precision."""
+    matrices = {name: getattr(controller, name) for name in "ABCD"}
+    for name, values in matrices.items():
+        largest = float(np.max(np.abs(values)))
+        if largest > _LARGEST_SINGLE:
+            raise ProblemError(
+                f"the coefficients must be below {_LARGEST_SINGLE:.3g} in single precision; got "
+                f"{largest:.3g} in {name}. Try double precision, or scale the states."
+            )
+    return Controller(
+        **{name: values.astype(np.float32) for name, values in matrices.items()},
+        dt_s=controller.dt_s,
+    )

@@ -1,0 +1,1 @@
+"""A controller as a transfer-function file of SPECULA."""

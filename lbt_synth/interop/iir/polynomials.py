@@ -1,0 +1,127 @@
+"""Transfer functions of controllers, their coefficients exact before they are rounded once."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.validation import BoolArray, FloatArray
+
+_COUPLED = 1e-9  # of the largest entry, in balanced units: less is what a solver leaves over
+_NOTHING = 1e-40  # of the largest entry: no digit of any coefficient depends on it
+_MOST_STATES = 40
+
+
+def axis_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArray]]:
+    """Numerator and denominator of each axis, coefficients ascending in z.
+
+    States that an axis does not drive, or does not show in its command, are left out; common
+    factors of z are divided out. Denominators are monic; both have the same length. Shapes: returns
+    list of (k,).
+    """
+    m, q = len(controller.C), controller.B.shape[1]
+    if m != q:
+        raise ProblemError(
+            f"a filter an axis needs as many commands as measurements; got {m} commands and {q} "
+            "measurements. Use the gain file itself."
+        )
+    balanced = StateSpace(
+        A=controller.A, B=controller.B, C=controller.C, D=controller.D, dt_s=controller.dt_s
+    ).balanced()
+    links = {name: _links(getattr(balanced, name)) for name in "ABC"}
+    reached = [_closure(links["A"], links["B"][:, i]) for i in range(q)]
+    shown = [_closure(links["A"].T, links["C"][i]) for i in range(q)]
+    direct = np.abs(controller.D) > _COUPLED * max(
+        np.max(np.abs(controller.D)), np.max(np.abs(controller.C @ controller.B))
+    )
+    for i in range(q):
+        for j in range(q):
+            if i != j and (direct[i, j] or np.any(reached[j] & shown[i])):
+                raise ProblemError(
+                    f"the axes must decouple: one transfer function each; here measurement {j + 1} "
+                    f"moves command {i + 1}. Use the gain file itself, which SPECULA's SsrFilter "
+                    "loads."
+                )
+    pairs = []
+    for i in range(q):
+        own = np.flatnonzero(reached[i] & shown[i])
+        if own.size > _MOST_STATES:
+            raise ProblemError(
+                f"an axis must have at most {_MOST_STATES} states for a transfer function; got "
+                f"{own.size}. Use the gain file itself, or design with fewer states."
+            )
+        pairs.append(
+            _polynomials(
+                _quiet(balanced.A[np.ix_(own, own)]),
+                _quiet(balanced.B[own, i]),
+                _quiet(balanced.C[i, own]),
+                float(controller.D[i, i]),
+            )
+        )
+    return pairs
+
+
+def _links(matrix: FloatArray) -> BoolArray:
+    return np.asarray(np.abs(matrix) > _COUPLED * np.max(np.abs(matrix), initial=0.0))
+
+
+def _quiet(matrix: FloatArray) -> FloatArray:
+    """Without entries so small that they only cost digits."""
+    size = np.max(np.abs(matrix), initial=0.0)
+    return np.where(np.abs(matrix) > _NOTHING * size, matrix, 0.0)
+
+
+def _closure(steps: BoolArray, start: BoolArray) -> BoolArray:
+    """States that can be reached from some: ``steps[i, j]`` leads from j to i."""
+    found = start.copy()
+    while True:
+        more = found | (steps @ found)
+        if np.array_equal(more, found):
+            return found
+        found = more
+
+
+def _polynomials(A: FloatArray, b: FloatArray, c: FloatArray, d: float) -> Any:
+    """``z c (zI - A)^-1 b + d`` as a quotient, by Faddeev and Leverrier's recursion in integers.
+
+    The entries are dyadic fractions, so a common power of two makes them integers; the
+    recursion's divisions then leave no remainder, and nothing is rounded before the end.
+    """
+    n = len(A)
+    (N, s), (B, sb), (C, sc) = (_integers(part) for part in (A, b, c))
+    den = [Fraction(0)] * n + [Fraction(1)]
+    num = [Fraction(0)] * (n + 1)
+    M = _identity(n)  # adj(zI - N) = M_1 z^(n-1) + M_2 z^(n-2) + ...
+    for k in range(1, n + 1):
+        num[n - k + 1] = Fraction(int(C @ M @ B), 1 << (s * (k - 1) + sb + sc))
+        M = N @ M
+        trace = -int(np.trace(M)) // k
+        den[n - k] = Fraction(trace, 1 << (s * k))
+        M = M + trace * _identity(n)
+    exact = Fraction(d)
+    num = [v + exact * w for v, w in zip(num, den, strict=True)]
+    while len(den) > 1 and num[0] == 0 and den[0] == 0:
+        num, den = num[1:], den[1:]
+    try:
+        return np.array([float(v) for v in num]), np.array([float(v) for v in den])
+    except OverflowError as error:
+        raise NumericalError(
+            "a coefficient of the transfer function is too large for double precision. "
+            "Use the gain file itself."
+        ) from error
+
+
+def _identity(n: int) -> Any:
+    return np.array([[int(i == j) for j in range(n)] for i in range(n)], dtype=object).reshape(n, n)
+
+
+def _integers(values: FloatArray) -> tuple[Any, int]:
+    """Integers and the power of two that they are to be divided by."""
+    ratios = [float(v).as_integer_ratio() for v in values.ravel()]
+    power = max((bottom.bit_length() - 1 for _, bottom in ratios), default=0)
+    whole = np.array([top * ((1 << power) // bottom) for top, bottom in ratios], dtype=object)
+    return whole.reshape(values.shape), power

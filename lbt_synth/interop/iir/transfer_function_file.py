@@ -1,0 +1,174 @@
+"""A controller as a transfer-function file of SPECULA."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from lbt_synth.design import Design, certify_loop
+from lbt_synth.errors import NumericalError, OutputError
+from lbt_synth.interop.exported import Exported
+from lbt_synth.interop.iir.polynomials import axis_polynomials
+from lbt_synth.interop.provenance import as_sentences, provenance, require_sound
+from lbt_synth.interop.rehearsal import rehearsed_error
+from lbt_synth.linear import Controller
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.fits import fits_bytes
+from lbt_synth.validation import FloatArray, frozen, number
+
+_LAYOUT_VERSION = 1  # of SPECULA's IirFilterData
+
+
+class DirectForm:
+    """Transfer functions stepped as SPECULA's IirFilter does: past inputs and past outputs.
+
+    Parameters
+    ----------
+    num, den : (m, k) ndarray
+        Coefficients ascending in z, right-aligned.
+    dtype : dtype
+        Precision of everything.
+    """
+
+    def __init__(self, num: FloatArray, den: FloatArray, dtype: Any = np.float64) -> None:
+        self._num, self._den, self._dtype = num.astype(dtype), den.astype(dtype), dtype
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._inputs = np.zeros(self._num.shape, dtype=self._dtype)
+        self._outputs = np.zeros(self._den.shape, dtype=self._dtype)
+
+    def step(self, y: FloatArray) -> FloatArray:
+        """Take y(k), return u(k)."""
+        self._inputs[:, :-1] = self._inputs[:, 1:]
+        self._outputs[:, :-1] = self._outputs[:, 1:]
+        self._inputs[:, -1] = y
+        past = np.sum(self._den[:, :-1] * self._outputs[:, :-1], axis=1)
+        u = (np.sum(self._num * self._inputs, axis=1) - past) / self._den[:, -1]
+        self._outputs[:, -1] = u
+        return np.asarray(u, dtype=np.float64)
+
+
+def export_iir(
+    path: str | os.PathLike[str],
+    design: Design,
+    *,
+    tolerance: float = 1e-6,
+    gain_digest: str | None = None,
+) -> Exported:
+    """Write a controller as a file of SPECULA's ``IirFilterData``, one transfer function an axis.
+
+    The coefficients are computed exactly and rounded once. Even so a transfer function loses
+    digits with its order, above all in single precision: it is run beside the controller in
+    the closed loop, in both precisions, before anything is written.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write, ending in ``.fits``.
+    design : Design
+        Design with as many commands as measurements, whose axes decouple.
+    tolerance : float, optional
+        Largest error in double precision that is accepted: difference of the commands over the
+        largest command, over 2000 frames.
+    gain_digest : str, optional
+        SHA-256 of the gain file, for the header (64 hexadecimal digits).
+
+    Returns
+    -------
+    Exported
+        The file, and its error in double and in single precision.
+
+    Raises
+    ------
+    OutputError
+        If the ending is not ``.fits``, or the file cannot be written.
+    ProblemError
+        If sizes differ or axes are coupled.
+    NumericalError
+        If the error in double precision is above the tolerance; ``residual`` holds it.
+    CertificateError
+        If the certificate that the design carries has a failed check.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, tempfile, pathlib
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     lbt.interop.export_iir(pathlib.Path(folder) / "slow.fits", slow).error < 1e-12
+    True
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".fits":
+        raise OutputError(
+            f"an IIR filter file must end in .fits; got {target.name!r}.", path=target
+        )
+    tolerance = number(tolerance, "tolerance", above=0)
+    require_sound(design)
+    lines = provenance(design, gain_digest)
+    num, den = _aligned(axis_polynomials(design.controller))
+    error, single = (_error(design, num, den, dtype) for dtype in (np.float64, np.float32))
+    if not error <= tolerance:
+        raise NumericalError(
+            f"the transfer function must give the commands of the controller to {tolerance:.3g} of "
+            f"the largest one; got {error:.3g}: its coefficients in double precision do not hold "
+            "the poles. Use the gain file itself, which SPECULA's SsrFilter loads, or a design of "
+            "fewer states.",
+            status="transfer function",
+            residual=error,
+        )
+    count = np.full(len(num), num.shape[1], dtype=np.int64)
+    cards: dict[str, Any] = {
+        "VERSION": (_LAYOUT_VERSION, "layout of the HDUs"),
+        "METHOD": (design.method, "synthesis"),
+        "ERROR64": (error, "commands in double precision, relative"),
+    }
+    arrays = {"ORDNUM": count, "ORDDEN": count, "NUM": num, "DEN": den}
+    written = write_atomically(target, fits_bytes(cards, arrays, comments=as_sentences(lines)))
+    return Exported(files=(written,), error=error, error_single=single)
+
+
+def _aligned(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Stack polynomials of any length: highest powers in the last column."""
+    length = max(len(den) for _, den in pairs)
+    num, den = (
+        np.array([np.pad(pair[i], (length - len(pair[i]), 0)) for pair in pairs]) for i in (0, 1)
+    )
+    return num, den
+
+
+def _error(design: Design, num: FloatArray, den: FloatArray, dtype: Any) -> float:
+    """Error of the rehearsal; inf where the loop is unstable, however slowly it grows."""
+    if design.hardware is not None:
+        top, bottom = (frozen(part.astype(dtype)) for part in (num, den))
+        written = _as_controller(top, bottom, design.controller.dt_s)
+        if not certify_loop(design.hardware, written).passed:
+            return float("inf")
+    return rehearsed_error(design, DirectForm(num, den, dtype))
+
+
+def _as_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
+    """Return the controller of these coefficients; each axis ends with its command as a state."""
+    axes = []
+    for top, bottom in zip(num, den, strict=True):
+        n = len(bottom) - 1
+        shift, feed = np.eye(n, k=1), top[-1] / bottom[-1]
+        A, B = np.zeros((n + 1, n + 1)), np.zeros((n + 1, 1))
+        A[:n, :n] = shift
+        A[:n, 0] -= bottom[-2::-1] / bottom[-1]
+        B[:n, 0] = top[-2::-1] / bottom[-1] - feed * bottom[-2::-1] / bottom[-1]
+        A[n, :1], B[n] = 1.0 if n else 0.0, feed
+        axes.append((A, B))
+    m, size = len(axes), len(axes[0][0])
+    return Controller(
+        A=block_diag(*(A for A, _ in axes)),
+        B=block_diag(*(B for _, B in axes)),
+        C=frozen(np.kron(np.eye(m), np.eye(size)[-1:])),
+        D=np.zeros((m, m)),
+        dt_s=dt_s,
+    )

@@ -1,0 +1,117 @@
+"""A controller as a MATLAB file."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lbt_synth
+from lbt_synth.design import Design
+from lbt_synth.errors import OutputError
+from lbt_synth.interop.exported import Exported
+from lbt_synth.interop.provenance import as_sentences, provenance, require_sound
+from lbt_synth.interop.rehearsal import MatrixForm, rehearsed_error
+from lbt_synth.linear import StateSpace
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.validation import FloatArray
+
+_TEXT_BYTES = 116  # of the header of a version 5 file; scipy writes the date there
+_CONVENTION = (
+    "textbook: x(k+1) = A x(k) + B y(k), u(k) = C x(k) + D y(k), as ss and Simulink want it: "
+    "ss(textbook.A, textbook.B, textbook.C, textbook.D, dt_s). "
+    "new_state: the same A and B, u(k) = C x(k+1) + D y(k), as in the gain file; "
+    "textbook.C = new_state.C * A, textbook.D = new_state.C * B + new_state.D."
+)
+
+
+class _Textbook:
+    """A system in the textbook form, stepped."""
+
+    def __init__(self, system: StateSpace) -> None:
+        self._system = system
+        self.reset()
+
+    def reset(self) -> None:
+        self._state = np.zeros(self._system.n_states)
+
+    def step(self, y: FloatArray) -> FloatArray:
+        s = self._system
+        u = s.C @ self._state + s.D @ y
+        self._state = s.A @ self._state + s.B @ y
+        return np.asarray(u)
+
+
+def export_mat(
+    path: str | os.PathLike[str], design: Design, *, gain_digest: str | None = None
+) -> Exported:
+    """Write a controller as a MATLAB file (version 5), in both output conventions.
+
+    The structures ``textbook`` and ``new_state`` each have A, B, C and D. In MATLAB,
+    ``sys = ss(textbook.A, textbook.B, textbook.C, textbook.D, dt_s)``. Beside them: ``dt_s``
+    [s], ``convention``, ``provenance`` (text), and for a loop ``frame_rate_hz`` and
+    ``delay_frames``.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write, ending in ``.mat``.
+    design : Design
+        The design.
+    gain_digest : str, optional
+        SHA-256 of the gain file, for ``provenance`` (64 hexadecimal digits).
+
+    Returns
+    -------
+    Exported
+        The file, and the error of the textbook form.
+
+    Raises
+    ------
+    OutputError
+        If the ending is not ``.mat``, or the file cannot be written.
+    CertificateError
+        If the certificate that the design carries has a failed check.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, scipy.io, tempfile, pathlib
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = lbt.interop.export_mat(pathlib.Path(folder) / "slow.mat", slow).files[0]
+    ...     scipy.io.loadmat(file, simplify_cells=True)["textbook"]["D"].tolist()
+    [[0.5, 0.0], [0.0, 0.5]]
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".mat":
+        raise OutputError(f"a MATLAB file must end in .mat; got {target.name!r}.", path=target)
+    require_sound(design)
+    lines = provenance(design, gain_digest)
+    textbook = design.controller.to_statespace()
+    content: dict[str, Any] = {
+        "textbook": {name: getattr(textbook, name) for name in "ABCD"},
+        "new_state": {name: getattr(design.controller, name) for name in "ABCD"},
+        "dt_s": design.controller.dt_s,
+        "convention": _CONVENTION,
+        "provenance": "\n".join(as_sentences(lines)),
+    }
+    if design.hardware is not None:
+        content["frame_rate_hz"] = design.hardware.frame_rate_hz
+        content["delay_frames"] = design.hardware.delay_frames
+    error = rehearsed_error(design, _Textbook(textbook))
+    single = rehearsed_error(design, MatrixForm(design.controller, np.float32))
+    written = write_atomically(target, _mat_bytes(content))
+    return Exported(files=(written,), error=error, error_single=single)
+
+
+def _mat_bytes(content: dict[str, Any]) -> bytes:
+    """Write a version 5 file without its date: the same design is the same file."""
+    from scipy.io import savemat
+
+    buffer: Any = io.BytesIO()  # scipy's own annotation knows names of files only
+    savemat(buffer, content, format="5", oned_as="column")
+    text = f"MATLAB 5.0 MAT-file, written by lbt_synth {lbt_synth.__version__}"
+    return text.ljust(_TEXT_BYTES).encode("ascii") + bytes(buffer.getvalue()[_TEXT_BYTES:])

@@ -1,0 +1,176 @@
+"""Modes, interaction matrix and reconstructor of a system, kept by their content."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lbt_synth.design.modal import Reconstructor, reconstructor
+from lbt_synth.errors import OutputError
+from lbt_synth.interop.specula.optics import Modes, Optics, make_modes, specula_version
+from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.validation import FloatArray, frozen, instance
+
+_LAYOUT = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calibration:
+    """What is measured once before a loop is closed.
+
+    Attributes
+    ----------
+    modes : Modes
+        Shapes of the mirror.
+    reference : (q,) ndarray
+        Slopes of a flat wavefront.
+    reconstructor : Reconstructor
+        Generalised inverse of the interaction matrix (slopes a nanometre of each mode).
+    key : str
+        Digest of all that it depends on.
+    cached : bool
+        Whether it came from the cache.
+    """
+
+    modes: Modes
+    reference: FloatArray
+    reconstructor: Reconstructor
+    key: str
+    cached: bool
+
+
+def cache_directory(path: str | os.PathLike[str] | None = None) -> Path:
+    """Return the directory for calibrations and phase screens, made if it is not there."""
+    if path is None:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        path = Path(base) / "lbt_synth"
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the cache directory {folder}: {error.strerror}. "
+            "Name another one with --cache.",
+            path=folder,
+        ) from error
+    return folder
+
+
+def calibrate(
+    system: EndToEndSystem,
+    *,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Calibration:
+    """Compute the modes, measure the interaction matrix without noise, and invert it.
+
+    Each mode is pushed and pulled by ``system.calibration_nm`` on a flat wavefront. The
+    result is kept in a cache under a digest of all that it depends on, SPECULA's version
+    included; a damaged file is measured anew.
+
+    Parameters
+    ----------
+    system : EndToEndSystem
+        The system.
+    cache : path-like, optional
+        Directory of the cache; see :func:`cache_directory`.
+    progress : callable, optional
+        Called with the number of modes that were measured since its last call.
+
+    Returns
+    -------
+    Calibration
+        The calibration.
+
+    Raises
+    ------
+    MissingExtraError
+        If SPECULA is missing.
+    ProblemError
+        If the mirror cannot carry the modes, or the sensor cannot tell them apart.
+    OutputError
+        If the cache cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> system = lbt.load_config("examples/lbt.yaml").end_to_end.system
+    >>> found = lbt.interop.calibrate(system)  # doctest: +SKIP
+    >>> found.reconstructor.condition_number < 12  # doctest: +SKIP
+    True
+    >>> lbt.interop.calibrate("examples/lbt.yaml")
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: expected an EndToEndSystem; got str.
+    """
+    instance(system, EndToEndSystem)
+    facts = {"layout": _LAYOUT, "specula": specula_version(), **system.calibration_facts()}
+    key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    path = cache_directory(cache) / f"calibration-{key[:16]}.npz"
+    found = _load(path, key)
+    if found is not None:
+        if progress is not None:
+            progress(system.modes)
+        return found
+    modes = make_modes(system)
+    reference, matrix = _measure(system, modes, progress)
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "MASK": modes.mask.astype(np.uint8),
+        "SHAPES": modes.shapes,
+        "REFERENCE": reference,
+        "INTERACTION": matrix,
+    }
+    meta = {"key": key, "facts": facts}
+    meta["digest"] = digest(arrays, meta)
+    write_atomically(path, npz_bytes(arrays, json.dumps(meta)))
+    return _calibration(modes, reference, matrix, key, cached=False)
+
+
+def _measure(
+    system: EndToEndSystem, modes: Modes, progress: Callable[[int], None] | None
+) -> tuple[FloatArray, FloatArray]:
+    optics = Optics(system, modes)
+    still, n = np.zeros(2), len(modes.shapes)
+    reference = optics.expose(np.zeros(n), still)
+    matrix = np.empty((reference.size, n))
+    for mode in range(n):
+        push = np.zeros(n)
+        push[mode] = -system.calibration_nm  # a correction is subtracted from the phase
+        pair = optics.expose(push, still) - optics.expose(-push, still)
+        matrix[:, mode] = pair / (2 * system.calibration_nm)
+        if progress is not None:
+            progress(1)
+    return reference, matrix
+
+
+def _load(path: Path, key: str) -> Calibration | None:
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        arrays, text = read_npz(path.read_bytes())
+        meta = json.loads(text)
+        if meta["key"] == key and meta["digest"] == digest(arrays, meta):
+            modes = Modes(mask=arrays["MASK"] > 0, shapes=arrays["SHAPES"].astype(np.float32))
+            return _calibration(modes, arrays["REFERENCE"], arrays["INTERACTION"], key, cached=True)
+    return None
+
+
+def _calibration(
+    modes: Modes, reference: FloatArray, matrix: FloatArray, key: str, *, cached: bool
+) -> Calibration:
+    return Calibration(
+        modes=modes,
+        reference=frozen(reference),
+        reconstructor=reconstructor(matrix),
+        key=key,
+        cached=cached,
+    )

@@ -1,0 +1,107 @@
+"""End-to-end runs as cases of a campaign: all that decides a run, in what JSON can hold."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from typing import Any
+
+from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
+from lbt_synth.interop.specula.setup import EndToEndSetup
+from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.linear import Controller
+from lbt_synth.models import (
+    DriftingVibration,
+    LoopHardware,
+    PositionLoop,
+    SinusoidalVibration,
+    Vibration,
+)
+from lbt_synth.models.truth import TrueVibration
+
+_SETUP = ("frames", "settle_frames", "seed", "gain", "leak", "leak_from_mode")
+_MATRICES = ("A", "B", "C", "D")
+
+
+def case_of(
+    setup: EndToEndSetup,
+    controller: Controller | None,
+    *,
+    vibrations: Sequence[TrueVibration] = (),
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Return the case of one run: other vibrations and another seed than the set-up's."""
+    system = {
+        field.name: getattr(setup.system, field.name)
+        for field in fields(EndToEndSystem)
+        if field.name != "hardware"
+    }
+    hardware = setup.system.hardware
+    return {
+        "versions": {name: _version(name) for name in ("lbt-synth", "specula")},
+        "system": system,
+        "hardware": {
+            "frame_rate_hz": hardware.frame_rate_hz,
+            "delay_frames": hardware.delay_frames,
+            "mirror": None if hardware.mirror is None else asdict(hardware.mirror),
+        },
+        "setup": {**{name: getattr(setup, name) for name in _SETUP}, "seed": seed},
+        "vibrations": [asdict(line) for line in vibrations],
+        "controller": None
+        if controller is None
+        else {name: getattr(controller, name).tolist() for name in _MATRICES}
+        | {"dt_s": controller.dt_s},
+    }
+
+
+def run_case(
+    case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
+) -> dict[str, Any]:
+    """Run one case of :func:`case_of`."""
+    system = EndToEndSystem(hardware=_hardware(case["hardware"]), **case["system"])
+    lines = tuple(_vibration(line) for line in case["vibrations"])
+    setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
+    matrices = case["controller"]
+    run = setup.run(
+        None if matrices is None else Controller(**matrices),
+        cache=cache,
+    )
+    return summary(run)
+
+
+def summary(run: EndToEndRun) -> dict[str, Any]:
+    """Return the figures of a run."""
+    rms = run.rms_nm
+    return {
+        "strehl": run.strehl,
+        "strehl_error": None if math.isnan(run.strehl_error) else run.strehl_error,
+        "other_modes_strehl": run.other_modes_strehl,
+        "tip_rms_nm": float(rms[0]),
+        "tilt_rms_nm": float(rms[1]),
+        "other_modes_rms_nm": float((rms[2:] ** 2).sum() ** 0.5),
+        "tip_tilt_gain": run.tip_tilt_gain,
+        "tip_tilt_gain_error": run.tip_tilt_gain_error,
+        "tip_tilt_noise_nm": run.tip_tilt_noise_nm,
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _hardware(path: Mapping[str, Any]) -> LoopHardware:
+    mirror = path["mirror"]
+    return LoopHardware(**{**path, "mirror": None if mirror is None else PositionLoop(**mirror)})
+
+
+def _vibration(line: Mapping[str, Any]) -> TrueVibration:
+    values = {**line, "direction": tuple(line["direction"])}
+    if "start_hz" in line:
+        return DriftingVibration(**values)
+    return Vibration(**values) if "damping" in line else SinusoidalVibration(**values)

@@ -1,0 +1,352 @@
+"""The optics, by SPECULA: air, pupil, mirror, pyramid, detector, camera.
+
+The only module that imports SPECULA (Istituto Nazionale di Astrofisica, MIT licence). Its
+objects are triggered one frame at a time; what is ours is the controller, the delay and the
+bookkeeping of modes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import logging
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lbt_synth.errors import MissingExtraError, OutputError, ProblemError
+from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.validation import FloatArray
+
+_SUPPORTED = "1.1"
+NO_CLAMP = -1e4  # a slope computer that sets negative pixels to zero loses a fifth of the gain
+_PUPIL_GAP = 4  # subapertures between the four pupils on the detector
+_MARGIN = 4
+_FIELD_ARCSEC = 2.0
+_LARGEST_SCREEN = 16384
+_PSF_SAMPLING = 3
+
+
+def specula_version() -> str:
+    """Version of the installed SPECULA."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        found = version("specula")
+    except PackageNotFoundError as error:
+        raise MissingExtraError(
+            'end-to-end simulation needs SPECULA: pip install "lbt-synth[e2e]".', extra="e2e"
+        ) from error
+    if not found.startswith(f"{_SUPPORTED}."):
+        raise MissingExtraError(
+            f"end-to-end simulation needs SPECULA {_SUPPORTED}; got {found}. "
+            'Try pip install "lbt-synth[e2e]".',
+            extra="e2e",
+        )
+    return found
+
+
+def _part(module: str) -> Any:
+    """Class of SPECULA by the name of its module, after the library has been started."""
+    specula_version()
+    import specula
+
+    if specula.global_precision is None:  # nobody has started it: CPU, single precision
+        specula.init(-1, precision=1, log_level=logging.ERROR)
+    path, _, name = module.rpartition(":")
+    return getattr(importlib.import_module(f"specula.{path}"), name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Modes:
+    """Modes of the mirror over the illuminated pixels of the pupil."""
+
+    mask: npt.NDArray[np.bool_]  # (pixels, pixels): illuminated pixels
+    # (modes, illuminated): shapes of rms 1, orthogonal to each other and to piston; tip and tilt
+    # first
+    shapes: npt.NDArray[np.float32]
+
+    def coefficients(self, phase_nm: npt.NDArray[np.float32]) -> FloatArray:
+        """Return the modal coefficients of a phase (illuminated,) [nm]."""
+        projected = np.asarray(self.shapes @ phase_nm, dtype=np.float64)
+        return np.asarray(projected / self.shapes.shape[1])
+
+
+def make_modes(system: EndToEndSystem) -> Modes:
+    """Compute Karhunen-Loeve modes of the influence functions, tip and tilt before them."""
+    influence = _part("lib.compute_zonal_ifunc:compute_zonal_ifunc")
+    modal_base = _part("lib.modal_base_generator:make_modal_base_from_ifs_fft")
+    mask = _pupil(system, _parameters(system)).A
+    functions, _, _, _ = influence(
+        system.pixels,
+        system.actuators_across,
+        geom="circular",
+        mask=mask.astype(np.float64),
+        do_slaving=True,
+        dtype=np.float64,
+    )
+    most = min(functions.shape) - 3
+    if system.modes > most:
+        raise ProblemError(
+            f"{system.modes} modes need a mirror with more actuators: {system.actuators_across} "
+            f"across a pupil of {system.pixels} pixels carry at most {most}. Try "
+            f"actuators_across={system.actuators_across + 2}, more pixels, or fewer modes."
+        )
+    shapes, _, _ = modal_base(
+        mask,
+        system.diameter_m,
+        functions,
+        1.0,
+        system.outer_scale_m,
+        zern_modes=2,
+        dtype=np.float64,
+    )
+    return Modes(mask=mask > 0, shapes=np.ascontiguousarray(shapes[: system.modes], np.float32))
+
+
+def _parameters(system: EndToEndSystem) -> Any:
+    make = _part("data_objects.simul_params:SimulParams")
+    return make(system.pixels, system.pixel_m, time_step=1 / system.frame_rate_hz)
+
+
+def _pupil(system: EndToEndSystem, parameters: Any) -> Any:
+    make = _part("data_objects.pupilstop:Pupilstop")
+    return make(parameters, mask_diam=1.0, obs_diam=system.obstruction)
+
+
+def _discard_damaged(files: Iterable[Path]) -> None:
+    """Delete phase screens that are cut off: they are drawn anew."""
+    from astropy.io import fits
+
+    for file in files:
+        try:
+            with warnings.catch_warnings(), fits.open(io.BytesIO(file.read_bytes())) as units:
+                warnings.simplefilter("error")
+                _ = units[0].data.shape
+        except Exception:  # astropy has no common class for what damage makes it raise
+            file.unlink()
+
+
+class Optics:
+    """One optical train, exposed frame after frame.
+
+    Parameters
+    ----------
+    system : EndToEndSystem
+        What it is of.
+    modes : Modes
+        Shapes of the mirror.
+    screens : pathlib.Path or None
+        Directory for phase screens; None for no turbulence.
+    frames : int, optional
+        Frames that will be exposed, for the size of the screens.
+    seed : int or None, optional
+        Seed of the turbulence and of the detector's noise; None for a detector without noise.
+    """
+
+    def __init__(
+        self,
+        system: EndToEndSystem,
+        modes: Modes,
+        *,
+        screens: Path | None = None,
+        frames: int = 1,
+        seed: int | None = None,
+    ) -> None:
+        self.system, self.modes = system, modes
+        self._step_ns = round(1e9 / system.frame_rate_hz)
+        self._time_ns = 0
+        self._weather: list[Any] = []  # seeing, speed and direction of the wind
+        self._where = np.nonzero(modes.mask)
+        self._value = _part("base_value:BaseValue")
+        parameters = _parameters(system)
+        self._pupil = _pupil(system, parameters)
+        self._commands = self._input(np.zeros(len(modes.shapes)))
+        self._tilts = self._input(np.zeros(2))
+        mirror = self._mirror(parameters, modes.shapes, self._commands, -1)
+        shaker = self._mirror(parameters, modes.shapes[:2], self._tilts, 1)
+        air = self._air(screens, frames, seed, parameters) if screens is not None else None
+        source = _part("data_objects.source:Source")([0, 0], 0, 1e3 * system.sensing_wavelength_um)
+        beam = _part("processing_objects.atmo_propagation:AtmoPropagation")(
+            parameters, {"star": source}
+        )
+        if air is not None:
+            beam.inputs["atmo_layer_list"].set(air.outputs["layer_list"])
+        beam.inputs["common_layer_list"].set(
+            [self._pupil, mirror.outputs["out_layer"], shaker.outputs["out_layer"]]
+        )
+        self._field = beam.outputs["out_star_ef"]
+        pyramid, indices = self._pyramid(parameters)
+        detector = self._detector(parameters, pyramid, seed)
+        self._slopes = self._slope_computer(detector, indices)
+        self._camera = _part("processing_objects.psf:PSF")(
+            parameters, 1e3 * system.imaging_wavelength_um, nd=_PSF_SAMPLING
+        )
+        self._camera.inputs["in_ef"].set(self._field)
+        self._train = [mirror, shaker, beam, pyramid, detector, self._slopes]
+        if air is not None:
+            self._train.insert(0, air)
+        for part in (*self._train, self._camera):
+            part.setup()
+        # photons a subaperture, over the whole detector
+        flux = system.photons * len(indices.ind_pup) * system.frame_rate_hz
+        self._field.S0 = flux / float(self._field.masked_area())
+
+    def expose(
+        self, commands_nm: FloatArray, tilts_nm: Sequence[float] | FloatArray, *, seeing: float = 1
+    ) -> FloatArray:
+        """Expose one frame and return its slopes.
+
+        Shapes: commands_nm (modes,), tilts_nm (2,) -> (q,).
+        """
+        self._time_ns += self._step_ns
+        self._commands.value[:] = commands_nm
+        self._tilts.value[:] = tilts_nm
+        if self._weather:
+            self._weather[0].value[:] = seeing * self.system.reference_seeing_arcsec
+        for given in (self._commands, self._tilts, self._pupil, *self._weather):
+            given.generation_time = self._time_ns
+        self._trigger(self._train)
+        return np.array(self._slopes.outputs["out_slopes"].slopes, dtype=np.float64)
+
+    def image(self) -> tuple[float, FloatArray]:
+        """Return the Strehl ratio and the image of the frame that was exposed last."""
+        self._trigger([self._camera])
+        return float(self._camera.sr.value), np.array(self._camera.psf.value, dtype=np.float64)
+
+    def phase_nm(self) -> npt.NDArray[np.float32]:
+        """Return the residual phase of the last frame over the illuminated pixels [nm]."""
+        return np.array(self._field.phaseInNm[self._where])
+
+    @property
+    def psf_pixel_mas(self) -> float:
+        """Pixel of the image [mas]."""
+        return float(self._camera.psf_pixel_size)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns of the image."""
+        rows, columns = self._camera.out_size
+        return int(rows), int(columns)
+
+    def _input(self, value: FloatArray) -> Any:
+        return self._value(value=np.array(value, dtype=np.float32), precision=1)
+
+    def _trigger(self, parts: Sequence[Any]) -> None:
+        for part in parts:
+            if part.check_ready(self._time_ns):
+                part.trigger()
+                part.post_trigger()
+
+    def _mirror(self, parameters: Any, shapes: Any, commands: Any, sign: int) -> Any:
+        functions = _part("data_objects.ifunc:IFunc")(
+            ifunc=shapes, mask=self.modes.mask.astype(np.float32)
+        )
+        mirror = _part("processing_objects.dm:DM")(parameters, 0, ifunc=functions, sign=sign)
+        mirror.inputs["in_command"].set(commands)
+        return mirror
+
+    def _air(self, screens: Path, frames: int, seed: int | None, parameters: Any) -> Any:
+        system = self.system
+        side = system.screen_pixels(frames)
+        if side > _LARGEST_SCREEN:
+            raise ProblemError(
+                f"a run must fit into a phase screen of {_LARGEST_SCREEN} pixels; {frames} frames "
+                f"at {system.wind_speed_m_s:g} m/s need {side}. Run fewer frames, with several "
+                "seeds."
+            )
+        air = self._evolution(screens, side, (seed or 0) + 1, parameters)
+        self._weather = [
+            self._input(np.array([value]))
+            for value in (
+                system.reference_seeing_arcsec,
+                system.wind_speed_m_s,
+                system.wind_direction_deg,
+            )
+        ]
+        names = ("seeing", "wind_speed", "wind_direction")
+        for name, given in zip(names, self._weather, strict=True):
+            air.inputs[name].set(given)
+        return air
+
+    def _evolution(self, screens: Path, side: int, seed: int, parameters: Any) -> Any:
+        """Air with a screen from a directory of its own: the name of a screen rounds its pixel."""
+        facts = [self.system.pixel_m, self.system.outer_scale_m, side, specula_version()]
+        folder = screens / hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            _discard_damaged(folder.glob(f"ps_seed{seed}_*.fits"))
+            return _part("processing_objects.atmo_evolution:AtmoEvolution")(
+                parameters,
+                self.system.outer_scale_m,
+                [0.0],
+                [1.0],
+                data_dir=str(folder),
+                pixel_phasescreens=side,
+                seed=seed,
+            )
+        except OSError as error:
+            raise OutputError(
+                f"cannot make or read a phase screen in {folder}: {error}. Name another "
+                "directory with --cache.",
+                path=folder,
+            ) from error
+
+    def _pyramid(self, parameters: Any) -> tuple[Any, Any]:
+        system = self.system
+        across = system.subapertures_across
+        side = 2 * across + _PUPIL_GAP + 2 * _MARGIN
+        natural = system.sensing_wavelength_um * 1e-6 / system.pixel_m * 180 * 3600 / np.pi
+        steps = 4 * int(np.ceil(2 * np.pi * system.modulation_lambda_over_d / 4))
+        pyramid = _part("processing_objects.modulated_pyramid:ModulatedPyramid")(
+            parameters,
+            1e3 * system.sensing_wavelength_um,
+            min(natural, _FIELD_ARCSEC),
+            across,
+            output_resolution=side,
+            mod_amp=system.modulation_lambda_over_d,
+            mod_step=steps,
+            pup_dist=across + _PUPIL_GAP,
+        )
+        pyramid.inputs["in_ef"].set(self._field)
+        # the four pupils lie on whole pixels around the middle of the detector
+        middle, apart = (side - 1) / 2, (across + _PUPIL_GAP) / 2
+        x = middle + apart * np.array([1, -1, -1, 1])
+        y = middle + apart * np.array([-1, -1, 1, 1])
+        rows, columns = np.mgrid[:side, :side]
+        radius = np.hypot(columns - x[:, None, None], rows - y[:, None, None])
+        lit = (radius <= across / 2) & (radius >= system.obstruction * across / 2)
+        indices = np.stack([np.flatnonzero(one) for one in lit], axis=1)
+        return pyramid, _part("data_objects.pupdata:PupData")(
+            ind_pup=indices, radius=np.full(4, across / 2), cx=x, cy=y, framesize=[side, side]
+        )
+
+    def _detector(self, parameters: Any, pyramid: Any, seed: int | None) -> Any:
+        side = pyramid.final_ccd_side
+        noisy = seed is not None
+        detector = _part("processing_objects.ccd:CCD")(
+            parameters,
+            [side, side],
+            1 / self.system.frame_rate_hz,
+            1.0,
+            photon_noise=noisy,
+            readout_noise=noisy,
+            readout_level=self.system.read_noise_electrons,
+            photon_seed=2 * (seed or 0),
+            readout_seed=2 * (seed or 0) + 1,
+        )
+        detector.inputs["in_i"].set(pyramid.outputs["out_i"])
+        return detector
+
+    def _slope_computer(self, detector: Any, indices: Any) -> Any:
+        computer = _part("processing_objects.pyr_slopec:PyrSlopec")(
+            indices, norm_factor=self.system.photons, thr_value=NO_CLAMP
+        )
+        computer.inputs["in_pixels"].set(detector.outputs["out_pixels"])
+        return computer

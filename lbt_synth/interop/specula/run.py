@@ -1,0 +1,192 @@
+"""Close the loop around the optics."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.interop.specula.calibration import Calibration, cache_directory, calibrate
+from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
+from lbt_synth.interop.specula.optics import Modes, Optics
+from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.simulation.run import SteppedController, stepped
+from lbt_synth.models import Truth
+from lbt_synth.models.truth import TrueVibration
+from lbt_synth.validation import FloatArray, instance, integer
+
+_SCREENS = "screens"
+RAMP_FRAMES = 200
+_LARGEST_SEED = 2**31 - 2  # the optics draw from twice that, in 32 bits
+
+
+def run_end_to_end(
+    system: EndToEndSystem,
+    controller: SteppedController,
+    *,
+    vibrations: Sequence[TrueVibration] = (),
+    frames: int = 1600,
+    settle_frames: int = 400,
+    seed: int = 0,
+    calibration: Calibration | None = None,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> EndToEndRun:
+    """Close the loop with a pyramid, a mirror and moving air, all of SPECULA.
+
+    In frame k, as in :class:`LoopHardware`: the controller is given y(k), the modal
+    coefficients of the slopes of exposure k-1, and returns u(k); the mirror of exposure k
+    has the shape of ``system.hardware.mirror_taps`` times u(k), u(k-1), ...; a fractional
+    delay and a moving mirror enter as their mean over the exposure. The seeing rises
+    from zero in the first 200 frames, so that the sensor does not lose the phase by whole
+    turns before the loop is closed.
+
+    The random parts depend on the seed, the vibrations and the number of frames only:
+    controllers that are given the same ones meet the same air, vibrations and noise.
+
+    Parameters
+    ----------
+    system : EndToEndSystem
+        Telescope, air, pyramid, mirror and camera.
+    controller : object with ``step(y)`` and ``reset()``
+        From modal measurements to modal commands, (modes,), such as :class:`MixedController`.
+    vibrations : sequence of Vibration, SinusoidalVibration or DriftingVibration, optional
+        Vibrations of tip and tilt; their direction has two components. One that drifts
+        begins to with the exposure.
+    frames : int, optional
+        Frames of the exposure.
+    settle_frames : int, optional
+        Frames run before and dropped, at least 200.
+    seed : int, optional
+        Seed of turbulence, vibrations and noise.
+    calibration : Calibration, optional
+        That of the system; by default from the cache, or measured.
+    cache : path-like, optional
+        Directory for calibrations and phase screens.
+    progress : callable, optional
+        Called with the number of frames that were run since its last call.
+
+    Returns
+    -------
+    EndToEndRun
+        Strehl ratio, series, images, optical gains.
+
+    Raises
+    ------
+    MissingExtraError
+        If SPECULA is missing.
+    ProblemError
+        If a value is out of range, or the controller returns something else than one
+        finite command a mode.
+    OutputError
+        If the cache cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> setup, design = config.end_to_end, lbt.kalman(config.plant)
+    >>> control = setup.controller(design)
+    >>> run = lbt.interop.run_end_to_end(setup.system, control)        # doctest: +SKIP
+
+    It takes half a minute; what cannot run is refused before:
+
+    >>> lbt.interop.run_end_to_end(setup.system, design)
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: controller must have step(y) and reset(), as MixedController \
+has; got FilterDesign.
+    """
+    instance(system, EndToEndSystem)
+    if not isinstance(controller, SteppedController):
+        raise ProblemError(
+            "controller must have step(y) and reset(), as MixedController has; "
+            f"got {type(controller).__name__}."
+        )
+    frames = integer(frames, "frames", at_least=2)
+    settle = integer(settle_frames, "settle_frames", at_least=RAMP_FRAMES)
+    seed = checked_seed(seed)
+    shaken = Truth(turbulence=None, vibrations=tuple(vibrations))
+    total = settle + frames
+    tilts = draw_disturbance(
+        shaken,
+        system.hardware,
+        frames=total,
+        cases=1,
+        rng=np.random.default_rng(seed),
+        zero_frame=settle,
+    )[0]
+    if calibration is None:
+        calibration = calibrate(system, cache=cache)
+    screens = cache_directory(cache) / _SCREENS
+    optics = Optics(system, calibration.modes, screens=screens, frames=total, seed=seed)
+    started = time.perf_counter()
+    recorded = _close(optics, calibration, controller, tilts, settle, progress)
+    return EndToEndRun(
+        system=system,
+        **recorded,
+        psf_pixel_mas=optics.psf_pixel_mas,
+        seed=seed,
+        settle_frames=settle,
+        seconds=time.perf_counter() - started,
+    )
+
+
+def checked_seed(seed: int) -> int:
+    """Return a seed that each part of the optics can take."""
+    checked = integer(seed, "seed", at_least=0)
+    if checked > _LARGEST_SEED:
+        raise ProblemError(f"seed must be at most {_LARGEST_SEED}; got {checked}.")
+    return checked
+
+
+def _close(
+    optics: Optics,
+    calibration: Calibration,
+    controller: SteppedController,
+    tilts: FloatArray,
+    settle: int,
+    progress: Callable[[int], None] | None,
+) -> dict[str, FloatArray]:
+    modes, system = calibration.modes, optics.system
+    inverse, n = calibration.reconstructor.matrix, len(calibration.modes.shapes)
+    taps = system.hardware.mirror_taps
+    kept = len(tilts) - settle
+    out = {name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")}
+    strehl, others = np.empty(kept), np.empty(kept)
+    psf = np.zeros(optics.image_shape)
+    past = np.zeros((len(taps), n))  # u(k), u(k-1), ...
+    slopes = calibration.reference
+    controller.reset()
+    for k in range(len(tilts)):
+        y = inverse @ (slopes - calibration.reference)
+        past = np.vstack([stepped(controller, y, n, frame=k), past[:-1]])
+        slopes = optics.expose(taps @ past, tilts[k], seeing=min(1.0, (k + 1) / RAMP_FRAMES))
+        row = k - settle
+        if row >= 0:
+            strehl[row], frame = optics.image()
+            psf += frame
+            residual, others[row] = _residual(modes, optics)
+            for name, value in zip(out, (y, past[0], residual), strict=True):
+                out[name][row] = value
+        if progress is not None:
+            progress(1)
+    return {
+        **out,
+        "strehl_series": strehl,
+        "other_modes_series": others,
+        "psf": psf / kept,
+    }
+
+
+def _residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:
+    """Modal coefficients of the residual, and the Strehl ratio of all but tip and tilt."""
+    phase = optics.phase_nm()
+    coefficients = modes.coefficients(phase)
+    rest = phase - coefficients[:2].astype(np.float32) @ modes.shapes[:2]
+    turn = 2 * np.pi / (1e3 * optics.system.imaging_wavelength_um)
+    return coefficients, float(np.abs(np.mean(np.exp(1j * turn * rest))) ** 2)

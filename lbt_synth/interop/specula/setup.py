@@ -1,0 +1,145 @@
+"""A system, its vibrations and the integrators of its modes: all a run needs but the filter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.design.modal import MixedController
+from lbt_synth.errors import ProblemError
+from lbt_synth.interop.specula.calibration import Calibration
+from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
+from lbt_synth.interop.specula.run import RAMP_FRAMES, checked_seed, run_end_to_end
+from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.models.loop_hardware import same_mirror
+from lbt_synth.models.truth import TrueVibration
+from lbt_synth.validation import FloatArray, instance, integer, number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EndToEndSetup:
+    """An end-to-end simulation as a configuration describes it.
+
+    Parameters
+    ----------
+    system : EndToEndSystem
+        Telescope, air, pyramid, mirror and camera.
+    vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration
+        Vibrations of tip and tilt.
+    frames, settle_frames, seed : int
+        Length of a run, and its seed.
+    gain : float
+        Integrator gain of every mode that no filter controls.
+    leak : float
+        Leak of the integrators from mode ``leak_from_mode`` on; those before have none.
+        A pyramid can trap a corner of the mirror at whole turns of the phase; a leak
+        lets go of it.
+    leak_from_mode : int
+        First mode with a leak, counted from 0.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> setup = lbt.load_config("examples/lbt.yaml").end_to_end
+    >>> setup.controller(None).n_modes
+    672
+    """
+
+    system: EndToEndSystem
+    vibrations: tuple[TrueVibration, ...] = ()
+    frames: int = 1600
+    settle_frames: int = 400
+    seed: int = 0
+    gain: float = 0.5
+    leak: float = 0.97
+    leak_from_mode: int = 50
+
+    def __post_init__(self) -> None:
+        instance(self.system, EndToEndSystem)
+        object.__setattr__(self, "vibrations", tuple(self.vibrations))
+        for name, least in (("frames", 2), ("settle_frames", RAMP_FRAMES)):
+            object.__setattr__(self, name, integer(getattr(self, name), name, at_least=least))
+        object.__setattr__(self, "seed", checked_seed(self.seed))
+        object.__setattr__(self, "gain", number(self.gain, "gain", at_least=0))
+        object.__setattr__(self, "leak", number(self.leak, "leak", at_least=0, at_most=1))
+        first = integer(self.leak_from_mode, "leak_from_mode", at_least=2)
+        object.__setattr__(self, "leak_from_mode", first)
+
+    @property
+    def leaks(self) -> FloatArray:
+        """Leak of each mode's integrator, (modes,)."""
+        leaks = np.ones(self.system.modes)
+        leaks[self.leak_from_mode :] = self.leak
+        return leaks
+
+    def controller(self, filter: Any, *, tip_tilt_gain: float | None = None) -> MixedController:  # noqa: A002
+        """Return the mixed controller with a filter for tip and tilt.
+
+        Parameters
+        ----------
+        filter : Design, Controller, object with ``step(y)`` and ``reset()``, or None
+            Controller of tip and tilt, two measurements and two commands; None for
+            integrators, as classical control has them.
+        tip_tilt_gain : float, optional
+            Integrator gain of tip and tilt where there is no filter.
+
+        Returns
+        -------
+        MixedController
+            For the modal measurements of :func:`run_end_to_end`.
+
+        Raises
+        ------
+        ProblemError
+            If the filter is of another loop.
+        """
+        hardware = getattr(filter, "hardware", None)
+        mine = self.system.hardware
+        if hardware is not None and (hardware.frame_rate_hz, hardware.delay_frames) != (
+            mine.frame_rate_hz,
+            mine.delay_frames,
+        ):
+            raise ProblemError(
+                f"the filter must be for the loop of the configuration, {mine.frame_rate_hz:g} Hz "
+                f"and {mine.delay_frames:g} frames; got one for {hardware.frame_rate_hz:g} Hz and "
+                f"{hardware.delay_frames:g} frames. Design it from this configuration."
+            )
+        if hardware is not None and not same_mirror(hardware, mine):
+            raise ProblemError(
+                "the filter was designed for another mirror than that of the configuration. Design "
+                "for its mirror.local_loop, best with --method lqg."
+            )
+        gains = np.full(self.system.modes, self.gain)
+        if tip_tilt_gain is not None:
+            gains[:2] = number(tip_tilt_gain, "tip_tilt_gain", at_least=0)
+        return MixedController(filter=filter, gains=gains, leak=self.leaks)
+
+    def run(
+        self,
+        filter: Any,  # noqa: A002
+        *,
+        tip_tilt_gain: float | None = None,
+        calibration: Calibration | None = None,
+        cache: Any = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> EndToEndRun:
+        """Close the loop with :meth:`controller`; the other arguments as `run_end_to_end`."""
+        return run_end_to_end(
+            self.system,
+            self.controller(filter, tip_tilt_gain=tip_tilt_gain),
+            vibrations=self.vibrations,
+            frames=self.frames,
+            settle_frames=self.settle_frames,
+            seed=self.seed,
+            calibration=calibration,
+            cache=cache,
+            progress=progress,
+        )

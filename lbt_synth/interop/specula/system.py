@@ -1,0 +1,191 @@
+"""What an end-to-end simulation is of: telescope, air, pyramid, mirror, camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import instance, integer, number
+
+_REFERENCE_UM = 0.5  # wavelength at which seeing is handed over
+_MOST_PIXELS = 1024
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EndToEndSystem:
+    """A telescope with a pyramid sensor and a mirror of many modes.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Frame rate and delay, or the response of a slow mirror; its sensor and influence
+        matrices are the identity, for optics take their places.
+    diameter_m : float
+        Telescope diameter [m].
+    obstruction : float
+        Diameter of the central obstruction as a fraction of the telescope's.
+    seeing_arcsec : float
+        Seeing at ``seeing_wavelength_um`` [arcsec].
+    outer_scale_m : float
+        Outer scale [m].
+    wind_speed_m_s : float
+        Speed of the one layer [m/s].
+    sensing_wavelength_um : float
+        Wavelength of the pyramid [um].
+    modulation_lambda_over_d : float
+        Radius of its modulation [lambda/D].
+    subapertures_across : int
+        Subapertures across the pupil.
+    photons : float
+        Photons a subaperture and a frame.
+    read_noise_electrons : float
+        Read noise of a pixel [electrons].
+    modes : int, optional
+        Modes of the mirror that are controlled, tip and tilt first.
+    actuators_across : int, optional
+        Actuators on a diameter of the mirror, in concentric rings.
+    seeing_wavelength_um : float, optional
+        Wavelength of the seeing [um].
+    imaging_wavelength_um : float, optional
+        Wavelength of the camera [um].
+    wind_direction_deg : float, optional
+        Direction in which the layer moves [degrees]; 0 is along tip.
+    pixels : int, optional
+        Pixels across the pupil, even.
+    calibration_nm : float, optional
+        Amplitude of each mode when the interaction matrix is measured [nm rms].
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite, out of its range, or values clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> config.end_to_end.system.modes, config.end_to_end.system.pixels
+    (672, 60)
+    """
+
+    hardware: LoopHardware
+    diameter_m: float
+    obstruction: float
+    seeing_arcsec: float
+    outer_scale_m: float
+    wind_speed_m_s: float
+    sensing_wavelength_um: float
+    modulation_lambda_over_d: float
+    subapertures_across: int
+    photons: float
+    read_noise_electrons: float
+    modes: int = 672
+    actuators_across: int = 31
+    seeing_wavelength_um: float = _REFERENCE_UM
+    imaging_wavelength_um: float = 2.2
+    wind_direction_deg: float = 0.0
+    pixels: int = 60
+    calibration_nm: float = 20.0
+
+    def __post_init__(self) -> None:
+        instance(self.hardware, LoopHardware)
+        for matrix, name in (
+            (self.hardware.sensor, "sensor_matrix"),
+            (self.hardware.influence, "influence_matrix"),
+        ):
+            if matrix.shape != (2, 2) or not np.array_equal(matrix, np.eye(2)):
+                raise ProblemError(
+                    f"the hardware of an end-to-end simulation must have two modes and the "
+                    f"identity as its {name}, for the optics take its place; got {matrix.shape}."
+                )
+        for name in (
+            "diameter_m",
+            "seeing_arcsec",
+            "outer_scale_m",
+            "wind_speed_m_s",
+            "photons",
+            "sensing_wavelength_um",
+            "modulation_lambda_over_d",
+            "seeing_wavelength_um",
+            "imaging_wavelength_um",
+            "calibration_nm",
+        ):
+            object.__setattr__(self, name, number(getattr(self, name), name, above=0))
+        checked = {
+            "obstruction": number(self.obstruction, "obstruction", at_least=0, below=1),
+            "read_noise_electrons": number(
+                self.read_noise_electrons, "read_noise_electrons", at_least=0
+            ),
+            "wind_direction_deg": number(self.wind_direction_deg, "wind_direction_deg"),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        for name, least in (
+            ("subapertures_across", 2),
+            ("modes", 3),
+            ("actuators_across", 3),
+            ("pixels", 8),
+        ):
+            object.__setattr__(self, name, integer(getattr(self, name), name, at_least=least))
+        if self.pixels % 2 or self.pixels < self.subapertures_across or self.pixels > _MOST_PIXELS:
+            raise ProblemError(
+                f"pixels must be even, at least subapertures_across ({self.subapertures_across}) "
+                f"and at most {_MOST_PIXELS}; got {self.pixels}. Try "
+                f"{2 * self.subapertures_across}."
+            )
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Frame rate [Hz]."""
+        return self.hardware.frame_rate_hz
+
+    @property
+    def pixel_m(self) -> float:
+        """Pixel in the pupil [m]."""
+        return self.diameter_m / self.pixels
+
+    @property
+    def reference_seeing_arcsec(self) -> float:
+        """Seeing at 0.5 um [arcsec]: it goes with the wavelength to the power of -1/5."""
+        return float(self.seeing_arcsec * (self.seeing_wavelength_um / _REFERENCE_UM) ** 0.2)
+
+    def screen_pixels(self, frames: int) -> int:
+        """Side of a square phase screen that does not come round within some frames.
+
+        Parameters
+        ----------
+        frames : int
+            Frames to be run.
+
+        Returns
+        -------
+        int
+            A power of two; the screen is at least six outer scales long, too, for it is
+            periodic and holds nothing slower.
+        """
+        travelled = frames / self.frame_rate_hz * self.wind_speed_m_s
+        length = max(travelled + 2 * self.diameter_m, 6 * self.outer_scale_m)
+        return int(2 ** math.ceil(math.log2(length / self.pixel_m)))
+
+    def calibration_facts(self) -> dict[str, Any]:
+        """Return what the modes and the interaction matrix depend on."""
+        return {
+            name: getattr(self, name)
+            for name in (
+                "diameter_m",
+                "obstruction",
+                "outer_scale_m",
+                "sensing_wavelength_um",
+                "modulation_lambda_over_d",
+                "subapertures_across",
+                "modes",
+                "actuators_across",
+                "pixels",
+                "calibration_nm",
+            )
+        }

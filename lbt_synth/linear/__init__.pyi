@@ -1,0 +1,12 @@
+from .estimation_problem import EstimationProblem as EstimationProblem
+from .infeasibility_proof import Witness as Witness
+from .infeasibility_proof import infeasible_level as infeasible_level
+from .norms import HinfNorm as HinfNorm
+from .norms import hinf_norm as hinf_norm
+from .norms import largest_singular_values as largest_singular_values
+from .riccati.dare import Attempt as Attempt
+from .riccati.dare import DareSolution as DareSolution
+from .riccati.dare import solve_dare as solve_dare
+from .state_space import Controller as Controller
+from .state_space import RunningController as RunningController
+from .state_space import StateSpace as StateSpace

@@ -1,0 +1,52 @@
+"""Stacks of matrices: arrays (N, n, m) that are worked on at once."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lbt_synth.validation import FloatArray
+
+Entry = TypeVar("Entry", bound=np.generic)
+
+
+def transposed(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
+    """Transpose each matrix of a stack."""
+    return np.swapaxes(stack, -1, -2)
+
+
+def symmetrised(stack: FloatArray) -> FloatArray:
+    """Symmetric part of each matrix of a stack."""
+    return np.asarray((stack + transposed(stack)) / 2, dtype=np.float64)
+
+
+def norms(stack: FloatArray) -> FloatArray:
+    """Frobenius norm of each matrix of a stack, (N,)."""
+    squares = np.einsum("...ij,...ij->...", stack, stack)
+    return np.asarray(np.sqrt(squares), dtype=np.float64)
+
+
+def solve_stack(matrices: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve each system of a stack; the answer of a singular one is nan.
+
+    Shapes: matrices (N, n, n), right (N, n, m) -> (N, n, m).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.batched import solve_stack
+    >>> solve_stack(np.array([[[2.0]], [[0.0]]]), np.ones((2, 1, 1))).ravel().tolist()
+    [0.5, nan]
+    """
+    try:
+        return np.asarray(np.linalg.solve(matrices, right), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        out = np.full(right.shape, np.nan)
+        for i in range(len(matrices)):
+            try:
+                out[i] = np.linalg.solve(matrices[i], right[i])
+            except np.linalg.LinAlgError:
+                continue
+        return out

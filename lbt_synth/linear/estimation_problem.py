@@ -1,0 +1,319 @@
+"""The estimation problem that every filter of this package solves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
+from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
+from lbt_synth.validation import FloatArray, definite, frozen, integer, matrix
+
+LONGEST_HORIZON = 100  # frames of a horizon
+
+
+def require_problem(problem: object) -> None:
+    """Refuse anything that is not an estimation problem."""
+    if not isinstance(problem, EstimationProblem):
+        raise ProblemError(
+            "expected an EstimationProblem, such as a plant; got "
+            f"{type(problem).__name__}. Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EstimationProblem(LinearSystem):
+    """Estimate ``z = L x`` from past ``y``, where ``x+ = A x + B w`` and ``y = C x + D w``.
+
+    The filter is the strictly causal one-step predictor: the estimate of z(k)
+    uses y up to k-1. For the Kalman filter w is white noise of unit variance,
+    for the H-infinity filter any signal of unit energy; B and D carry the
+    weights. B D' need not be zero.
+
+    Parameters
+    ----------
+    A : (n, n) array_like
+        State matrix.
+    B : (n, p) array_like
+        Disturbance to state.
+    C : (q, n) array_like
+        State to measurement.
+    D : (q, p) array_like
+        Disturbance to measurement; ``D D'`` must be positive definite.
+    L : (l, n) array_like
+        State to the signal that is estimated.
+    dt_s : float, optional
+        Sampling period [s]; 1 when the samples have no physical rate.
+
+    Raises
+    ------
+    DimensionError
+        If sizes clash.
+    NonFiniteError
+        If an entry is NaN or infinite.
+    DefinitenessError
+        If ``D D'`` is singular: some combination of measurements is free of noise.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> walk = lbt.EstimationProblem(
+    ...     A=[[1.0]], B=[[1.0, 0.0]], C=[[1.0]], D=[[0.0, 1.0]], L=[[1.0]]
+    ... )
+    >>> round(lbt.kalman(walk).rms ** 2, 6)  # the golden ratio
+    1.618034
+    """
+
+    L: FloatArray
+
+    def __post_init__(self) -> None:
+        LinearSystem.__post_init__(self)
+        L = matrix(self.L, "L", cols=(self.n_states, f"to match A {self.A.shape}"))
+        object.__setattr__(self, "L", L)
+        try:
+            definite(self.D @ self.D.T, "D D'")
+        except DefinitenessError as error:
+            raise DefinitenessError(
+                f"{error} Every measurement needs noise of its own: add a column to D."
+            ) from error
+
+    @property
+    def Q(self) -> FloatArray:
+        """Covariance of the process noise, ``B B'`` (n, n)."""
+        return frozen(self.B @ self.B.T)
+
+    @property
+    def R(self) -> FloatArray:
+        """Covariance of the measurement noise, ``D D'`` (q, q)."""
+        return frozen(self.D @ self.D.T)
+
+    @property
+    def S(self) -> FloatArray:
+        """Cross-covariance of process and measurement noise, ``B D'`` (n, q)."""
+        return frozen(self.B @ self.D.T)
+
+    def error_system(self, gain_predictor: FloatArray) -> StateSpace:
+        """System from w to the estimation error ``z - z_hat`` of a predictor gain.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Gain of ``x_hat(k+1) = A x_hat(k) + gain (y(k) - C x_hat(k))``.
+
+        Returns
+        -------
+        StateSpace
+            ``(A - gain C, B - gain D, L, 0)``.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> p = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> float(p.error_system([[0.4]]).A[0, 0])
+        0.5
+        """
+        gain = self._checked_gain(gain_predictor)
+        return StateSpace(
+            A=self.A - gain @ self.C,
+            B=self.B - gain @ self.D,
+            C=self.L,
+            D=np.zeros((self.L.shape[0], self.B.shape[1])),
+            dt_s=self.dt_s,
+        )
+
+    def with_unit_weights(self) -> EstimationProblem:
+        """Return the problem with each disturbance scaled to unit size.
+
+        The columns of ``[B; D]`` are divided by their norms: the paper's own
+        generalised plant, whose disturbances act with identity weights.
+
+        Returns
+        -------
+        EstimationProblem
+            The same states, measurements and signals.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> p = lbt.EstimationProblem(A=0.9, B=[[5.0, 0.0]], C=1.0, D=[[0.0, 2.0]], L=1.0)
+        >>> p.with_unit_weights().B.tolist()
+        [[1.0, 0.0]]
+        """
+        size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
+        size = np.where(size > 0, size, 1.0)
+        return EstimationProblem(
+            A=self.A, B=self.B / size, C=self.C, D=self.D / size, L=self.L, dt_s=self.dt_s
+        )
+
+    def ahead(self, frames: int) -> EstimationProblem:
+        """Problem whose one-step prediction is the estimate of ``z(k + frames)`` from y up to k.
+
+        1 is this problem. 0 is its filter (a-posteriori) form: the estimated signal gets
+        a state of its own, one frame late. Less than 0 smooths with a fixed lag.
+        For 2 and more the measurement gets states of its own, and the disturbances that
+        come in between count in the error, for which they are not delayed.
+
+        Parameters
+        ----------
+        frames : int
+            Frames from the newest measurement to the estimate.
+
+        Returns
+        -------
+        EstimationProblem
+            With some more states; the first ones are x(k + max(frames, 1) - 1).
+
+        Raises
+        ------
+        ProblemError
+            If ``frames`` is no integer, or is 2 or more while ``B D'`` is not zero: part of
+            the noise would act on the states before it is measured.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> [round(lbt.kalman(walk, horizon=h).rms ** 2, 6) for h in (-1, 0, 1, 2)]
+        [0.472136, 0.618034, 1.618034, 2.618034]
+        """
+        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
+        if steps > LONGEST_HORIZON:
+            raise ProblemError(f"horizon must be at most {LONGEST_HORIZON} frames; got {steps}.")
+        if steps == 1:
+            return self
+        n, p, q = self.n_states, self.B.shape[1], self.C.shape[0]
+        if steps > 1:
+            size = np.linalg.norm(self.B, 2) * np.linalg.norm(self.D, 2)
+            if np.linalg.norm(self.S, 2) > 1e-12 * size:
+                raise ProblemError(
+                    f"a prediction of {steps} frames needs process and measurement noise that are "
+                    "uncorrelated (B D' = 0); got B D' with a norm of "
+                    f"{np.linalg.norm(self.S, 2):.3g}. Try horizon=1, or separate the noises."
+                )
+            late, entry = (steps - 1) * q, self.C
+        else:
+            late, entry = (1 - steps) * len(self.L), self.L
+        width = len(entry)
+        A = np.zeros((n + late, n + late))
+        A[:n, :n], A[n : n + width, :n] = self.A, entry
+        A[n + width :, n:-width] = np.eye(late - width)
+        last = np.zeros((width, n + late))
+        last[:, -width:] = np.eye(width)
+        padding = np.zeros((max(q, len(self.L)), late))
+        return EstimationProblem(
+            A=A,
+            B=np.vstack([self.B, np.zeros((late, p))]),
+            C=last if steps > 1 else np.hstack([self.C, padding[:q]]),
+            D=self.D,
+            L=np.hstack([self.L, padding[: len(self.L)]]) if steps > 1 else last,
+            dt_s=self.dt_s,
+        )
+
+    def with_memory(self, taps: FloatArray) -> EstimationProblem:
+        """Problem with the past innovations of a filter as states, for filters that weigh them.
+
+        The new states are zero in truth, so that z is the same signal; a filter that feeds its
+        innovations into them, with the gain 1, estimates ``L x + taps [nu(k); nu(k-1); ...]``.
+
+        Parameters
+        ----------
+        taps : (l, T q) array_like
+            Weights of the innovations, the newest first.
+
+        Returns
+        -------
+        EstimationProblem
+            Of the same kind, with T q more states.
+
+        Raises
+        ------
+        DimensionError
+            If the taps do not fit.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> walk.with_memory([[0.3, 0.1]]).n_states
+        3
+        """
+        weights = matrix(taps, "taps", rows=(len(self.L), f"to match L {self.L.shape}"))
+        q, size = self.C.shape[0], weights.shape[1]
+        if size == 0 or size % q:
+            raise DimensionError(
+                f"taps must have a multiple of {q} columns, one for each measurement of each past "
+                f"frame; got {weights.shape}."
+            )
+        A = np.zeros((self.n_states + size, self.n_states + size))
+        A[: self.n_states, : self.n_states] = self.A
+        A[self.n_states + q :, self.n_states : -q] = np.eye(size - q)
+        return replace(
+            self,
+            A=A,
+            B=np.vstack([self.B, np.zeros((size, self.B.shape[1]))]),
+            C=np.hstack([self.C, np.zeros((q, size))]),
+            L=np.hstack([self.L, weights]),
+        )
+
+    def estimator(self, gain_predictor: FloatArray) -> Controller:
+        """Estimator of z from what is known: here from y(k), as :meth:`controller`.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain.
+
+        Returns
+        -------
+        Controller
+            In new-state form.
+        """
+        return self.controller(gain_predictor)
+
+    def controller(self, gain_predictor: FloatArray) -> Controller:
+        """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.
+
+        Parameters
+        ----------
+        gain_predictor : (n, q) array_like
+            Predictor gain.
+
+        Returns
+        -------
+        Controller
+            The filter, in new-state form.
+
+        Raises
+        ------
+        DimensionError
+            If the gain does not fit.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> p = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+        >>> float(p.controller([[0.4]]).start().step([1.0])[0])
+        0.4
+        """
+        gain = self._checked_gain(gain_predictor)
+        return Controller(
+            A=self.A - gain @ self.C,
+            B=gain,
+            C=self.L,
+            D=np.zeros((self.L.shape[0], self.C.shape[0])),
+            dt_s=self.dt_s,
+        )
+
+    def _checked_gain(self, gain_predictor: FloatArray) -> FloatArray:
+        return matrix(
+            gain_predictor,
+            "gain_predictor",
+            rows=(self.A.shape[0], f"to match A {self.A.shape}"),
+            cols=(self.C.shape[0], f"to match C {self.C.shape}"),
+        )

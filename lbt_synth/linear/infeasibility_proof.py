@@ -1,0 +1,110 @@
+"""Disturbances that no filter can see: proof that a level of gamma cannot be reached.
+
+A disturbance that makes every measurement zero leaves every filter with the estimate
+zero, so its estimation error is the signal z itself. A set of such disturbances is
+written as moments: the columns of ``states`` and ``disturbances`` are pairs (x, w) whose
+measurement ``C x + D w`` is zero, and whose successors ``A x + B w`` have at least the
+second moments of the states. Then, whatever the filter,
+
+    gamma^2 >= ||L (A states + B disturbances)||^2 / ||disturbances||^2      (Frobenius)
+
+by weak duality with the linear matrix inequality of the filter: the moments are a point of
+its dual. What rounding takes from "at least" is charged to the bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.linear.estimation_problem import EstimationProblem
+from lbt_synth.validation import FloatArray, matrix
+
+_RANK_TOLERANCE = 1e-13
+_STRAYED = 1e-9  # what of the successors may lie where a filter has no error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Witness:
+    """Pairs of states and disturbances that no measurement shows.
+
+    Attributes
+    ----------
+    states : (n, r) ndarray
+        States x of the problem.
+    disturbances : (p, r) ndarray
+        Disturbances w that go with them.
+    """
+
+    states: FloatArray
+    disturbances: FloatArray
+
+    def __post_init__(self) -> None:
+        states = matrix(self.states, "states")
+        columns = (states.shape[1], f"to match the states {states.shape}")
+        disturbances = matrix(self.disturbances, "disturbances", cols=columns)
+        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "disturbances", disturbances)
+
+
+def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: FloatArray) -> float:
+    """Level of gamma below which a witness proves that no filter exists.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    witness : Witness
+        The disturbances; what the measurements would show of them is taken out first.
+    covariance : (n, n) ndarray
+        Least covariance of the prediction error (Kalman), which bounds the storage matrix
+        of every filter, ``P <= gamma^2 covariance^-1``; it prices what rounding took.
+
+    Returns
+    -------
+    float
+        The level; 0 if the witness proves nothing.
+
+    Examples
+    --------
+    Of ``x(k+1) = w1(k)``, ``y = x + w2``, nothing is known when z = x is predicted:
+
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.linear import Witness, infeasible_level
+    >>> p = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> push = Witness(states=np.zeros((1, 1)), disturbances=np.array([[1.0], [0.0]]))
+    >>> infeasible_level(p, push, np.eye(1))
+    1.0
+    """
+    basis, inverse = identity_coordinates(covariance)
+    x = basis @ (inverse @ witness.states)  # the error of a filter stays in this space
+    w = witness.disturbances
+    w = w - problem.D.T @ np.linalg.solve(problem.R, problem.C @ x + problem.D @ w)
+    after = problem.A @ x + problem.B @ w
+    deviation = np.sqrt(np.diag(covariance))
+    units = np.maximum(deviation, 1e-7 * deviation.max(initial=0.0))[:, None]
+    units = np.where(units > 0, units, 1.0)
+    strayed = np.linalg.norm((after - basis @ (inverse @ after)) / units)
+    if strayed > _STRAYED * np.linalg.norm(after / units):
+        return 0.0
+    growth = inverse @ (after @ after.T - x @ x.T) @ inverse.T
+    values, vectors = np.linalg.eigh((growth + growth.T) / 2)
+    grown = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+    lost = -float(values[values < 0].sum())
+    gained = float(np.sum((problem.L @ x) ** 2) + np.sum((problem.L @ grown) ** 2))
+    spent = float(np.sum(w**2)) + lost
+    return float(np.sqrt(gained / spent)) if spent > 0 else 0.0
+
+
+def identity_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Basis T with ``covariance = T T'``, and its left inverse; null directions are dropped."""
+    spread = np.sqrt(np.diag(covariance))
+    spread = np.where(spread > 0, spread, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
+    kept = values > _RANK_TOLERANCE * values[-1]
+    root = np.sqrt(values[kept])
+    basis = spread[:, None] * vectors[:, kept] * root
+    inverse = (vectors[:, kept] / root).T / spread
+    return np.asarray(basis, dtype=np.float64), np.asarray(inverse, dtype=np.float64)

@@ -1,0 +1,1 @@
+"""Linear matrix inequalities and conic programmes (the only importer of cvxpy)."""

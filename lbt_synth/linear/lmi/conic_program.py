@@ -1,0 +1,197 @@
+"""Conic programmes over the coefficients of a Youla parameter.
+
+A function with denominators (a sensor gain other than one) is not convex. It is replaced by
+a convex one that lies above it and touches it at the present coefficients c0: with
+``b = 1 - steering c`` and b0 its value at c0::
+
+    |b|^2 >= l(b) = 2 Re(conj(b0) b) - |b0|^2,    so    |a|^2 / |b|^2 <= |a|^2 / l(b)
+
+Minimising the right-hand side lowers the function, and its domain keeps b in the half-plane
+of b0 at every frequency of the programme: the loop does not leave its stable set (the
+convex-concave procedure; A. L. Yuille, A. Rangarajan, Neural Comput. 15, 915 (2003),
+doi:10.1162/08997660360581958).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+
+from lbt_synth.errors import NumericalError
+from lbt_synth.linear.convex_functions import (
+    Bounded,
+    Combined,
+    Constraint,
+    Discs,
+    Fractions,
+    Function,
+    HalfPlanes,
+)
+from lbt_synth.linear.lmi.solver import USABLE, solve
+from lbt_synth.validation import ComplexArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShapingSolution:
+    """Answer of a programme."""
+
+    # (n,): the coefficients; None if the constraints cannot hold together
+    coefficients: FloatArray | None
+    status: str  # The solver's word
+
+
+def least(
+    function: Function,
+    constraints: tuple[Constraint, ...],
+    *,
+    size: int,
+    scale: float,
+    start: FloatArray | None = None,
+) -> ShapingSolution:
+    """Minimise a function, or what touches it from above at a start. Shapes: start (size,)."""
+    c = cp.Variable(size)
+    held: list[cp.Constraint] = []
+    objective = _expression(function, c, held, scale, start)
+    for constraint in constraints:
+        held += _held(constraint, c, 0.0)
+    status, _ = solve(cp.Minimize(objective), held)
+    if status not in USABLE or c.value is None:
+        return ShapingSolution(coefficients=None, status=status)
+    return ShapingSolution(coefficients=np.asarray(c.value, dtype=np.float64), status=status)
+
+
+def least_relaxation(
+    groups: tuple[tuple[Constraint, ...], ...], *, size: int, rigid: tuple[bool, ...]
+) -> FloatArray:
+    """Least factors by which groups of constraints have to be relaxed to hold together.
+
+    Shapes: returns (groups,).
+    """
+    c, slack = cp.Variable(size), cp.Variable(len(groups), nonneg=True)
+    held: list[cp.Constraint] = []
+    for i, group in enumerate(groups):
+        for constraint in group:
+            held += _held(constraint, c, 0.0 if rigid[i] else slack[i])
+    status, _ = solve(cp.Minimize(cp.sum(slack)), held)
+    if "infeasible" in status:
+        return np.full(len(groups), np.inf)
+    if status not in USABLE or slack.value is None:
+        raise NumericalError(
+            f"the search for demands that clash ended as {status!r}. The demands may be close to "
+            "what can be met, or very far from it; relax them, or try another number of functions.",
+            status=status,
+        )
+    return np.asarray(np.where(rigid, 0.0, slack.value), dtype=np.float64)
+
+
+def _expression(
+    function: Function,
+    c: cp.Variable,
+    held: list[cp.Constraint],
+    scale: float,
+    start: FloatArray | None,
+) -> cp.Expression:
+    """Convex expression of a function over its scale; what it needs is added to ``held``."""
+    if isinstance(function, Combined):
+        parts = [
+            weight * _expression(part, c, held, scale, start)
+            for weight, part in zip(function.weights, function.parts, strict=True)
+        ]
+        return cp.maximum(*parts) if function.worst and len(parts) > 1 else cp.sum(parts)
+    if function.steering is not None:
+        assert start is not None  # a function with denominators is minimised from a start
+        return _majorant(function, function.steering, c, held, scale, start)
+    unit = 1 / np.sqrt(scale)
+    if function.worst:
+        level = cp.Variable(nonneg=True)
+        held.append(_cones(level, function.centres * unit, function.rows * unit, c))
+        return cp.square(level)
+    root, target = _triangle(function)
+    return cp.sum_squares(unit * root @ c - unit * target)
+
+
+def _majorant(
+    function: Fractions,
+    steering: ComplexArray,
+    c: cp.Variable,
+    held: list[cp.Constraint],
+    scale: float,
+    start: FloatArray,
+) -> cp.Expression:
+    """Convex upper bound of a function with denominators that touches it at the start."""
+    b0, a0 = function.denominators(start), np.sqrt(function.numerators(start))
+    values = a0**2 / np.abs(b0) ** 2
+    largest = float(np.max(values))
+    # 2 Re(conj(b0) b) - |b0|^2 over |b0|^2: one at the start
+    slopes = np.real(-2 * b0.conj()[:, None] * steering) / np.abs(b0[:, None]) ** 2
+    denominators = (1 - slopes @ start) + slopes @ c
+    # each fraction in units of its own value, but not of a vanishing one
+    sizes = np.maximum(values, max(1e-9 * largest, 1e-12 * scale))
+    largest = float(np.max(sizes))
+    unit = np.sqrt(sizes) * np.abs(b0)
+    stacked = _stacked(function.centres / unit[:, None], function.rows / unit[:, None, None], c)
+    if function.worst:
+        level: cp.Expression = cp.Variable(nonneg=True)
+        # in units of the largest value
+        ratio = np.sqrt(sizes / largest)
+        stacked = cp.multiply(stacked, np.broadcast_to(ratio, stacked.shape))
+        levels: cp.Expression = level * np.ones(len(b0))
+        total = level * (largest / scale)
+    else:
+        levels = cp.Variable(len(b0), nonneg=True)
+        total = (sizes / scale) @ levels
+    difference = cp.reshape(levels - denominators, (1, len(b0)), order="C")
+    held.append(cp.SOC(levels + denominators, cp.vstack([2 * stacked, difference])))
+    return total
+
+
+def _held(
+    constraint: Constraint, c: cp.Variable, slack: float | cp.Expression
+) -> list[cp.Constraint]:
+    """Constraint of the programme, its bound times ``1 + slack``."""
+    if isinstance(constraint, HalfPlanes):
+        unit = 1 / constraint.bounds
+        return [cp.multiply(unit, constraint.rows @ c) <= 1 + slack]
+    if isinstance(constraint, Discs):
+        unit = 1 / constraint.radii
+        return [
+            _cones(
+                1 + slack,
+                constraint.centres[:, None] * unit[:, None],
+                constraint.rows[:, None, :] * unit[:, None, None],
+                c,
+            )
+        ]
+    assert isinstance(constraint, Bounded)
+    root, target = _triangle(constraint.function)
+    unit = 1 / np.sqrt(constraint.limit)
+    return [cp.norm(unit * root @ c - unit * target) <= 1 + slack]
+
+
+def _cones(
+    level: float | cp.Expression, centres: ComplexArray, rows: ComplexArray, c: cp.Variable
+) -> cp.Constraint:
+    """``sqrt(sum over r |centres + rows c|^2) <= level`` at each frequency."""
+    return cp.SOC(level * np.ones(len(centres)), _stacked(centres, rows, c))
+
+
+def _stacked(centres: ComplexArray, rows: ComplexArray, c: cp.Variable) -> cp.Expression:
+    """Real and imaginary parts of the responses, (2 r, F)."""
+    parts = []
+    for i in range(centres.shape[1]):
+        parts += [
+            centres[:, i].real + rows[:, i].real @ c,
+            centres[:, i].imag + rows[:, i].imag @ c,
+        ]
+    return cp.vstack(parts)
+
+
+def _triangle(function: Fractions) -> tuple[FloatArray, FloatArray]:
+    """Root and target with ``sum |centres + rows c|^2 = ||root c - target||^2``."""
+    size = function.rows.shape[-1]
+    rows = function.rows.reshape(-1, size)
+    whole = np.hstack([rows, -function.centres.reshape(-1, 1)])
+    triangle = np.asarray(np.linalg.qr(np.vstack([whole.real, whole.imag]), mode="r"))
+    return triangle[:, :size], triangle[:, size]

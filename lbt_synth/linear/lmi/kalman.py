@@ -1,0 +1,45 @@
+"""The Kalman filter as a semidefinite programme."""
+
+from __future__ import annotations
+
+import cvxpy as cp
+import numpy as np
+
+from lbt_synth.errors import NumericalError
+from lbt_synth.linear.estimation_problem import EstimationProblem
+from lbt_synth.linear.lmi.balanced_coordinates import balanced
+from lbt_synth.linear.lmi.solver import USABLE, LmiSolution, solve, symmetrised
+from lbt_synth.validation import FloatArray
+
+
+def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: float) -> LmiSolution:
+    """Maximise tr P subject to ``[[APA' + Q - P, APC'], [CPA', R + CPC']] >= 0``.
+
+    The stabilising solution of the filter Riccati equation is the greatest P that satisfies the
+    inequality (S. Boyd et al., "Linear Matrix Inequalities in System and Control Theory", SIAM
+    (1994), doi:10.1137/1.9781611970777). Shapes: coordinates (n, n).
+    """
+    frame = balanced(problem, coordinates, scale)
+    A, B, C = frame.problem.A, frame.problem.B, frame.problem.C
+    n, q = A.shape[0], C.shape[0]
+    P = cp.Variable((n, n), symmetric=True)
+    block = cp.bmat(
+        [[A @ P @ A.T + B @ B.T - P, A @ P @ C.T], [C @ P @ A.T, np.eye(q) + C @ P @ C.T]]
+    )
+    status, iterations = solve(cp.Maximize(cp.trace(P)), [symmetrised(block) >> 0, P >> 0])
+    if status not in USABLE or P.value is None:
+        raise NumericalError(
+            f"the semidefinite programme of the Kalman filter ended as {status!r}; expected "
+            'an optimum. Try method="riccati".',
+            status=status,
+        )
+    information = np.linalg.inv((P.value + P.value.T) / 2)
+    predictor, filtering = frame.gains(information)
+    return LmiSolution(
+        gamma=np.inf,
+        P=frame.covariance(P.value),
+        gain_predictor=predictor,
+        gain_filter=filtering,
+        status=status,
+        iterations=iterations,
+    )

@@ -1,0 +1,198 @@
+"""One filter for a segment of plants, with parameter-dependent Lyapunov and slack matrices.
+
+For the plants ``A = (1 - t) A_0 + t A_1`` with t in [0, 1], the filter ``xf+ = Af xf + Bf y``,
+``zf = Cf xf`` and, in the coordinates (x, e) with ``e = x - xf``, slack matrices::
+
+    G(t) = [[Z(t), 0], [U(t), K]],     Z and U affine in t, K of the filter
+
+the error has a norm below gamma on the whole segment if for some P(t), quadratic in t,::
+
+    [[G + G' - P,  G A_e,  G B_e,      0   ],
+     [    .     ,    P  ,    0  ,    C_e'  ],
+     [    .     ,    .  ,  g^2 I ,    0    ],   > 0      (M. C. de Oliveira, J. Bernussou,
+     [    .     ,    .  ,    .   ,    I    ]]             J. C. Geromel)
+
+which is linear in P, Z, U, K and the products ``K Af``, ``K Bf`` and Cf. Z and U multiply
+nothing of the filter, so they may follow the parameter; K may not. The entries are
+polynomials of degree two in t, and their three Bernstein coefficients are asked to be
+positive definite. For the variance the third row and column become an inequality of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from lbt_synth.errors import NumericalError
+from lbt_synth.linear.estimation_problem import EstimationProblem
+from lbt_synth.linear.infeasibility_proof import identity_coordinates
+from lbt_synth.linear.lmi.solver import USABLE, solve, symmetrised
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.validation import FloatArray, frozen
+
+_RANK = 1e-11  # share of a covariance that is added to it, so that no direction is lost
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SegmentFilter:
+    """A filter for a segment of plants, as the solver left it."""
+
+    # A, B, C: ``xf+ = A xf + B y``, ``zf = C xf``; of the order of the plant, less the states that
+    # are sums of others
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    bound: float  # Norm, or standard deviation, that the programme claims for the whole segment
+    status: str  # The solver's word; no evidence
+    iterations: int  # Iterations of the solver
+
+
+def segment_filter(
+    problem: EstimationProblem,
+    ends: tuple[FloatArray, FloatArray],
+    *,
+    norm: str,
+    coordinates: FloatArray,
+    scale: float,
+) -> SegmentFilter:
+    """Filter of the least bound over a segment of plants.
+
+    Shapes: ends list of (n, n), coordinates (n, n).
+    """
+    frame = _Frame.of(problem, ends, coordinates, scale)
+    programme = _Programme(frame)
+    level = cp.Variable(nonneg=True)
+    constraints = [
+        inequality >> 0 for k in range(3) for inequality in programme.inequalities(k, norm, level)
+    ]
+    status, iterations = solve(cp.Minimize(level), constraints)
+    if status not in USABLE or programme.K.value is None or level.value is None:
+        raise NumericalError(
+            f"the semidefinite programme of the interval ended as {status!r}; expected an optimum. "
+            "Try a narrower interval.",
+            status=status,
+        )
+    try:
+        inverse = np.linalg.inv(programme.K.value)
+    except np.linalg.LinAlgError as error:
+        raise NumericalError(
+            "the slack matrix of the filter is singular. Try a narrower interval.", status=status
+        ) from error
+    back = frame.basis @ inverse
+    return SegmentFilter(
+        A=frozen(back @ programme.KA.value @ frame.inverse),
+        B=frozen(-back @ programme.KB.value @ frame.sensor_scale),
+        C=frozen(programme.output.value @ frame.inverse * scale),
+        bound=float(np.sqrt(level.value)) * scale,
+        status=status,
+        iterations=iterations,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Frame:
+    """The segment in states that are of size one and independent, without those that are none.
+
+    The errors of these states are ``basis`` times errors of size one.
+    """
+
+    ends: tuple[FloatArray, FloatArray]
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    L: FloatArray
+    basis: FloatArray
+    inverse: FloatArray
+    sensor_scale: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        problem: EstimationProblem,
+        ends: tuple[FloatArray, FloatArray],
+        coordinates: FloatArray,
+        scale: float,
+    ) -> _Frame:
+        states = stationary_covariance((ends[0] + ends[1]) / 2, problem.Q)
+        wide, narrow = identity_coordinates(states)
+        errors = narrow @ coordinates @ narrow.T
+        basis, inverse = identity_coordinates(
+            errors + _RANK * np.trace(errors) * np.eye(len(errors))
+        )
+        sensor_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
+        return cls(
+            ends=(narrow @ ends[0] @ wide, narrow @ ends[1] @ wide),
+            B=narrow @ problem.B,
+            C=sensor_scale @ problem.C @ wide,
+            D=sensor_scale @ problem.D,
+            L=problem.L @ wide / scale,
+            basis=basis,
+            inverse=inverse,
+            sensor_scale=np.asarray(sensor_scale, dtype=np.float64),
+        )
+
+
+class _Programme:
+    """Variables of the programme, and its inequalities."""
+
+    def __init__(self, frame: _Frame) -> None:
+        n, (outputs, q) = len(frame.basis), (len(frame.L), len(frame.C))
+        self.frame = frame
+        self.Z = [cp.Variable((n, n)) for _ in range(2)]
+        self.U = [cp.Variable((n, n)) for _ in range(2)]
+        self.K = cp.Variable((n, n))
+        self.KA = cp.Variable((n, n))
+        self.KB = cp.Variable((n, q))  # of -Bf
+        self.output = cp.Variable((outputs, n))
+
+    def inequalities(self, k: int, norm: str, level: Any) -> list[Any]:
+        """Matrices that are to be positive: the Bernstein coefficients of index k."""
+        f, n = self.frame, len(self.frame.basis)
+        p, outputs = f.B.shape[1], len(f.L)
+        Z, U = _coefficient(self.Z, k), _coefficient(self.U, k)
+        zero = np.zeros((n, n))
+        own = U + self.K @ f.inverse  # of what drives the states
+        G = cp.bmat([[Z, zero], [U, self.K]])
+        after = _product(self.U, f.ends, k) + self.K @ f.inverse @ _coefficient(f.ends, k)
+        GA = cp.bmat(
+            [
+                [_product(self.Z, f.ends, k), zero],
+                [after + self.KB @ f.C - self.KA @ f.inverse, self.KA],
+            ]
+        )
+        GB = cp.vstack([Z @ f.B, own @ f.B + self.KB @ f.D])
+        C = cp.hstack([f.L - self.output @ f.inverse, self.output])
+        P = cp.Variable((2 * n, 2 * n), symmetric=True)
+        slack, none = G + G.T - P, np.zeros((2 * n, outputs))
+        if norm == "hinf":
+            across = np.zeros((2 * n, p))
+            whole = [
+                [slack, GA, GB, none],
+                [GA.T, P, across, C.T],
+                [GB.T, across.T, level * np.eye(p), np.zeros((p, outputs))],
+                [none.T, C, np.zeros((outputs, p)), np.eye(outputs)],
+            ]
+            return [symmetrised(cp.bmat(whole))]
+        W = cp.Variable((p, p), symmetric=True)
+        decay = [[slack, GA, none], [GA.T, P, C.T], [none.T, C, np.eye(outputs)]]
+        entry = [[slack, GB], [GB.T, W]]
+        return [
+            symmetrised(cp.bmat(decay)),
+            symmetrised(cp.bmat(entry)),
+            cp.reshape(level - cp.trace(W), (1, 1), order="C"),
+        ]
+
+
+def _coefficient(ends: Any, k: int) -> Any:
+    """Bernstein coefficient k, of degree two, of what is affine between two ends."""
+    return (1 - k / 2) * ends[0] + (k / 2) * ends[1]
+
+
+def _product(left: Any, right: Any, k: int) -> Any:
+    """Bernstein coefficient k of the product of two affine functions."""
+    if k == 1:
+        return (left[0] @ right[1] + left[1] @ right[0]) / 2
+    return left[k // 2] @ right[k // 2]

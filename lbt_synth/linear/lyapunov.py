@@ -1,0 +1,95 @@
+"""Stationary covariances: the discrete Lyapunov (Stein) equation."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
+
+from lbt_synth.linear.batched import norms, symmetrised, transposed
+from lbt_synth.validation import FloatArray
+
+_SOLVED = 1e-14  # relative residual of an equation that is solved to rounding
+
+
+def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Solve ``X = A X A' + Q`` for a stable A, with iterative refinement.
+
+    By squaring; where that leaves a residual, by a bilinear transformation if it leaves less. The
+    latter inverts ``A + I``, which is all but singular for states in very different units. Shapes:
+    A (n, n), Q (n, n) -> (n, n).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.lyapunov import stationary_covariance
+    >>> float(stationary_covariance(np.array([[0.6]]), np.array([[64.0]]))[0, 0])
+    100.0
+    """
+    squared, residuals = stationary_covariances(A[None], Q[None])
+    if residuals[0] < _SOLVED:
+        return np.asarray(squared[0])
+    with warnings.catch_warnings():
+        # states of very different sizes; whoever uses X measures its residual
+        warnings.simplefilter("ignore", LinAlgWarning)
+        warnings.simplefilter("ignore", RuntimeWarning)
+        X = solve_discrete_lyapunov(A, Q)
+        X = X + solve_discrete_lyapunov(A, A @ X @ A.T - X + Q)
+    other: FloatArray = np.asarray((X + X.T) / 2, dtype=np.float64)
+    return np.asarray(squared[0]) if residuals[0] <= lyapunov_residual(A, Q, other) else other
+
+
+def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Solve ``X = A X A' + Q`` for a stack, by squaring with refinement.
+
+    Shapes: A, Q (N, n, n) -> X (N, n, n), residuals (N,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.lyapunov import stationary_covariances
+    >>> X, residuals = stationary_covariances(np.array([[[0.6]]]), np.array([[[64.0]]]))
+    >>> round(float(X[0, 0, 0]), 12), bool(residuals[0] < 1e-14)
+    (100.0, True)
+    """
+    X = smith_sum(A, Q)
+    with np.errstate(all="ignore"):  # what is not finite is reported
+        for _ in range(2):
+            X = symmetrised(X + smith_sum(A, symmetrised(A @ X @ transposed(A) - X + Q)))
+        AXA = A @ X @ transposed(A)
+        size = norms(X) + norms(AXA) + norms(Q)
+        residuals = norms(AXA - X + Q) / np.where(size > 0, size, 1.0)
+    return X, residuals
+
+
+def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:
+    """Relative residual of ``X = A X A' + Q`` in the 1-norm."""
+    AXA = A @ X @ A.T
+    scale = np.linalg.norm(X, 1) + np.linalg.norm(AXA, 1) + np.linalg.norm(Q, 1)
+    return float(np.linalg.norm(AXA - X + Q, 1) / scale) if scale > 0 else 0.0
+
+
+def smith_sum(A: FloatArray, Q: FloatArray, *, max_steps: int = 60) -> FloatArray:
+    """Sum ``A^i Q A'^i`` over all i by squaring, for a stack of matrices.
+
+    R. A. Smith, SIAM J. Appl. Math. 16, 198 (1968), doi:10.1137/0116017. Not finite where A is not
+    stable. For corrections: it loses digits as A nears the unit circle. Shapes: A, Q (N, n, n) ->
+    (N, n, n).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.lyapunov import smith_sum
+    >>> round(float(smith_sum(np.array([[[0.6]]]), np.array([[[64.0]]]))[0, 0, 0]), 12)
+    100.0
+    """
+    X = Q
+    with np.errstate(all="ignore"):
+        for _ in range(max_steps):
+            X = X + A @ X @ transposed(A)
+            A = A @ A
+            size = norms(A)
+            if not np.any(size > 1e-9):  # what remains is of its square
+                return np.where((size <= 1)[:, None, None], X, np.nan)
+    return np.where((size <= 1e-9)[:, None, None], X, np.nan)

@@ -1,0 +1,305 @@
+"""H-infinity norm of a discrete-time system by level sets on its symplectic pencil.
+
+N. A. Bruinsma, M. Steinbuch, Syst. Control Lett. 14, 287 (1990),
+doi:10.1016/0167-6911(90)90049-Z, in its discrete form: sigma is a singular
+value of G(exp(j theta)) if and only if exp(j theta) is a generalised eigenvalue
+of a pencil. No eigenvalue is discarded for lying off the unit circle: each one
+only proposes an angle at which G is evaluated, so a rounding error cannot hide
+a peak, and a spurious angle does no harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import eigvals
+
+from lbt_synth.errors import NumericalError, UnstableLoopError
+from lbt_synth.linear.state_space import StateSpace, pointwise_response, swept_response
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_TOLERANCE = 2e-11
+_CAREFUL = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HinfNorm:
+    """Norm with its bracket; ``float(norm)`` gives the value.
+
+    Attributes
+    ----------
+    value : float
+        Largest singular value found, attained at ``peak_frequency_hz``.
+    lower, upper : float
+        Two-sided bracket of the level sets. Next to a pole on the unit circle the evaluation
+        itself is only as good as the distance to it: with a pole at 1 - 1e-9, some 1e-7.
+    peak_frequency_hz : float
+        Frequency of the peak [Hz] (cycles a sample when the system has no period).
+    """
+
+    value: float
+    lower: float
+    upper: float
+    peak_frequency_hz: float
+
+    def __float__(self) -> float:
+        return self.value
+
+
+def hinf_norm(system: Any) -> HinfNorm:
+    """Largest singular value of a stable discrete-time system over all frequencies.
+
+    Parameters
+    ----------
+    system : StateSpace, control.StateSpace or tuple (A, B, C, D)
+        The system; C and D need not be square, D may be non-zero.
+
+    Returns
+    -------
+    HinfNorm
+        Value, bracket and peak frequency.
+
+    Raises
+    ------
+    ProblemError
+        If the system is not one, or is in continuous time.
+    UnstableLoopError
+        If it is not stable: the norm is then infinite.
+    NumericalError
+        If the level sets do not close.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lag = lbt.hinf_norm(([[0.5]], [[1.0]], [[1.0]], [[0.0]]))
+    >>> round(float(lag), 9), lag.peak_frequency_hz
+    (2.0, 0.0)
+    """
+    G = StateSpace.of(system)
+    radius = G.spectral_radius
+    if not radius < 1:
+        raise UnstableLoopError(
+            f"the system must be stable, all poles inside the unit circle; got a pole of modulus "
+            f"{radius:.9g}. An unstable system has no finite norm.",
+            spectral_radius=radius,
+        )
+    return _peak(G.balanced(), 0.0, np.pi)
+
+
+def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
+    """Largest singular value over a band of frequencies; poles outside the band do no harm.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.linear.norms import band_norm
+    >>> walk = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> round(float(band_norm(walk, 1 / 6, 0.5)), 9)
+    1.0
+    """
+    low, high = (2 * np.pi * f * system.dt_s for f in (low_hz, high_hz))
+    found = _peak(system.balanced(), low, high)
+    # an end of the band, there and back, must not fall outside it
+    return replace(found, peak_frequency_hz=min(max(found.peak_frequency_hz, low_hz), high_hz))
+
+
+def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
+    """Largest singular value of a balanced system between two angles, by level sets."""
+    seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
+    peak, angle = _climbed(
+        seeds=_folded(seeds, low, high),
+        largest=lambda angles: _largest(G, angles),
+        proposed=lambda level: _folded(_level_angles(G, level), low, high),
+    )
+    return HinfNorm(
+        value=peak,
+        lower=peak,
+        upper=peak * (1 + 2 * _TOLERANCE),
+        peak_frequency_hz=angle / (2 * np.pi * G.dt_s),
+    )
+
+
+def largest_real_part(system: StateSpace) -> float:
+    """Largest real part of a stable scalar system's response over all frequencies.
+
+    By the level sets of ``G(z) + G(1/z) = 2 level``, as the norm.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.linear.norms import largest_real_part
+    >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[-1.0]])
+    >>> round(largest_real_part(lag), 9)
+    1.0
+    """
+    G = system.balanced()
+    size = max(float(hinf_norm(G)), 1e-300)
+    # the response moved by its own size is positive, and so are its levels
+    moved = StateSpace(A=G.A, B=G.B, C=G.C, D=G.D + 2 * size, dt_s=G.dt_s)
+
+    def largest(angles: FloatArray) -> tuple[float, float]:
+        values = np.real(pointwise_response(moved, np.exp(1j * angles))[:, 0, 0])
+        best = int(np.argmax(values))
+        return float(values[best]), float(angles[best])
+
+    peak, _ = _climbed(
+        seeds=_folded(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)]), 0.0, np.pi),
+        largest=largest,
+        proposed=lambda level: _folded(_real_part_angles(moved, level), 0.0, np.pi),
+    )
+    return peak * (1 + 2 * _TOLERANCE) - 2 * size
+
+
+def _climbed(
+    *,
+    seeds: FloatArray,
+    largest: Callable[[FloatArray], tuple[float, float]],
+    proposed: Callable[[float], FloatArray],
+) -> tuple[float, float]:
+    """Peak over angles, and where: raise a level until nothing lies above it.
+
+    ``largest`` gives the largest value at some angles, at least 0, and its angle;
+    ``proposed`` the angles that delimit what may lie above a level.
+    """
+    peak, angle = largest(seeds)
+    if peak == 0:
+        return peak, angle
+    for _ in range(100):
+        level = peak * (1 + _TOLERANCE)
+        candidates = proposed(level)
+        tests = np.concatenate([candidates, (candidates[1:] + candidates[:-1]) / 2])
+        new_peak, new_angle = largest(tests)
+        if new_peak > peak:
+            peak, angle = new_peak, new_angle
+        if new_peak <= level:
+            return peak, angle
+    raise NumericalError(
+        f"the largest value over frequency was not bracketed: it is at least {peak:.9g}. "
+        "Balance the system's states.",
+        status="level sets",
+    )
+
+
+def largest_singular_values(system: StateSpace, frequency_hz: Any) -> FloatArray:
+    """Largest singular value of the transfer matrix at each frequency.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The system.
+    frequency_hz : (f,) array_like
+        Frequencies [Hz].
+
+    Returns
+    -------
+    (f,) ndarray
+        Largest singular values.
+
+    Raises
+    ------
+    ProblemError
+        If a frequency is not finite.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[3.0, 4.0]], C=[[1.0]], D=[[0.0, 0.0]])
+    >>> float(lbt.linear.largest_singular_values(lag, [0.0])[0].round(12))
+    10.0
+    """
+    return spectral_norms(system.frequency_response(frequency_hz))
+
+
+def spectral_norms(matrices: ComplexArray) -> FloatArray:
+    """Largest singular value of each matrix of a stack, (N,).
+
+    From the Gram matrix of the smaller side, which costs no accuracy for the largest one.
+    """
+    if matrices.shape[-2] > matrices.shape[-1]:
+        matrices = matrices.swapaxes(-1, -2)
+    size = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
+    scale = np.where(size > 0, size, 1.0)
+    scaled = matrices / scale[:, None, None]
+    if scaled.shape[-2] == 1:
+        largest = np.einsum("nij,nij->n", scaled, scaled.conj()).real
+    elif scaled.shape[-2] == 2:
+        gram = scaled @ scaled.conj().swapaxes(-1, -2)
+        mean = (gram[:, 0, 0].real + gram[:, 1, 1].real) / 2
+        half = (gram[:, 0, 0].real - gram[:, 1, 1].real) / 2
+        largest = mean + np.hypot(half, np.abs(gram[:, 0, 1]))
+    else:
+        gram = scaled @ scaled.conj().swapaxes(-1, -2)
+        largest = np.linalg.eigvalsh(gram)[:, -1]
+    return np.asarray(scale * np.sqrt(np.maximum(largest, 0.0)), dtype=np.float64)
+
+
+def _folded(angles: FloatArray, low: float, high: float) -> FloatArray:
+    """Sorted distinct angles between two of [0, pi], these included."""
+    inside = np.abs(np.mod(angles + np.pi, 2 * np.pi) - np.pi)
+    return np.unique(np.concatenate([np.clip(inside, low, high), [low, high]]))
+
+
+def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
+    """Largest singular value of a balanced system; the highest few are evaluated with care."""
+    z = np.exp(1j * angles)
+    high = np.argsort(spectral_norms(swept_response(G, z)))[-_CAREFUL:]
+    careful = spectral_norms(pointwise_response(G, z[high]))
+    best = int(np.argmax(careful))
+    return float(careful[best]), float(angles[high[best]])
+
+
+def _level_angles(G: StateSpace, level: float) -> FloatArray:
+    """Angles of the generalised eigenvalues at which ``level`` may be a singular value.
+
+    With e = C x + D w, w = (B'p + D'e) / level^2 and the adjoint state p,
+    ``z [x; A'p + C'e; 0] = [A x + B w; p; B'p + D'e - level^2 w]``; no matrix is inverted.
+    """
+    n, m = G.B.shape
+    # one scaling of states serves both x and p; levels are scaled to one
+    C, D = G.C / np.sqrt(level), G.D / level
+    B = G.B / np.sqrt(level)
+    zero = np.zeros
+    E = np.block(
+        [
+            [np.eye(n), zero((n, n)), zero((n, m))],
+            [C.T @ C, G.A.T, C.T @ D],
+            [zero((m, 2 * n + m))],
+        ]
+    )
+    F = np.block(
+        [
+            [G.A, zero((n, n)), B],
+            [zero((n, n)), np.eye(n), zero((n, m))],
+            [D.T @ C, B.T, D.T @ D - np.eye(m)],
+        ]
+    )
+    return _pencil_angles(F, E)
+
+
+def _real_part_angles(G: StateSpace, level: float) -> FloatArray:
+    """Angles of the generalised eigenvalues at which ``Re G`` of a scalar system may be a level.
+
+    ``z [x; A'p + C'u; 0] = [A x + B u; p; C x + B'p + 2 (D - level) u]``.
+    """
+    n = G.n_states
+    zero = np.zeros
+    E = np.block(
+        [[np.eye(n), zero((n, n + 1))], [zero((n, n)), G.A.T, G.C.T], [zero((1, 2 * n + 1))]]
+    )
+    F = np.block(
+        [
+            [G.A, zero((n, n)), G.B],
+            [zero((n, n)), np.eye(n), zero((n, 1))],
+            [G.C, G.B.T, 2 * (G.D - level)],
+        ]
+    )
+    return _pencil_angles(F, E)
+
+
+def _pencil_angles(F: FloatArray, E: FloatArray) -> FloatArray:
+    with np.errstate(all="ignore"):
+        values = eigvals(F, E)
+    return np.asarray(np.angle(values[np.isfinite(values) & (values != 0)]))

@@ -1,0 +1,1 @@
+"""Discrete algebraic Riccati equations, those of filtering and of H-infinity included."""

@@ -1,0 +1,323 @@
+"""The discrete algebraic Riccati equation, one or many at once, with its evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
+from lbt_synth.linear.riccati.diagnosis import require_stabilising
+from lbt_synth.linear.riccati.equations import Equations
+from lbt_synth.linear.riccati.routes import ROUTES
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    frozen,
+    matrix,
+    square,
+    symmetric,
+)
+
+RESIDUAL_LIMIT = 1e-12  # a solution beyond these limits is not returned
+ERROR_LIMIT = 1e-3
+_SATISFIED = 1e-8  # beyond this estimate of its error the next route is tried
+_DOUBTFUL = 1e-6  # a pole this close to the unit circle makes the conditions be checked
+_NEAR = 1e-2  # from here to the unit circle, a pole may be one on it that rounding has moved:
+_CLEAR = 1e-5  # part of its distance that the error of X may be
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attempt:
+    """What one route did.
+
+    Attributes
+    ----------
+    method : str
+        "doubling", "shifted doubling" or "schur".
+    tried, solved : int
+        Equations it was given, and those it solved.
+    """
+
+    method: str
+    tried: int
+    solved: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DareSolution:
+    """Stabilising solution of a discrete algebraic Riccati equation, or of a stack of them.
+
+    Attributes
+    ----------
+    X : (..., n, n) ndarray
+        The solution, symmetric.
+    gain_feedback : (..., m, n) ndarray
+        ``(R + B'XB)^-1 (B'XA + S')``; the closed loop is ``A - B gain_feedback``.
+    poles : (..., n) complex ndarray
+        Poles of the closed loop.
+    residuals : (...) ndarray
+        Relative residual of each equation: its norm (Frobenius) over ``||X|| (1 + ||closed
+        loop||^2) + ||A'XA|| + ||Q||``, in units of the states that balance the equation.
+        The first term is what rounding X can make of it.
+    errors : (...) ndarray
+        Estimate of the relative error of X: the size of the next Newton step. It grows
+        with the condition of the equation.
+    negative : (...) int ndarray
+        Number of negative eigenvalues of ``R + B'XB``. Where it is zero, X is the least
+        cost of the control problem; elsewhere X is a saddle point.
+    iterations : int
+        Most doublings made for an equation.
+    attempts : tuple of Attempt
+        Routes in the order they were tried.
+    """
+
+    X: FloatArray
+    gain_feedback: FloatArray
+    poles: ComplexArray
+    residuals: FloatArray
+    errors: FloatArray
+    negative: IntArray
+    iterations: int
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def residual(self) -> float:
+        """Largest relative residual."""
+        return float(np.max(self.residuals, initial=0.0))
+
+    @property
+    def error(self) -> float:
+        """Largest estimate of the relative error of X."""
+        return float(np.max(self.errors, initial=0.0))
+
+    @property
+    def method(self) -> str:
+        """Routes that solved something, in the order they were tried."""
+        solvers = [attempt.method for attempt in self.attempts if attempt.solved]
+        return ", ".join(solvers or [attempt.method for attempt in self.attempts])
+
+
+def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
+    """Solve ``X = A'XA + Q - (A'XB + S)(R + B'XB)^-1 (B'XA + S')`` for its stabilising X.
+
+    Structured doubling in balanced units; if that fails, doubling from some steps of
+    the Riccati recursion, which a singular R needs; if that fails, the ordered Schur
+    form of the extended pencil. Each answer is refined by Newton steps on a residual in
+    extended precision, and verified: a stable closed loop and a small residual make it
+    the stabilising solution, of which there is only one. For the filter equation pass
+    ``(A', C', B B', D D', B D')``.
+
+    Leading dimensions of the arguments are those of a stack of equations, broadcast
+    against each other and solved at once.
+
+    Parameters
+    ----------
+    A : (..., n, n) array_like
+        State matrix.
+    B : (..., n, m) array_like
+        Input matrix.
+    Q : (..., n, n) array_like
+        State weight, symmetric.
+    R : (..., m, m) array_like
+        Input weight, symmetric. It may be singular. If it has negative eigenvalues the
+        equation is that of an H-infinity problem, and X must then be positive
+        semidefinite and leave ``R + B'XB`` the signs of R.
+    S : (..., n, m) array_like, optional
+        Cross weight.
+
+    Returns
+    -------
+    DareSolution
+        The solution, its gain, its poles and the residual that was measured.
+
+    Raises
+    ------
+    DimensionError, NonFiniteError, DefinitenessError
+        If the input is wrong.
+    DetectabilityError
+        If there is no stabilising solution; the message names the mode, or the zero on
+        the unit circle.
+    InfeasibleError
+        If R is indefinite and the stabilising solution does not meet its conditions.
+    NumericalError
+        If no route reaches a stable closed loop, a relative residual of 1e-12 and an
+        estimated error of 1e-3.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> round(float(lbt.solve_dare(1, 1, 1, 1).X[0, 0]), 12)  # (1 + sqrt 5) / 2
+    1.61803398875
+
+    Three equations at once:
+
+    >>> lbt.solve_dare(1, 1, [[[1]], [[2]], [[6]]], 1).X.ravel().round(6).tolist()
+    [1.618034, 2.732051, 6.872983]
+    """
+    equations, lead = _stacked(A, B, Q, R, S)
+    with np.errstate(all="ignore"):  # what is not finite is refused
+        return _solved(equations, lead)
+
+
+def _solved(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
+    """Solve a stack, verify each answer, and put the leading dimensions back."""
+    factors = equations.normalising_factors()
+    units = equations.balancing_units()
+    balanced = equations.divided(factors).in_units(units)
+    best = _attempted(balanced)
+    radius = np.abs(best.poles).max(axis=-1)
+
+    solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
+    solved &= (1 - radius > _NEAR) | (best.errors <= _CLEAR * (1 - radius))
+    for i in np.flatnonzero(~solved | (radius > 1 - _DOUBTFUL)):
+        try:
+            require_stabilising(balanced, int(i), _name(int(i), lead), zeros=not solved[i])
+        except ProblemError:
+            raise
+        except ValueError:  # numbers out of range (LinAlgError): refused without a reason
+            continue
+    if not solved.all():
+        _refuse(int(np.flatnonzero(~solved)[0]), lead, best)
+    X = best.X
+    weights = balanced.weights(X)
+    negative = np.sum(np.linalg.eigvalsh(weights) < 0, axis=-1)
+    _require_saddle(balanced.R, X, negative, lead)
+
+    column, row = units[:, None, :], units[:, :, None]
+    n, m = equations.B.shape[-2:]
+    return DareSolution(
+        X=frozen((X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
+        gain_feedback=frozen((best.gains / column).reshape(*lead, m, n)),
+        poles=_read_only(best.poles.reshape(*lead, n)),
+        residuals=frozen(best.residuals.reshape(lead)),
+        errors=frozen(best.errors.reshape(lead)),
+        negative=_read_only(negative.reshape(lead)),
+        iterations=int(np.max(best.steps, initial=0)),
+        attempts=tuple(best.attempts),
+    )
+
+
+def _read_only(array: Any) -> Any:
+    array.setflags(write=False)
+    return array
+
+
+def _stacked(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[int, ...]]:
+    """Check the arguments; return them as one stack, and its leading dimensions."""
+    A = square(A, "A", stacked=True)
+    n, why = A.shape[-1], f"to match A {A.shape}"
+    B = matrix(B, "B", rows=(n, why), stacked=True)
+    m, also = B.shape[-1], f"to match B {B.shape}"
+    if m == 0:
+        raise DimensionError(f"B must have at least one column; got {B.shape}.")
+    Q = symmetric(Q, "Q", size=(n, why), stacked=True)
+    R = symmetric(R, "R", size=(m, also), stacked=True)
+    if S is None:
+        S = np.zeros((n, m))
+    S = matrix(S, "S", rows=(n, why), cols=(m, also), stacked=True)
+    parts = {"A": A, "B": B, "Q": Q, "R": R, "S": S}
+    try:
+        lead = np.broadcast_shapes(*(part.shape[:-2] for part in parts.values()))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {part.shape}" for name, part in parts.items())
+        raise DimensionError(
+            f"the leading dimensions must be the same or 1, to be stacked; got {shapes}."
+        ) from error
+    stacks = {
+        name: np.broadcast_to(part, lead + part.shape[-2:]).reshape(-1, *part.shape[-2:])
+        for name, part in parts.items()
+    }
+    return Equations(**stacks), lead
+
+
+class _Best:
+    """The best answer to each equation so far, and what was tried."""
+
+    def __init__(self, equations: Equations) -> None:
+        count, n, m = equations.B.shape
+        self.X = np.full((count, n, n), np.nan)
+        self.gains = np.full((count, m, n), np.nan)
+        self.poles: ComplexArray = np.full((count, n), np.inf, dtype=np.complex128)
+        self.residuals, self.errors = np.full(count, np.inf), np.full(count, np.inf)
+        self.steps: IntArray = np.zeros(count, dtype=np.int64)
+        self.attempts: list[Attempt] = []
+
+
+def _attempted(equations: Equations) -> _Best:
+    """Try the routes in order, each on what the ones before have not solved."""
+    best = _Best(equations)
+    pending = np.arange(len(best.X))
+    for method, route in ROUTES:
+        if pending.size == 0:
+            break
+        part = equations.take(pending)
+        found, steps = route(part)
+        refined = part.refined(found)
+        poles = part.poles(refined.gains)
+        size = np.where(np.abs(poles).max(axis=-1) < 1, refined.residuals, np.inf)
+        better = size < best.residuals[pending]
+        chosen = pending[better]
+        best.X[chosen], best.gains[chosen] = refined.X[better], refined.gains[better]
+        best.residuals[chosen], best.errors[chosen] = size[better], refined.errors[better]
+        best.poles[chosen], best.steps[chosen] = poles[better], steps[better]
+        satisfied = (size <= RESIDUAL_LIMIT) & (refined.errors <= _SATISFIED)
+        best.attempts.append(
+            Attempt(method=method, tried=int(pending.size), solved=int(satisfied.sum()))
+        )
+        pending = pending[~satisfied]
+    return best
+
+
+def _name(index: int, lead: tuple[int, ...]) -> str:
+    """Begin of a message about one equation of many; empty for a single one."""
+    if not lead:
+        return ""
+    where = tuple(int(i) for i in np.unravel_index(index, lead))
+    return f"equation {where[0] if len(where) == 1 else where}: "
+
+
+def _refuse(index: int, lead: tuple[int, ...], best: _Best) -> None:
+    residual, error = float(best.residuals[index]), float(best.errors[index])
+    stable = bool(np.isfinite(residual))
+    gap = 1 - float(np.abs(best.poles[index]).max())
+    found = (
+        f"a relative residual of {residual:.3g}, an estimated error of {error:.3g} and a pole "
+        f"{gap:.3g} inside the unit circle"
+        if stable
+        else "no stable closed loop"
+    )
+    raise NumericalError(
+        f"{_name(index, lead)}the Riccati equation was not solved: "
+        f"{', '.join(attempt.method for attempt in best.attempts)} gave {found}; expected a stable "
+        f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
+        f"{ERROR_LIMIT:g} (of a pole near the unit circle, below {_CLEAR:g} of its distance). "
+        "There may be no stabilising solution; look for modes near the unit circle that are barely "
+        "driven or seen.",
+        status="residual",
+        residual=residual if stable else None,
+    )
+
+
+def _require_saddle(
+    R: FloatArray, X: FloatArray, negative: IntArray, lead: tuple[int, ...]
+) -> None:
+    """Existence conditions of the H-infinity problem, wherever R has negative eigenvalues."""
+    values = np.linalg.eigvalsh(R)
+    expected = np.sum(values < -1e-12 * np.abs(values).max(axis=-1, keepdims=True), axis=-1)
+    for i in np.flatnonzero(expected > 0):
+        spectrum = np.linalg.eigvalsh(X[i])
+        if negative[i] != expected[i]:
+            raise InfeasibleError(
+                f"{_name(int(i), lead)}R + B'XB must have as many negative eigenvalues as R, "
+                f"{expected[i]}; got {negative[i]}. The level that R holds cannot be met: "
+                "try a larger one."
+            )
+        if spectrum[0] < -1e-9 * max(abs(spectrum[-1]), abs(spectrum[0])):
+            raise InfeasibleError(
+                f"{_name(int(i), lead)}X must be positive semidefinite, as R is indefinite; got an "
+                f"eigenvalue of {spectrum[0]:.3g}. The level that R holds cannot be met: "
+                "try a larger one."
+            )

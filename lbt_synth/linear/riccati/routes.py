@@ -1,0 +1,115 @@
+"""Routes to the stabilising solution of a Riccati equation, in the order they are tried.
+
+A route takes a stack of equations and returns an approximate X for each, not finite
+where it failed. What it returns is refined and verified by the caller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from lbt_synth.linear.batched import solve_stack, symmetrised, transposed
+from lbt_synth.linear.riccati.doubling import doubling
+from lbt_synth.linear.riccati.equations import Equations
+from lbt_synth.validation import BoolArray, FloatArray, IntArray
+
+_WELL_CONDITIONED = 1e-8  # least ratio of R's eigenvalues at which R is inverted
+
+Route: TypeAlias = Callable[[Equations], tuple[FloatArray, IntArray]]
+
+
+def by_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
+    """Structured doubling; needs an R that can be inverted."""
+    nothing = np.zeros_like(equations.Q)
+    return _doubled_from(equations, nothing, _invertible(equations.R))
+
+
+def by_shifted_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
+    """Structured doubling for the excess over some steps of the Riccati recursion.
+
+    With ``X = P + Y`` the equation of Y has the weight ``R + B'PB``, which can be
+    inverted although R cannot, and for a positive semidefinite problem its constant
+    term is the next step of the recursion less P, again positive semidefinite.
+    """
+    P = np.zeros_like(equations.Q)
+    ready = np.zeros(len(P), dtype=bool)  # without a shift it is the first route
+    for _ in range(equations.A.shape[-1] + 1):
+        if np.all(ready):
+            break
+        weights = equations.weights(P)
+        cross = transposed(equations.B) @ P @ equations.A + transposed(equations.S)
+        inverse = np.linalg.pinv(
+            np.where(np.isfinite(weights), weights, 0.0), rcond=1e-10, hermitian=True
+        )
+        step = symmetrised(
+            equations.Q
+            + transposed(equations.A) @ P @ equations.A
+            - transposed(cross) @ inverse @ cross
+        )
+        P = np.where(ready[:, None, None], P, step)
+        ready = ready | _invertible(equations.weights(P))
+    return _doubled_from(equations, P, ready)
+
+
+def by_schur(equations: Equations) -> tuple[FloatArray, IntArray]:
+    """Ordered generalised Schur form of the extended pencil (scipy), one by one."""
+    X = np.full_like(equations.Q, np.nan)
+    for i in range(len(X)):
+        try:
+            X[i] = symmetrised(
+                solve_discrete_are(
+                    equations.A[i],
+                    equations.B[i],
+                    equations.Q[i],
+                    equations.R[i],
+                    s=equations.S[i],
+                )
+            )
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+    return X, np.zeros(len(X), dtype=np.int64)
+
+
+ROUTES: tuple[tuple[str, Route], ...] = (
+    ("doubling", by_doubling),
+    ("shifted doubling", by_shifted_doubling),
+    ("schur", by_schur),
+)
+
+
+def _invertible(R: FloatArray) -> BoolArray:
+    """Whether each weight has a condition number that inverting it may have, (N,)."""
+    finite = np.asarray(np.all(np.isfinite(R), axis=(-2, -1)))
+    size = np.abs(np.linalg.eigvalsh(np.where(finite[:, None, None], R, 0.0)))
+    least, largest = size.min(axis=-1), size.max(axis=-1)
+    return np.asarray(finite & (least > _WELL_CONDITIONED * largest), dtype=np.bool_)
+
+
+def _doubled_from(
+    equations: Equations, P: FloatArray, usable: BoolArray
+) -> tuple[FloatArray, IntArray]:
+    """Doubling for ``X - P`` of the usable equations; nan for the others."""
+    X = np.full_like(equations.Q, np.nan)
+    steps = np.zeros(len(X), dtype=np.int64)
+    which = np.flatnonzero(usable)
+    if which.size == 0:
+        return X, steps
+    part, P = equations.take(which), P[which]
+    A, B = part.A, part.B
+    PA = P @ A
+    R, S = part.weights(P), part.S + transposed(PA) @ B
+    Q = symmetrised(part.Q + transposed(A) @ PA - P)
+    feedback = solve_stack(R, np.concatenate([transposed(S), transposed(B)], axis=-1))
+    n = A.shape[-1]
+    done = doubling(
+        A - B @ feedback[..., :n],
+        symmetrised(B @ feedback[..., n:]),
+        symmetrised(Q - S @ feedback[..., :n]),
+    )
+    X[which] = np.where(done.converged[:, None, None], P + done.X, np.nan)
+    steps[which] = done.steps
+    return X, steps

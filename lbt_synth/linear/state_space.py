@@ -1,0 +1,358 @@
+"""Discrete-time linear systems, in the two output conventions of this field.
+
+:class:`StateSpace` is the textbook form ``y(k) = C x(k) + D u(k)``.
+:class:`Controller` is the form of real-time computers (and of SPECULA's
+state-space filter): the state is updated first and the output is read from
+the *new* state, ``u(k) = C x(k+1) + D y(k)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.linalg import matrix_balance, schur
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.validation import ComplexArray, FloatArray, matrix, number, real_array, square
+
+_CHUNK = 60_000  # complex numbers worked on at once by a frequency response: they fit a cache
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LinearSystem:
+    """Four matrices that fit each other, and a sampling period."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    dt_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        A = square(self.A, "A")
+        why = f"to match A {A.shape}"
+        B = matrix(self.B, "B", rows=(len(A), why))
+        C = matrix(self.C, "C", cols=(len(A), why))
+        rows, cols = (len(C), f"to match C {C.shape}"), (B.shape[1], f"to match B {B.shape}")
+        D = matrix(self.D, "D", rows=rows, cols=cols)
+        for name, value in (("A", A), ("B", B), ("C", C), ("D", D)):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StateSpace(LinearSystem):
+    """Discrete-time system ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
+
+    Parameters
+    ----------
+    A : (n, n) array_like
+        State matrix.
+    B : (n, m) array_like
+        Input matrix.
+    C : (p, n) array_like
+        Output matrix.
+    D : (p, m) array_like
+        Feedthrough matrix.
+    dt_s : float, optional
+        Sampling period [s]; 1 when the samples have no physical rate.
+
+    Raises
+    ------
+    ProblemError
+        If a matrix is not finite or the sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> float(abs(lag.frequency_response([0.0])[0, 0, 0]))
+    2.0
+    """
+
+    @classmethod
+    def of(cls, system: Any) -> StateSpace:
+        """Take a StateSpace, a discrete control.StateSpace, or a tuple (A, B, C, D).
+
+        Parameters
+        ----------
+        system : StateSpace, control.StateSpace or tuple
+            The system.
+
+        Returns
+        -------
+        StateSpace
+            The same system.
+
+        Raises
+        ------
+        ProblemError
+            If it is none of these, or a continuous-time system.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> lbt.linear.StateSpace.of(([[0.5]], [[1.0]], [[1.0]], [[0.0]])).spectral_radius
+        0.5
+        """
+        if isinstance(system, StateSpace):
+            return system
+        if isinstance(system, tuple | list) and len(system) == 4:
+            A, B, C, D = system
+            return cls(A=A, B=B, C=C, D=D)
+        if all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt")):
+            if system.dt == 0:
+                raise ProblemError(
+                    "the system must be in discrete time; got a continuous one (dt = 0). "
+                    "Try control.sample_system(system, dt)."
+                )
+            unspecified = system.dt is None or system.dt is True
+            dt_s = 1.0 if unspecified else float(system.dt)
+            return cls(A=system.A, B=system.B, C=system.C, D=system.D, dt_s=dt_s)
+        raise ProblemError(
+            "a system must be a StateSpace, a control.StateSpace or a tuple (A, B, C, D); "
+            f"got {type(system).__name__}."
+        )
+
+    def to_control(self) -> Any:
+        """Return the system as a ``control.StateSpace`` with its sampling period.
+
+        Returns
+        -------
+        control.StateSpace
+            The same matrices.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.01)
+        >>> lag.to_control().dt
+        0.01
+        """
+        import control
+
+        return control.StateSpace(
+            self.A, self.B, self.C, self.D, self.dt_s, remove_useless_states=False
+        )
+
+    def balanced(self) -> StateSpace:
+        """Return the same input-output map with states in units (powers of two) that balance it.
+
+        Returns
+        -------
+        StateSpace
+            Rows and columns of ``[[A, B], [C, 0]]`` are of similar size, state by state.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1024.0]], C=[[2.0**-10]], D=[[0.0]])
+        >>> float(lag.balanced().B[0, 0])
+        1.0
+        """
+        n = self.n_states
+        scale = max(float(np.abs(self.A).max()), 1e-300)
+        entry, leaving = np.linalg.norm(self.B, axis=1), np.linalg.norm(self.C, axis=0)
+        scaling = bordered_scaling(self.A, _of_size(entry, scale), _of_size(leaving, scale))
+        units = np.asarray(scaling[:n] / scaling[n], dtype=np.float64)
+        if not np.all(np.isfinite(units)):
+            return self
+        # the sizes of B and C as a whole are shared between them, too
+        large, small = entry / units, leaving * units
+        both = float(np.sqrt(max(float(np.max(large)), 1e-300) / max(float(np.max(small)), 1e-300)))
+        units = units * np.exp2(np.round(np.log2(both))) if 0 < both < np.inf else units
+        return StateSpace(
+            A=self.A * units / units[:, None],
+            B=self.B / units[:, None],
+            C=self.C * units,
+            D=self.D,
+            dt_s=self.dt_s,
+        )
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Eigenvalues of A, (n,)."""
+        return np.linalg.eigvals(self.A).astype(np.complex128)
+
+    @property
+    def spectral_radius(self) -> float:
+        """Largest modulus of the poles."""
+        return float(np.max(np.abs(self.poles)))
+
+    def frequency_response(self, frequency_hz: Any) -> ComplexArray:
+        """Transfer matrix ``D + C (zI - A)^-1 B`` at ``z = exp(2 pi i f dt)``.
+
+        Parameters
+        ----------
+        frequency_hz : (f,) array_like
+            Frequencies [Hz].
+
+        Returns
+        -------
+        (f, p, m) complex ndarray
+            One matrix a frequency.
+
+        Raises
+        ------
+        ProblemError
+            If a frequency is not finite, or is that of a pole on the unit circle.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> delay = lbt.linear.StateSpace(A=[[0.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.25)
+        >>> complex(delay.frequency_response([1.0])[0, 0, 0].round(12))
+        -1j
+        """
+        frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
+        z = np.exp(2j * np.pi * frequency * self.dt_s)
+        # a few points are solved one by one, which is more accurate next to a pole
+        few = z.size <= self.n_states
+        response = pointwise_response(self, z) if few else swept_response(self.balanced(), z)
+        undefined = ~np.isfinite(response).all(axis=(1, 2))
+        if undefined.any():
+            raise ProblemError(
+                f"the system has a pole at {frequency[undefined][0]:.9g} Hz, on the unit circle, "
+                "and no response there; leave that frequency out."
+            )
+        return response
+
+
+def bordered_scaling(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> FloatArray:
+    """Scaling, powers of two, that balances ``[[|A|, entry], [leaving', 0]]``, (n + 1,)."""
+    border = np.block([[np.abs(A), entry[:, None]], [leaving[None, :], np.zeros((1, 1))]])
+    _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
+    return np.asarray(scaling, dtype=np.float64)
+
+
+def _of_size(vector: FloatArray, size: float) -> FloatArray:
+    largest = float(np.max(vector, initial=0.0))
+    return vector * (size / largest) if largest > 0 else vector
+
+
+def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
+    """Transfer matrices at points z, one linear system a point; inf at a pole."""
+    n, m = system.B.shape
+    pencil = z[:, None, None] * np.eye(n) - system.A
+    try:
+        states = np.linalg.solve(pencil, np.broadcast_to(system.B, (z.size, n, m)))
+    except np.linalg.LinAlgError:
+        out = np.full((z.size, len(system.C), m), np.inf, dtype=np.complex128)
+        for i in range(z.size if z.size > 1 else 0):
+            out[i] = pointwise_response(system, z[i : i + 1])[0]
+        return out
+    return np.asarray(system.C @ states + system.D, dtype=np.complex128)
+
+
+def swept_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
+    """Transfer matrices at points z, by one Schur form and a substitution a point.
+
+    ``A = U T U*`` is unitary, so nothing is lost when A is defective, as it is with
+    every delay. The smaller of inputs and outputs is carried through the substitution.
+    The system should be balanced; not finite at a pole.
+    """
+    if len(system.C) > system.B.shape[1]:
+        dual = StateSpace(A=system.A.T, B=system.C.T, C=system.B.T, D=system.D.T)
+        return np.swapaxes(swept_response(dual, z), 1, 2)
+    T, U = schur(system.A.astype(np.complex128), output="complex")
+    rows, B = system.C @ U, U.conj().T @ system.B
+    p, n = rows.shape
+    out = np.empty((z.size, p, B.shape[1]), dtype=np.complex128)
+    step = max(1, _CHUNK // (n * p))
+    with np.errstate(all="ignore"):  # a pole among the points is the caller's to report
+        for start in range(0, z.size, step):
+            part = z[start : start + step]
+            left = np.empty((n, p * part.size), dtype=np.complex128)  # C U (zI - T)^-1
+            for i in range(n):
+                sums = rows[:, i, None] + (T[:i, i] @ left[:i]).reshape(p, part.size)
+                left[i] = (sums / (part - T[i, i])).ravel()
+            solved = left.reshape(n, p, part.size).transpose(2, 1, 0)
+            out[start : start + step] = solved @ B + system.D
+    return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Controller(LinearSystem):
+    """Controller in new-state form: ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
+
+    Parameters
+    ----------
+    A : (n, n) array_like
+        State matrix.
+    B : (n, q) array_like
+        Input matrix; y(k) has q measurements.
+    C : (m, n) array_like
+        Output matrix, applied to the state *after* its update.
+    D : (m, q) array_like
+        Feedthrough matrix.
+    dt_s : float, optional
+        Sampling period [s].
+
+    Raises
+    ------
+    ProblemError
+        If a matrix is not finite or the sizes clash.
+
+    Examples
+    --------
+    An integrator ``u(k) = u(k-1) + 0.5 y(k)``:
+
+    >>> import lbt_synth as lbt
+    >>> integrator = lbt.Controller(A=[[1.0]], B=[[0.5]], C=[[1.0]], D=[[0.0]])
+    >>> run = integrator.start()
+    >>> [float(run.step([1.0])[0]) for _ in range(3)]
+    [0.5, 1.0, 1.5]
+    """
+
+    def to_statespace(self) -> StateSpace:
+        """Return the same input-output map in the textbook (current-state) form."""
+        return StateSpace(
+            A=self.A, B=self.B, C=self.C @ self.A, D=self.C @ self.B + self.D, dt_s=self.dt_s
+        )
+
+    def start(self) -> RunningController:
+        """Return a running copy with a zero state, to be stepped frame by frame."""
+        return RunningController(self)
+
+
+@dataclass(slots=True, eq=False)
+class RunningController:
+    """A controller with its state: ``step(y) -> u`` once a frame, and ``reset()``.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> run = lbt.Controller(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]]).start()
+    >>> _ = run.step([2.0])
+    >>> run.reset()
+    >>> float(run.step([3.0])[0])
+    3.0
+    """
+
+    controller: Controller
+    state: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the state to zero."""
+        self.state = np.zeros(self.controller.n_states)
+
+    def step(self, y: Any) -> FloatArray:
+        """Take the measurements y(k), (q,), and return the command u(k), (m,)."""
+        k = self.controller
+        measured = np.asarray(y, dtype=np.float64)
+        if measured.shape != (k.B.shape[1],):
+            raise DimensionError(
+                f"y must have shape ({k.B.shape[1]},) to match B {k.B.shape}; got {measured.shape}."
+            )
+        self.state = k.A @ self.state + k.B @ measured
+        return k.C @ self.state + k.D @ measured

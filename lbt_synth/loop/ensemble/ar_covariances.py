@@ -1,0 +1,70 @@
+"""Covariances that auto-regressive processes leave in stacks of loops: Lyapunov equations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear.batched import transposed
+from lbt_synth.linear.lyapunov import stationary_covariances
+from lbt_synth.loop.ensemble.loop_stacks import LoopStack, side_by_side
+from lbt_synth.models import ARModel, ModalTurbulence
+from lbt_synth.validation import FloatArray, IntArray
+
+PROCESSES = (ARModel, ModalTurbulence)
+_RESIDUAL = 1e-9  # of a Lyapunov equation, relative
+
+
+def process_covariances(
+    loops: LoopStack, process: ARModel | ModalTurbulence, directions: FloatArray
+) -> FloatArray:
+    """Covariance (k, n, n) of the residual that one process a loop leaves, along a direction.
+
+    Shapes: directions (n,).
+    """
+    if isinstance(process, ARModel):
+        coefficients, drive = process.coefficients[None], np.array([process.driving_rms_nm])
+    else:
+        coefficients, drive = process.coefficients, process.driving_rms_nm
+    order, s, k = coefficients.shape[1], loops.A.shape[1], len(loops.A)
+    n = loops.C.shape[1]
+    along = np.broadcast_to(directions, (k, n))[:, :, None]
+    A = np.zeros((k, s + order, s + order))
+    A[:, :s, :s] = loops.A
+    A[:, :s, s : s + 1] = loops.B[..., :n] @ along  # the newest sample acts on its frame
+    A[:, s, s:] = coefficients
+    A[:, s + 1 :, s:-1] = np.eye(order - 1)
+    Q = np.zeros_like(A)
+    Q[:, s, s] = drive**2
+    C = np.zeros((k, n, s + order))
+    C[..., :s] = loops.C
+    C[..., s : s + 1] = loops.D[..., :n] @ along
+    X, residuals = stationary_covariances(A, Q)
+    if not np.all(residuals < _RESIDUAL):
+        worst = float(np.max(np.nan_to_num(residuals, nan=np.inf)))
+        raise ProblemError(
+            "the covariance of a process in a loop was not found: relative residual "
+            f"{worst:.3g} of its Lyapunov equation. The process or the loop is nearly a random "
+            "walk; damp it."
+        )
+    return np.asarray(C @ X @ transposed(C))
+
+
+def add_process(
+    total: FloatArray,
+    rows: IntArray,
+    loops: list[tuple[IntArray, LoopStack]],
+    process: ARModel | ModalTurbulence,
+    direction: FloatArray,
+) -> None:
+    """Add to ``total[rows]`` what a process leaves in all pieces that it reaches.
+
+    Shapes: total (p, n, n), rows (k,), loops list of (w,), direction (n,).
+    """
+    reached = [(modes, stack) for modes, stack in loops if np.any(direction[..., modes])]
+    if not reached:
+        return
+    modes = np.concatenate([modes for modes, _ in reached])
+    stack = side_by_side([stack for _, stack in reached])
+    at = (rows[:, None, None], *np.ix_(modes, modes))
+    total[at] += process_covariances(stack, process, direction[..., modes])

@@ -1,0 +1,258 @@
+"""What many loops meet: arrays with one entry a loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
+from lbt_synth.models.truth import spectrum_key
+from lbt_synth.validation import FloatArray, IntArray, frozen, instance, real_array, sequence
+
+Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleVibration:
+    """A vibration that is another one in each of p loops.
+
+    Parameters
+    ----------
+    frequency_hz : float or (p,) array_like
+        Frequency [Hz].
+    rms_nm : float or (p,) array_like
+        Standard deviation along its direction [nm rms wavefront].
+    direction : (n,) or (p, n) array_like, optional
+        Direction over the modes, made a unit vector; along the first of two by default.
+    damping : float or (p,) array_like, optional
+        Damping ratio, between 0 and 1; without it the vibration is a sinusoid.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.loop.EnsembleVibration(frequency_hz=[19.5, 20.0, 20.5], rms_nm=563.6)
+    >>> line.damping is None
+    True
+    """
+
+    frequency_hz: Any
+    rms_nm: Any
+    direction: Any = (1.0, 0.0)
+    damping: Any = None
+
+    def __post_init__(self) -> None:
+        for name, high in (("frequency_hz", np.inf), ("rms_nm", np.inf), ("damping", 1.0)):
+            if getattr(self, name) is None:
+                continue
+            value = real_array(getattr(self, name), name)
+            if np.any(value <= 0) or np.any(value >= high):
+                allowed = "above 0" if high == np.inf else "between 0 and 1"
+                raise ProblemError(
+                    f"{name} must be {allowed}; got {value.min():.6g} to {value.max():.6g}."
+                )
+            object.__setattr__(self, name, value)
+        direction = real_array(self.direction, "direction")
+        size = np.linalg.norm(direction, axis=-1, keepdims=True)
+        if direction.ndim not in (1, 2) or not np.all(size > 0):
+            raise ProblemError(
+                "direction must be a vector over the modes, or one a loop, and not zero; got shape "
+                f"{direction.shape}."
+            )
+        object.__setattr__(self, "direction", frozen(direction / size))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopEnsemble:
+    """What p loops meet that have the same sensor and mirror.
+
+    Parameters
+    ----------
+    sensor_gain : float or (p,) array_like, optional
+        Real sensor gain of each loop relative to the sensor matrix.
+    delay_frames : float or (p,) array_like, optional
+        Real total delay [frames], at least 1; that of the loop by default.
+    noise_nm : float, (p,) or (p, q) array_like, optional
+        Standard deviation of the noise on each measurement per frame [nm].
+    turbulence : Spectrum, FrozenFlows, ModalTurbulence, sequence of these, or None, optional
+        Spectrum of each mode, the modes independent: one for all of them, or one a mode. A
+        FrozenFlows or ModalTurbulence holds one a loop, any other spectrum serves all loops.
+    vibrations : sequence of EnsembleVibration, optional
+        The vibrations.
+    loops : int, optional
+        Number of loops p, where no array tells it.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+    DimensionError
+        If arrays have different lengths.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> weak = lbt.loop.LoopEnsemble(sensor_gain=[0.4, 0.7, 1.0], noise_nm=15.5)
+    >>> weak.loops
+    3
+    """
+
+    sensor_gain: Any = 1.0
+    delay_frames: Any = None
+    noise_nm: Any = 0.0
+    turbulence: Any = None
+    vibrations: tuple[EnsembleVibration, ...] = ()
+    loops: int = 0
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "vibrations", sequence(self.vibrations, "vibrations"))
+        for line in self.vibrations:
+            instance(line, EnsembleVibration)
+        given = {"sensor_gain": self.sensor_gain, "noise_nm": self.noise_nm}
+        given |= {} if self.delay_frames is None else {"delay_frames": self.delay_frames}
+        for name, bound in (("sensor_gain", 0.0), ("noise_nm", 0.0), ("delay_frames", 1.0)):
+            if name in given:
+                value = real_array(given[name], name)
+                if np.any(value < bound) or (name == "sensor_gain" and np.any(value == 0)):
+                    word = "above" if name == "sensor_gain" else "at least"
+                    raise ProblemError(f"{name} must be {word} {bound:g}; got {value.min():.6g}.")
+                set_(self, name, value)
+        lengths = {name: len(values) for name, values in self._arrays().items()}
+        lengths |= {} if self.loops == 0 else {"loops": self.loops}
+        if len(set(lengths.values()) - {1}) > 1:
+            text = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise DimensionError(f"all must have one entry a loop; got {text}.")
+        if 0 in lengths.values():
+            raise DimensionError("an ensemble needs at least one loop; got none.")
+        set_(self, "loops", max(lengths.values(), default=1))
+
+    def _arrays(self) -> dict[str, Any]:
+        """Return what has one entry a loop, by name."""
+        out: dict[str, Any] = {}
+        for name in ("sensor_gain", "noise_nm", "delay_frames"):
+            if np.ndim(getattr(self, name)):
+                out[name] = getattr(self, name)
+        for i, line in enumerate(self.vibrations):
+            for name, scalar in (
+                ("frequency_hz", 0),
+                ("rms_nm", 0),
+                ("damping", 0),
+                ("direction", 1),
+            ):
+                value = getattr(line, name)
+                if value is not None and np.ndim(value) > scalar:
+                    out[f"{name} of vibration {i}"] = value
+        each = self.turbulence if isinstance(self.turbulence, Sequence) else (self.turbulence,)
+        for part in each:
+            if isinstance(part, FrozenFlows):
+                out["turbulence"] = part
+            elif isinstance(part, ModalTurbulence):
+                out["turbulence"] = part.coefficients
+            elif part is not None and not isinstance(part, Spectrum):
+                raise ProblemError(
+                    "turbulence must be a spectrum, FrozenFlows, ModalTurbulence or None, or a "
+                    f"sequence of these; got {type(part).__name__}."
+                )
+        return out
+
+    def delays(self, hardware: LoopHardware) -> FloatArray:
+        """Return the total delay of each loop [frames], (p,)."""
+        delay = hardware.delay_frames if self.delay_frames is None else self.delay_frames
+        return np.broadcast_to(delay, (self.loops,))
+
+    def gains(self) -> FloatArray:
+        """Return the sensor gain of each loop, (p,)."""
+        return np.broadcast_to(self.sensor_gain, (self.loops,))
+
+    def noise(self, hardware: LoopHardware) -> FloatArray:
+        """Return the noise of each measurement [nm], (p, q)."""
+        q, given = hardware.n_measurements, np.asarray(self.noise_nm)
+        given = given[:, None] if given.ndim == 1 else given
+        if given.ndim == 2 and given.shape[1] not in (1, q):
+            raise DimensionError(
+                f"noise_nm must have one column a measurement ({q}); got {given.shape[1]}."
+            )
+        return np.broadcast_to(given, (self.loops, q))
+
+    def groups(self, hardware: LoopHardware) -> list[tuple[Turbulence, tuple[int, ...]]]:
+        """Return the turbulence with the modes that have it."""
+        n, given = hardware.modes, self.turbulence
+        each = tuple(given) if isinstance(given, Sequence) else (given,) * n
+        if len(each) != n:
+            raise DimensionError(f"turbulence must have one entry a mode ({n}); got {len(each)}.")
+        found: dict[object, tuple[Turbulence, tuple[int, ...]]] = {}
+        for mode, part in enumerate(each):
+            if part is None:
+                continue
+            key = spectrum_key(part) if isinstance(part, ARModel) else id(part)
+            first, modes = found.get(key, (part, ()))
+            found[key] = (first, (*modes, mode))
+        return list(found.values())
+
+    def distinct(self, hardware: LoopHardware, *, apart: bool) -> tuple[IntArray, IntArray]:
+        """Return one row of each loop that differs by more than its vibrations, and which is whose.
+
+        With ``apart`` all rows differ: each has its own controller.
+        """
+        rows = np.arange(self.loops)
+        columns = [self.gains(), self.delays(hardware), *self.noise(hardware).T]
+        for part, _ in self.groups(hardware):
+            if isinstance(part, FrozenFlows) and len(part) > 1:
+                columns += [part.seeing_arcsec, part.wind_speed_m_s]
+                columns += [] if part.outer_scale_m is None else [part.outer_scale_m]
+            elif isinstance(part, ModalTurbulence) and part.n_modes > 1:
+                columns += [*part.coefficients.T, part.driving_rms_nm]
+        if apart:
+            return rows, rows
+        varying = [column for column in columns if np.ptp(column) > 0]
+        if not varying:
+            return rows[:1], np.zeros(self.loops, dtype=np.int64)
+        _, first, which = np.unique(
+            np.stack(varying, axis=1), axis=0, return_index=True, return_inverse=True
+        )
+        return (rows, rows) if first.size == self.loops else (first, which.reshape(-1))
+
+    def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:
+        """Return the vibrations with all their arrays (p,), and directions (p, n)."""
+        out, p, nyquist = [], self.loops, hardware.frame_rate_hz / 2
+        for line in self.vibrations:
+            if line.direction.shape[-1] != hardware.modes:
+                raise DimensionError(
+                    f"the direction of a vibration must have {hardware.modes} components, one a "
+                    f"mode; got {line.direction.shape[-1]}."
+                )
+            if not np.max(line.frequency_hz) < nyquist:
+                raise ProblemError(
+                    f"a vibration must lie below the Nyquist frequency {nyquist:.6g} Hz; got "
+                    f"{np.max(line.frequency_hz):.6g} Hz."
+                )
+            filled = {
+                name: None if value is None else np.broadcast_to(value, (p,))
+                for name in ("frequency_hz", "rms_nm", "damping")
+                for value in (getattr(line, name),)
+            }
+            direction = np.broadcast_to(line.direction, (p, hardware.modes))
+            out.append(replace(line, **filled, direction=direction))
+        return out
+
+
+def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
+    """Return the turbulence of some loops."""
+    if isinstance(turbulence, FrozenFlows) and len(turbulence) > 1:
+        return turbulence.taken(rows)
+    if isinstance(turbulence, ModalTurbulence) and turbulence.n_modes > 1:
+        return ModalTurbulence(
+            coefficients=turbulence.coefficients[rows],
+            driving_rms_nm=turbulence.driving_rms_nm[rows],
+            frame_rate_hz=turbulence.frame_rate_hz,
+        )
+    return turbulence

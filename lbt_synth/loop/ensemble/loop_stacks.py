@@ -1,0 +1,111 @@
+"""Closed loops of one piece at many sensor gains and delays, as stacks of systems.
+
+Between two whole delays a settled mirror shows the commands of two frames within an exposure,
+so that every matrix of the loop is affine in the fraction, as it is in the sensor gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.loop.closed_loop import loop_matrices
+from lbt_synth.loop.ensemble.independent_parts import LoopPart
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.lifted_mirror import Response, tapped_mirror
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DelayGroup:
+    """Loops whose mirror is ``(1 - fraction) first + fraction second``."""
+
+    rows: IntArray  # (k,): which loops
+    fraction: FloatArray  # (k,): how much of the second
+    # first, second: Two mirrors with the same states
+    first: Response
+    second: Response
+
+    def taken(self, which: IntArray) -> DelayGroup:
+        """Return some of its loops."""
+        return replace(self, rows=self.rows[which], fraction=self.fraction[which])
+
+
+def delay_groups(hardware: LoopHardware, delay_frames: FloatArray) -> Iterator[DelayGroup]:
+    """Yield the loops by the whole part of their delay; by the delay if the mirror moves."""
+    if hardware.mirror is None:
+        lead = np.floor(delay_frames - 1).astype(np.int64)
+        fraction = delay_frames - 1 - lead
+        for whole in np.unique(lead):
+            rows = np.flatnonzero(lead == whole)
+            count = whole + (2 if np.any(fraction[rows] > 0) else 1)
+            taps = np.zeros((2, count))
+            taps[0, whole] = taps[1, -1] = 1.0
+            yield DelayGroup(
+                rows=rows,
+                fraction=fraction[rows],
+                first=tapped_mirror(taps[0]),
+                second=tapped_mirror(taps[1]),
+            )
+        return
+    for delay in np.unique(delay_frames):
+        mirror = replace(hardware, delay_frames=float(delay)).mirror_system.whole
+        rows = np.flatnonzero(delay_frames == delay)
+        yield DelayGroup(rows=rows, fraction=np.zeros(rows.size), first=mirror, second=mirror)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopStack:
+    """Closed loops from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``, (k, ., .) each."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+
+    def taken(self, which: IntArray) -> LoopStack:
+        """Return some of the loops."""
+        return LoopStack(A=self.A[which], B=self.B[which], C=self.C[which], D=self.D[which])
+
+    def rejections(self, turn: FloatArray) -> ComplexArray:
+        """Rejection (k, n, n) of each loop at its own frequency [radians a frame]."""
+        n = self.C.shape[1]
+        pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
+        states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
+        return np.asarray(self.C @ states + self.D[..., :n])
+
+
+def stacked_loops(part: LoopPart, group: DelayGroup, sensor_gains: FloatArray) -> LoopStack:
+    """Close the loops of a group around a piece. Shapes: sensor_gains (k,)."""
+    controllers = part.controllers(group.rows)
+    ends = [
+        loop_matrices(*controllers, mirror=mirror, sensor=part.sensor, influence=part.influence)
+        for mirror in (group.first, group.second)
+    ]
+    share = group.fraction[:, None, None]
+    A0, A1, B, C0, C1, D = (
+        one if one is two or not group.fraction.any() else one + share * (two - one)
+        for one, two in zip(*ends, strict=True)
+    )
+    gain, n, count = sensor_gains[:, None, None], part.modes.size, group.rows.size
+    B, D = (np.broadcast_to(m, (count, *m.shape[1:])) for m in (B, D[:, :n]))
+    return LoopStack(A=A0 + gain * A1, B=B, C=(C0 + gain * C1)[:, :n], D=D)
+
+
+def side_by_side(stacks: list[LoopStack]) -> LoopStack:
+    """Put loops that know nothing of each other into one system, only from the total phase."""
+    if len(stacks) == 1:
+        return stacks[0]
+    count = len(stacks[0].A)
+    s = np.cumsum([0] + [stack.A.shape[1] for stack in stacks])
+    n = np.cumsum([0] + [stack.C.shape[1] for stack in stacks])
+    A, B = np.zeros((count, s[-1], s[-1])), np.zeros((count, s[-1], n[-1]))
+    C, D = np.zeros((count, n[-1], s[-1])), np.zeros((count, n[-1], n[-1]))
+    for i, stack in enumerate(stacks):
+        x, r = slice(s[i], s[i + 1]), slice(n[i], n[i + 1])
+        modes = slice(stack.C.shape[1])
+        A[:, x, x], B[:, x, r] = stack.A, stack.B[..., modes]
+        C[:, r, x], D[:, r, r] = stack.C, stack.D[..., modes]
+    return LoopStack(A=A, B=B, C=C, D=D)

@@ -1,0 +1,292 @@
+"""The least worst residual where a sinusoid may lie anywhere in a band.
+
+A sinusoid that is spread over the band like a probability density is a process, and its
+limit is a lower bound for every controller that has to face the worst frequency. The best
+filter for the worst density rejects all frequencies that have weight by the same factor
+and the others more, so its own worst case is that bound: the two meet (a saddle point).
+Rejection is ``|P|^2 / Phi`` with P of a few coefficients, hence for a given P the density
+fills up ``Phi`` to a level proportional to ``|P|^2``; the level follows from the total, and P
+from the filled spectrum in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum
+from lbt_synth.loop.least_residuals.prediction import Prediction, Reach
+from lbt_synth.loop.least_residuals.residual import mode_limit, truth_modes
+from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
+from lbt_synth.models.truth import fitted_direction
+from lbt_synth.validation import FloatArray, frozen, number
+
+_PANELS = 128  # over the band, at least
+_ORDER = 10
+_ROUNDS = 100
+_WHOLE_STEPS = 12
+_SETTLED = 1e-8  # relative gap of the variance at which the search ends
+_LARGEST_GAP = 0.1  # and with which it is still an answer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BandLimit:
+    """The least worst residual with a sinusoid anywhere in a band.
+
+    Attributes
+    ----------
+    rms_nm : float
+        No linear controller has a smaller worst residual over the band [nm rms].
+    achieved_nm : float
+        Worst residual of the filter that was found (of infinite order) [nm rms]; what can be
+        had lies between the two, which are within 1e-8, for bands of almost all
+        frequencies within some percent.
+    variance_nm2 : (n,) ndarray
+        The limit by direction, that of the sinusoid included [nm^2].
+    directions : (n, n) ndarray
+        Directions over the modes, one a row, along which the loop decouples.
+    frequency_hz : (f,) ndarray
+        Frequencies in the band [Hz].
+    weight : (f,) ndarray
+        Probability of each, of the density that is hardest to reject; the sum is 1.
+    """
+
+    rms_nm: float
+    achieved_nm: float
+    variance_nm2: FloatArray
+    directions: FloatArray
+    frequency_hz: FloatArray
+    weight: FloatArray
+
+
+def least_worst_residual(
+    hardware: LoopHardware,
+    truth: Truth,
+    *,
+    band_hz: tuple[float, float],
+    rms_nm: float,
+    direction: Sequence[float] = (1.0, 0.0),
+) -> BandLimit:
+    """Least worst residual of any linear controller with a sinusoid anywhere in a band.
+
+    The controller knows the truth, the band, and the size and direction of the sinusoid, but
+    not its frequency; what counts is the frequency that is worst for it.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop, with any delay. The sensor must see and the mirror reach every mode.
+    truth : Truth
+        All else; its own sinusoids are left out, as in :func:`least_residual`.
+    band_hz : tuple of float
+        Lowest and highest frequency of the sinusoid [Hz], between 0 and Nyquist.
+    rms_nm : float
+        Its standard deviation, amplitude / sqrt(2) [nm].
+    direction : sequence of float, optional
+        Its direction over the modes, made a unit vector.
+
+    Returns
+    -------
+    BandLimit
+        The limit, a worst case that is achieved, and the density that is hardest to reject.
+
+    Raises
+    ------
+    ProblemError
+        If the band or the sinusoid does not fit the loop, or the modes do not decouple.
+    NumericalError
+        If the search does not settle.
+
+    Examples
+    --------
+    Where nothing else moves and the noise is 3 nm, a line that may lie anywhere is white noise:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> calm = lbt.Truth(turbulence=None, noise_nm=3.0)
+    >>> limit = lbt.loop.least_worst_residual(
+    ...     path, calm, band_hz=(1e-9, 399.999999), rms_nm=4.0, direction=(1,)
+    ... )
+    >>> round(limit.rms_nm, 4), round(limit.achieved_nm, 4)
+    (4.0, 4.0)
+    """
+    low, high = _checked_band(band_hz, hardware.frame_rate_hz / 2)
+    line = SinusoidalVibration(
+        frequency_hz=high, rms_nm=rms_nm, direction=tuple(np.ravel(direction))
+    )
+    along = fitted_direction(line, hardware)
+    decoupled = truth_modes(hardware, truth, (along,))
+    own = int(np.argmax(np.abs(decoupled.directions @ along)))
+    reach = Reach.of(hardware)
+    nyquist = hardware.frame_rate_hz / 2
+    saddle = _saddle(reach, decoupled.modes[own], (low / nyquist, high / nyquist), line.rms_nm**2)
+    variance = np.array(
+        [
+            saddle.lower if i == own else mode_limit(reach, mode)[0]
+            for i, mode in enumerate(decoupled.modes)
+        ]
+    )
+    return BandLimit(
+        rms_nm=float(np.sqrt(variance.sum())),
+        achieved_nm=float(np.sqrt(variance.sum() + saddle.gap)),
+        variance_nm2=frozen(variance),
+        directions=frozen(decoupled.directions),
+        frequency_hz=frozen(saddle.x * nyquist),
+        weight=frozen(saddle.weight),
+    )
+
+
+def _checked_band(band_hz: tuple[float, float], nyquist_hz: float) -> tuple[float, float]:
+    try:
+        low, high = band_hz
+    except (TypeError, ValueError) as error:
+        raise DimensionError(
+            f"band_hz must be two frequencies, the lowest and the highest; got {band_hz!r}."
+        ) from error
+    low = number(low, "band_hz[0]", above=0)
+    high = number(high, "band_hz[1]", above=0)
+    if not low < high < nyquist_hz:
+        raise ProblemError(
+            f"band_hz must increase and stay below the Nyquist frequency {nyquist_hz:.6g} Hz; got "
+            f"{low:.6g} to {high:.6g} Hz. For a known frequency, see least_residual."
+        )
+    return low, high
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Saddle:
+    """Lower bound and gap [nm^2] for one mode, and the density at nodes x."""
+
+    lower: float
+    gap: float
+    x: FloatArray
+    weight: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Band:
+    """One mode with a band, prepared for many densities.
+
+    ``outside`` are the integrals of the logarithm outside the band; x, quadrature and weights
+    are nodes within it, base the spectrum with noise there.
+    """
+
+    reach: Reach
+    mode: ModeSpectrum
+    reference: float
+    outside: FloatArray
+    x: FloatArray
+    quadrature: FloatArray
+    base: FloatArray
+
+    def filled(self, shape: FloatArray, total: float) -> tuple[float, FloatArray]:
+        """Level, and what has to be added to the base to fill it up to ``level * shape``."""
+        heights = self.base / shape
+        order = np.argsort(heights, kind="stable")
+        q = self.quadrature[order]
+        area = np.cumsum(q * shape[order])
+        levels = (total + np.cumsum(q * self.base[order])) / area
+        above = np.concatenate([heights[order][1:], [np.inf]])
+        level = float(levels[np.argmax(levels <= above)])
+        return level, np.maximum(level * shape - self.base, 0.0)
+
+    def prediction(self, added: FloatArray) -> Prediction:
+        """Best prediction with some spectrum added within the band."""
+        noise = self.mode.noise_nm2
+        if noise > 0:
+            values = np.log1p((self.base - noise + added) / self.reference)
+        else:
+            values = np.log((self.base + added) / self.reference)
+        inside = (self.quadrature * values) @ self.reach.weights(self.x)
+        return Prediction.of(self.reach, self.outside + inside)
+
+    def bounds(
+        self, prediction: Prediction, added: FloatArray, worst: float
+    ) -> tuple[float, float]:
+        """Lower bound [nm^2] of a density, and how far its filter's worst case is above it.
+
+        ``worst`` is the largest ``|P|^2 / Phi`` over the band.
+        """
+        total = float(self.quadrature @ added)
+        sigma2 = self.reference * np.exp(prediction.mean_log)
+        rejection = prediction.error_power(self.x) / (self.base + added)
+        mean = float(self.quadrature @ (added * rejection))
+        gap = float(sigma2) * (total * worst - mean)
+        return prediction.variance(self.reference, self.mode.noise_nm2), max(gap, 0.0)
+
+
+def _saddle(reach: Reach, mode: ModeSpectrum, ends: tuple[float, float], total: float) -> _Saddle:
+    band = _prepared(reach, mode, ends, total)
+    if band is None:  # outside the band nothing is new: the line is known from its past, too
+        x, q = gauss_panels(np.linspace(*ends, _PANELS + 1), _ORDER)
+        return _Saddle(lower=0.0, gap=0.0, x=x, weight=q / q.sum())
+    # between the nodes, too
+    fine = np.unique(np.concatenate([np.linspace(*ends, 8 * _PANELS + 1), band.x]))
+    base = mode.power(fine) + mode.noise_nm2
+    shape, fine_shape = np.ones(band.x.size), np.ones(fine.size)
+    best: _Saddle | None = None
+    for rounds in range(_ROUNDS):
+        level, added = band.filled(shape, total)
+        prediction = band.prediction(added)
+        fine_power = prediction.error_power(fine)
+        worst = float(np.max(fine_power / np.maximum(base, level * fine_shape)))
+        lower, gap = band.bounds(prediction, added, worst)
+        if best is None or gap < best.gap:
+            weight = band.quadrature * added / total
+            best = _Saddle(lower=lower, gap=gap, x=band.x, weight=weight)
+        if gap <= _SETTLED * lower:
+            break
+        # by half a step where whole ones go back and forth
+        share = 1.0 if rounds < _WHOLE_STEPS else 0.5
+        shape = _towards(shape, prediction.error_power(band.x), share)
+        fine_shape = _towards(fine_shape, fine_power, share)
+    assert best is not None  # of the first round
+    if not best.gap <= _LARGEST_GAP * best.lower:
+        raise NumericalError(
+            f"the worst density of a sinusoid did not settle in {_ROUNDS} rounds: a gap of "
+            f"{best.gap / best.lower:.3g} of the variance is left. Try a narrower band.",
+            status="rounds",
+            residual=best.gap / best.lower,
+        )
+    return best
+
+
+def _towards(shape: FloatArray, target: FloatArray, share: float) -> FloatArray:
+    """Geometric mean, kept off zero."""
+    mixed = shape ** (1 - share) * target**share
+    return np.asarray(np.maximum(mixed, 1e-14 * np.max(mixed)))
+
+
+def _prepared(
+    reach: Reach, mode: ModeSpectrum, ends: tuple[float, float], total: float
+) -> _Band | None:
+    noise = mode.noise_nm2
+    width = ends[1] - ends[0]
+    reference = mode.reference()
+    if noise == 0:
+        reference = max(reference, total / width)
+        # the line fills the band: only outside of it may the spectrum vanish
+        panels = mode.log_moments(reach, reference, ends=ends, skip=True)
+    else:
+        panels = mode.log_moments(reach, reference, ends=ends)
+    if panels is None:
+        return None
+    middle = (panels.low + panels.high) / 2
+    inside = (middle > ends[0]) & (middle < ends[1])
+    cuts = [np.linspace(*ends, _PANELS + 1), panels.low[inside], panels.high[inside]]
+    edges = np.unique(np.clip(np.concatenate(cuts), *ends))
+    edges = edges[np.concatenate([[True], np.diff(edges) > 1e-4 * width / _PANELS])]
+    x, q = gauss_panels(edges, _ORDER)
+    return _Band(
+        reach=reach,
+        mode=mode,
+        reference=reference,
+        outside=panels.integrals[~inside].sum(axis=0),
+        x=x,
+        quadrature=q,
+        base=mode.power(x) + noise,
+    )

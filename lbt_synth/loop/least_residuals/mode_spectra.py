@@ -1,0 +1,215 @@
+"""Modes that can be treated one by one: rotated directions, their spectra, their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear.quadrature import SettledPanels, settled_panels
+from lbt_synth.loop.least_residuals.prediction import Reach
+from lbt_synth.models import ARModel, LoopHardware, Spectrum, Vibration
+from lbt_synth.models.truth import breakpoints_below, spectrum_key
+from lbt_synth.validation import FloatArray
+
+_COUPLING = 1e-9  # relative size of what counts as coupled
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModeSpectrum:
+    """One decoupled mode: its disturbance and the white noise on its measurement."""
+
+    rate_hz: float  # Frame rate [Hz]
+    parts: tuple[Spectrum, ...]  # Independent parts of the disturbance
+    noise_nm2: float  # Variance of the noise per frame, seen as a phase [nm^2]
+
+    def power(self, x: FloatArray) -> FloatArray:
+        """Two-sided disturbance spectrum per sample [nm^2] at x, in units of Nyquist."""
+        nyquist = self.rate_hz / 2
+        total = np.zeros(x.shape)
+        for part in self.parts:
+            density = np.asarray(part.psd(x * nyquist), dtype=np.float64)
+            if density.shape != x.shape or not np.all(np.isfinite(density) & (density >= 0)):
+                raise ProblemError(
+                    "a spectrum must return one finite number of at least 0 for each frequency; "
+                    f"{type(part).__name__}.psd does not between 0 and {nyquist:.6g} Hz."
+                )
+            total = total + density * nyquist
+        return total
+
+    def edges(self, extra: Sequence[float] = ()) -> FloatArray:
+        """First panels of (0, 1): geometric, and more of them at lines and kinks."""
+        grid = [np.geomspace(1e-6, 1, 40), np.linspace(0, 1, 17), np.array(extra, dtype=float)]
+        offsets = np.array([0.0, 1.0, 4.0, 16.0])
+        for part in self.parts:
+            grid.append(breakpoints_below(part, self.rate_hz / 2) / (self.rate_hz / 2))
+            if isinstance(part, ARModel):
+                for pole in np.linalg.eigvals(part.companion):
+                    centre, width = abs(np.angle(pole)) / np.pi, (1 - abs(pole)) / np.pi
+                    grid += [centre + offsets * width, centre - offsets * width]
+        points = np.unique(np.clip(np.concatenate(grid), 0, 1))
+        keep = np.concatenate([[True], np.diff(points) > 1e-12])
+        return np.unique(np.concatenate([points[keep], [1.0], np.array(extra, dtype=float)]))
+
+    def reference(self) -> float:
+        """Return the unit of the logarithm [nm^2]: the noise, else the largest of the spectrum."""
+        if self.noise_nm2 > 0:
+            return self.noise_nm2
+        edges = self.edges()
+        return float(np.max(self.power((edges[1:] + edges[:-1]) / 2), initial=0.0))
+
+    def log_moments(
+        self,
+        reach: Reach,
+        reference: float,
+        *,
+        ends: Sequence[float] = (),
+        skip: bool = False,
+    ) -> SettledPanels | None:
+        """Integrals of ``log(Phi / reference)`` times the weights; None where Phi vanishes.
+
+        The two ``ends`` are ends of panels; with ``skip``, what lies between them is 0.
+        """
+        noiseless = self.noise_nm2 == 0
+
+        def integrand(x: FloatArray) -> FloatArray:
+            with np.errstate(over="ignore"):
+                ratio = self.power(x) / reference
+            if not np.all(np.isfinite(ratio)):
+                raise ProblemError(
+                    f"the noise variance {self.noise_nm2:.3g} nm^2 is too small beside the "
+                    "disturbance to be told from zero; set noise_nm to 0."
+                )
+            if skip:
+                ratio = np.where((x > ends[0]) & (x < ends[1]), 1.0, ratio)
+            if noiseless and np.any(ratio == 0):
+                raise _VanishingError
+            values = np.log(ratio) if noiseless else np.log1p(ratio)
+            return np.asarray(values[:, None] * reach.weights(x))
+
+        try:
+            return settled_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
+        except _VanishingError:
+            return None
+
+
+class _VanishingError(Exception):
+    """A spectrum without noise is zero over an interval: its process is known for ever."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DecoupledModes:
+    """Directions over the modes (rows) and the spectrum along each."""
+
+    directions: FloatArray
+    modes: tuple[ModeSpectrum, ...]
+
+
+def decoupled_modes(
+    hardware: LoopHardware,
+    *,
+    noise_nm2: FloatArray,
+    turbulence: Sequence[Spectrum | None],
+    vibrations: Sequence[tuple[FloatArray, Vibration]] = (),
+    directions: Sequence[FloatArray] = (),
+) -> DecoupledModes:
+    """Rotate the modes until disturbance and noise are diagonal.
+
+    Shapes: noise_nm2 (q, q), vibrations list of (direction, Vibration), directions list of (n,).
+    """
+    n, rate = hardware.modes, hardware.frame_rate_hz
+    noise = noise_on_modes(hardware, noise_nm2)
+    if np.linalg.matrix_rank(hardware.influence) < n:
+        raise ProblemError(
+            "the mirror must reach every mode: an influence matrix with full row rank; got rank "
+            f"{np.linalg.matrix_rank(hardware.influence)} for {n} modes. Leave out the modes that "
+            "it cannot correct."
+        )
+    for model in [t for t in turbulence if isinstance(t, ARModel)]:
+        if not np.isclose(model.frame_rate_hz, rate, rtol=1e-9):
+            raise ProblemError(
+                f"a disturbance must be sampled at the loop's {rate:.6g} Hz; "
+                f"got {model.frame_rate_hz:.6g} Hz."
+            )
+    # modes with the same spectrum may be turned into each other
+    keys = [spectrum_key(spectrum) for spectrum in turbulence]
+    kinds = dict(zip(keys, turbulence, strict=True))
+    groups = {key: np.diag([float(own == key) for own in keys]) for key in kinds}
+    matrices = [("the noise of the sensor", noise)]
+    matrices += [("the turbulence", projector) for projector in groups.values()]
+    matrices += [
+        (f"the vibration at {line.frequency_hz:.6g} Hz", np.outer(along, along))
+        for along, line in vibrations
+    ]
+    matrices += [("the given direction", np.outer(along, along)) for along in directions]
+    axes = common_axes(matrices)
+    modes = []
+    for axis in axes:
+        own = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
+        parts = [] if kinds[own] is None else [kinds[own]]
+        parts += [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
+        modes.append(
+            ModeSpectrum(
+                rate_hz=rate,
+                parts=tuple(part for part in parts if part is not None),
+                noise_nm2=max(float(axis @ noise @ axis), 0.0),
+            )
+        )
+    return DecoupledModes(directions=axes, modes=tuple(modes))
+
+
+def noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
+    """Covariance (n, n) of the best unbiased estimate of the modes from one measurement."""
+    sensor, n = hardware.sensor, hardware.modes
+    if np.linalg.matrix_rank(sensor) < n:
+        raise ProblemError(
+            "the sensor must see every mode: a sensor matrix with full column rank; got rank "
+            f"{np.linalg.matrix_rank(sensor)} for {n} modes. Leave out the modes that it does not "
+            "see."
+        )
+    if not np.any(noise_nm2):
+        return np.zeros((n, n))
+    try:
+        size = float(np.max(np.abs(noise_nm2)))
+        factor = np.linalg.cholesky(noise_nm2 / size)
+    except np.linalg.LinAlgError as error:
+        raise ProblemError(
+            "the noise must be zero, or have a positive definite covariance; got a singular one. "
+            "Add a little noise to each measurement."
+        ) from error
+    white = np.linalg.solve(factor, sensor)
+    return np.asarray(size * np.linalg.inv(white.T @ white))
+
+
+def common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
+    """Orthonormal rows that make all symmetric matrices diagonal."""
+    n = len(matrices[0][1])
+    unit = [(name, m / max(float(np.linalg.norm(m, 2)), 1e-300)) for name, m in matrices]
+
+    def coupled(axes: FloatArray) -> str | None:
+        for name, m in unit:
+            turned = axes @ m @ axes.T
+            if np.max(np.abs(turned - np.diag(np.diag(turned)))) > _COUPLING:
+                return name
+        return None
+
+    plain = np.eye(n)
+    if coupled(plain) is None:
+        return plain
+    # matrices that commute share the eigenvectors of almost every sum of them
+    shares = np.random.default_rng(0).uniform(1, 2, len(unit))
+    axes = np.linalg.eigh(sum(s * m for s, (_, m) in zip(shares, unit, strict=True)))[1].T
+    largest = np.argmax(np.abs(axes), axis=1)
+    axes = axes * np.sign(axes[np.arange(n), largest])[:, None]
+    axes = axes[np.argsort(largest, kind="stable")]
+    name = coupled(axes)
+    if name is not None:
+        raise ProblemError(
+            "a limit needs modes that decouple: vibrations parallel or at right angles to each "
+            "other, along principal axes of the sensor's noise and within modes of one turbulence; "
+            f"got {name} across them. Turn the directions, take equal noise on all modes, or treat "
+            "each mode by itself."
+        )
+    return np.asarray(axes)

@@ -1,0 +1,149 @@
+"""What of a process cannot be known in time: the error of the best prediction.
+
+With the measured spectrum ``Phi = S + R = |F|^2``, F outer, and the path ``z^-1 M`` from a
+filter's output to the residual written as an inner factor times an outer one, the least
+variance is that of the part of F which the inner factor makes unreachable, less R. The
+inner factor is ``z^-whole`` times an all-pass factor with the mirror's zeros outside the unit
+circle: one for a settled mirror and a fraction of a frame above one half, one or two for a
+mirror that moves slowly. The unreachable part has as many coefficients as these have zeros.
+All that is needed of F are integrals of ``log Phi`` times smooth weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_FEW_DIGITS = 1e-2  # a quotient by less than this would lose more than two digits
+_REAL = 1e-7  # relative imaginary part of what counts as a real zero
+_ALIKE = 1e9  # condition of the zeros' Gram matrix beyond which they cannot be told apart
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reach:
+    """Inner factor of the path."""
+
+    whole: int  # Frames of pure delay from the measured sample to the one that is corrected
+    zeros: tuple[float, ...]  # Zeros of the all-pass factor in the backward shift, in (-1, 1)
+    terms: int  # Cosine integrals that are needed, the mean included
+
+    @staticmethod
+    def of(hardware: LoopHardware) -> Reach:
+        """Inner factor of a loop's path."""
+        mirror = hardware.mirror_system
+        found = mirror.core.zeros
+        late = found[np.abs(found) > 1]  # on the circle: a stable inverse, in the limit
+        whole = mirror.lead + 1
+        if np.any(np.abs(late.imag) > _REAL * np.abs(late)):
+            raise ProblemError(
+                "the limit of a mirror is known for real zeros outside the unit circle; got "
+                f"complex ones at {late[np.argmax(np.abs(late.imag))]:.6g}. Try another delay "
+                "or frame rate, or the residual of lqg."
+            )
+        zeros = tuple(sorted(float(a) for a in 1 / late.real))
+        if len(zeros) > 1 and np.linalg.cond(_gram(zeros)) > _ALIKE:
+            raise ProblemError(
+                "the limit of a mirror needs zeros outside the unit circle that differ; got "
+                f"{', '.join(f'{1 / a:.9g}' for a in zeros)}. Try another delay or frame rate."
+            )
+        # for small zeros, the quotient (F - f_0 - ...) / zero^whole is summed as a series
+        small = [abs(a) for a in zeros if abs(a) ** whole <= _FEW_DIGITS]
+        if not small:
+            return Reach(whole=whole, zeros=zeros, terms=whole)
+        more = int(np.ceil(np.log(1e-17) / np.log(max(*small, 1e-300))))
+        return Reach(whole=whole, zeros=zeros, terms=whole + 1 + more)
+
+    @property
+    def by_series(self) -> bool:
+        """Whether the value at a zero is summed from its series."""
+        return self.terms > self.whole
+
+    @property
+    def by_weight(self) -> tuple[float, ...]:
+        """Zeros at which the value is an integral with a weight of its own."""
+        return tuple(a for a in self.zeros if abs(a) ** self.whole > _FEW_DIGITS)
+
+    def weights(self, x: FloatArray) -> FloatArray:
+        """Weights (f, k) of the logarithm at frequencies x, in units of Nyquist."""
+        columns = [np.cos(np.pi * n * x) for n in range(self.terms)]
+        for a in self.by_weight:
+            shifted = a * np.exp(-1j * np.pi * x)
+            columns.append(np.real(shifted / (1 - shifted)))
+        return np.stack(columns, axis=-1)
+
+
+def _gram(zeros: tuple[float, ...]) -> FloatArray:
+    """Inner products of the kernels ``1 / (1 - a z^-1)``."""
+    a = np.array(zeros)
+    return np.asarray(1 / (1 - np.outer(a, a)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prediction:
+    """Best prediction of a process whose spectrum has given integrals of its logarithm."""
+
+    reach: Reach  # Inner factor of the path
+    mean_log: float  # Mean of ``log(Phi / reference)``
+    coefficients: FloatArray  # (whole,): ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``
+    tails: FloatArray  # (zeros,): values at the zeros of the all-pass factor of what follows them
+
+    @staticmethod
+    def of(reach: Reach, moments: FloatArray) -> Prediction:
+        """From the integrals of the logarithm times the weights of a reach."""
+        polynomial = np.polynomial.polynomial.polyval
+        f = _exponential(moments[: reach.terms])
+        whole, tails = reach.whole, np.zeros(len(reach.zeros))
+        for i, a in enumerate(reach.zeros):
+            if a in reach.by_weight:
+                value = float(np.exp(moments[reach.terms + reach.by_weight.index(a)]))
+                tails[i] = (value - float(polynomial(a, f[:whole]))) / a**whole
+            else:
+                tails[i] = float(polynomial(a, f[whole:]))
+        return Prediction(
+            reach=reach, mean_log=float(moments[0]), coefficients=f[:whole], tails=tails
+        )
+
+    @property
+    def _kernels(self) -> FloatArray:
+        """Weights of the kernels ``1 / (1 - a z^-1)`` that the unreachable part is made of."""
+        if not self.reach.zeros:
+            return np.zeros(0)
+        return np.asarray(np.linalg.solve(_gram(self.reach.zeros), self.tails))
+
+    @property
+    def later_power(self) -> float:
+        """Sum of squares of all unreachable coefficients but the first, over sigma^2."""
+        later = float(np.sum(self.coefficients[1:] ** 2))
+        return later + max(float(self.tails @ self._kernels), 0.0)
+
+    def variance(self, reference: float, noise: float) -> float:
+        """Least variance of the residual; the reference is the noise unless that is zero."""
+        sigma2 = np.exp(self.mean_log)
+        if noise > 0:  # sums of positive numbers: no digits are lost however large the noise
+            return float(reference * (np.expm1(self.mean_log) + sigma2 * self.later_power))
+        return float(reference * sigma2 * (1 + self.later_power))
+
+    def error_power(self, x: FloatArray) -> FloatArray:
+        """``|P|^2 / sigma^2`` at frequencies x: the rejection is ``|P / F|^2``."""
+        shift = np.exp(-1j * np.pi * x)
+        part: ComplexArray = np.asarray(
+            np.polynomial.polynomial.polyval(shift, self.coefficients), dtype=np.complex128
+        )
+        for a, weight in zip(self.reach.zeros, self._kernels, strict=True):
+            part = part + weight * shift**self.reach.whole / (1 - a * shift)
+        return np.asarray(np.abs(part) ** 2)
+
+
+def _exponential(c: FloatArray) -> FloatArray:
+    """Coefficients of ``exp(c_1 x + c_2 x^2 + ...)``, as many as there are c."""
+    f = np.zeros(c.size)
+    f[0] = 1.0
+    weighted = np.arange(c.size) * c
+    for n in range(1, c.size):
+        f[n] = weighted[1 : n + 1] @ f[n - 1 :: -1][:n] / n
+    return f

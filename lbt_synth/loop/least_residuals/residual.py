@@ -1,0 +1,147 @@
+"""The least residual of any linear controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.loop.least_residuals.mode_spectra import (
+    DecoupledModes,
+    ModeSpectrum,
+    decoupled_modes,
+)
+from lbt_synth.loop.least_residuals.plant_modes import plant_modes
+from lbt_synth.loop.least_residuals.prediction import Prediction, Reach
+from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant, Truth, Vibration
+from lbt_synth.models.truth import fitted_direction, stationary_vibrations
+from lbt_synth.validation import FloatArray, frozen, instance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualLimit:
+    """The least residual of any linear controller.
+
+    Attributes
+    ----------
+    variance_nm2 : (n,) ndarray
+        Least variance along each direction [nm^2].
+    directions : (n, n) ndarray
+        Directions over the modes, one a row, along which the loop decouples.
+    change : float
+        What the last refinement of the integrals changed, relative to the variance; the
+        largest over the directions.
+    """
+
+    variance_nm2: FloatArray
+    directions: FloatArray
+    change: float
+
+    @property
+    def rms_nm(self) -> float:
+        """Least residual over all modes [nm rms]."""
+        return float(np.sqrt(np.sum(self.variance_nm2)))
+
+
+def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
+    """Least stationary residual that any linear controller leaves under a truth.
+
+    By spectral factorisation, without any design: a controller that knew the spectra, the
+    noise and the sensor gain could come as close to it as it likes, none could pass it.
+    Sinusoids of the truth cost nothing (one frequency can be rejected entirely at a price as
+    small as one likes) and are left out; see :func:`least_worst_residual` for one whose
+    frequency is not known. Random vibrations count with their spectra.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop, with any delay. The sensor must see and the mirror reach every mode.
+    truth : Truth
+        Disturbances, noise and sensor gain.
+
+    Returns
+    -------
+    ResidualLimit
+        Least variance along each direction, and the least residual.
+
+    Raises
+    ------
+    ProblemError
+        If a mode is not seen or not reached, the modes do not decouple, or a disturbance does
+        not fit the loop.
+    NumericalError
+        If an integral over a spectrum does not settle.
+
+    Examples
+    --------
+    An AR1 process without noise, predicted over two frames:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
+    >>> slow = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=2.0, frame_rate_hz=800)
+    >>> limit = lbt.loop.least_residual(path, lbt.Truth(turbulence=slow))
+    >>> round(float(limit.variance_nm2[0]), 8)  # 2^2 (1 + 0.5^2)
+    5.0
+    """
+    modes = truth_modes(hardware, truth)
+    return _limit(Reach.of(hardware), modes)
+
+
+def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
+    """Least residual that any linear controller leaves where a plant's model is the truth."""
+    if isinstance(plant, FullStatePlant):
+        return _limit(Reach.of(plant.hardware), plant_modes(plant))
+    lines = [(fitted_direction(line, plant.hardware), line) for line in plant.vibrations]
+    modes = decoupled_modes(
+        plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
+    )
+    return _limit(Reach.of(plant.hardware), modes)
+
+
+def truth_modes(
+    hardware: LoopHardware, truth: Truth, directions: tuple[FloatArray, ...] = ()
+) -> DecoupledModes:
+    """Decouple the modes of a truth, its sinusoids left out."""
+    instance(hardware, LoopHardware)
+    instance(truth, Truth)
+    lines = []
+    for vibration in stationary_vibrations(truth.vibrations):
+        along = fitted_direction(vibration, hardware)
+        if isinstance(vibration, Vibration):
+            lines.append((along, vibration))
+    noise = np.diag((truth.noise_of(hardware.n_measurements) / truth.sensor_gain) ** 2)
+    return decoupled_modes(
+        hardware,
+        noise_nm2=noise,
+        turbulence=truth.turbulence_of(hardware.modes),
+        vibrations=lines,
+        directions=directions,
+    )
+
+
+def _limit(reach: Reach, decoupled: DecoupledModes) -> ResidualLimit:
+    known: dict[tuple[object, ...], tuple[float, float]] = {}
+    found = []
+    for mode in decoupled.modes:
+        key = (tuple(id(part) for part in mode.parts), mode.noise_nm2)
+        if key not in known:
+            known[key] = mode_limit(reach, mode)
+        found.append(known[key])
+    variance, change = np.array(found).T
+    return ResidualLimit(
+        variance_nm2=frozen(variance),
+        directions=frozen(decoupled.directions),
+        change=float(np.max(change)),
+    )
+
+
+def mode_limit(reach: Reach, mode: ModeSpectrum) -> tuple[float, float]:
+    """Least variance of one mode, and its relative change at the last refinement."""
+    reference = mode.reference()
+    panels = mode.log_moments(reach, reference) if mode.parts and reference > 0 else None
+    if panels is None:  # nothing to correct, or nothing that is not known beforehand
+        return 0.0, 0.0
+    moments = panels.integrals.sum(axis=0)
+    variance = Prediction.of(reach, moments).variance(reference, mode.noise_nm2)
+    scale = min(1.0, float(moments[0])) if mode.noise_nm2 > 0 else 1.0
+    return variance, panels.change / scale if scale > 0 else 0.0

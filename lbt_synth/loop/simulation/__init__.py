@@ -1,0 +1,1 @@
+"""The closed loop in the time domain."""

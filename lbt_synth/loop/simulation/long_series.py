@@ -1,0 +1,247 @@
+"""Linear systems driven by long series, by matrix products over blocks of frames.
+
+Within a block of b frames the outputs are a matrix times (state at the block's
+beginning, inputs of the block); the states at the beginnings obey a recursion
+with ``A^b``. One system, of any size, has many cases of inputs, and its recursion is
+solved by blocks again; a stack of small systems has one case each, and its recursion
+goes block by block, all systems at once. The result is that of the frame-by-frame
+recursion up to rounding.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from lbt_synth.errors import DimensionError
+from lbt_synth.linear import StateSpace
+from lbt_synth.linear.batched import transposed
+from lbt_synth.validation import FloatArray, real_array
+
+_BLOCK = 8
+_STACK_BLOCK = 32  # of small systems: their products are small, and their recursion is slow
+_STEPS = 16  # of the recursion between blocks
+_CACHED = 500_000  # numbers of inputs and outputs worked on at once
+
+
+def filter_series(system: StateSpace, inputs: Any) -> FloatArray:
+    """Compute the outputs of a discrete-time system from a zero state.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The system, with m inputs and p outputs.
+    inputs : (..., frames, m) array_like
+        Input series; leading dimensions are independent cases.
+
+    Returns
+    -------
+    (..., frames, p) ndarray
+        ``y(k) = C x(k) + D u(k)``.
+
+    Raises
+    ------
+    ProblemError
+        If the inputs are not finite or have another shape.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> total = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[1.0]])
+    >>> lbt.loop.filter_series(total, [[1.0], [2.0], [3.0]])[:, 0].tolist()
+    [1.0, 3.0, 6.0]
+    """
+    u = np.asarray(inputs, dtype=np.float64)
+    m, p = system.B.shape[1], system.C.shape[0]
+    if u.ndim < 2 or u.shape[-1] != m:
+        raise DimensionError(
+            f"inputs must be (..., frames, {m}) to match B {system.B.shape}; got {u.shape}."
+        )
+    if not np.all(np.isfinite(u)):
+        real_array(u, "inputs")  # raises, and says where
+    lead, frames = u.shape[:-2], u.shape[-2]
+    cases = int(np.prod(lead))
+    u = u.reshape(cases, frames, m)
+    operators = _block_operators(system.A, system.B, system.C, system.D, _BLOCK)
+    out = np.empty((cases, frames, p))
+    # as many cases at once as fit into the processor's cache
+    batch = max(1, _CACHED // max(1, frames * (m + p)))
+    for start in range(0, cases, batch):
+        part = slice(start, start + batch)
+        out[part] = _filter_batch(operators, u[part])
+    return out.reshape(*lead, frames, p)
+
+
+def _filter_batch(operators: _BlockOperators, u: FloatArray) -> FloatArray:
+    cases, frames, m = u.shape
+    blocks = -(-frames // _BLOCK)
+    if frames != blocks * _BLOCK:
+        padded = np.zeros((cases, blocks * _BLOCK, m))
+        padded[:, :frames] = u
+        u = padded
+    chunks = u.reshape(cases, blocks, _BLOCK * m)
+    starts = _recursion(operators.step, chunks @ operators.reach)
+    out = chunks @ operators.toeplitz
+    out += starts @ operators.observe
+    return np.asarray(out.reshape(cases, blocks * _BLOCK, -1)[:, :frames])
+
+
+def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
+    """Compute the state after the last frame of ``x(k+1) = A x(k) + drive(k)``, from zero.
+
+    By halves: two steps of A with two drives are one step of A^2 with ``A drive + drive``. Shapes:
+    A (n, n), drive (frames, n) -> (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.loop.simulation.long_series import last_state
+    >>> last_state(np.array([[0.5]]), np.array([[4.0], [2.0], [1.0]])).tolist()
+    [3.0]
+    """
+    step = A
+    while len(drive) > 1:
+        if len(drive) % 2:
+            drive = np.concatenate([np.zeros((1, drive.shape[1])), drive])
+        drive = drive[0::2] @ step.T + drive[1::2]
+        step = step @ step
+    return drive[0] if len(drive) else np.zeros(len(A))
+
+
+class SystemStack:
+    """Small systems of the same sizes, ready to be driven by one series each.
+
+    Parameters
+    ----------
+    A, B, C, D : (N, n, n), (N, n, m), (N, p, n), (N, p, m) ndarray
+        The systems, ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.loop.simulation.long_series import SystemStack
+    >>> one = np.ones((2, 1, 1))
+    >>> sums = SystemStack(np.array([[[1.0]], [[0.5]]]), one, one, one)
+    >>> sums.filtered(np.ones((2, 3, 1)))[:, :, 0].tolist()
+    [[1.0, 2.0, 3.0], [1.0, 2.0, 2.5]]
+    """
+
+    def __init__(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
+        self._operators = _block_operators(A, B, C, D, _STACK_BLOCK)
+        self._outputs, self._inputs = D.shape[-2:]
+
+    def filtered(self, inputs: FloatArray, *, in_place: bool = False) -> FloatArray:
+        """Compute the outputs from zero states. Shapes: inputs (N, frames, m) -> (N, frames, p)."""
+        u, op, block = inputs, self._operators, _STACK_BLOCK
+        count, frames, m = u.shape
+        p, n = self._outputs, op.step.shape[-1]
+        whole, tail = divmod(frames, block)
+        out = u if in_place else np.empty((count, frames, p))
+        full = u[:, : whole * block].reshape(count, whole, block * m)
+        last = np.zeros((count, block, m))  # the last block, when it is not full
+        last[:, :tail] = u[:, whole * block :]
+        last = last.reshape(count, 1, block * m)
+        # as many systems at once as fit into the processor's cache
+        batch = min(count, max(1, _CACHED // max(1, frames * (m + p))))
+        parts = [slice(start, start + batch) for start in range(0, count, batch)]
+
+        drive = np.zeros((whole + 1, n, count))
+        for part in parts:
+            drive[:whole, :, part] = (full[part] @ op.reach[part]).transpose(1, 2, 0)
+        states = _block_states(op.step, drive)
+        product, more = np.empty((2, batch, whole, block * p))
+        for part in parts:
+            some = full[part]
+            size = len(some)
+            before = np.ascontiguousarray(states[:whole, :, part].transpose(2, 0, 1))
+            np.matmul(some, op.toeplitz[part], out=product[:size])
+            np.matmul(before, op.observe[part], out=more[:size])
+            target = out[part, : whole * block].reshape(size, whole, block * p)
+            np.add(product[:size], more[:size], out=target)
+        if tail:
+            ends = last @ op.toeplitz + states[whole].T[:, None] @ op.observe
+            out[:, whole * block :] = ends.reshape(count, block, p)[:, :tail]
+        return out
+
+
+def _block_states(step: FloatArray, drive: FloatArray) -> FloatArray:
+    """States at the blocks' beginnings, (blocks, n, N), one block after the other.
+
+    The systems are the last axis, so that the products of all small matrices are a few
+    sums over long rows.
+    """
+    matrices = np.ascontiguousarray(step.transpose(2, 1, 0))  # (column, row, system)
+    states = np.zeros_like(drive)
+    for j in range(len(drive) - 1):
+        np.einsum("jis,js->is", matrices, states[j], out=states[j + 1])
+        states[j + 1] += drive[j]
+    return states
+
+
+class _BlockOperators(NamedTuple):
+    """What a block of frames does, transposed for row vectors; of one system or of each of many.
+
+    ``step`` advances the state by a block, ``reach`` maps the block's inputs to
+    the state after it, ``observe`` the state before it and ``toeplitz`` the
+    inputs to the block's outputs.
+    """
+
+    step: FloatArray
+    reach: FloatArray
+    observe: FloatArray
+    toeplitz: FloatArray
+
+
+def _block_operators(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, block: int
+) -> _BlockOperators:
+    lead, (p, m) = D.shape[:-2], D.shape[-2:]
+    rows, columns = [C], [B]  # C A^i, A^i B
+    for _ in range(block - 1):
+        rows.append(rows[-1] @ A)
+        columns.append(A @ columns[-1])
+    markov = np.zeros((*lead, 2 * block - 1, p, m))  # zeros, D, C B, C A B, ...
+    markov[..., block - 1, :, :] = D
+    for i in range(block - 1):
+        markov[..., block + i, :, :] = rows[i] @ B
+    # entry (j, output, input, i) is that of lag i - j
+    late = sliding_window_view(markov, block, axis=-3)[..., ::-1, :, :, :]
+    axes = [*range(len(lead)), *(len(lead) + i for i in (0, 2, 3, 1))]
+    return _BlockOperators(
+        step=np.linalg.matrix_power(A, block),
+        reach=np.concatenate([transposed(column) for column in reversed(columns)], axis=-2),
+        observe=np.concatenate([transposed(row) for row in rows], axis=-1),
+        toeplitz=np.ascontiguousarray(late.transpose(axes)).reshape(*lead, block * m, block * p),
+    )
+
+
+def _powers(A: FloatArray, highest: int) -> list[FloatArray]:
+    powers = [np.eye(A.shape[0])]
+    for _ in range(highest):
+        powers.append(powers[-1] @ A)
+    return powers
+
+
+def _recursion(A: FloatArray, drive: FloatArray) -> FloatArray:
+    """States ``x(j+1) = A x(j) + drive(j)`` from zero, for (cases, steps, n) drives."""
+    cases, steps, n = drive.shape
+    if steps <= 2 * _STEPS:
+        out = np.zeros((cases, steps, n))
+        for j in range(steps - 1):
+            out[:, j + 1] = out[:, j] @ A.T + drive[:, j]
+        return out
+    blocks = -(-steps // _STEPS)
+    padded = np.zeros((cases, blocks * _STEPS, n))
+    padded[:, :steps] = drive
+    chunks = padded.reshape(cases, blocks, _STEPS, n)
+    powers = _powers(A, _STEPS)
+    inside = np.zeros_like(chunks)  # states of each block when it begins at zero
+    for j in range(_STEPS - 1):
+        inside[:, :, j + 1] = inside[:, :, j] @ A.T + chunks[:, :, j]
+    ends = inside[:, :, -1] @ A.T + chunks[:, :, -1]
+    starts = _recursion(powers[_STEPS], ends)
+    transport = np.hstack([power.T for power in powers[:_STEPS]])  # (n, block n)
+    inside += (starts @ transport).reshape(cases, blocks, _STEPS, n)
+    return inside.reshape(cases, blocks * _STEPS, n)[:, :steps]

@@ -1,0 +1,188 @@
+"""Frozen flows of many seeings, wind speeds and outer scales, over one telescope.
+
+The spectrum scales with ``seeing^(5/3)``, and is a function of ``f D / V``: only the outer scale
+needs tables of its own. Over an octave of it the logarithm of the spectrum is interpolated by a
+polynomial.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.atmosphere import (
+    Atmosphere,
+    LogSpline,
+    tilt_spline,
+    tilt_strength_nm2,
+    tilt_variance,
+)
+from lbt_synth.validation import FloatArray, IntArray, instance, real_array
+
+_TERMS = 12  # of the polynomial over an octave of the outer scale
+_FEW_SCALES = 16  # outer scales that have a table each
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrozenFlows:
+    """Frozen von Karman layers, one a loop, over the telescope of one atmosphere.
+
+    Parameters
+    ----------
+    atmosphere : Atmosphere
+        The telescope, and the values of what is not given.
+    seeing_arcsec, wind_speed_m_s, outer_scale_m : (p,) array_like, optional
+        Seeing [arcsec], wind speed [m/s] and outer scale [m] of each loop, or one number for
+        all; those of the atmosphere by default.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not above 0.
+    DimensionError
+        If they are not lists of the same length.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
+    >>> flows = lbt.models.FrozenFlows(atmosphere=air, seeing_arcsec=[0.8, 1.6])
+    >>> (flows.psd([5.0]) / air.psd([5.0])).round(4).ravel().tolist()
+    [1.0, 3.1748]
+    """
+
+    atmosphere: Atmosphere
+    seeing_arcsec: Any = None
+    wind_speed_m_s: Any = None
+    outer_scale_m: Any = None
+
+    def __post_init__(self) -> None:
+        instance(self.atmosphere, Atmosphere)
+        given = {}
+        for name in ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m"):
+            value = getattr(self, name)
+            value = getattr(self.atmosphere, name) if value is None else value
+            if value is None:  # Kolmogorov
+                continue
+            given[name] = np.atleast_1d(real_array(value, name))
+            if np.any(given[name] <= 0):
+                raise ProblemError(f"{name} must be above 0; got {given[name].min():.6g}.")
+        try:
+            arrays = np.broadcast_arrays(*given.values())
+        except ValueError as error:
+            shapes = ", ".join(f"{name} {value.shape}" for name, value in given.items())
+            raise DimensionError(
+                f"seeing, wind and outer scale must be lists of the same length; got {shapes}."
+            ) from error
+        if arrays[0].ndim != 1:
+            raise DimensionError(f"they must be lists, one number a loop; got {arrays[0].shape}.")
+        for name, value in zip(given, arrays, strict=True):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        """Return the number of loops p."""
+        return int(self.seeing_arcsec.size)
+
+    def taken(self, rows: IntArray) -> FrozenFlows:
+        """Return the flows of some loops."""
+        outer = None if self.outer_scale_m is None else self.outer_scale_m[rows]
+        return FrozenFlows(
+            atmosphere=self.atmosphere,
+            seeing_arcsec=self.seeing_arcsec[rows],
+            wind_speed_m_s=self.wind_speed_m_s[rows],
+            outer_scale_m=outer,
+        )
+
+    @property
+    def tilt_rms_nm(self) -> FloatArray:
+        """Standard deviation of tip, and of tilt, of each loop [nm rms wavefront], (p,)."""
+        ratios, which = np.unique(self._scale_ratio, return_inverse=True)
+        obstruction = self.atmosphere.obstruction
+        variances = np.array([tilt_variance(float(ratio), obstruction) for ratio in ratios])
+        return np.asarray(np.sqrt(self._strength * variances[which.reshape(-1)]))
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """One-sided temporal power spectra of one axis [nm^2/Hz].
+
+        Parameters
+        ----------
+        frequency_hz : (f,) array_like
+            Frequencies [Hz], above 0.
+
+        Returns
+        -------
+        (p, f) ndarray
+            Spectrum of each loop.
+
+        Raises
+        ------
+        ProblemError
+            If a frequency is not a finite number above 0.
+        """
+        frequency = real_array(frequency_hz, "frequency_hz")
+        if frequency.ndim != 1 or np.any(frequency <= 0):
+            raise ProblemError("frequency_hz must be a list of frequencies above 0 Hz.")
+        air = self.atmosphere
+        crossing_s = air.diameter_m / self.wind_speed_m_s
+        # spectra that differ by their strength only are computed once
+        shapes = np.stack([crossing_s, self._scale_ratio], axis=1)
+        unique, which = np.unique(shapes, axis=0, return_inverse=True)
+        x = np.log(frequency) + np.log(unique[:, :1])
+        values = np.empty(x.shape)
+        ratios = np.unique(unique[:, 1])
+        if len(ratios) <= _FEW_SCALES:
+            for ratio in ratios:
+                rows = unique[:, 1] == ratio
+                values[rows] = tilt_spline(float(ratio), air.obstruction)(x[rows])
+        else:
+            _interpolate_over_scales(x, unique[:, 1], air.obstruction, values)
+        return np.asarray(
+            np.exp(values)[which.reshape(-1)] * (self._strength * crossing_s)[:, None]
+        )
+
+    @property
+    def _strength(self) -> FloatArray:
+        seeing = self.seeing_arcsec / self.atmosphere.seeing_arcsec
+        return np.asarray(tilt_strength_nm2(self.atmosphere) * seeing ** (5 / 3))
+
+    @property
+    def _scale_ratio(self) -> FloatArray:
+        if self.outer_scale_m is None:
+            return np.zeros(len(self))
+        return np.asarray(self.atmosphere.diameter_m / self.outer_scale_m)
+
+
+def _interpolate_over_scales(
+    x: FloatArray, scale_ratio: FloatArray, obstruction: float, values: FloatArray
+) -> None:
+    """Fill in the logarithms of spectra that each have their own outer scale."""
+    from scipy.interpolate import PPoly  # slow to import
+
+    octave = np.floor(np.log2(scale_ratio))
+    for each in np.unique(octave):
+        knots, coefficients = _octave_splines(int(each), obstruction)
+        rows = np.flatnonzero(octave == each)
+        place = 2 * (np.log2(scale_ratio[rows]) - each) - 1
+        for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
+            spline = PPoly.construct_fast(coefficients @ terms, knots)
+            values[row] = LogSpline(spline=spline)(x[row])
+
+
+@lru_cache(maxsize=16)
+def _octave_splines(octave: int, obstruction: float) -> tuple[FloatArray, FloatArray]:
+    """Knots, and coefficients of the splines as polynomials in the logarithm of the outer scale.
+
+    They are (4, intervals, terms), over one octave of the diameter over the outer scale.
+    """
+    nodes = chebyshev.chebpts1(_TERMS)
+    ratios = 2.0 ** (octave + (nodes + 1) / 2)
+    splines = [tilt_spline(float(ratio), obstruction).spline for ratio in ratios]
+    inverse = np.linalg.inv(chebyshev.chebvander(nodes, _TERMS - 1))
+    return splines[0].x, np.stack([spline.c for spline in splines], axis=-1) @ inverse.T

@@ -1,0 +1,259 @@
+"""The mirror at the frame rate: exposure-averaged position, driven by the frames' commands.
+
+Commands arrive once a frame, ``delay_frames - 1`` frames after the exposure that follows
+their computation has begun; an exposure averages the position over one frame. A settled
+mirror shows the commands of at most two frames within an exposure. One with dynamics is
+lifted: its local loop runs a whole number of samples between two commands, and the integral
+of its position over either part of an exposure is a linear function of its state and of the
+command (discretisation of hybrid adaptive-optics loops: C. Correia, H.-F. Raynaud,
+C. Kulcsar, J.-M. Conan, J. Opt. Soc. Am. A 27, 333 (2010), doi:10.1364/JOSAA.27.000333).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear.state_space import bordered_scaling
+from lbt_synth.models.mirror import PositionLoop
+from lbt_synth.validation import ComplexArray, FloatArray, frozen
+
+_WHOLE = 1e-9  # by which the ratio of the rates may miss an integer, relative
+_NOTHING = 1e-14  # a leading tap of at most this is none
+_TAIL = 1e-15  # what is left of the step response where the taps end
+_MOST_TAPS = 4000
+_MOST_SAMPLES = 100_000  # of the local loop, a frame; they are run one by one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Response:
+    """A system of one input and one output, which may have no state at all."""
+
+    A: FloatArray  # (n, n): state matrix
+    # B, C (n,): input and output vectors
+    B: FloatArray
+    C: FloatArray
+    D: float  # Feedthrough
+
+    def __post_init__(self) -> None:
+        for name in "ABC":  # systems are kept, and shared
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return len(self.B)
+
+    @property
+    def zeros(self) -> ComplexArray:
+        """Zeros in z, those at the origin included; D must not vanish."""
+        inverse = self.A - np.outer(self.B, self.C) / self.D
+        return np.linalg.eigvals(inverse).astype(np.complex128)
+
+    def impulse(self, frames: int) -> FloatArray:
+        """Impulse response over so many frames."""
+        out, state = np.zeros(frames), self.B
+        out[0] = self.D
+        for k in range(1, frames):
+            out[k] = self.C @ state
+            state = self.A @ state
+        return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MirrorSystem:
+    """What an exposure sees of the commands."""
+
+    whole: Response  # From u(k) to the position averaged over exposure k
+    # The same, ``lead`` frames earlier; its feedthrough is not zero. Its states are the first ones
+    # of ``whole``.
+    core: Response
+    lead: int  # Frames in which a command does nothing
+    taps: FloatArray  # (t,): impulse response of ``whole``, to rounding; the sum is 1
+
+
+@lru_cache(maxsize=64)
+def settled_mirror(delay_frames: float) -> MirrorSystem:
+    """Return the system of a mirror that takes its position at once.
+
+    Its states are the past commands, the newest first.
+    """
+    lead = int(np.floor(delay_frames - 1))
+    fraction = delay_frames - 1 - lead
+    taps = np.zeros(lead + (2 if fraction > 0 else 1))
+    taps[lead] = 1 - fraction
+    if fraction > 0:
+        taps[lead + 1] = fraction
+    return MirrorSystem(
+        whole=tapped_mirror(taps), core=tapped_mirror(taps[lead:]), lead=lead, taps=frozen(taps)
+    )
+
+
+def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float) -> MirrorSystem:
+    """Return the system of a mirror in its local loop, exactly.
+
+    The samples of the local loop are counted from the arrival of each command; the edges of
+    an exposure may lie between them.
+    """
+    return _lifted(
+        loop.natural_frequency_hz,
+        loop.damping,
+        loop.proportional_per_s2,
+        loop.derivative_per_s,
+        loop.feed_forward,
+        loop.sampling_hz,
+        loop.delay_samples,
+        loop.ramp_samples,
+        frame_rate_hz,
+        delay_frames,
+    )
+
+
+@lru_cache(maxsize=64)
+def _lifted(
+    natural_frequency_hz: float,
+    damping: float,
+    proportional_per_s2: float,
+    derivative_per_s: float,
+    feed_forward: float,
+    sampling_hz: float,
+    delay_samples: int,
+    ramp_samples: int,
+    frame_rate_hz: float,
+    delay_frames: float,
+) -> MirrorSystem:
+    loop = PositionLoop(
+        natural_frequency_hz=natural_frequency_hz,
+        damping=damping,
+        proportional_per_s2=proportional_per_s2,
+        derivative_per_s=derivative_per_s,
+        feed_forward=feed_forward,
+        sampling_hz=sampling_hz,
+        delay_samples=delay_samples,
+        ramp_samples=ramp_samples,
+    )
+    samples = samples_a_frame(loop, frame_rate_hz)
+    lead = int(np.floor(delay_frames - 1))
+    fraction = delay_frames - 1 - lead
+    core = _frame(loop, samples, (1 - fraction) * samples)
+    while abs(core.D) <= _NOTHING:  # the mirror has not moved yet: one frame of delay more
+        core = Response(A=core.A, B=core.B, C=core.C @ core.A, D=float(core.C @ core.B))
+        lead += 1
+    core = _balanced(core)
+    return MirrorSystem(
+        whole=_delayed(core, lead),
+        core=core,
+        lead=lead,
+        taps=frozen(np.concatenate([np.zeros(lead), _taps(core)])),
+    )
+
+
+def samples_a_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
+    """Return the samples of a local loop in a frame."""
+    ratio = loop.sampling_hz / frame_rate_hz
+    if not ratio <= _MOST_SAMPLES:
+        raise ProblemError(
+            f"the local loop of the mirror must run at most {_MOST_SAMPLES} samples a frame; got "
+            f"{loop.sampling_hz:.9g} Hz over {frame_rate_hz:.9g} Hz = {ratio:.9g}. Lower "
+            f"sampling_hz to {_MOST_SAMPLES * frame_rate_hz:.9g} Hz or less, or raise the frame "
+            "rate; a mirror that settles within a few samples of so slow a loop needs no local "
+            "loop at all."
+        )
+    samples = round(ratio)
+    if samples < 1 or abs(ratio - samples) > _WHOLE * ratio:
+        low, high = int(np.floor(ratio)), int(np.floor(ratio)) + 1
+        fitting = [loop.sampling_hz / n for n in (high, low) if n > 0]
+        raise ProblemError(
+            "the local loop of the mirror must run a whole number of samples a frame; got "
+            f"{loop.sampling_hz:.9g} Hz over {frame_rate_hz:.9g} Hz = {ratio:.9g}. Frame rates "
+            f"that fit are {' and '.join(f'{rate:.9g}' for rate in fitting)} Hz."
+        )
+    if loop.ramp_samples > samples:
+        raise ProblemError(
+            f"ramp_samples must be at most {samples}, the samples of a frame; got "
+            f"{loop.ramp_samples}."
+        )
+    return samples
+
+
+def _frame(loop: PositionLoop, samples: int, split: float) -> Response:
+    """One frame after the arrival of a command, seen by the two exposures that it lies in.
+
+    ``split`` samples of it belong to the exposure under way, the rest to the next one.
+    """
+    local = loop.closed_loop()
+    n, ramped, late = local.n_states, loop.ramp_samples > 1, split < samples
+    width = n + 2  # the local loop's states at the arrival, the command, the one before it
+    state, first, last = np.eye(n, width), np.zeros(width), np.zeros(width)
+    whole, edge = loop.travelled(1.0), int(split)
+    part = loop.travelled(split - edge)
+    for i in range(samples):
+        r = np.zeros(width)
+        r[n] = min(1.0, (i + 1) / loop.ramp_samples)
+        r[n + 1] = 1 - r[n]
+        given = np.vstack([state, r])
+        if i < edge:
+            first += whole @ given
+        elif i == edge:
+            first += part @ given
+            last += (whole - part) @ given
+        else:
+            last += whole @ given
+        state = local.A @ state + local.B @ r[None]
+    scale = 1 / (samples * loop.static_gain)
+    size = n + int(late) + int(ramped)
+    A, B, C = np.zeros((size, size)), np.zeros(size), np.zeros(size)
+    A[:n, :n], B[:n], C[:n] = state[:, :n], state[:, n], first[:n] * scale
+    if late:  # the part of the last frame that this exposure sees is a state
+        A[n, :n], B[n], C[n] = last[:n] * scale, last[n] * scale, 1.0
+    if ramped:
+        A[:n, -1], C[-1], B[-1] = state[:, n + 1], first[n + 1] * scale, 1.0
+        if late:
+            A[n, -1] = last[n + 1] * scale
+    return Response(A=A, B=B, C=C, D=float(first[n] * scale))
+
+
+def _taps(core: Response) -> FloatArray:
+    """Impulse response until what is left of the step response is rounding."""
+    radius = float(np.max(np.abs(np.linalg.eigvals(core.A))))
+    frames = 2 * core.n_states + 2 + int(np.ceil(np.log(1e-18) / np.log(max(radius, 1e-9))))
+    if not radius < 1 or frames > _MOST_TAPS:
+        raise ProblemError(
+            f"the mirror must settle within {_MOST_TAPS} frames; got one that decays by a factor "
+            f"of {radius:.9g} a frame. Raise the bandwidth or the damping of its local loop."
+        )
+    taps = core.impulse(frames)
+    left = np.cumsum(np.abs(taps[::-1]))[::-1]
+    taps = taps[: max(int(np.sum(left > _TAIL)), 1)]
+    return np.asarray(taps / taps.sum())
+
+
+def _delayed(core: Response, lead: int) -> Response:
+    """Put the output of a core through a delay."""
+    n = core.n_states
+    A, B, C = np.eye(n + lead, k=-1), np.zeros(n + lead), np.zeros(n + lead)
+    A[: n + 1], B[:n] = 0.0, core.B
+    A[:n, :n] = core.A
+    if not lead:
+        return core
+    A[n, :n], B[n], C[-1] = core.C, core.D, 1.0
+    return Response(A=A, B=B, C=C, D=0.0)
+
+
+def tapped_mirror(taps: FloatArray) -> Response:
+    """Return a mirror by its impulse response; its states are the past commands."""
+    n = len(taps) - 1
+    B = np.zeros(n)
+    B[:1] = 1.0
+    return Response(A=np.eye(n, k=-1), B=B, C=frozen(taps[1:]), D=float(taps[0]))
+
+
+def _balanced(core: Response) -> Response:
+    """Put the states into units, powers of two, that balance the system."""
+    n = core.n_states
+    scaling = bordered_scaling(core.A, np.abs(core.B), np.abs(core.C))
+    units = scaling[:n] / scaling[n]
+    return Response(A=core.A * units / units[:, None], B=core.B / units, C=core.C * units, D=core.D)

@@ -1,0 +1,199 @@
+"""The path from command to measurement: mirror, delay, sensor (Agapito et al. 2008, eqs. 1-2)."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.models.lifted_mirror import MirrorSystem, lifted_mirror, settled_mirror
+from lbt_synth.models.mirror import PositionLoop
+from lbt_synth.validation import FloatArray, frozen, instance, matrix, number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopHardware:
+    """Sensor, mirror and delay around which a controller closes the loop.
+
+    In frames k of ``1 / frame_rate_hz``, with d the total delay::
+
+        y(k)       = sensor_matrix phi_res(k-1) + noise(k)
+        phi_res(k) = phi_tot(k) - phi_cor(k)
+        phi_cor(k) = influence_matrix u(k-d+1)
+
+    A fractional delay ``d = j + 1 + f`` holds the command of two frames within
+    one exposure: ``phi_cor(k) = influence_matrix ((1-f) u(k-j) + f u(k-j-1))``.
+
+    With a ``mirror`` the position follows each command as its local loop lets it, and the
+    delay is that at which the command arrives: ``phi_cor(k) = influence_matrix (c[0] u(k) +
+    c[1] u(k-1) + ...)`` with the exposure-averaged taps c of :attr:`mirror_taps`.
+
+    Parameters
+    ----------
+    frame_rate_hz : float
+        Frame rate [Hz].
+    delay_frames : float, optional
+        Total delay d [frames], at least 1.
+    sensor_matrix : (q, n) array_like, optional
+        Sensor response to the n modes; the identity by default.
+    influence_matrix : (n, m) array_like, optional
+        Mirror response to the m commands; the identity by default.
+    modes : int, optional
+        Number of modes n when neither matrix is given.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror, the same for all commands; a mirror that settles at once by
+        default.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite, out of range, or the sizes clash; or if the local loop does
+        not run a whole number of samples a frame.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.25)
+    >>> [float(tap) for tap in path.mirror_taps]  # of u(k), u(k-1), u(k-2)
+    [0.0, 0.75, 0.25]
+    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
+    ... )
+    >>> moving = lbt.LoopHardware(frame_rate_hz=800, mirror=shell)
+    >>> moving.mirror_taps[:3].round(3).tolist()
+    [0.0, 0.631, 0.387]
+    """
+
+    frame_rate_hz: float
+    delay_frames: float = 2.0
+    sensor_matrix: FloatArray | None = None
+    influence_matrix: FloatArray | None = None
+    modes: int = 2
+    mirror: PositionLoop | None = None
+
+    def __post_init__(self) -> None:
+        sensor, influence, n = self.sensor_matrix, self.influence_matrix, self.modes
+        if sensor is not None:
+            sensor = matrix(sensor, "sensor_matrix")
+            n = sensor.shape[1]
+        if influence is not None:
+            rows = None if sensor is None else (n, f"to match sensor_matrix {sensor.shape}")
+            influence = matrix(influence, "influence_matrix", rows=rows)
+            n = influence.shape[0]
+        if n < 1 or (influence is not None and influence.shape[1] < 1):
+            raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
+        for name, value in (("sensor_matrix", sensor), ("influence_matrix", influence)):
+            if value is not None and not np.any(value):
+                raise ProblemError(f"{name} must respond to something; got only zeros.")
+        object.__setattr__(self, "modes", n)
+        object.__setattr__(self, "sensor_matrix", frozen(np.eye(n)) if sensor is None else sensor)
+        object.__setattr__(
+            self, "influence_matrix", frozen(np.eye(n)) if influence is None else influence
+        )
+        object.__setattr__(
+            self, "frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0)
+        )
+        object.__setattr__(
+            self,
+            "delay_frames",
+            number(
+                self.delay_frames,
+                "delay_frames",
+                at_least=1,
+                at_most=100,
+                hint="One frame is the exposure itself: no loop is faster.",
+            ),
+        )
+        if self.mirror is not None:
+            instance(self.mirror, PositionLoop)
+            lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
+
+    @property
+    def sensor(self) -> FloatArray:
+        """Sensor matrix (q, n)."""
+        assert self.sensor_matrix is not None  # set by __post_init__
+        return self.sensor_matrix
+
+    @property
+    def influence(self) -> FloatArray:
+        """Influence matrix N (n, m)."""
+        assert self.influence_matrix is not None  # set by __post_init__
+        return self.influence_matrix
+
+    @property
+    def projector(self) -> FloatArray:
+        """Generalised inverse of the influence matrix, (m, n)."""
+        return frozen(np.linalg.pinv(self.influence))
+
+    @property
+    def n_commands(self) -> int:
+        """Number of commands m."""
+        return int(self.influence.shape[1])
+
+    @property
+    def n_measurements(self) -> int:
+        """Number of measurements q."""
+        return int(self.sensor.shape[0])
+
+    @property
+    def dt_s(self) -> float:
+        """Frame period [s]."""
+        return 1 / self.frame_rate_hz
+
+    @property
+    def mirror_system(self) -> MirrorSystem:
+        """Mirror and delay as a system at the frame rate, of one command."""
+        if self.mirror is None:
+            return settled_mirror(self.delay_frames)
+        return lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
+
+    @property
+    def mirror_taps(self) -> FloatArray:
+        """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``, to rounding."""
+        return self.mirror_system.taps
+
+
+def same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
+    """Whether two loops have the same dynamics of the mirror."""
+    if one.mirror is None or other.mirror is None:
+        return one.mirror is other.mirror
+    return astuple(one.mirror) == astuple(other.mirror)
+
+
+def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
+    """Say in what the loop that a design was made for differs from the one it is run in."""
+    notes = []
+    if own.delay_frames != here.delay_frames:
+        notes.append(
+            f"designed for a delay of {own.delay_frames:g} frames, run with {here.delay_frames:g}."
+        )
+    if not (
+        np.array_equal(own.sensor, here.sensor) and np.array_equal(own.influence, here.influence)
+    ):
+        notes.append("designed for another sensor or influence matrix than it is run with.")
+    if not same_mirror(own, here):
+        kinds = [
+            "a mirror that settles at once" if h.mirror is None else "a mirror with dynamics"
+            for h in (own, here)
+        ]
+        notes.append(
+            f"designed for {kinds[0]}, run with {kinds[1]}."
+            if kinds[0] != kinds[1]
+            else "designed for other dynamics of the mirror than it is run with."
+        )
+    return notes
+
+
+def past_corrections(taps: FloatArray, commands: FloatArray) -> FloatArray:
+    """Return ``c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...``, which measurement k sees.
+
+    Commands before the first row count as zero: the first ``len(taps)`` rows are not known. Shapes:
+    taps (t,), commands (frames, m) -> (frames, m).
+    """
+    frames = len(commands)
+    out = np.zeros(commands.shape)
+    for i in np.flatnonzero(taps):
+        if i + 1 < frames:
+            out[i + 1 :] += taps[i] * commands[: frames - 1 - i]
+    return out

@@ -1,0 +1,402 @@
+"""The local position loop of an adaptive secondary mirror: one mode of its thin shell.
+
+The shell floats on a film of air in front of voice coils and capacitive sensors; each
+position is held by a sampled proportional-derivative feedback and a feed-forward force
+proportional to the commanded position (A. Riccardi et al., "Adaptive secondary mirrors for
+the Large Binocular Telescope", Proc. SPIE 5169, 721 (2003), doi:10.1117/12.511374; Agapito
+et al. 2008, section II). Here is one mode of it, with force over modal mass as an
+acceleration, all sampling exact by matrix exponentials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import StateSpace
+from lbt_synth.validation import FloatArray, frozen, integer, number
+
+_STABLE = 1 - 1e-9
+_MOST_SAMPLES = 500_000
+_POINTS = 8  # of a step response, a sample
+_LONGEST_DELAY = 64  # samples
+_BLOCK = 64  # samples of a step response that are computed at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StepResponse:
+    """Position of a mirror after a unit step of its command.
+
+    Attributes
+    ----------
+    time_s : (t,) ndarray
+        Time since the command arrived [s].
+    position : (t,) ndarray
+        Position over its final value.
+    tolerance : float
+        Half width of the band around 1 in which the mirror counts as settled.
+    rise_s : float
+        Time from 10 % to 90 % [s].
+    overshoot : float
+        Largest position less 1; 0 if it stays below.
+    settling_s : float
+        Time after which the position stays within the band [s].
+    """
+
+    time_s: FloatArray
+    position: FloatArray
+    tolerance: float
+    rise_s: float
+    overshoot: float
+    settling_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PositionLoop:
+    """One mode of an adaptive secondary mirror in its local position loop.
+
+    With position x, command r and the samples i of the local loop::
+
+        x'' + 2 damping w x' + w^2 x = a,      w = 2 pi natural_frequency_hz
+        a_next(i) = feed_forward w^2 r(i) + proportional_per_s2 (r(i) - x(i))
+                    - derivative_per_s (x(i) - x(i-1)) sampling_hz
+
+    The acceleration is held over a sample and acts ``delay_samples`` samples after it was
+    computed from. The static gain is 1 with a feed-forward of 1, and is calibrated away
+    otherwise (it belongs to the influence matrix).
+
+    Parameters
+    ----------
+    natural_frequency_hz : float
+        Natural frequency of the mode without the local loop [Hz].
+    damping : float
+        Its damping ratio, by the air film.
+    proportional_per_s2 : float
+        Position gain: force over modal mass and position [1/s^2].
+    derivative_per_s : float
+        Velocity gain: force over modal mass and velocity [1/s].
+    feed_forward : float, optional
+        Feed-forward force over that which holds the commanded position.
+    sampling_hz : float, optional
+        Rate of the local loop [Hz].
+    delay_samples : int, optional
+        Computing delay of the local loop [samples].
+    ramp_samples : int, optional
+        The command is reached in so many equal steps, one a sample; 1 for a plain step.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range, or the local loop is unstable.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500, bandwidth_damping=0.7
+    ... )
+    >>> step = shell.step_response()
+    >>> f"{1e3 * step.settling_s:.2f} ms, overshoot {100 * step.overshoot:.0f} %"
+    '0.81 ms, overshoot 4 %'
+    """
+
+    natural_frequency_hz: float
+    damping: float
+    proportional_per_s2: float
+    derivative_per_s: float
+    feed_forward: float = 1.0
+    sampling_hz: float = 72_000.0
+    delay_samples: int = 1
+    ramp_samples: int = 1
+
+    def __post_init__(self) -> None:
+        checked = {
+            "natural_frequency_hz": number(
+                self.natural_frequency_hz, "natural_frequency_hz", above=0
+            ),
+            "damping": number(self.damping, "damping", at_least=0),
+            "proportional_per_s2": number(
+                self.proportional_per_s2, "proportional_per_s2", at_least=0
+            ),
+            "derivative_per_s": number(self.derivative_per_s, "derivative_per_s", at_least=0),
+            "feed_forward": number(self.feed_forward, "feed_forward", at_least=0, at_most=10),
+            "sampling_hz": number(self.sampling_hz, "sampling_hz", above=0),
+            "delay_samples": integer(self.delay_samples, "delay_samples", at_least=0),
+            "ramp_samples": integer(self.ramp_samples, "ramp_samples", at_least=1),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        if self.delay_samples > _LONGEST_DELAY:
+            raise ProblemError(
+                f"delay_samples must be at most {_LONGEST_DELAY}; got {self.delay_samples}."
+            )
+        if not self.natural_frequency_hz < self.sampling_hz / 2:
+            raise ProblemError(
+                "natural_frequency_hz must lie below half of sampling_hz, "
+                f"{self.sampling_hz / 2:.6g} Hz; got {self.natural_frequency_hz:.6g} Hz."
+            )
+        if not self.static_gain > 0:
+            raise ProblemError(
+                "the mirror must follow its command: give it a feed-forward or a proportional "
+                "gain above 0; got 0 for both."
+            )
+        radius = self.closed_loop().spectral_radius
+        if not radius < _STABLE:
+            raise ProblemError(
+                "the local loop of the mirror must be stable; got a spectral radius of "
+                f"{radius:.9g} a sample, with a proportional gain of "
+                f"{self.proportional_per_s2:.6g} 1/s^2, a derivative gain of "
+                f"{self.derivative_per_s:.6g} 1/s and a delay of {self.delay_samples} samples at "
+                f"{self.sampling_hz:.6g} Hz. Lower the bandwidth, raise the damping, or sample "
+                "faster."
+            )
+
+    @classmethod
+    def of_bandwidth(
+        cls,
+        *,
+        natural_frequency_hz: float,
+        damping: float,
+        bandwidth_hz: float,
+        bandwidth_damping: float = 0.7,
+        feed_forward: float = 1.0,
+        sampling_hz: float = 72_000.0,
+        delay_samples: int = 1,
+        ramp_samples: int = 1,
+    ) -> PositionLoop:
+        """Choose the gains that would give a continuous loop this frequency and damping.
+
+        Sampling and delay take some of the damping away.
+
+        Parameters
+        ----------
+        natural_frequency_hz, damping : float
+            As in :class:`PositionLoop`.
+        bandwidth_hz : float
+            Natural frequency with the local loop, at least that without it [Hz].
+        bandwidth_damping : float, optional
+            Damping ratio with the local loop.
+        feed_forward, sampling_hz, delay_samples, ramp_samples : optional
+            As in :class:`PositionLoop`.
+
+        Returns
+        -------
+        PositionLoop
+            The loop.
+
+        Raises
+        ------
+        ProblemError
+            If a value is out of its range, the loop would lower stiffness or damping, or it
+            is unstable.
+        """
+        own = 2 * np.pi * number(natural_frequency_hz, "natural_frequency_hz", above=0)
+        air = number(damping, "damping", at_least=0)
+        wanted = (
+            2
+            * np.pi
+            * number(
+                bandwidth_hz,
+                "bandwidth_hz",
+                at_least=float(natural_frequency_hz),
+                hint="The local loop makes the mode stiffer; its natural frequency is the least.",
+            )
+        )
+        ratio = number(
+            bandwidth_damping,
+            "bandwidth_damping",
+            at_least=air * own / wanted * (1 - 1e-12),
+            hint="The air film alone damps more than that.",
+        )
+        return cls(
+            natural_frequency_hz=natural_frequency_hz,
+            damping=damping,
+            proportional_per_s2=wanted**2 - own**2,
+            derivative_per_s=max(2 * ratio * wanted - 2 * air * own, 0.0),
+            feed_forward=feed_forward,
+            sampling_hz=sampling_hz,
+            delay_samples=delay_samples,
+            ramp_samples=ramp_samples,
+        )
+
+    @property
+    def static_gain(self) -> float:
+        """Final position over a constant command, before calibration."""
+        stiffness = (2 * np.pi * self.natural_frequency_hz) ** 2
+        gain = self.proportional_per_s2
+        return float((gain + self.feed_forward * stiffness) / (gain + stiffness))
+
+    def closed_loop(self) -> StateSpace:
+        """Return the local loop from command to position, at its own rate.
+
+        Returns
+        -------
+        StateSpace
+            States: position, velocity [positions a sample], last position, and the
+            accelerations under way; before calibration.
+        """
+        end = self._motion(1.0)
+        n = 3 + self.delay_samples
+        A, B = np.zeros((n, n)), np.zeros((n, 1))
+        A[:2], B[:2] = end[:2, :n], end[:2, n:]
+        A[2, 0] = 1.0
+        if self.delay_samples:
+            law = self._law()
+            A[3], B[3] = law[:n], law[n]
+            A[4:, 3:-1] = np.eye(self.delay_samples - 1)
+        C = np.zeros((1, n))
+        C[0, 0] = 1.0
+        return StateSpace(A=A, B=B, C=C, D=np.zeros((1, 1)), dt_s=1 / self.sampling_hz)
+
+    def travelled(self, samples: float) -> FloatArray:
+        """Integral of the position over a part of a sample, in samples.
+
+        Parameters
+        ----------
+        samples : float
+            The part, 0 to 1.
+
+        Returns
+        -------
+        (n + 1,) ndarray
+            Row over the states at its beginning and the command.
+        """
+        return np.asarray(self._motion(samples)[2])
+
+    def step_response(self, tolerance: float = 0.1) -> StepResponse:
+        """Answer to a unit step of the command, at rest before.
+
+        Parameters
+        ----------
+        tolerance : float, optional
+            Half width of the band around the final position.
+
+        Returns
+        -------
+        StepResponse
+            Eight exact points a sample, until the mode has decayed to 1e-6, with rise,
+            overshoot and settling time.
+
+        Raises
+        ------
+        ProblemError
+            If the tolerance is not in (0, 1), or the mode hardly decays.
+        """
+        band = number(tolerance, "tolerance", above=0, below=1)
+        loop = self.closed_loop()
+        decay = -np.log(loop.spectral_radius)
+        samples = self.ramp_samples + int(np.ceil(np.log(1e6) / decay)) + 2 * loop.n_states
+        if samples > _MOST_SAMPLES:
+            raise ProblemError(
+                f"the mirror must settle within {_MOST_SAMPLES / self.sampling_hz:.4g} s; got one "
+                f"that decays by 1/e in {1 / decay / self.sampling_hz:.4g} s. Raise its damping."
+            )
+        parts = [self._motion(p / _POINTS)[0] for p in range(_POINTS)]
+        rows = np.stack(parts) / self.static_gain
+        r = np.minimum(1.0, np.arange(1, samples + 1) / self.ramp_samples)
+        states = _driven(loop, r)
+        x = (states @ rows[:, :-1].T + r[:, None] * rows[:, -1]).ravel()
+        time = np.arange(x.size) / (_POINTS * self.sampling_hz)
+        return StepResponse(
+            time_s=frozen(time),
+            position=frozen(x),
+            tolerance=band,
+            rise_s=_crossing(time, x, 0.9) - _crossing(time, x, 0.1),
+            overshoot=max(float(np.max(x)) - 1, 0.0),
+            settling_s=_last_outside(time, x, band),
+        )
+
+    @property
+    def bandwidth_hz(self) -> float:
+        """Frequency at which the amplitude has fallen to 0.707 of its static value [Hz]."""
+        loop = self.closed_loop()
+
+        def excess(frequency: float) -> float:
+            amplitude = np.abs(loop.frequency_response([frequency])[0, 0, 0])
+            return float(amplitude / self.static_gain - np.sqrt(0.5))
+
+        grid = np.geomspace(1e-3 * self.natural_frequency_hz, self.sampling_hz / 2, 2000)
+        amplitude = np.abs(loop.frequency_response(grid)[:, 0, 0]) / self.static_gain
+        below = np.flatnonzero(amplitude < np.sqrt(0.5))
+        if below.size == 0 or below[0] == 0:
+            return float("nan") if below.size else float(grid[-1])
+        return float(brentq(excess, grid[below[0] - 1], grid[below[0]]))
+
+    def _law(self) -> FloatArray:
+        """Acceleration [positions a sample^2] that is computed, over states and command."""
+        dt = 1 / self.sampling_hz
+        kp, kd = self.proportional_per_s2 * dt**2, self.derivative_per_s * dt
+        forward = self.feed_forward * (2 * np.pi * self.natural_frequency_hz * dt) ** 2
+        row = np.zeros(4 + self.delay_samples)
+        row[0], row[2], row[-1] = -kp - kd, kd, kp + forward
+        return row
+
+    def _motion(self, part: float) -> FloatArray:
+        """Position, velocity and travelled position after a part of a sample.
+
+        (3, n + 1), over the states at the sample's beginning and the command.
+        """
+        moved = _exponential(
+            2 * np.pi * self.natural_frequency_hz / self.sampling_hz, self.damping, float(part)
+        )
+        if self.delay_samples:
+            acting = np.zeros(4 + self.delay_samples)
+            acting[-2] = 1.0
+        else:
+            acting = self._law()
+        out = moved[:3, 3:] * acting
+        out[:, :2] += moved[:3, :2]
+        return np.asarray(out)
+
+
+def _driven(loop: StateSpace, command: FloatArray) -> FloatArray:
+    """States at each sample from rest, (samples, n), many samples at once."""
+    n, blocks = loop.n_states, -(-command.size // _BLOCK)
+    powers = [np.eye(n)]
+    for _ in range(_BLOCK):
+        powers.append(powers[-1] @ loop.A)
+    reached = np.stack([power @ loop.B[:, 0] for power in powers[:-1]])
+    given = np.zeros((blocks, _BLOCK))
+    given.ravel()[: command.size] = command
+    lag = np.arange(_BLOCK + 1)[:, None] - 1 - np.arange(_BLOCK)  # after sample j, of sample i
+    kernel = np.where((lag >= 0)[..., None], reached[np.maximum(lag, 0)], 0.0)
+    inside = np.einsum("bi,jin->bjn", given, kernel)
+    observe, out, state = np.stack(powers), np.empty((blocks, _BLOCK, n)), np.zeros(n)
+    for block in range(blocks):
+        path = observe @ state + inside[block]
+        out[block], state = path[:-1], path[-1]
+    return out.reshape(-1, n)[: command.size]
+
+
+@lru_cache(maxsize=256)
+def _exponential(omega: float, damping: float, time: float) -> FloatArray:
+    """Exponential of the motion [x, x', integral of x, acceleration], in samples."""
+    generator = np.zeros((4, 4))
+    generator[0, 1] = 1.0
+    generator[1, :2] = -(omega**2), -2 * damping * omega
+    generator[1, 3] = 1.0
+    generator[2, 0] = 1.0
+    return frozen(expm(generator * time))
+
+
+def _crossing(time: FloatArray, x: FloatArray, level: float) -> float:
+    """Time at which a series first crosses a level from below, between its points."""
+    i = int(np.argmax(x >= level))
+    if i == 0:
+        return float(time[0])
+    return float(time[i - 1] + (level - x[i - 1]) / (x[i] - x[i - 1]) * (time[i] - time[i - 1]))
+
+
+def _last_outside(time: FloatArray, x: FloatArray, band: float) -> float:
+    """Time after which a series stays within a band around 1, between its points."""
+    outside = np.flatnonzero(np.abs(x - 1) > band)
+    if outside.size == 0 or outside[-1] == x.size - 1:
+        return float(time[0] if outside.size == 0 else np.inf)
+    i = int(outside[-1])
+    edge = 1 + band * np.sign(x[i] - 1)
+    return float(time[i] + (edge - x[i]) / (x[i + 1] - x[i]) * (time[i + 1] - time[i]))

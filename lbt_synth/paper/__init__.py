@@ -1,1 +1,0 @@
-"""The tables and figures of Agapito et al. 2008, computed anew beside the published ones."""

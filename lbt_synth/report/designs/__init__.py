@@ -1,0 +1,1 @@
+"""The report on designs side by side."""

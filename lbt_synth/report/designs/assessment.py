@@ -1,0 +1,249 @@
+"""One design in the loop of a configuration: all that is exact about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.design import Check, Design, EstimatorDesign
+from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.interop import FrameCost, frame_cost
+from lbt_synth.linear import Controller, largest_singular_values
+from lbt_synth.linear.norms import spectral_norms
+from lbt_synth.loop import (
+    ClosedLoop,
+    Imaging,
+    LoopMargins,
+    ResidualBudget,
+    close_loop,
+    loop_margins,
+    residual_budget,
+    stable_sensor_gains,
+    strehl,
+)
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, spectral_radii
+from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.studies import StrehlMap, strehl_map
+from lbt_synth.validation import ComplexArray, FloatArray, frozen
+
+_GAINS = np.geomspace(0.01, 100.0, 400)  # where stable intervals are looked for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopDesign(Design):
+    """A design in another loop than its own: that of a configuration."""
+
+    loop_hardware: LoopHardware  # The loop
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """The loop."""
+        return self.loop_hardware
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DesignAssessment:
+    """What is known exactly of one design in the loop of a configuration.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the report.
+    design : Design
+        The design.
+    notes : tuple of str
+        In what it was made for another loop.
+    stable : bool
+        Whether the loop is stable at the real sensor gain.
+    spectral_radius : float
+        Largest modulus of the closed loop's poles.
+    loop_poles, controller_poles : (n,) complex ndarray
+        Poles of the closed loop, and of the controller alone.
+    gamma, estimation_rms : float
+        Norm and standard deviation of the estimation error of its own model; nan for a design
+        that estimates nothing.
+    budget : ResidualBudget or None
+        Exact residual; None where the loop is unstable.
+    strehl : float
+        Strehl ratio in [0, 1]; nan where the loop is unstable.
+    margins : LoopMargins or None
+        Margins at the real sensor gain; None where the loop is unstable.
+    sensor_gains : tuple of (float, float)
+        Intervals of real sensor gains for which the loop is stable, relative to the sensor
+        matrix of the configuration; searched for between 0.01 and 100 times the assumed one.
+    checks : tuple of Check
+        The certificate, computed anew.
+    certificate_error : str
+        Why it could not be; empty if it could.
+    cost : FrameCost
+        Arithmetic of one frame, as exported to C.
+    error_norms : (f,) ndarray or None
+        Largest singular values of the estimation error at the frequencies of the report.
+    rejection, noise_transfer : (f,) ndarray or None
+        Those of the loop, from phase to residual and from noise to residual; None where the
+        loop is unstable.
+    curve : StrehlMap
+        Strehl ratio over the frequency error at the real sensor gain.
+    map : StrehlMap
+        The same over frequency error and real sensor gain.
+    """
+
+    name: str
+    design: Design
+    notes: tuple[str, ...]
+    stable: bool
+    spectral_radius: float
+    loop_poles: ComplexArray
+    controller_poles: ComplexArray
+    gamma: float
+    estimation_rms: float
+    budget: ResidualBudget | None
+    strehl: float
+    margins: LoopMargins | None
+    sensor_gains: tuple[tuple[float, float], ...]
+    checks: tuple[Check, ...]
+    certificate_error: str
+    cost: FrameCost
+    error_norms: FloatArray | None
+    rejection: FloatArray | None
+    noise_transfer: FloatArray | None
+    curve: StrehlMap
+    map: StrehlMap
+
+    @property
+    def certified(self) -> bool:
+        """Whether the certificate could be computed anew, and every check passed."""
+        return not self.certificate_error and all(check.passed for check in self.checks)
+
+    @property
+    def residual_nm(self) -> float:
+        """Exact residual [nm rms]; nan where the loop is unstable."""
+        return float("nan") if self.budget is None else self.budget.rms_nm
+
+
+def assessed(
+    name: str,
+    design: Design,
+    hardware: LoopHardware,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    frequency_hz: FloatArray,
+    errors_hz: Sequence[float] | FloatArray,
+    sensor_gains: Sequence[float] | FloatArray,
+    assumed_gain: float,
+) -> DesignAssessment:
+    """Assess a design. Shapes: frequency_hz (f,)."""
+    require_fitting(name, design, hardware)
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    budget = residual_budget(loop, truth) if loop.is_stable else None
+    margins = loop_margins(loop) if loop.is_stable else None
+    checks, complaint = _recertified(design)
+    own = design.hardware
+    carrier = LoopDesign(
+        method=design.method,
+        controller=design.controller,
+        certificate=design.certificate,
+        solver=design.solver,
+        loop_hardware=hardware,
+    )
+    curve, found = (
+        strehl_map(carrier, truth, imaging, errors_hz=errors_hz, sensor_gains=gains)
+        for gains in ([truth.sensor_gain], np.asarray(sensor_gains) / assumed_gain)
+    )
+    return DesignAssessment(
+        name=name,
+        design=design,
+        notes=() if own is None else tuple(loop_differences(own, hardware)),
+        stable=loop.is_stable,
+        spectral_radius=loop.spectral_radius,
+        loop_poles=loop.system.poles,
+        controller_poles=np.linalg.eigvals(design.controller.A).astype(np.complex128),
+        gamma=design.gamma if isinstance(design, EstimatorDesign) else float("nan"),
+        estimation_rms=design.rms if isinstance(design, EstimatorDesign) else float("nan"),
+        budget=budget,
+        strehl=float("nan") if budget is None else strehl(budget, imaging),
+        margins=margins,
+        sensor_gains=tuple(
+            (low * assumed_gain, high * assumed_gain)
+            for low, high in stable_intervals(hardware, design.controller, margins, loop)
+        ),
+        checks=checks,
+        certificate_error=complaint,
+        cost=frame_cost(design),
+        error_norms=largest_singular_values(design.error_system(), frequency_hz)
+        if isinstance(design, EstimatorDesign)
+        else None,
+        rejection=_norms(loop, frequency_hz, noise=False),
+        noise_transfer=_norms(loop, frequency_hz, noise=True),
+        curve=curve,
+        map=replace(found, sensor_gains=frozen(np.asarray(sensor_gains))),  # the real ones again
+    )
+
+
+def require_fitting(name: str, design: Design, hardware: LoopHardware) -> None:
+    """Refuse a design that cannot be run in a loop."""
+    own = design.hardware
+    if own is None:
+        raise ProblemError(
+            f"{name} is a filter of a bare estimation problem; a report needs designs for a loop. "
+            "Design it for the plant of a configuration."
+        )
+    for what, mine, theirs in (
+        ("axes", own.modes, hardware.modes),
+        ("measurements", own.n_measurements, hardware.n_measurements),
+        ("commands", own.n_commands, hardware.n_commands),
+    ):
+        if mine != theirs:
+            raise ProblemError(
+                f"{name} must be for the configuration's {theirs} {what}; got a design for {mine}. "
+                "Design it for this configuration."
+            )
+    if not np.isclose(own.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
+        raise ProblemError(
+            f"{name} must run at the configuration's {hardware.frame_rate_hz:g} Hz; got a design "
+            f"for {own.frame_rate_hz:g} Hz. Design it for this frame rate."
+        )
+
+
+def stable_intervals(
+    hardware: LoopHardware,
+    controller: Controller,
+    margins: LoopMargins | None,
+    loop: ClosedLoop,
+) -> list[tuple[float, float]]:
+    """Intervals of sensor gains for which a loop is stable, in increasing order.
+
+    The one around the loop's own gain is that of its margins; others are looked for at 400 gains
+    from 0.01 to 100.
+    """
+    found = []
+    if margins is not None:
+        found.append((margins.gain_low * loop.sensor_gain, margins.gain_high * loop.sensor_gain))
+    radii = spectral_radii(hardware, controller, _GAINS)
+    inside = np.nonzero(radii < 1 - STABILITY_MARGIN)[0]
+    for run in np.split(inside, np.nonzero(np.diff(inside) > 1)[0] + 1):
+        if not run.size:
+            continue
+        nominal = float(_GAINS[run[np.argmin(radii[run])]])
+        if not any(low < nominal < high for low, high in found):
+            found.append(stable_sensor_gains(hardware, controller, nominal=nominal))
+    return sorted(found)
+
+
+def _recertified(design: Design) -> tuple[tuple[Check, ...], str]:
+    """Return the checks of the certificate computed anew, or why that failed."""
+    try:
+        return design.recertified().checks, ""
+    except (LbtSynthError, ArithmeticError) as error:
+        return (), str(error)
+
+
+def _norms(loop: ClosedLoop, frequency_hz: FloatArray, *, noise: bool) -> FloatArray | None:
+    if not loop.is_stable:
+        return None
+    response = loop.noise_transfer(frequency_hz) if noise else loop.sensitivity(frequency_hz)
+    return frozen(spectral_norms(response))

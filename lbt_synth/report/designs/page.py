@@ -1,0 +1,208 @@
+"""A report of designs as a page, and the files that it becomes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.models import SinusoidalVibration
+from lbt_synth.models.truth import stationary_vibrations
+from lbt_synth.report.designs.charts import (
+    dynamics_charts,
+    robustness_charts,
+    simulation_charts,
+    transfer_charts,
+)
+from lbt_synth.report.designs.report import DesignReport
+from lbt_synth.report.designs.tables import (
+    certificate_table,
+    files_table,
+    summary_table,
+    versions_table,
+)
+from lbt_synth.report.designs.verdict import verdict
+from lbt_synth.report.number_text import listing_text, number_text
+from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.provenance import creator, require_letters, time_text
+
+
+def write_report(
+    report: DesignReport,
+    path: str | os.PathLike[str],
+    *,
+    pdf: str | os.PathLike[str] | None = None,
+    title: str | None = None,
+) -> tuple[Path, ...]:
+    """Write a report as one HTML file that opens offline, and as a PDF if that is wanted.
+
+    Parameters
+    ----------
+    report : DesignReport
+        Result of :func:`design_report`.
+    path : path-like
+        File to write, that ends in .html.
+    pdf : path-like, optional
+        File to write, that ends in .pdf.
+    title : str, optional
+        Heading of the page; by default it names the configuration.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The files; all of them are written, or none.
+
+    Raises
+    ------
+    OutputError
+        If a name ends in something else, or a file cannot be written.
+    ProblemError
+        If the title is empty, or cannot be shown.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> report = lbt.report.design_report(config, {"integrator": slow})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [file.name for file in lbt.report.write_report(report, pathlib.Path(folder) / "a.html")]
+    ['a.html']
+    """
+    require_page_names(path, pdf)
+    return write_page(design_page(report, title=title), path, pdf)
+
+
+def design_page(report: DesignReport, *, title: str | None = None) -> Page:
+    """Return the page of a report."""
+    source = report.config.source.name
+    heading = f"Controllers for {source}" if title is None else title.strip()
+    if not heading:
+        raise ProblemError("title must hold at least one letter; got an empty text.")
+    require_letters(heading, "title")
+    count = len(report.assessments)
+    names = listing_text([one.name for one in report.assessments])
+    sections = [
+        Section(key="summary", title="Summary", blocks=tuple(_summary(report))),
+        Section(
+            key="transfer",
+            title="Transfer functions",
+            blocks=tuple(_transfer(report)),
+        ),
+        Section(key="errors", title="Robustness", blocks=tuple(robustness_charts(report))),
+        Section(key="dynamics", title="Dynamics", blocks=tuple(dynamics_charts(report))),
+        Section(key="simulation", title="Simulation", blocks=tuple(_simulation(report))),
+        Section(key="certificates", title="Certificates", blocks=tuple(_certificates(report))),
+        Section(
+            key="sources",
+            title="Configuration and versions",
+            blocks=(
+                files_table(report),
+                versions_table(report),
+                Listing(caption=source, text=report.config_text),
+            ),
+        ),
+    ]
+    return Page(
+        title=heading,
+        subtitle=f"{count} design{'s' if count > 1 else ''}: {names}. Made "
+        f"{time_text(report.made)}.",
+        sections=tuple(sections),
+        creator=creator(),
+    )
+
+
+def _summary(report: DesignReport) -> list[Block]:
+    blocks: list[Block] = []
+    for one in report.assessments:
+        if not one.stable:
+            blocks.append(
+                Notice(
+                    text=f"{one.name} is UNSTABLE in the loop of this configuration: its largest "
+                    f"pole has a modulus of {number_text(one.spectral_radius, 6)} at a sensor gain "
+                    f"of {number_text(report.real_gain)}. It must not be used here.",
+                    tone="bad",
+                )
+            )
+        if not one.certified:
+            why = one.certificate_error or "; ".join(
+                f"{check.name} {number_text(check.value, 6)}, limit {number_text(check.limit, 6)}"
+                for check in one.checks
+                if not check.passed
+            )
+            blocks.append(Notice(text=f"The certificate of {one.name} fails: {why}", tone="bad"))
+    blocks.append(Paragraph(text=verdict(report)))
+    blocks.append(summary_table(report))
+    blocks.append(Paragraph(text=_situation(report)))
+    blocks += [
+        Notice(text=f"{one.name} was {note}") for one in report.assessments for note in one.notes
+    ]
+    return blocks
+
+
+def _situation(report: DesignReport) -> str:
+    """Return what the loop is and what it meets."""
+    hardware, truth = report.config.hardware, report.config.truth
+    lines = [
+        f"a {'sinusoid' if isinstance(line, SinusoidalVibration) else 'resonance'} of "
+        f"{number_text(line.rms_nm)} nm rms at {number_text(line.frequency_hz)} Hz"
+        for line in stationary_vibrations(truth.vibrations)
+    ]
+    noise = listing_text([number_text(float(v), 3) for v in _distinct(report)])
+    axes = "1 axis" if hardware.modes == 1 else f"{hardware.modes} axes"
+    turbulence = report.config.settings.true_turbulence.replace("_", " ")
+    return (
+        f"The loop: {axes} at {number_text(hardware.frame_rate_hz)} Hz, a delay of "
+        f"{number_text(hardware.delay_frames)} frames, a mirror "
+        f"{'that settles at once' if hardware.mirror is None else 'with dynamics'}. What it "
+        f"meets: turbulence ({turbulence}), {listing_text(lines) or 'no vibration'}, {noise} nm of "
+        f"noise a frame and measurement, a real sensor gain of {number_text(report.real_gain)}. "
+        "Residuals and Strehl ratios are exact, by Lyapunov equations and integrals over transfer "
+        "functions, unless they are called simulated."
+    )
+
+
+def _transfer(report: DesignReport) -> list[Block]:
+    """Return the transfer functions; those of a loop need a stable one."""
+    charts: list[Block] = [*transfer_charts(report)]
+    if report.stable:
+        return charts
+    return [
+        Paragraph(text="No loop is stable, so none has a rejection or a noise transfer."),
+        *charts,
+    ]
+
+
+def _distinct(report: DesignReport) -> list[float]:
+    noise = report.config.truth.noise_of(report.config.hardware.n_measurements)
+    return sorted({float(value) for value in noise})
+
+
+def _simulation(report: DesignReport) -> list[Block]:
+    settings = report.config.settings.simulation
+    charts = simulation_charts(report)
+    if not charts:
+        return [Paragraph(text="No loop is stable, so none was simulated.")]
+    frames = next(iter(report.simulations.values())).frames
+    runs = "1 run" if settings.cases == 1 else f"{settings.cases} runs"
+    text = f"{runs} of {frames} frames each, seed {settings.seed}."
+    return [Paragraph(text=text), *charts]
+
+
+def _certificates(report: DesignReport) -> list[Block]:
+    blocks: list[Block] = [
+        Paragraph(
+            text="Every check was computed anew from the matrices of the gain file, by other means "
+            "than the solver that made the design. They hold for the loop that the design was made "
+            "for, at the sensor gain that it assumes."
+        )
+    ]
+    for one in report.assessments:
+        if one.certificate_error:
+            blocks.append(
+                Notice(text=f"{one.name}: not computed: {one.certificate_error}", tone="bad")
+            )
+        else:
+            blocks.append(certificate_table(one))
+    return blocks

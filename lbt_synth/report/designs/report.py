@@ -1,0 +1,223 @@
+"""Designs side by side in the loop of a configuration: all numbers of a report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from lbt_synth.config import Config
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.models.truth import stationary_vibrations
+from lbt_synth.report.designs.assessment import DesignAssessment, assessed, require_fitting
+from lbt_synth.report.designs.simulation import DesignSimulation, common_settling, simulated
+from lbt_synth.report.figures.figures import frequency_grid
+from lbt_synth.report.provenance import (
+    SourceFile,
+    read_source,
+    require_letters,
+    time_of_making,
+    versions,
+)
+from lbt_synth.studies import LimitRow, LimitStudy, limit_study
+from lbt_synth.validation import FloatArray, frozen, instance
+
+_SOLVED = ("sdp", "lmi")  # routes of designs that a convex solver made
+_MOST_FRAMES = 8192  # of a simulated run
+_MOST_DESIGNS = 36  # that lines can be told apart of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DesignReport:
+    """Designs in the loop of a configuration: what is known of each, beside the limits.
+
+    Attributes
+    ----------
+    config : Config
+        The configuration.
+    config_text : str
+        Its file as it was read.
+    assessments : tuple of DesignAssessment
+        One a design, exact.
+    simulations : mapping of str to DesignSimulation
+        Of the designs whose loop is stable.
+    limits : LimitStudy
+        Residuals over the frequency error, and what no linear controller goes below.
+    frequency_hz : (f,) ndarray
+        Frequencies of the transfer functions [Hz].
+    errors_hz : (e,) ndarray
+        Frequency errors, design less truth [Hz]; only 0 where the truth has no vibration.
+    files : tuple of SourceFile
+        Digests of the files that were read.
+    versions : tuple of (str, str)
+        Programs and libraries.
+    made : datetime
+        When.
+    """
+
+    config: Config
+    config_text: str
+    assessments: tuple[DesignAssessment, ...]
+    simulations: Mapping[str, DesignSimulation]
+    limits: LimitStudy
+    frequency_hz: FloatArray
+    errors_hz: FloatArray
+    files: tuple[SourceFile, ...]
+    versions: tuple[tuple[str, str], ...]
+    made: datetime
+
+    @property
+    def rows(self) -> tuple[tuple[DesignAssessment, LimitRow], ...]:
+        """Each design with its distance to the limits."""
+        return tuple(zip(self.assessments, self.limits.rows, strict=True))
+
+    @property
+    def stable(self) -> tuple[DesignAssessment, ...]:
+        """The designs whose loop is stable."""
+        return tuple(one for one in self.assessments if one.stable)
+
+    @property
+    def real_gain(self) -> float:
+        """Real sensor gain, relative to the sensor matrix of the configuration."""
+        return self.config.sensor_gain * self.config.truth.sensor_gain
+
+
+def design_report(
+    config: Config,
+    designs: Mapping[str, Design],
+    *,
+    gain_files: Mapping[str, str | os.PathLike[str]] | None = None,
+    advance: Callable[[int], object] | None = None,
+) -> DesignReport:
+    """Examine designs in the loop of a configuration.
+
+    Each controller is closed with the configuration's loop as it is, whatever it was designed
+    for. Certificates are computed anew.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+    designs : mapping of str to Design
+        Designs by name.
+    gain_files : mapping of str to path-like, optional
+        Files that designs came from, whose digests the report gives.
+    advance : callable, optional
+        Called with a number of steps whenever they are done; there are :func:`steps_of` of them.
+
+    Returns
+    -------
+    DesignReport
+        The numbers; :func:`write_report` makes pages of them.
+
+    Raises
+    ------
+    ProblemError
+        If there is no design, one does not fit the loop, a name cannot be shown, or a true
+        vibration drifts.
+    FileError
+        If the configuration or a gain file cannot be read.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> report = lbt.report.design_report(config, {"integrator": slow})
+    >>> one = report.assessments[0]
+    >>> one.certified, f"{one.residual_nm:.0f} nm, Strehl {one.strehl:.2f}"
+    (True, '152 nm, Strehl 0.70')
+    """
+    instance(config, Config)
+    if not 1 <= len(designs) <= _MOST_DESIGNS:
+        raise ProblemError(f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}.")
+    for name, design in designs.items():
+        instance(design, Design)
+        require_letters(name, "name of a design")
+        require_fitting(name, design, config.hardware)
+    made = time_of_making()
+    source, content = read_source(config.source, "configuration")
+    files = [source]
+    for name, path in (gain_files or {}).items():
+        files.append(read_source(Path(path), f"gain file of {name}")[0])
+    count = advance or (lambda _: None)
+    truth, hardware = config.truth, config.hardware
+    errors = possible_errors(config)
+    lines_hz = sorted({line.frequency_hz for line in stationary_vibrations(truth.vibrations)})
+    grid = frozen(frequency_grid(hardware.frame_rate_hz, lines_hz))
+    settings = config.settings
+    assessments = []
+    for name, design in designs.items():
+        assessments.append(
+            assessed(
+                name,
+                design,
+                hardware,
+                truth,
+                config.imaging,
+                frequency_hz=grid,
+                errors_hz=errors,
+                sensor_gains=np.unique(settings.robustness.sensor_gains),
+                assumed_gain=config.sensor_gain,
+            )
+        )
+        count(1)
+    limits = limit_study(designs, hardware, truth, config.imaging, errors_hz=list(errors))
+    count(1)
+    stable = [one for one in assessments if one.stable]
+    settle = common_settling(
+        [one.design for one in stable], hardware, truth, settings.simulation.settle_frames
+    )
+    simulations = {}
+    for one in stable:
+        simulations[one.name] = simulated(
+            one.design,
+            hardware,
+            truth,
+            config.imaging,
+            frames=min(settings.simulation.frames, _MOST_FRAMES),
+            cases=settings.simulation.cases,
+            seed=settings.simulation.seed,
+            settle_frames=settle,
+        )
+        count(1)
+    solved = any(design.solver.route in _SOLVED for design in designs.values())
+    return DesignReport(
+        config=config,
+        config_text=content.decode("utf-8", errors="replace"),
+        assessments=tuple(assessments),
+        simulations=simulations,
+        limits=limits,
+        frequency_hz=grid,
+        errors_hz=errors,
+        files=tuple(files),
+        versions=versions(("cvxpy", "clarabel") if solved else ()),
+        made=made,
+    )
+
+
+def steps_of(designs: int) -> int:
+    """Return how many steps a report of so many designs counts, at most."""
+    return 2 * designs + 1
+
+
+def possible_errors(config: Config) -> FloatArray:
+    """Frequency errors of the configuration, with three more between any two, and with 0.
+
+    Those are left out that would move a true vibration to 0 or to the Nyquist frequency. Without
+    vibrations there is only 0.
+    """
+    lines = [line.frequency_hz for line in stationary_vibrations(config.truth.vibrations)]
+    if not lines:
+        return frozen([0.0])
+    known = np.unique([*config.settings.robustness.errors_hz, 0.0])
+    places = np.arange(4 * known.size - 3) / 4
+    fine = np.interp(places, np.arange(known.size), known)
+    nyquist = config.hardware.frame_rate_hz / 2
+    kept = (min(lines) - fine > 0) & (max(lines) - fine < nyquist)
+    return frozen(fine[kept])

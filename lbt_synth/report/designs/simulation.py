@@ -1,0 +1,147 @@
+"""Designs in the time domain: the same weather for all, and spectra beside the exact ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.design import Design
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, filter_series, simulate
+from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.models import LoopHardware, Truth, Vibration
+from lbt_synth.models.truth import fitted_direction, stationary_vibrations
+from lbt_synth.validation import FloatArray, frozen
+
+STEP_NM = 100.0
+_SEGMENT = 2048  # frames of a segment of the spectra, at most
+_EXCERPT = 400  # frames that are drawn
+_STEP_FRAMES = 120
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DesignSimulation:
+    """One design in a simulated loop."""
+
+    # strehl, residual_nm: Mean Strehl ratio of the runs, and residual over all of them [nm rms]
+    strehl: float
+    residual_nm: float
+    scatter: float  # Standard deviation of the Strehl ratio between runs; nan for a single one
+    frames: int  # Frames of a run
+    time_s: FloatArray  # (t,): times of the excerpt, from its first frame [s]
+    series_nm: FloatArray  # (t, n): residual of the first run
+    frequency_hz: FloatArray  # (f,): frequencies of the spectra
+    # open_nm2_hz, residual_nm2_hz (f,): spectra by Welch's method, sums over the axes, before and
+    # after the correction
+    open_nm2_hz: FloatArray
+    residual_nm2_hz: FloatArray
+    # (f,): residual's spectrum by the transfer functions, with the window's image of each sinusoid
+    exact_nm2_hz: FloatArray
+    step_time_s: FloatArray  # (s,): times after a step of the disturbance [s]
+    # step_residual_nm, step_command_nm (s,): answer of the first axis to a step of ``STEP_NM``,
+    # without other disturbances
+    step_residual_nm: FloatArray
+    step_command_nm: FloatArray
+
+
+def simulated(
+    design: Design,
+    hardware: LoopHardware,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    frames: int,
+    cases: int,
+    seed: int,
+    settle_frames: int,
+) -> DesignSimulation:
+    """Run a design in a loop."""
+    from scipy.signal import welch  # slow to import
+
+    run = simulate(
+        design.controller,
+        truth,
+        hardware=hardware,
+        frames=frames,
+        cases=cases,
+        seed=seed,
+        settle_frames=settle_frames,
+    )
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    rate, length = hardware.frame_rate_hz, min(frames, _SEGMENT)
+    spectra = []
+    for series in (run.total_nm, run.residual_nm):
+        frequency, density = welch(series, fs=rate, nperseg=length, axis=1, detrend=False)
+        spectra.append(density.mean(axis=0).sum(axis=1))
+    strehls = run.strehl(imaging)
+    shown = min(frames, _EXCERPT)
+    step_time_s, step_residual, step_command = step_response(loop)
+    return DesignSimulation(
+        strehl=float(np.mean(strehls)),
+        residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
+        scatter=float(np.std(strehls, ddof=1)) if cases > 1 else float("nan"),
+        frames=frames,
+        time_s=frozen(np.arange(shown) / rate),
+        series_nm=frozen(run.residual_nm[0, :shown]),
+        frequency_hz=frozen(frequency[1:]),
+        open_nm2_hz=frozen(spectra[0][1:]),
+        residual_nm2_hz=frozen(spectra[1][1:]),
+        exact_nm2_hz=frozen(exact_spectrum(loop, truth, frequency, length)[1:]),
+        step_time_s=step_time_s,
+        step_residual_nm=step_residual,
+        step_command_nm=step_command,
+    )
+
+
+def common_settling(designs: list[Design], hardware: LoopHardware, truth: Truth, least: int) -> int:
+    """Frames that all loops need to settle, so that one seed is one weather for all."""
+    radii = [
+        close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain).spectral_radius
+        for design in designs
+    ]
+    return max([least, *map(settling_frames, radii)])
+
+
+def step_response(loop: ClosedLoop) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return times [s], residual and first command after a step on the first axis [nm]."""
+    n = loop.hardware.modes
+    inputs = np.zeros((_STEP_FRAMES, n + loop.hardware.n_measurements))
+    inputs[:, 0] = STEP_NM
+    outputs = filter_series(loop.system, inputs)
+    time_s = np.arange(_STEP_FRAMES) / loop.hardware.frame_rate_hz
+    return frozen(time_s), frozen(outputs[:, 0]), frozen(outputs[:, n])
+
+
+def exact_spectrum(
+    loop: ClosedLoop, truth: Truth, frequency_hz: FloatArray, length: int
+) -> FloatArray:
+    """One-sided spectrum of the residual, summed over the axes [nm^2/Hz], (f,).
+
+    What is random is the sum of ``|transfer|^2 spectrum``. A sinusoid of amplitude a at f0 is what
+    Welch's method makes of it with a Hann window w of that length:
+    ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the window's Fourier transform.
+    """
+    from scipy.signal import get_window  # slow to import
+
+    n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
+    inside = np.clip(frequency_hz, frequency_hz[1] / 2, None)  # spectra may be infinite at 0
+    rejection = loop.sensitivity(inside)
+    total = np.zeros(frequency_hz.size)
+    for spectrum, modes in truth.turbulence_groups(n):
+        gain = np.sum(np.abs(rejection[:, :, list(modes)]) ** 2, axis=(1, 2))
+        total += gain * spectrum.psd(inside)
+    noise = loop.noise_transfer(inside) * truth.noise_of(loop.hardware.n_measurements)
+    total += np.sum(np.abs(noise) ** 2, axis=(1, 2)) * 2 / rate
+    window = get_window("hann", length)
+    for line in stationary_vibrations(truth.vibrations):
+        direction = fitted_direction(line, loop.hardware)
+        if isinstance(line, Vibration):
+            gain = np.sum(np.abs(rejection @ direction) ** 2, axis=1)
+            total += gain * line.ar_model(rate).psd(inside)
+            continue
+        left = line.amplitude_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
+        power = float(np.sum(np.abs(left) ** 2)) / 2
+        offset = 2j * np.pi * (frequency_hz - line.frequency_hz) / rate
+        image = np.exp(-np.outer(offset, np.arange(length))) @ window
+        total += power * np.abs(image) ** 2 / (rate * np.sum(window**2))
+    return total

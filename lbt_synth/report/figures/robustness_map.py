@@ -1,0 +1,129 @@
+"""Figure of Strehl ratios over frequency error and sensor gain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.report.figures.map_cells import bands, cell_edges
+from lbt_synth.report.figures.style import house_style, new_figure
+from lbt_synth.studies import StrehlMap
+
+_LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
+
+
+def map_figure(maps: Mapping[str, StrehlMap]) -> Any:
+    """Draw the Strehl ratio of designs over frequency error and sensor gain.
+
+    Parameters
+    ----------
+    maps : mapping of str to StrehlMap
+        Maps of :func:`strehl_map` by the names of their designs.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One column of panels a design, one row a delay error, one colour bar for all. Sensor
+        gains at which the loop is unstable are hatched.
+
+    Raises
+    ------
+    ProblemError
+        If there is no map, or the maps have different delay errors.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> found = lbt.studies.strehl_map(
+    ...     lbt.integrator(path, gain=0.5),
+    ...     lbt.Truth(turbulence=None),
+    ...     lbt.Imaging(diameter_m=8.22),
+    ...     errors_hz=[0],
+    ...     sensor_gains=[1, 3],
+    ... )
+    >>> len(
+    ...     lbt.report.figures.map_figure({"integrator": found}).axes
+    ... )  # one panel and the colour bar
+    2
+    """
+    if not maps:
+        raise ProblemError("a map figure needs at least one map; got none.")
+    delays = next(iter(maps.values())).delay_errors_frames
+    for name, found in maps.items():
+        if not np.array_equal(found.delay_errors_frames, delays):
+            raise ProblemError(
+                f"the maps must have the same delay errors {delays.tolist()}; got "
+                f"{found.delay_errors_frames.tolist()} for {name}."
+            )
+    low, high = _limits(maps)
+    with house_style():
+        columns, rows = len(maps), len(delays)
+        figure = new_figure(max(4.4, 1.3 + 2.6 * columns), 0.7 + 2.5 * rows)
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for column, (name, found) in enumerate(maps.items()):
+            for row, panel in enumerate(panels[:, column]):
+                mesh = _panel(panel, found, row, low, high)
+                panel.label_outer()
+            panels[0, column].set_title(name)
+        for row, delay in enumerate(delays):
+            late = f"delay error {delay:+g} frames\n" if rows > 1 or delay != 0 else ""
+            panels[row, 0].set_ylabel(f"{late}sensor gain [-]")
+        figure.supxlabel("frequency in the design less the true one [Hz]", fontsize=9)
+        bar = figure.colorbar(mesh, ax=panels, pad=0.02, fraction=0.06, aspect=22 * rows)
+        bar.set_label("Strehl ratio [%]")
+        bar.outline.set_visible(False)
+    return figure
+
+
+def _limits(maps: Mapping[str, StrehlMap]) -> tuple[float, float]:
+    """Return the ends of the colour scale [%], the same for all panels."""
+    values = 100 * np.concatenate([found.strehl.ravel() for found in maps.values()])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return 0.0, 100.0
+    low, high = float(values.min()), float(values.max())
+    return (low, high) if high - low > 1 else (low - 0.5, high + 0.5)
+
+
+def _panel(panel: Any, found: StrehlMap, row: int, low: float, high: float) -> Any:
+    across, up = np.argsort(found.errors_hz), np.argsort(found.sensor_gains)
+    errors, gains = found.errors_hz[across], found.sensor_gains[up]
+    percent = 100 * found.strehl[row][np.ix_(up, across)]
+    panel.grid(False)
+    x, y = cell_edges(errors), cell_edges(gains)
+    mesh = panel.pcolormesh(
+        x, y, np.ma.masked_invalid(percent), cmap="viridis", vmin=low, vmax=high, rasterized=True
+    )
+    inside = percent[np.isfinite(percent)]
+    levels = [level for level in _LEVELS if inside.size and inside.min() < level < inside.max()]
+    if min(percent.shape) > 1 and levels:
+        lines = panel.contour(
+            errors,
+            gains,
+            np.ma.masked_invalid(percent),
+            levels=levels,
+            linewidths=0.8,
+            colors=["white" if level < (low + high) / 2 else "black" for level in levels],
+        )
+        panel.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+    height = y[-1] - y[0]
+    for bottom, top in bands(~found.stable[row][up], y):
+        panel.axhspan(bottom, top, facecolor="0.85", edgecolor="0.55", hatch="////", linewidth=0)
+        if top - bottom < 0.08 * height:  # no room for a word
+            continue
+        panel.text(
+            (x[0] + x[-1]) / 2,
+            np.clip((bottom + top) / 2, y[0] + 0.05 * height, y[-1] - 0.05 * height),
+            "unstable",
+            ha="center",
+            va="center",
+            fontsize=8,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
+        )
+    panel.set_xlim(x[0], x[-1])
+    panel.set_ylim(y[0], y[-1])
+    return mesh

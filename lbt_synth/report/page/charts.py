@@ -1,0 +1,252 @@
+"""What a chart shows, whoever draws it: axes with units, curves, areas, bars and maps.
+
+A description knows no drawing library. ``matplotlib_charts`` draws it for paper and
+``bokeh_charts`` for the screen, both from the same numbers and limits.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.report.page.line_styles import MARKER_NAMES
+from lbt_synth.validation import FloatArray, choice, float_array, frozen
+
+_KEY = re.compile(r"[a-z][a-z0-9-]*")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Axis:
+    """An axis of a panel."""
+
+    label: str  # What is on it
+    unit: str = ""  # Its unit; empty for a name without one, "-" for a pure number
+    log: bool = False  # Whether its scale is logarithmic; what is not positive is then not drawn
+    # low, high: Ends of the scale; by default those of what is drawn
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def text(self) -> str:
+        """Label and unit."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Curve:
+    """Points, joined by a line or not."""
+
+    # What the legend calls it; an empty name is not in the legend. The same name in several panels
+    # of a chart is one entry.
+    name: str
+    # x, y (n,): the points; nan breaks the line. Empty for a name that is in the legend only.
+    x: FloatArray
+    y: FloatArray
+    look: int | None = 0  # Number of its colour, dashes and marker; None is dark grey
+    line: bool = True  # Whether the points are joined
+    step: bool = False  # Whether each value holds until the next point
+    # "own" for that of the look, or one of circle, square, triangle, diamond, cross, plus
+    marker: str | None = None
+    filled: bool = True  # Whether markers are filled
+    size: float = 5.0  # Size of a marker [points]
+    width: float = 1.6  # Width of the line [points]
+    dashed: bool = True  # Whether the line has the dashes of its look; False draws it solid
+    hover: bool = True  # Whether its values are shown under the pointer
+
+    def __post_init__(self) -> None:
+        _take_columns(self, "x", "y")
+        if self.marker is not None:
+            choice(self.marker, "marker", ("own", *MARKER_NAMES))
+        if not self.line and self.marker is None:
+            raise ProblemError("a curve must have a line or a marker; got neither.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Area:
+    """The area between two curves: an interval of confidence, a spread of quantiles."""
+
+    name: str  # What the legend calls it
+    # x, low, high (n,): where, and between what
+    x: FloatArray
+    low: FloatArray
+    high: FloatArray
+    look: int | None = 0  # Number of its colour; None is grey
+
+    def __post_init__(self) -> None:
+        _take_columns(self, "x", "low", "high")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rule:
+    """A straight line across a panel."""
+
+    name: str  # What the legend calls it
+    at: float  # Where it is
+    axis: str = "x"  # "x" or "y": the axis that ``at`` is a value of
+    dash: int = 0  # Number of its dashes; it is always grey
+
+    def __post_init__(self) -> None:
+        choice(self.axis, "axis", ("x", "y"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Span:
+    """A shaded range of an axis, from end to end of the other."""
+
+    name: str  # What the legend calls it
+    # low, high: The range
+    low: float
+    high: float
+    axis: str = "x"  # "x" or "y": the axis that these are values of
+    look: int | None = None  # Number of its colour; None is grey
+
+    def __post_init__(self) -> None:
+        choice(self.axis, "axis", ("x", "y"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bars:
+    """Bars along x, one a category of the panel, from the top; several series stand in groups."""
+
+    name: str  # What the legend calls the series
+    values: FloatArray  # (c,): lengths; nan draws none
+    # low, high (c,): ends of an interval around each value
+    low: FloatArray | None = None
+    high: FloatArray | None = None
+    look: int | None = 0  # Number of its colour
+
+    def __post_init__(self) -> None:
+        given = ("low", "high") if self.low is not None and self.high is not None else ()
+        _take_columns(self, "values", *given)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Map:
+    """Values over a grid, as colours."""
+
+    # x, y (nx,): increasing centres of the cells
+    x: FloatArray
+    y: FloatArray
+    values: FloatArray  # (ny, nx): what is shown; nan is hatched
+    # label, unit: Of the values
+    label: str
+    unit: str = ""
+    # low, high: Ends of the colour scale
+    low: float = 0.0
+    high: float = 1.0
+    levels: tuple[float, ...] = ()  # Where lines of equal value are drawn
+    blank: str = "no value"  # What a hatched cell means
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "values"):
+            object.__setattr__(self, name, frozen(float_array(getattr(self, name), name)))
+        if self.values.shape != (self.y.size, self.x.size) or not self.values.size:
+            raise DimensionError(
+                f"values must have a row for each of {self.y.size} y and a column for each of "
+                f"{self.x.size} x; got {self.values.shape}."
+            )
+        for name in ("x", "y"):
+            if np.any(np.diff(getattr(self, name)) <= 0):
+                raise ProblemError(f"{name} of a map must increase; it does not.")
+        if not self.low < self.high:
+            raise ProblemError(f"low must be below high; got {self.low:g} and {self.high:g}.")
+
+    @property
+    def text(self) -> str:
+        """Label and unit of the values."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+
+Mark: TypeAlias = Curve | Area | Rule | Span | Bars | Map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Panel:
+    """One pair of axes and what is drawn in them, the first things at the bottom."""
+
+    # x, y: The axes
+    x: Axis
+    y: Axis
+    marks: tuple[Mark, ...]  # What is drawn
+    title: str = ""  # What tells this panel from the others of its chart
+    categories: tuple[str, ...] = ()  # Names along y, from the top, for bars
+    equal: bool = False  # Whether both axes have the same scale
+    height_in: float | None = None  # Height of the axes on paper [inch]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "marks", tuple(self.marks))
+        object.__setattr__(self, "categories", tuple(self.categories))
+        for bars in self.of(Bars):
+            if bars.values.size != len(self.categories):
+                raise DimensionError(
+                    f"bars must have a value for each of {len(self.categories)} categories; got "
+                    f"{bars.values.size}."
+                )
+
+    def of(self, kind: Any) -> list[Any]:
+        """Return what is drawn of one kind."""
+        return [mark for mark in self.marks if isinstance(mark, kind)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Chart:
+    """A figure of one or several panels, with its words."""
+
+    key: str  # Its anchor in the page: small letters, digits and hyphens; unique in the page
+    title: str  # A short heading
+    caption: str  # What is seen and how to read it
+    alt: str  # The same for those who do not see it: what is drawn, and what it shows
+    panels: tuple[Panel, ...]  # The panels, row by row
+    columns: int = 1  # Panels side by side, where there is room
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "panels", tuple(self.panels))
+        require_key(self.key)
+        for name in ("title", "caption", "alt"):
+            if not getattr(self, name).strip():
+                raise ProblemError(f"a chart must have words for its {name}; got none.")
+        if not self.panels or self.columns < 1:
+            raise ProblemError("a chart must have at least one panel and one column.")
+
+    @property
+    def maps(self) -> list[Map]:
+        """All maps of the chart."""
+        return [found for panel in self.panels for found in panel.of(Map)]
+
+
+def require_key(key: str) -> str:
+    """Refuse what cannot be an anchor."""
+    if not _KEY.fullmatch(key):
+        raise ProblemError(
+            f"a key must be of small letters, digits and hyphens, and start with a letter; "
+            f"got {key!r}."
+        )
+    return key
+
+
+def legend_of(panels: Sequence[Panel]) -> dict[str, Mark]:
+    """Return what a legend has to name, each by the first mark of that name."""
+    found: dict[str, Mark] = {}
+    for panel in panels:
+        for mark in panel.marks:
+            if isinstance(mark, Map):
+                if np.any(np.isnan(mark.values)):
+                    found.setdefault(mark.blank, mark)
+            elif mark.name:
+                found.setdefault(mark.name, mark)
+    return found
+
+
+def _take_columns(mark: Any, *names: str) -> None:
+    """Make columns of a mark read-only arrays of the same length."""
+    for name in names:
+        object.__setattr__(mark, name, frozen(float_array(getattr(mark, name), name)))
+    shapes = {getattr(mark, name).shape for name in names}
+    if len(shapes) != 1 or len(shapes.pop()) != 1:
+        listing = ", ".join(f"{name} {getattr(mark, name).shape}" for name in names)
+        raise DimensionError(f"columns of a mark must be lists of the same length; got {listing}.")

@@ -1,0 +1,330 @@
+"""A page on sheets of A4, drawn by matplotlib."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.page.charts import Chart, Panel
+from lbt_synth.report.page.matplotlib_charts import draw_chart, drawing, height_of
+from lbt_synth.report.page.typeset import (
+    BODY,
+    BOLD,
+    LINE,
+    MONO,
+    Style,
+    mono_lines,
+    width_of,
+    wrapped,
+)
+from lbt_synth.storage.tables import Cell, Table
+
+WIDTH, HEIGHT = 8.27, 11.69  # A4 [inch]
+_SIDE, _TOP, _BOTTOM = 0.635, 0.6, 0.65
+INSIDE = WIDTH - 2 * _SIDE
+_COLUMNS = 6  # of a table, after the first one
+_ROOM = HEIGHT - _TOP - _BOTTOM - 0.5  # of a sheet below the heading of a section [inch]
+_TOGETHER = 12  # lines of a paragraph or rows of a table that are not torn apart
+_PAD = 0.05  # around the text of a cell
+_INKS = {"bad": "#a40e26", "good": "#116329", "note": "#6a4b00", "plain": "#1b1f24"}
+_TINTS = {"bad": "#fdecee", "good": "#e9f5ec", "note": "#fff6dc"}
+Draw = Callable[[Any], None]
+
+
+def page_pdf(page: Page) -> bytes:
+    """Return a page as a PDF of A4 sheets.
+
+    The first section stands on the title page. Without a date, the same page is the same file.
+    """
+    from matplotlib.backends.backend_pdf import PdfPages
+    from matplotlib.figure import Figure
+
+    with drawing():
+        sheets = _Sheets()
+        sheets.words(page.title, Style(size=19, weight="bold"), after=0.08)
+        sheets.words(page.subtitle, Style(size=9, ink="#4a5560"), after=0.25)
+        for number, section in enumerate(page.sections):
+            sheets.section(section, first=number == 0)
+        buffer = io.BytesIO()
+        facts = {
+            "Title": page.title,
+            "Author": page.creator,
+            "Creator": page.creator,
+            "CreationDate": None,
+        }
+        with PdfPages(buffer, metadata=facts) as pdf:
+            for number, draws in enumerate(sheets.pages):
+                figure = Figure(figsize=(WIDTH, HEIGHT))
+                for draw in draws:
+                    draw(figure)
+                foot = f"page {number + 1} of {len(sheets.pages)}"
+                _text(figure, WIDTH - _SIDE - width_of(foot, LINE), 0.35, foot, LINE)
+                room = INSIDE - width_of(foot, LINE) - 0.3
+                _text(figure, _SIDE, 0.35, wrapped(page.title, LINE, room)[0], LINE)
+                pdf.savefig(figure)
+    return buffer.getvalue()
+
+
+class _Sheets:
+    """Sheets that are filled from the top; what is drawn on each is remembered."""
+
+    def __init__(self) -> None:
+        self.pages: list[list[Draw]] = [[]]
+        self.y = HEIGHT - _TOP
+
+    def take(self, height: float) -> float:
+        """Return the top of a place of that height, on a new sheet if there is no room."""
+        if self.y - height < _BOTTOM and self.pages[-1]:
+            self.pages.append([])
+            self.y = HEIGHT - _TOP
+        top = self.y
+        self.y -= height
+        return top
+
+    def draw(self, what: Draw) -> None:
+        self.pages[-1].append(what)
+
+    def section(self, section: Section, *, first: bool) -> None:
+        """Set a section; its heading is not left alone at the foot of a sheet."""
+        head = Style(size=14, weight="bold")
+        opening = 0.0
+        for block in section.blocks:  # up to the first thing that is no text
+            first_part = next(by_sheets(block)) if isinstance(block, Chart) else block
+            opening += height_of_block(first_part)
+            if not isinstance(block, Paragraph | Notice):
+                break
+        room = 0.45 + min(opening, _ROOM)
+        if not first and self.y - room < _BOTTOM:
+            self.y = 0.0
+        self.words(section.title, head, after=0.1)
+        for block in section.blocks:
+            self.block(block)
+        self.y -= 0.15
+
+    def block(self, block: Block) -> None:
+        if isinstance(block, Paragraph):
+            self.words(block.text, BODY, after=0.1)
+        elif isinstance(block, Notice):
+            self.notice(block)
+        elif isinstance(block, Listing):
+            self.listing(block)
+        elif isinstance(block, Table):
+            for part in block.by_columns(_COLUMNS):
+                self.table(part)
+        else:
+            for chart in by_sheets(block):
+                self.chart(chart)
+
+    def words(self, text: str, style: Style, *, after: float) -> None:
+        """Lines of a text; a short one is kept together."""
+        lines = wrapped(text, style, INSIDE)
+        if len(lines) <= _TOGETHER and self.y - len(lines) * style.leading < _BOTTOM:
+            self.y = 0.0
+        for line in lines:
+            top = self.take(style.leading)
+            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=style))
+        self.y -= after
+
+    def notice(self, notice: Notice) -> None:
+        style = Style(
+            size=9, weight="bold" if notice.tone == "bad" else "normal", ink=_INKS[notice.tone]
+        )
+        lines = wrapped(notice.text, style, INSIDE - 0.3)
+        height = len(lines) * style.leading + 0.16
+        top = self.take(height + 0.1)
+        tint = _TINTS.get(notice.tone, "#f4f6f8")
+        self.draw(partial(_box, left=_SIDE, top=top, width=INSIDE, height=height, shade=tint))
+        self.draw(
+            partial(_box, left=_SIDE, top=top, width=0.05, height=height, shade=_INKS[notice.tone])
+        )
+        for i, line in enumerate(lines):
+            at = top - 0.08 - i * style.leading
+            self.draw(partial(_line, top=at, left=_SIDE + 0.18, text=line, style=style))
+
+    def listing(self, listing: Listing) -> None:
+        lines = mono_lines(listing.text, INSIDE)
+        self.take(BOLD.leading + 4 * MONO.leading)  # not the heading alone
+        self.y += BOLD.leading + 4 * MONO.leading
+        self.words(listing.caption, BOLD, after=0.05)
+        for line in lines:
+            top = self.take(MONO.leading)
+            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=MONO))
+        self.y -= 0.1
+
+    def chart(self, chart: Chart) -> None:
+        caption = wrapped(chart.caption, LINE, INSIDE)
+        title = wrapped(chart.title, BOLD, INSIDE)
+        top = self.take(height_of_block(chart))
+        for line in title:
+            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=BOLD))
+            top -= BOLD.leading
+        top -= 0.05
+        self.draw(partial(draw_chart, chart=chart, left=_SIDE, top=top, width=INSIDE))
+        top -= height_of(chart, INSIDE) + 0.05
+        for line in caption:
+            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=LINE))
+            top -= LINE.leading
+
+    def table(self, table: Table) -> None:
+        """Set a table, its headings repeated on each sheet."""
+        rows = list(table.cells())
+        head = tuple(Cell(text=text) for text in table.headings)
+        widths = column_widths([head, *rows])
+        top_row = _Row(head, widths, table.words, heading=True)
+        body = [_Row(cells, widths, table.words) for cells in rows]
+        kept = body if len(body) <= _TOGETHER else body[:1]
+        start = top_row.height + sum(row.height for row in kept)
+        if self.y - start - BOLD.leading - 0.1 < _BOTTOM:
+            self.y = 0.0
+        self.words(table.caption, BOLD, after=0.03)
+        self.row(top_row)
+        for row in body:
+            if self.y - row.height < _BOTTOM:
+                self.y = 0.0
+                self.row(top_row)
+            self.row(row)
+        self.y -= 0.2
+
+    def row(self, row: _Row) -> None:
+        self.draw(partial(row.draw, top=self.take(row.height)))
+
+
+class _Row:
+    """A row of a table with its cells wrapped."""
+
+    def __init__(
+        self,
+        cells: tuple[Cell, ...],
+        widths: list[float],
+        words: tuple[int, ...],
+        *,
+        heading: bool = False,
+    ) -> None:
+        self.cells, self.words, self.heading = cells, words, heading
+        self.group = len(cells) == 1 and len(widths) > 1
+        self.widths = [sum(widths)] if self.group else widths
+        self.lines = [
+            wrapped(cell.text, self._style(cell), width - 2 * _PAD)
+            for cell, width in zip(cells, self.widths, strict=True)
+        ]
+        self.height = max(len(lines) for lines in self.lines) * LINE.leading + 0.07
+
+    def _style(self, cell: Cell) -> Style:
+        bold = self.heading or self.group or cell.tone == "bad"
+        return Style(size=LINE.size, weight="bold" if bold else "normal", ink=_INKS[cell.tone])
+
+    def draw(self, figure: Any, *, top: float) -> None:
+        """Draw the row on a sheet."""
+        left = _SIDE
+        bottom = top - self.height
+        if self.group:
+            _box(
+                figure,
+                left=left,
+                top=top,
+                width=sum(self.widths),
+                height=self.height,
+                shade="#f4f6f8",
+            )
+        for i, (cell, lines, width) in enumerate(
+            zip(self.cells, self.lines, self.widths, strict=True)
+        ):
+            style = self._style(cell)
+            if cell.tone == "bad":
+                _box(
+                    figure, left=left, top=top, width=width, height=self.height, shade=_TINTS["bad"]
+                )
+            for j, line in enumerate(lines):
+                at = left + _PAD
+                if i > 0 and i not in self.words:
+                    at = left + width - _PAD - width_of(line, style)
+                _line(figure, top=top - 0.035 - j * style.leading, left=at, text=line, style=style)
+            left += width
+        thickness = 0.012 if self.heading else 0.005
+        _box(
+            figure,
+            left=_SIDE,
+            top=bottom + thickness,
+            width=left - _SIDE,
+            height=thickness,
+            shade="#1b1f24" if self.heading else "#c9d1d9",
+        )
+
+
+def by_sheets(chart: Chart) -> Iterator[Chart]:
+    """Yield charts that each fit a sheet below the heading of a section, in whole rows."""
+    panels = chart.panels
+    parts: list[tuple[Panel, ...]] = [()]
+    for start in range(0, len(panels), chart.columns):
+        row = panels[start : start + chart.columns]
+        longer = replace(chart, panels=parts[-1] + row)
+        if parts[-1] and height_of_block(longer) > _ROOM:
+            parts.append(row)
+        else:
+            parts[-1] += row
+    for number, part in enumerate(parts):
+        more = f"{chart.title} (continued)" if number else chart.title
+        yield replace(chart, title=more, panels=part)
+
+
+def height_of_block(block: Block) -> float:
+    """Height that a block needs on one sheet [inch]; of a table or listing, that of its start."""
+    if isinstance(block, Chart):
+        caption, title = wrapped(block.caption, LINE, INSIDE), wrapped(block.title, BOLD, INSIDE)
+        words = len(caption) * LINE.leading + len(title) * BOLD.leading
+        return height_of(block, INSIDE) + words + 0.35
+    if isinstance(block, Table | Listing):
+        return 1.0
+    return len(wrapped(block.text, BODY, INSIDE)) * BODY.leading + 0.2
+
+
+def column_widths(rows: list[tuple[Cell, ...]]) -> list[float]:
+    """Widths of columns [inch] that fit the sheet: the widest are narrowed, and wrap."""
+    bold = Style(size=LINE.size, weight="bold")
+    count = max(len(row) for row in rows)
+    natural = [
+        max(width_of(row[i].text, bold) for row in rows if len(row) == count) + 2 * _PAD + 0.02
+        for i in range(count)
+    ]
+    cap = INSIDE
+    while sum(min(width, cap) for width in natural) > INSIDE:
+        cap *= 0.98
+    return [min(width, cap) for width in natural]
+
+
+def _text(figure: Any, x: float, y: float, text: str, style: Style) -> None:
+    figure.text(
+        x,
+        y,
+        text,
+        transform=figure.dpi_scale_trans,
+        fontsize=style.size,
+        color=style.ink,
+        fontweight=style.weight,
+        family=style.family,
+        va="baseline",
+    )
+
+
+def _line(figure: Any, *, top: float, left: float, text: str, style: Style) -> None:
+    _text(figure, left, top - 0.8 * style.leading, text, style)
+
+
+def _box(figure: Any, *, left: float, top: float, width: float, height: float, shade: str) -> None:
+    from matplotlib.patches import Rectangle
+
+    figure.add_artist(
+        Rectangle(
+            (left, top - height),
+            width,
+            height,
+            transform=figure.dpi_scale_trans,
+            facecolor=shade,
+            edgecolor="none",
+            zorder=0,
+        )
+    )

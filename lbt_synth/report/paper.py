@@ -1,0 +1,74 @@
+"""Write the tables and figures of the paper into a directory."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from lbt_synth.design import FilterDesign
+from lbt_synth.files import save_gain
+from lbt_synth.report.figures.figures import robustness_figure, sigma_figure
+from lbt_synth.report.figures.style import save_figure
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.tables import csv_bytes
+from lbt_synth.studies import RobustnessRow
+from lbt_synth.studies.paper.parameters import PARAMETERS, VIBRATION_HZ
+from lbt_synth.studies.paper.published import TABLE_III
+from lbt_synth.studies.paper.tables import Comparison, compared, paper_filters, table_ii
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PaperResult:
+    """What :func:`write_paper` computed and wrote."""
+
+    # table_ii, table_iii: Entries, ours beside the paper's
+    table_ii: list[Comparison]
+    table_iii: list[Comparison]
+    # kalman, hinf: The two filters at the true frequency
+    kalman: FilterDesign
+    hinf: FilterDesign
+    files: list[Path]  # Files written
+
+
+def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) -> PaperResult:
+    """Write tables, figures and gain files of the comparison."""
+    folder = Path(directory)
+    second, third = table_ii(), compared(rows)
+    kalman_design, hinf_design = paper_filters()
+    headings = ("row", "method", "strehl_percent", "paper_strehl_percent", "difference_points")
+    files = [
+        write_atomically(
+            folder / name,
+            csv_bytes(
+                headings,
+                [
+                    (e.label, e.method, f"{e.ours:.2f}", e.paper, f"{e.difference:.2f}")
+                    for e in entries
+                ],
+            ),
+        )
+        for name, entries in (("table_ii.csv", second), ("table_iii.csv", third))
+    ]
+    files.append(
+        write_atomically(
+            folder / "parameters.csv", csv_bytes(("parameter", "value", "origin"), PARAMETERS)
+        )
+    )
+    published = {
+        method: [(row.model_hz - VIBRATION_HZ, getattr(row, method)) for row in TABLE_III]
+        for method in ("kalman", "hinf")
+    }
+    filters = {"Kalman": kalman_design, r"H$_\infty$": hinf_design}
+    for name, figure in (
+        ("robustness", robustness_figure(rows, published)),
+        ("sigma", sigma_figure(filters, unit_weights=True)),
+    ):
+        files += [save_figure(figure, folder / f"{name}{ending}") for ending in (".png", ".pdf")]
+    files += [
+        save_gain(folder / "paper_kalman.fits", kalman_design),
+        save_gain(folder / "paper_hinf.fits", hinf_design),
+    ]
+    return PaperResult(
+        table_ii=second, table_iii=third, kalman=kalman_design, hinf=hinf_design, files=files
+    )

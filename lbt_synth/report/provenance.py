@@ -1,0 +1,88 @@
+"""When, by what and from which files a page was made."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import lbt_synth
+from lbt_synth.errors import FileError, ProblemError
+
+_DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
+_TURNING = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # directions of writing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceFile:
+    """A file that a page was made from."""
+
+    name: str  # Its name, without directories
+    role: str  # What it is
+    sha256: str  # SHA-256 of its bytes, 64 hexadecimal digits
+
+
+def read_source(path: str | os.PathLike[str], role: str) -> tuple[SourceFile, bytes]:
+    """Read a file and return what names it, and its bytes."""
+    source = Path(path)
+    require_letters(source.name, f"name of the {role}")
+    try:
+        content = source.read_bytes()
+    except OSError as error:
+        raise FileError(f"cannot read {source}: {error.strerror}.", path=source) from error
+    digest = hashlib.sha256(content).hexdigest()
+    return SourceFile(name=source.name, role=role, sha256=digest), content
+
+
+def require_letters(text: str, what: str) -> str:
+    """Refuse a text that no page can show as it is."""
+    for letter in text:
+        if (
+            unicodedata.category(letter) in ("Cc", "Cs")
+            or unicodedata.bidirectional(letter) in _TURNING
+            or letter in "\ufffe\uffff"
+        ):
+            raise ProblemError(
+                f"{what} must be of letters that a page can show; got {text!a}. Choose another."
+            )
+    return text
+
+
+def time_of_making() -> datetime:
+    """Return the time, in UTC: that of SOURCE_DATE_EPOCH if it is set, else now."""
+    given = os.environ.get("SOURCE_DATE_EPOCH")
+    if given is None:
+        return datetime.now(UTC).replace(microsecond=0)
+    try:
+        return datetime.fromtimestamp(int(given), UTC)
+    except (ValueError, OverflowError, OSError) as error:
+        raise ProblemError(
+            f"SOURCE_DATE_EPOCH must be a number of seconds since 1970; got {given!r}."
+        ) from error
+
+
+def time_text(moment: datetime) -> str:
+    """Return a time as a text: 2026-11-21 17:05:09 UTC."""
+    return moment.strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def creator() -> str:
+    """Program and version."""
+    return f"lbt_synth {lbt_synth.__version__}"
+
+
+def versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
+    """Return name and version of what makes a page; of ``extra`` distributions, too."""
+    found = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
+    for name in (*_DISTRIBUTIONS, *extra):
+        try:
+            found.append((name, version(name)))
+        except PackageNotFoundError:
+            found.append((name, "not installed"))
+    return tuple(found)

@@ -1,0 +1,78 @@
+"""The page of a study as files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.study.info import study_info
+from lbt_synth.report.study.page import study_page
+from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
+
+
+def write_study_page(
+    study: Study,
+    columns: Mapping[str, Any],
+    path: str | os.PathLike[str],
+    *,
+    statistics: StudyStatistics | None = None,
+    failures: Sequence[Failure] = (),
+    computing_s: float | None = None,
+    pdf: str | os.PathLike[str] | None = None,
+) -> tuple[Path, ...]:
+    """Write the page of a study as one HTML file that opens offline, and as a PDF if wanted.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    columns : mapping of str to (n,) array_like
+        Its results, all or those that there are so far.
+    path : path-like
+        File to write, that ends in .html, in the directory of the results.
+    statistics : StudyStatistics, optional
+        Those of the columns, if they are known already.
+    failures : sequence of Failure, optional
+        What failed.
+    computing_s : float, optional
+        Time of all its batches, of all processes together [s].
+    pdf : path-like, optional
+        File to write, that ends in .pdf.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The files; all of them are written, or none.
+
+    Raises
+    ------
+    ProblemError
+        If the columns are not those of the study.
+    OutputError
+        If a name ends in something else, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> values = study.values(0, 2)
+    >>> columns = dict(zip(study.parameter_names, values.T))
+    >>> columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = lbt.report.write_study_page(
+    ...         study, columns, pathlib.Path(folder) / "summary.html"
+    ...     )
+    >>> files[0].name
+    'summary.html'
+    """
+    require_page_names(path, pdf, inputs=study.inputs)
+    if statistics is None:
+        names = [each.name for each in study.controllers]
+        statistics = study_statistics(columns, study.parameter_names, names)
+    info = study_info(
+        study, directory=Path(path).parent, failures=failures, computing_s=computing_s
+    )
+    return write_page(study_page(info, statistics, columns), path, pdf)

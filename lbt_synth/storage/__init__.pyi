@@ -1,0 +1,1 @@
+from .resumable_runs import run_cases as run_cases

@@ -1,0 +1,92 @@
+"""Arrays and one text of metadata in one file, FITS or NPZ, with a digest of both.
+
+Each ``read_*`` raises ``ValueError``, ``KeyError`` or ``OSError`` on bytes that
+are not its format; the caller turns that into an error of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lbt_synth.storage import fits as fitsfile
+from lbt_synth.validation import FloatArray
+
+Cards = Mapping[str, tuple[Any, str]]
+TEXT = "META"
+
+
+def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
+    """SHA-256 over all arrays and all metadata but the digest itself."""
+    plain = {key: value for key, value in meta.items() if key != "digest"}
+    total = hashlib.sha256(json.dumps(plain, sort_keys=True, allow_nan=False).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name], dtype="<f8")
+        total.update(f"|{name}|{array.shape}|".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+def fits_bytes(
+    arrays: Mapping[str, npt.NDArray[Any]],
+    text: str,
+    primary: Cards,
+    cards: Mapping[str, Cards] | None = None,
+) -> bytes:
+    """Write a primary HDU without data, one image HDU an array in their order, then the text."""
+    everything: dict[str, Any] = {**arrays, TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
+    return fitsfile.fits_bytes(primary, everything, headers=cards)
+
+
+def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
+    """Read the arrays and the text of :func:`fits_bytes`."""
+    from astropy.io import fits
+    from astropy.utils.exceptions import AstropyWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AstropyWarning)
+        try:
+            with fits.open(
+                io.BytesIO(content), memmap=False, lazy_load_hdus=False, checksum=True
+            ) as units:
+                data = {unit.name: np.array(unit.data) for unit in units[1:]}
+        except Exception as error:  # astropy has no common class for what damage makes it raise
+            raise ValueError("its FITS structure or a checksum is broken") from error
+    return _parted(data)
+
+
+def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> bytes:
+    """Write a NumPy archive; the text is an array of bytes, so nothing is pickled."""
+    buffer = io.BytesIO()
+    everything: dict[str, Any] = {**arrays, TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
+    np.savez(buffer, **everything)
+    return buffer.getvalue()
+
+
+def read_npz(content: bytes) -> tuple[dict[str, FloatArray], str]:
+    """Read the arrays and the text of :func:`npz_bytes`."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            data = {name: np.array(archive[name]) for name in archive.files}
+    except Exception as error:  # zip, zlib and NumPy each raise their own
+        raise ValueError("it is not a NumPy archive") from error
+    return _parted(data)
+
+
+def _parted(data: dict[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], str]:
+    text = data.pop(TEXT).astype(np.uint8).tobytes().decode()
+    return {name: array.astype(np.float64) for name, array in data.items()}, text
+
+
+def reason(error: Exception) -> str:
+    """Return what an error says, in one line without its full stop."""
+    if isinstance(error, KeyError):
+        return f"{error.args[0]} is missing".rstrip(".")
+    return str(error).split("\n")[0].rstrip(".") or type(error).__name__

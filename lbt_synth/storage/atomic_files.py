@@ -1,0 +1,190 @@
+"""Files: read as a whole, written as a whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from lbt_synth.errors import OutputError
+
+
+def require_writable(
+    *paths: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
+) -> None:
+    """Refuse outputs that cannot be written or would replace an input, before any work is done.
+
+    Examples
+    --------
+    >>> from lbt_synth.storage.atomic_files import require_writable
+    >>> require_writable("nowhere/at/all.png")
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.OutputError: cannot write nowhere/at/all.png: no directory nowhere/at.
+    """
+    refuse_replacing(paths, inputs)
+    for path in paths:
+        target = Path(path)
+        if not target.parent.is_dir():
+            raise OutputError(f"cannot write {target}: no directory {target.parent}.", path=target)
+        if target.is_dir():
+            raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+        try:
+            with tempfile.TemporaryFile(dir=target.parent):
+                pass
+        except (OSError, ValueError) as error:
+            raise OutputError(
+                f"cannot write {target}: the directory {target.parent} takes no new files "
+                f"({getattr(error, 'strerror', None) or error}).",
+                path=target,
+            ) from error
+
+
+def refuse_replacing(
+    outputs: Iterable[str | os.PathLike[str]], inputs: Iterable[str | os.PathLike[str]]
+) -> None:
+    """Refuse to write what is read: the same file by whatever name, symbolic or hard link.
+
+    Examples
+    --------
+    >>> from lbt_synth.storage.atomic_files import refuse_replacing
+    >>> refuse_replacing(["a/../k.fits"], ["k.fits"])
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.OutputError: a/../k.fits must not replace the input k.fits; give another name.
+    """
+    read = list(inputs)
+    for path in outputs:
+        for source in read:
+            if _is_same(Path(path), Path(source)):
+                raise OutputError(
+                    f"{path} must not replace the input {source}; give another name.",
+                    path=Path(path),
+                )
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    try:
+        if one.resolve() == other.resolve():
+            return True
+        return one.samefile(other)
+    except (OSError, ValueError, RuntimeError):  # one is not there, no name, or a ring of links
+        return False
+
+
+def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
+    """Write a file through a temporary one in the same directory.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> from lbt_synth.storage.atomic_files import write_atomically
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_atomically(pathlib.Path(folder) / "a.txt", b"whole").read_bytes()
+    b'whole'
+    """
+    return write_together({path: content})[0]
+
+
+def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Path, ...]:
+    """Write files that belong together: all of them, or none.
+
+    Every file is written in full under a temporary name before the first is renamed.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> from lbt_synth.storage.atomic_files import write_together
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     at = pathlib.Path(folder)
+    ...     [p.name for p in write_together({at / "a.c": b"code", at / "a.h": b"names"})]
+    ['a.c', 'a.h']
+    """
+    targets = {Path(path): content for path, content in contents.items()}
+    for target in targets:
+        if target.is_dir():
+            raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+    staged: dict[Path, Path] = {}
+    older: dict[Path, bytes | None] = {}
+    target = next(iter(targets))
+    try:
+        for target, content in targets.items():
+            staged[target] = _stage(target, content)
+        for target, temporary in staged.items():
+            # what a later failure has to put back; a single file is replaced in one step
+            older[target] = target.read_bytes() if len(targets) > 1 and target.exists() else None
+            temporary.replace(target)
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        for temporary in staged.values():
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+        older.pop(target, None)  # this one was not replaced
+        for done, content_before in older.items():
+            with contextlib.suppress(OSError):
+                if content_before is None:
+                    done.unlink()
+                else:
+                    _stage(done, content_before).replace(done)
+        raise _unwritten(target, error) from error
+    return tuple(targets)
+
+
+def _stage(target: Path, content: bytes) -> Path:
+    """Write a whole file under a temporary name beside its target; none is left if that fails."""
+    with _staged(target) as (stream, temporary):
+        stream.write(content)
+    return temporary
+
+
+@contextlib.contextmanager
+def _staged(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
+    """Give a stream to a temporary file beside a target, and its name; gone if the block fails."""
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            yield stream, temporary
+            stream.flush()
+            os.fsync(stream.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+@contextlib.contextmanager
+def writing_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Give a stream whose content becomes a file when the block ends well, and not before.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> from lbt_synth.storage.atomic_files import writing_atomically
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with writing_atomically(pathlib.Path(folder) / "a.txt") as stream:
+    ...         _ = stream.write(b"part by part")
+    ...     (pathlib.Path(folder) / "a.txt").read_bytes()
+    b'part by part'
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+    try:
+        with _staged(target) as (stream, temporary):
+            yield stream
+        temporary.replace(target)
+    except OSError as error:
+        raise _unwritten(target, error) from error
+
+
+def _unwritten(target: Path, error: Exception) -> OutputError:
+    reason = getattr(error, "strerror", None) or error
+    return OutputError(
+        f"cannot write {target}: {reason}. Check the directory and its free space.", path=target
+    )

@@ -1,0 +1,60 @@
+"""Arrays as FITS bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+_CARD, _HEADER = 80, 2880 * 36
+
+
+def has_card(content: bytes, keyword: str) -> bool:
+    """Whether the first header of a FITS file has a card of that keyword."""
+    mark = keyword.ljust(8).encode() + b"="
+    for start in range(0, min(len(content), _HEADER), _CARD):
+        card = content[start : start + _CARD]
+        if card.startswith(mark):
+            return True
+        if card.startswith(b"END "):
+            return False
+    return False
+
+
+def fits_bytes(
+    cards: Mapping[str, Any],
+    arrays: Mapping[str, Any],
+    *,
+    headers: Mapping[str, Mapping[str, Any]] | None = None,
+    comments: Sequence[str] = (),
+) -> bytes:
+    """Return a primary HDU of cards and one image HDU an array, each with its checksums.
+
+    The same content gives the same bytes: no date is written.
+
+    Examples
+    --------
+    >>> import io
+    >>> from astropy.io import fits
+    >>> from lbt_synth.storage.fits import fits_bytes
+    >>> with fits.open(io.BytesIO(fits_bytes({"VERSION": 1}, {"A": [[1.0, 2.0]]}))) as units:
+    ...     units["A"].data.tolist()
+    [[1.0, 2.0]]
+    """
+    from astropy.io import fits
+
+    primary = fits.PrimaryHDU()
+    units = [primary]
+    units += [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
+    for unit in units:
+        own = cards if unit is primary else (headers or {}).get(unit.name, {})
+        for key, value in own.items():
+            unit.header[key] = value
+        for line in comments if unit is primary else ():
+            unit.header.add_comment(line)
+        unit.add_checksum(when="of this unit")  # not the time: the same content is the same file
+    buffer = io.BytesIO()
+    fits.HDUList(units).writeto(buffer)
+    return buffer.getvalue()

@@ -1,0 +1,219 @@
+"""Many independent cases, one file each: killed at any moment, a campaign goes on where it was.
+
+A case is a name and arguments that JSON can hold. Its result is written, whole or
+not at all, as soon as it is there, with a digest of what was asked; the process that
+started the campaign is the only one that writes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    wait,
+)
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.errors import NumericalError, OutputError, ProblemError
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.worker_processes import WorkerPool, alone_in, one_thread_each
+from lbt_synth.validation import integer
+
+Case = Mapping[str, Any]
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*\Z")
+
+
+def run_cases(
+    function: Callable[[Case], Mapping[str, Any]],
+    cases: Mapping[str, Case],
+    directory: str | os.PathLike[str],
+    *,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Run what is missing of some cases, and return the results of all.
+
+    Parameters
+    ----------
+    function : callable
+        Maps a case to its result, a mapping that JSON can hold; importable by name where
+        other processes run it. What it returns must depend on the case only.
+    cases : mapping of str to mapping
+        Arguments of each case by its name, which is that of its file.
+    directory : path-like
+        An existing directory; results go into ``NAME.json``.
+    jobs : int, optional
+        Processes; 1 runs in this one.
+    executor : concurrent.futures.Executor, optional
+        Runs the cases instead of ``jobs`` processes, and is left open.
+    progress : callable, optional
+        Called with the number of cases that were found or finished since its last call.
+
+    Returns
+    -------
+    dict of str to dict
+        Results in the order of the cases.
+
+    Raises
+    ------
+    OutputError
+        If the directory holds results of other arguments under these names, is in use by
+        another campaign, or cannot be written.
+    ProblemError
+        If a name is no file name, or a case or a result does not fit into JSON.
+    NumericalError
+        If a process ended without a result.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import lbt_synth as lbt
+    >>> def double(case):
+    ...     return {"twice": 2 * case["x"]}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     first = lbt.storage.run_cases(double, {"a": {"x": 1}}, folder)
+    ...     both = lbt.storage.run_cases(
+    ...         double, {"a": {"x": 1}, "b": {"x": 2}}, folder
+    ...     )  # only b is run
+    >>> both
+    {'a': {'twice': 2}, 'b': {'twice': 4}}
+    """
+    folder = Path(directory)
+    jobs = integer(jobs, "jobs", at_least=1)
+    digests = {name: _digest(name, case) for name, case in cases.items()}
+    with alone_in(folder, "campaign"):
+        results = {}
+        for name, expected in digests.items():
+            found = _read(folder / f"{name}.json", expected)
+            if found is not None:
+                results[name] = found
+        if progress is not None and results:
+            progress(len(results))
+        missing = {name: case for name, case in cases.items() if name not in results}
+        with contextlib.closing(_results(function, missing, jobs, executor)) as coming:
+            for name, result in coming:
+                results[name] = _write(folder, name, digests[name], cases[name], result)
+                if progress is not None:
+                    progress(1)
+    return {name: results[name] for name in cases}
+
+
+def _results(
+    function: Callable[[Case], Mapping[str, Any]],
+    cases: Mapping[str, Case],
+    jobs: int,
+    executor: Executor | None,
+) -> Generator[tuple[str, Mapping[str, Any]], None, None]:
+    """Yield results as they come; if a case fails, those that run are still waited for."""
+    if not cases:
+        return
+    if executor is None and (jobs == 1 or len(cases) == 1):
+        for name, case in cases.items():
+            yield name, function(case)
+        return
+    with contextlib.ExitStack() as stack:
+        if executor is None:
+            executor = stack.enter_context(_pool(min(jobs, len(cases))))
+        futures = {executor.submit(function, dict(case)): name for name, case in cases.items()}
+        failure: BaseException | None = None
+        try:
+            pending: set[Future[Mapping[str, Any]]] = set(futures)
+            while pending:
+                done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                for future in done:
+                    if future.cancelled():
+                        continue
+                    error = future.exception()
+                    if error is None:
+                        yield futures[future], future.result()
+                    elif failure is None:
+                        failure = error
+                        for other in pending:
+                            other.cancel()
+        finally:
+            for future in futures:
+                future.cancel()
+        if failure is not None:
+            raise failure
+
+
+@contextlib.contextmanager
+def _pool(workers: int) -> Iterator[Executor]:
+    """Give processes that are waited for, unless this one is interrupted."""
+    with one_thread_each():
+        pool = WorkerPool(workers)
+        try:
+            yield pool.executor
+        except BrokenExecutor as error:
+            pool.close()
+            raise NumericalError(
+                "a process of the campaign ended without a word, for want of memory perhaps. "
+                "What is finished is kept: start again, with fewer jobs."
+            ) from error
+        except (KeyboardInterrupt, SystemExit, GeneratorExit):
+            pool.kill()
+            raise
+        except BaseException:
+            pool.close()
+            raise
+        pool.close()
+
+
+def _digest(name: str, case: Case) -> str:
+    if not isinstance(name, str) or not _NAME.match(name):
+        raise ProblemError(f"the name of a case must be letters, digits and . _ + -; got {name!r}.")
+    try:
+        return _hash(case)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"the case {name} must fit into JSON: {error}.") from error
+
+
+def _hash(content: Mapping[str, Any]) -> str:
+    text = json.dumps(dict(content), sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _read(path: Path, expected: str) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        asked, digest, result = content["asked"], content["digest"], dict(content["result"])
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise OutputError(
+            f"{path} is no result of a campaign: {error}. Delete it, or name another directory.",
+            path=path,
+        ) from error
+    if asked != expected:
+        raise OutputError(
+            f"{path} is of other settings than those asked for. Name another directory, or delete "
+            "the results of the old settings.",
+            path=path,
+        )
+    if digest != _hash(result):
+        raise OutputError(
+            f"{path} was changed after it was written. Delete it, and it is run again.", path=path
+        )
+    return result
+
+
+def _write(
+    folder: Path, name: str, asked: str, case: Case, result: Mapping[str, Any]
+) -> dict[str, Any]:
+    try:
+        written = {"asked": asked, "digest": _hash(result), "case": case, "result": dict(result)}
+        text = json.dumps(written, indent=1, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"the result of {name} must fit into JSON: {error}.") from error
+    write_atomically(folder / f"{name}.json", text.encode())
+    return dict(json.loads(text)["result"])

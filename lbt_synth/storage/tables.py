@@ -1,0 +1,82 @@
+"""Tables of text, and tables as CSV files."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lbt_synth.errors import DimensionError
+from lbt_synth.validation import choice
+
+TONES = ("plain", "good", "bad", "note")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """A cell of a table that is not only a text."""
+
+    text: str  # The text
+    tone: str = "plain"  # "plain", "good", "bad" or "note"; the text has to say it, too
+
+    def __post_init__(self) -> None:
+        choice(self.tone, "tone", TONES)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table; the first cell of each row is its heading."""
+
+    caption: str  # What it holds
+    headings: tuple[str, ...]  # One a column, the first over the headings of the rows
+    # One a row; a row of a single cell is a heading of the rows below
+    rows: tuple[tuple[str | Cell, ...], ...]
+    # Columns of words, which are set flush left; the first one always is
+    words: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "headings", tuple(self.headings))
+        object.__setattr__(self, "rows", tuple(tuple(row) for row in self.rows))
+        for row in self.rows:
+            if len(row) not in (1, len(self.headings)):
+                raise DimensionError(
+                    f"a row of {self.caption!r} must have 1 or {len(self.headings)} cells; got "
+                    f"{len(row)}."
+                )
+
+    def cells(self) -> Iterator[tuple[Cell, ...]]:
+        """Rows with every text as a cell."""
+        for row in self.rows:
+            yield tuple(Cell(text=c) if isinstance(c, str) else c for c in row)
+
+    def by_columns(self, most: int) -> Iterator[Table]:
+        """Tables of so many columns at most after the first, which all of them repeat."""
+        columns = range(1, len(self.headings))
+        for start in range(1, max(len(self.headings), 2), most):
+            kept = [c for c in columns if start <= c < start + most]
+            yield Table(
+                caption=self.caption if start == 1 else f"{self.caption} (continued)",
+                headings=(self.headings[0], *(self.headings[c] for c in kept)),
+                rows=tuple(
+                    row if len(row) == 1 else (row[0], *(row[c] for c in kept)) for row in self.rows
+                ),
+                words=tuple(i + 1 for i, c in enumerate(kept) if c in self.words),
+            )
+
+
+def csv_bytes(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
+    r"""Return a CSV table as UTF-8, floats with all their digits.
+
+    Examples
+    --------
+    >>> from lbt_synth.storage.tables import csv_bytes
+    >>> csv_bytes(["f_hz", "strehl"], [[20.0, 0.8]])
+    b'f_hz,strehl\n20.0,0.8\n'
+    """
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(headings)
+    writer.writerows(rows)
+    return buffer.getvalue().encode()

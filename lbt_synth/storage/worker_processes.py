@@ -1,0 +1,98 @@
+"""Processes that compute, with one thread of linear algebra each, and who may write where."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from lbt_synth.errors import OutputError
+
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_ORPHAN_SECONDS = 1.0
+
+
+class WorkerPool:
+    """Fresh processes that are gone when their parent is, however it ends.
+
+    Start it within :func:`one_thread_each`, which the processes inherit.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self._others: set[BaseProcess] = set(multiprocessing.active_children())
+        self._pool = ProcessPoolExecutor(
+            workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_watch_parent,
+            initargs=(os.getpid(),),
+        )
+
+    @property
+    def executor(self) -> Executor:
+        """The executor."""
+        return self._pool
+
+    def close(self) -> None:
+        """Wait for what is running, and end."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def kill(self) -> None:
+        """End at once: what is running is not waited for."""
+        for worker in set(multiprocessing.active_children()) - self._others:
+            worker.terminate()
+        self.close()
+
+
+@contextlib.contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Let processes that are started in the block have one thread of linear algebra."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+
+
+def _watch_parent(parent: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and ends them
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_ORPHAN_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path, what: str) -> Iterator[None]:
+    """Hold a lock that the system lets go of when this process ends, however it ends."""
+    try:
+        import fcntl
+    except ImportError:  # Windows: two of them in one directory are not noticed
+        yield
+        return
+    try:
+        stream = (folder / ".lock").open("w")
+    except OSError as error:
+        raise OutputError(f"cannot write into {folder}: {error.strerror}.", path=folder) from error
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise OutputError(
+                f"another {what} is running in {folder}. Wait for it, or name another directory.",
+                path=folder,
+            ) from error
+        yield

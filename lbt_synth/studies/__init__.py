@@ -1,0 +1,13 @@
+"""Studies: what a design is worth when the world is not its model.
+
+Each study answers one question over many loops: frequency errors, sensor gains, limits, trade-offs.
+A Monte Carlo study draws its samples from a configuration and resumes after an interrupt.
+The tables of Agapito et al. (2008) are computed beside the published ones.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# A function that shares its module's name hides the module, whichever is imported first.
+from lbt_synth.studies.tradeoff import tradeoff as tradeoff  # noqa: E402

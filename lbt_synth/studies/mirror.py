@@ -1,0 +1,124 @@
+"""Designs that ignore the mirror's dynamics, know them, or command for them, on one mirror."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from lbt_synth.design import Design, kalman, lqg, optimal_integrator
+from lbt_synth.errors import ProblemError
+from lbt_synth.loop import Imaging, close_loop, residual_budget, settling_error, strehl
+from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+from lbt_synth.validation import instance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MirrorRow:
+    """One design on the real mirror.
+
+    Attributes
+    ----------
+    design : str
+        What it believes of the mirror.
+    stable : bool
+        Whether its loop is stable; the figures are nan where it is not.
+    residual_nm : float
+        Residual under the truth [nm rms].
+    strehl : float
+        Strehl ratio in [0, 1].
+    unsettled_nm : float
+        What is left of the assumption that the mirror has settled, for the commands of this
+        design: settled less real position [nm rms].
+    """
+
+    design: str
+    stable: bool
+    residual_nm: float
+    strehl: float
+    unsettled_nm: float
+
+
+def mirror_study(
+    plant: TipTiltPlant,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    command_weight: float = 0.0,
+    more: Mapping[str, Design] | None = None,
+) -> tuple[MirrorRow, ...]:
+    """Compare designs for a mirror that moves: what ignoring its dynamics costs.
+
+    The integrator with the best gain on this mirror; the Kalman filter of a mirror that
+    settles at once; the same that takes the real positions out of its measurements; the LQG,
+    which also commands for the dynamics. Each runs on the plant's own mirror.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant, with the real mirror in its hardware.
+    truth : Truth
+        What the loop meets.
+    imaging : Imaging
+        The camera.
+    command_weight : float, optional
+        As for :func:`lqg`.
+    more : mapping of str to Design, optional
+        Other designs, by name.
+
+    Returns
+    -------
+    tuple of MirrorRow
+        One a design.
+
+    Raises
+    ------
+    ProblemError
+        If the plant is none of :func:`tip_tilt_plant`.
+    SynthesisError
+        If a design fails.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=60
+    ... )
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5, mirror=shell)
+    >>> rows = lbt.studies.mirror_study(
+    ...     plant, lbt.Truth(turbulence=slow, noise_nm=15.5), lbt.Imaging(diameter_m=8.22)
+    ... )
+    >>> [(row.design, row.stable) for row in rows][1::2]
+    [('kalman, settled mirror', False), ('lqg', True)]
+    """
+    if not isinstance(plant, TipTiltPlant):
+        raise ProblemError(f"a mirror study needs a TipTiltPlant; got {type(plant).__name__}.")
+    instance(truth, Truth)
+    instance(imaging, Imaging)
+    hardware = plant.hardware
+    believed = replace(plant, hardware=replace(hardware, mirror=None))
+    designs: dict[str, Design] = {
+        "integrator, best gain": optimal_integrator(hardware, truth),
+        "kalman, settled mirror": kalman(believed),
+        "kalman, real positions": kalman(plant),
+        "lqg": lqg(plant, command_weight=command_weight),
+    }
+    designs |= dict(more or {})
+    return tuple(_row(name, made, hardware, truth, imaging) for name, made in designs.items())
+
+
+def _row(
+    name: str, made: Design, hardware: LoopHardware, truth: Truth, imaging: Imaging
+) -> MirrorRow:
+    loop = close_loop(hardware, made.controller, sensor_gain=truth.sensor_gain)
+    if not loop.is_stable:
+        nan = float("nan")
+        return MirrorRow(design=name, stable=False, residual_nm=nan, strehl=nan, unsettled_nm=nan)
+    budget = residual_budget(loop, truth)
+    return MirrorRow(
+        design=name,
+        stable=True,
+        residual_nm=budget.rms_nm,
+        strehl=strehl(budget, imaging),
+        unsettled_nm=settling_error(loop, truth).rms_nm,
+    )

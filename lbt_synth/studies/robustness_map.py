@@ -1,0 +1,214 @@
+"""Strehl ratio of one design over frequency error, sensor gain and delay error, exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.design import Design
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.loop import EnsembleVibration, Imaging, LoopEnsemble, ensemble_residuals
+from lbt_synth.models import LoopHardware, Truth, Vibration
+from lbt_synth.models.truth import fitted_direction, stationary_vibrations
+from lbt_synth.validation import BoolArray, FloatArray, frozen, instance, number, real_array
+
+_GAINS_AT_ONCE = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StrehlMap:
+    """Strehl ratio of a fixed design over what it may have been told wrongly.
+
+    Attributes
+    ----------
+    errors_hz : (e,) ndarray
+        Frequency that the design believes less the true one [Hz].
+    sensor_gains : (g,) ndarray
+        Real sensor gain relative to the design's sensor matrix.
+    delay_errors_frames : (d,) ndarray
+        Real delay less that of the design [frames].
+    strehl : (d, g, e) ndarray
+        Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by more
+        than 160 times its width.
+    residual_nm : (d, g, e) ndarray
+        Residual of the modes [nm rms]; nan where the loop is unstable.
+    stable : (d, g) bool ndarray
+        Whether the loop is stable. A frequency error has no part in that.
+    """
+
+    errors_hz: FloatArray
+    sensor_gains: FloatArray
+    delay_errors_frames: FloatArray
+    strehl: FloatArray
+    residual_nm: FloatArray
+    stable: BoolArray
+
+
+def strehl_map(
+    design: Design,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    errors_hz: Any,
+    sensor_gains: Any,
+    delay_errors_frames: Any = (0.0,),
+    advance: Callable[[int], object] | None = None,
+) -> StrehlMap:
+    """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
+
+    Parameters
+    ----------
+    design : Design
+        The design, with a loop of one or two modes; its controller stays as it is.
+    truth : Truth
+        What the loop meets without any error. Its own sensor gain plays no part.
+    imaging : Imaging
+        The camera.
+    errors_hz : (e,) array_like
+        Frequency that the design believes less the true one [Hz]: every vibration of the truth
+        is moved by minus the error, its rms kept.
+    sensor_gains : (g,) array_like
+        Real sensor gains relative to the design's sensor matrix.
+    delay_errors_frames : (d,) array_like, optional
+        Real delay less that of the design [frames].
+    advance : callable, optional
+        Called with a number of points whenever they are done.
+
+    Returns
+    -------
+    StrehlMap
+        Strehl ratio, residual and stability at all combinations.
+
+    Raises
+    ------
+    ProblemError
+        If the design has no loop, or a value is out of its range or given twice.
+    DimensionError
+        If the loop has more than two modes, or a vibration another number of them.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=797)
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
+    ... )
+    >>> truth = lbt.Truth(
+    ...     turbulence=slow,
+    ...     noise_nm=15.5,
+    ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797),),
+    ... )
+    >>> found = lbt.studies.strehl_map(
+    ...     lbt.kalman(plant),
+    ...     truth,
+    ...     lbt.Imaging(diameter_m=8.22),
+    ...     errors_hz=[0, 3],
+    ...     sensor_gains=[0.5, 1.0, 9.0],
+    ... )
+    >>> found.strehl.shape, found.stable[0].tolist()
+    ((1, 3, 2), [True, True, False])
+    >>> bool(found.strehl[0, 1, 0] > found.strehl[0, 1, 1])
+    True
+    """
+    for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
+        instance(value, kind)
+    hardware = design.hardware
+    if hardware is None:
+        raise ProblemError(
+            "a map needs a design for a loop; got one of a bare estimation problem. Design for a "
+            "plant of tip_tilt_plant."
+        )
+    if hardware.modes > 2:
+        raise DimensionError(
+            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
+        )
+    errors = _axis(errors_hz, "errors_hz")
+    gains = _axis(sensor_gains, "sensor_gains", above=0)
+    delays = _axis(
+        delay_errors_frames,
+        "delay_errors_frames",
+        at_least=1 - hardware.delay_frames,
+        at_most=100 - hardware.delay_frames,
+        hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
+        "lie between 1 and 100.",
+    )
+    lines = _moved_lines(truth, errors, hardware)
+    shape = (delays.size, gains.size, errors.size)
+    strehls, residuals = np.full(shape, np.nan), np.full(shape, np.nan)
+    stable = np.zeros(shape[:2], dtype=np.bool_)
+    for i, delay in enumerate(delays):
+        for start in range(0, gains.size, _GAINS_AT_ONCE):
+            rows = slice(start, start + _GAINS_AT_ONCE)
+            part = gains[rows]
+            ensemble = LoopEnsemble(
+                sensor_gain=np.repeat(part, errors.size),
+                delay_frames=hardware.delay_frames + delay,
+                noise_nm=truth.noise_of(hardware.n_measurements)[None],
+                turbulence=truth.turbulence,
+                vibrations=tuple(
+                    replace(line, frequency_hz=np.tile(line.frequency_hz, part.size))
+                    for line in lines
+                ),
+            )
+            found = ensemble_residuals(design.controller, hardware, ensemble)
+            stable[i, rows] = found.stable.reshape(part.size, -1)[:, 0]
+            strehls[i, rows] = found.strehl(imaging).reshape(part.size, -1)
+            residuals[i, rows] = found.rms_nm.reshape(part.size, -1)
+            if advance is not None:
+                advance(part.size * errors.size)
+    stable.setflags(write=False)
+    return StrehlMap(
+        errors_hz=errors,
+        sensor_gains=gains,
+        delay_errors_frames=delays,
+        strehl=frozen(strehls),
+        residual_nm=frozen(residuals),
+        stable=stable,
+    )
+
+
+def _axis(values: Any, name: str, **bounds: Any) -> FloatArray:
+    """Values of one axis of the map, each within its bounds and there once."""
+    axis = real_array(values, name)
+    if axis.ndim != 1 or axis.size == 0:
+        raise DimensionError(f"{name} must be a list of at least one number; got {axis.shape}.")
+    for value in axis:
+        number(value, name, **bounds)
+    if np.unique(axis).size != axis.size:
+        raise ProblemError(f"{name} must hold each value once; got {axis.tolist()}.")
+    return axis
+
+
+def _moved_lines(
+    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
+) -> list[EnsembleVibration]:
+    """Vibrations that lie below what the design believes, one frequency an error."""
+    if not truth.vibrations and np.any(errors_hz != 0):
+        raise ProblemError(
+            "a frequency error needs a vibration in the truth; got a truth without any."
+        )
+    nyquist = hardware.frame_rate_hz / 2
+    moved = []
+    for vibration in stationary_vibrations(truth.vibrations):
+        fitted_direction(vibration, hardware)
+        frequencies = vibration.frequency_hz - errors_hz
+        wrong = ~((frequencies > 0) & (frequencies < nyquist))
+        if np.any(wrong):
+            raise ProblemError(
+                f"errors_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
+                f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
+                f"{vibration.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
+            )
+        moved.append(
+            EnsembleVibration(
+                frequency_hz=frequencies,
+                rms_nm=vibration.rms_nm,
+                direction=vibration.direction,
+                damping=vibration.damping if isinstance(vibration, Vibration) else None,
+            )
+        )
+    return moved

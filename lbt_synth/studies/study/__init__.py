@@ -1,0 +1,1 @@
+"""The command study: samples of a configuration on many processes, and their statistics."""

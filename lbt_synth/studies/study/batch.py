@@ -1,0 +1,190 @@
+"""Many samples at once, exactly; what cannot be done at once is done point by point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from lbt_synth.errors import CertificateError
+from lbt_synth.loop import EnsembleResiduals
+from lbt_synth.loop.ensemble.residuals import residuals_of_matrices, textbook_matrices
+from lbt_synth.studies.study import reference_evaluation as point
+from lbt_synth.studies.study.batch_result import BatchResult, Failure
+from lbt_synth.studies.study.config_paths import Keys
+from lbt_synth.studies.study.sample import sample_of
+from lbt_synth.studies.study.sample_arrays import (
+    TOLD_DELAY,
+    changes_beliefs_only,
+    changes_numbers_only,
+    rows_of,
+)
+from lbt_synth.studies.study.sample_designs import (
+    changes_numbers_of_designs,
+    designed_for_samples,
+    designs_by_axis,
+    designs_filters,
+)
+from lbt_synth.studies.study.study import Study, StudyController
+from lbt_synth.validation import FloatArray, IntArray
+
+_AGREEMENT = 1e-5  # of a sample evaluated both ways; a residual of less than 1 nm counts as 1 nm
+_FEWEST = 4  # samples of a group that are worth an ensemble
+
+
+def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResult:
+    """Evaluate samples that follow each other.
+
+    Samples whose configurations differ by numbers only are evaluated together by
+    :func:`ensemble_residuals`; Kalman filters for samples are designed together by
+    :func:`modal_filters`. Other designs, simulations, and samples that a configuration refuses
+    are evaluated one after the other. So is one sample of each group that is evaluated together,
+    and the two answers have to agree.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    values : (b, parameters) ndarray
+        Rows of ``Study.values``.
+    start : int
+        Number of the first.
+
+    Returns
+    -------
+    BatchResult
+        A value of each of ``study.result_columns`` for each sample. A controller that has no
+        result is among the failures, and has nan; an unstable loop has ``stable`` 0 and nan
+        otherwise.
+
+    Raises
+    ------
+    CertificateError
+        If the sample that is evaluated both ways has two answers.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> batch = lbt.studies.evaluate_samples(study, study.values(0, 2), 0)
+    >>> batch.columns["kalman.strehl"].round(3).tolist(), batch.columns["kalman.stable"].tolist()
+    ([0.837, 0.821], [1.0, 1.0])
+    """
+    columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
+    failures: list[Failure] = []
+    left: dict[int, list[StudyController]] = {}  # what is done point by point, by sample
+    for controller in study.controllers:
+        done = np.zeros(len(values), dtype=np.bool_)
+        for rows, found, strehl in _evaluated_together(study, controller, values):
+            done[rows] = True
+            results = {
+                "strehl": strehl,
+                "residual_nm": found.rms_nm,
+                "turbulence_nm": found.turbulence_nm,
+                "vibration_nm": found.vibration_nm,
+                "noise_nm": found.noise_nm,
+                "stable": found.stable.astype(np.float64),
+            }
+            for name, result in results.items():
+                columns[f"{controller.name}.{name}"][rows] = result
+            _require_agreement(
+                replace(study, controllers=(controller,)),
+                values,
+                start,
+                int(rows[rows.size // 2]),
+                columns,
+            )
+        for i in np.flatnonzero(~done).tolist():
+            left.setdefault(i, []).append(controller)
+    for i, controllers in sorted(left.items()):
+        some = replace(study, controllers=tuple(controllers))
+        with np.errstate(all="ignore"):  # what overflows fails its checks
+            results_of_row, failed = point.evaluate_row(some, values[i], start + i)
+        failures += failed
+        for name, value in results_of_row.items():
+            columns[name][i] = value
+    return BatchResult(start=start, columns=columns, failures=tuple(failures))
+
+
+def _evaluated_together(
+    study: Study, controller: StudyController, values: FloatArray
+) -> Iterator[tuple[IntArray, EnsembleResiduals, FloatArray]]:
+    """Yield what could be evaluated together: rows, residuals, Strehl ratios."""
+    if study.settings.evaluation != "exact":
+        return
+    if controller.design is not None:
+        matrices = textbook_matrices([controller.design.controller])
+
+        def together(keys: Keys) -> bool:
+            return _changes_numbers(study, keys)
+
+    elif designs_filters(controller):
+        matrices = None
+
+        def together(keys: Keys) -> bool:
+            return (
+                keys != TOLD_DELAY
+                and _changes_numbers(study, keys)
+                and changes_numbers_of_designs(study, keys)
+            )
+
+    else:
+        return
+    for group in _groups(study, values, together):
+        try:
+            sample = sample_of(study, values[group[0]])
+            if matrices is None and not designs_by_axis(sample.config):
+                continue
+            rows = rows_of(study, sample, values[group])
+            good = rows.valid()
+            rows, group = rows.taken(np.flatnonzero(good)), group[good]
+            if not group.size:
+                continue
+            with np.errstate(over="raise", divide="raise", invalid="raise"):
+                own = designed_for_samples(rows) if matrices is None else matrices
+                found = residuals_of_matrices(own, sample.hardware, rows.ensemble())
+            strehl = found.strehl(sample.config.imaging)
+        except point.EXPECTED_ERRORS:
+            continue  # one of them fails; which one is found point by point
+        yield group, found, strehl
+
+
+def _changes_numbers(study: Study, keys: Keys) -> bool:
+    """Whether a fixed controller meets samples that differ there in one ensemble."""
+    return changes_numbers_only(study, keys) or changes_beliefs_only(study, keys)
+
+
+def _require_agreement(
+    study: Study, values: FloatArray, start: int, i: int, columns: Mapping[str, FloatArray]
+) -> None:
+    """Hold one sample against its evaluation by itself."""
+    alone, failed = point.evaluate_row(study, values[i], start + i)
+    if failed:
+        raise CertificateError(
+            f"row {start + i} has a result among others, and fails by itself: {failed[0].error} "
+            "This is a fault of the program; please report it with the study file."
+        )
+    for name, expected in alone.items():
+        found = float(columns[name][i])
+        apart = abs(found - expected)
+        if not apart <= _AGREEMENT * max(abs(expected), 1.0):
+            raise CertificateError(
+                f"row {start + i} has {name} {found:.9g} among others, and {expected:.9g} by "
+                "itself: one of the two is wrong. This is a fault of the program; please report "
+                "it with the study file."
+            )
+
+
+def _groups(
+    study: Study, values: FloatArray, together: Callable[[Keys], bool]
+) -> Iterator[IntArray]:
+    """Yield the samples that can be evaluated together."""
+    apart = [
+        i
+        for i, parameter in enumerate(study.parameters)
+        if not all(together(keys) for keys in parameter.places)
+    ]
+    _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
+    for group in np.flatnonzero(counts >= min(_FEWEST, len(values))):
+        yield np.flatnonzero(which.reshape(-1) == group)

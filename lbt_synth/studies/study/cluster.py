@@ -1,0 +1,93 @@
+"""Dask: the only module that knows it (extra ``dask``)."""
+
+from __future__ import annotations
+
+import logging
+import pkgutil
+import sys
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import lbt_synth
+from lbt_synth.errors import MissingExtraError, ProblemError
+
+_TIMEOUT_S = 10
+_VERSION = "lbt_synth:__version__"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cluster:
+    """A connection to a scheduler."""
+
+    executor: Executor  # Runs calls on the cluster
+    workers: int  # Threads of all its workers together
+
+
+@contextmanager
+def connected(address: str) -> Iterator[Cluster]:
+    """Connect to a Dask scheduler whose workers have this version of the package."""
+    try:
+        from distributed import Client
+        from distributed.comm import get_address_host_port
+    except ImportError as error:
+        raise MissingExtraError(
+            '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
+        ) from error
+    try:
+        # a client of what is no address complains once more when it is thrown away
+        get_address_host_port(address if "://" in address else f"tcp://{address}", strict=True)
+        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
+        text = " ".join(str(error).split()) or "no answer"
+        raise ProblemError(
+            f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
+            "such as tcp://host:8786; start one with dask scheduler, and dask worker."
+        ) from error
+    with _silent(), client:
+        try:
+            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+        except TimeoutError as error:
+            raise ProblemError(
+                f"the scheduler at {address} has no workers; start some with dask worker {address}."
+            ) from error
+        _require_versions(address, client)
+        count = sum(client.ncores().values())
+        yield Cluster(executor=client.get_executor(pure=False), workers=count)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Let nothing be logged: a lost scheduler is told by an error, not by tracebacks."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def _require_versions(address: str, client: Any) -> None:
+    """Refuse a scheduler or workers that have not this lbt_synth: both read what they are sent."""
+    try:
+        found = {"scheduler": client.run_on_scheduler(pkgutil.resolve_name, _VERSION)}
+    except ImportError as error:
+        found = {"scheduler": error}
+    # the function is one of Python's own, so that it is there whatever else is not
+    found |= client.run(pkgutil.resolve_name, _VERSION, on_error="return")
+    for name, version in found.items():
+        if version != lbt_synth.__version__:
+            text = f"has none ({version})" if isinstance(version, Exception) else f"has {version}"
+            who = "the scheduler" if name == "scheduler" else f"the worker {name}"
+            raise ProblemError(
+                f"scheduler and workers must have lbt_synth {lbt_synth.__version__}, as here; "
+                f"{who} of {address} {text}. Start them from the same environment."
+            )
+
+
+def is_death_of_workers(error: BaseException) -> bool:
+    """Whether a task failed because every worker that tried it died."""
+    scheduler = sys.modules.get("distributed.scheduler")
+    return scheduler is not None and isinstance(error, scheduler.KilledWorker)

@@ -1,0 +1,85 @@
+"""Controllers against each other on the same samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.studies.study.percentiles import Percentile, Share, percentiles, share
+from lbt_synth.studies.study.sample_status import Outcomes
+from lbt_synth.validation import FloatArray
+
+DIFFERENCES = (5.0, 25.0, 50.0, 75.0, 95.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """Two controllers on the samples on which neither failed."""
+
+    # first, second: Their names
+    first: str
+    second: str
+    # better, equal: Samples in which the first has the higher Strehl ratio, and in which both have
+    # the same (both unstable, as a rule)
+    better: Share
+    equal: Share
+    # mean, mean_error: Mean of the first's Strehl ratio less the second's, and its standard error
+    mean: float
+    mean_error: float
+    difference: tuple[Percentile, ...]  # Percentiles of that difference
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loss:
+    """What a controller loses against the best one of each sample."""
+
+    best: Share  # Samples in which no controller has a higher Strehl ratio
+    # Percentiles of the highest Strehl ratio less this one's: 50, 95 and 99
+    loss: tuple[Percentile, ...]
+
+
+def mean_and_error(values: FloatArray) -> tuple[float, float]:
+    """Mean and its standard error for independent samples; nan where there are too few."""
+    n = len(values)
+    mean = float(np.mean(values)) if n else np.nan
+    return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan
+
+
+def compare(first: Outcomes, second: Outcomes) -> Comparison:
+    """Compare two controllers sample by sample."""
+    both = first.evaluated & second.evaluated
+    difference = first.strehl[both] - second.strehl[both]
+    mean, error = mean_and_error(difference)
+    n = len(difference)
+    return Comparison(
+        first=first.controller,
+        second=second.controller,
+        better=share(int(np.count_nonzero(difference > 0)), n),
+        equal=share(int(np.count_nonzero(difference == 0)), n),
+        mean=mean,
+        mean_error=error,
+        difference=percentiles(difference, DIFFERENCES),
+    )
+
+
+def losses_of(controllers: Sequence[Outcomes]) -> tuple[FloatArray, ...]:
+    """Return the best Strehl ratio of each sample less that of each controller.
+
+    Shapes: returns list of (m,).
+    """
+    whole = np.logical_and.reduce([each.evaluated for each in controllers])
+    best = np.max([each.strehl[whole] for each in controllers], axis=0)
+    return tuple(best - each.strehl[whole] for each in controllers)
+
+
+def losses(controllers: Sequence[Outcomes]) -> tuple[Loss, ...]:
+    """Loss of each controller against the best one of each sample."""
+    return tuple(
+        Loss(
+            best=share(int(np.count_nonzero(loss == 0)), len(loss)),
+            loss=percentiles(loss, (50.0, 95.0, 99.0)),
+        )
+        for loss in losses_of(controllers)
+    )

@@ -1,0 +1,125 @@
+"""Places in a configuration by their paths, such as ``truth.vibrations[0].frequency_hz``."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lbt_synth.errors import ConfigError
+
+Keys = tuple[str | int, ...]
+_PART = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
+
+
+def keys_of(path: str) -> Keys:
+    """Return the keys of a path.
+
+    Examples
+    --------
+    >>> from lbt_synth.studies.study.config_paths import keys_of
+    >>> keys_of("truth.vibrations[0].frequency_hz")
+    ('truth', 'vibrations', 0, 'frequency_hz')
+    """
+    keys: list[str | int] = []
+    for part in path.split("."):
+        found = _PART.fullmatch(part)
+        if found is None:
+            raise ConfigError(
+                f"{path!r} is no path in a configuration; expected one such as "
+                "truth.vibrations[0].frequency_hz."
+            )
+        keys.append(found[1])
+        keys += [int(index) for index in re.findall(r"[0-9]+", found[2])]
+    return tuple(keys)
+
+
+def require_number(content: Mapping[str, Any], path: str) -> None:
+    """Refuse a path that does not lead to a number."""
+    here: Any = content
+    parent: Any = {}
+    walked = ""
+    for key in keys_of(path):
+        place = walked or "the configuration"
+        if isinstance(key, int):
+            if not isinstance(here, list):
+                raise ConfigError(f"{path}: {place} is no list; {_seen(here)}.")
+            if key >= len(here):
+                raise ConfigError(
+                    f"{path}: {place} has {len(here)} entr{'y' if len(here) == 1 else 'ies'}, "
+                    f"counted from 0; got [{key}]."
+                )
+            walked += f"[{key}]"
+        else:
+            if not isinstance(here, dict):
+                raise ConfigError(f"{path}: {place} has no keys; {_seen(here)}.")
+            if key not in here:
+                close = difflib.get_close_matches(key, list(here), n=1, cutoff=0.6)
+                hint = f"did you mean {close[0]}? " if close else ""
+                raise ConfigError(
+                    f"{path}: {place} has no {key}; {hint}there are {', '.join(sorted(here))}."
+                )
+            walked += f".{key}" if walked else key
+        parent, here = here, here[key]
+    if here is None:
+        entries = parent.items() if isinstance(parent, Mapping) else ()
+        there = [k for k, v in entries if type(v) in (int, float)]
+        others = f" Numbers that are set there: {', '.join(sorted(there))}." if there else ""
+        raise ConfigError(
+            f"{path} is not set in the configuration, so it cannot be varied.{others}"
+        )
+    if isinstance(here, bool | str) or not isinstance(here, int | float):
+        raise ConfigError(f"{path} must lead to a number of the configuration; {_seen(here)}.")
+
+
+def _seen(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"it is a section with {', '.join(sorted(value))}"
+    if isinstance(value, list):
+        return f"it is a list of {len(value)}"
+    return "it is not set" if value is None else f"it is {value!r}"
+
+
+def is_integer(content: Mapping[str, Any], keys: Keys) -> bool:
+    """Whether a place that :func:`require_number` lets pass takes integers only."""
+    return isinstance(number_at(content, keys), int)
+
+
+def number_at(content: Mapping[str, Any], keys: Keys) -> float | int:
+    """Return the number at a place that :func:`require_number` lets pass."""
+    here: Any = content
+    for key in keys:
+        here = here[key]
+    number: float | int = here
+    return number
+
+
+def put(content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]) -> None:
+    """Put a number at its place, which :func:`require_number` lets pass in ``full``.
+
+    Sections on the way that are not there are made, lists are taken from ``full``, the same
+    configuration with its defaults. A number that is an integer there stays one if it can.
+    """
+    here: Any = content
+    whole: Any = full
+    for key in keys[:-1]:
+        whole = whole[key]
+        if isinstance(here, dict) and key not in here:
+            here[key] = _copied(whole) if isinstance(whole, list) else {}
+        here = here[key]
+    stays = isinstance(whole[keys[-1]], int) and float(value).is_integer()
+    here[keys[-1]] = int(value) if stays else float(value)
+
+
+def nested_copy(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy whose sections and lists may be changed."""
+    return {key: _copied(value) for key, value in content.items()}
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return nested_copy(value)
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_copied(item) for item in value]
+    return value

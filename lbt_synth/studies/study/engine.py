@@ -1,0 +1,247 @@
+"""Batches on any executor: a bounded number of them at once, and what to do when one dies."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import LbtSynthError, NumericalError
+from lbt_synth.storage.worker_processes import WorkerPool, one_thread_each
+from lbt_synth.studies.study.batch_result import BatchResult, Failure
+from lbt_synth.studies.study.batches import Batches
+from lbt_synth.studies.study.cluster import is_death_of_workers
+from lbt_synth.studies.study.store import Rows
+from lbt_synth.studies.study.study import Study
+from lbt_synth.validation import FloatArray
+
+Evaluate = Callable[[Study, FloatArray, int], BatchResult]
+Finished = tuple[BatchResult, float]  # and the seconds that it took
+
+DIED = "its process ended without a word: killed, or for want of memory"
+_MOST_DEATHS = 40  # one after the other, without a batch that comes back
+_SPARE = 2  # batches in flight for each worker, so that none waits
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    rows: Rows
+    alone: bool
+
+
+class _Inline(Executor):
+    """Runs what it is given in this process, at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class _Workers:
+    """Where batches run: an executor, and how to replace it when it breaks."""
+
+    def __init__(self, executor: Executor, pool: WorkerPool | None, jobs: int) -> None:
+        self.executor = executor
+        self._pool = pool
+        self._jobs = jobs
+
+    def renew(self, error: BaseException) -> None:
+        """Start anew after processes died."""
+        if self._pool is None:
+            raise NumericalError(
+                f"the executor broke: {error or type(error).__name__}. What is finished is kept: "
+                "start again, with a new executor."
+            ) from error
+        self._pool.close()
+        self._pool = WorkerPool(self._jobs)
+        self.executor = self._pool.executor
+
+    def end(self, *, at_once: bool) -> None:
+        """End the processes, if they are ours."""
+        if self._pool is not None:
+            if at_once:
+                self._pool.kill()
+            else:
+                self._pool.close()
+
+
+@contextmanager
+def _workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
+    if executor is not None or jobs == 1:
+        yield _Workers(executor or _Inline(), None, jobs)
+        return
+    with one_thread_each():
+        pool = WorkerPool(jobs)
+        workers = _Workers(pool.executor, pool, jobs)
+        try:
+            yield workers
+        except BaseException:
+            workers.end(at_once=True)
+            raise
+        workers.end(at_once=False)
+
+
+def computed(evaluate: Evaluate, study: Study, values: FloatArray, start: int) -> Finished:
+    """Evaluate a batch, and time it; this is what a worker runs."""
+    before = time.perf_counter()
+    batch = evaluate(study, values, start)
+    return batch, time.perf_counter() - before
+
+
+def run_batches(
+    study: Study,
+    ranges: Sequence[Rows],
+    *,
+    evaluate: Evaluate,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    workers: int | None = None,
+) -> Generator[Finished, None, None]:
+    """Yield the results of all rows of some ranges, in the order in which they come.
+
+    Where a process dies, what was in flight is run again, each batch alone; one that kills its
+    process again is halved, down to single rows, which fail. Shapes: ranges list of (int, int).
+    """
+    count = workers or jobs
+    batches = Batches(ranges, count)
+    most = 1 if executor is None and jobs == 1 else _SPARE * count
+    running: dict[Future[Finished], _Task] = {}
+    suspects: deque[Rows] = deque()
+    deaths = 0
+    with _workers(jobs, executor) as engine:
+        try:
+            while batches.left or suspects or running:
+                broken: BaseException | None = None
+                try:
+                    while (batches.left and not suspects and len(running) < most) or (
+                        suspects and not running
+                    ):
+                        rows = suspects[0] if suspects else batches.next()
+                        task = _Task(rows=rows, alone=bool(suspects))
+                        values = study.values(*rows)
+                        try:
+                            future = engine.executor.submit(
+                                computed, evaluate, study, values, rows[0]
+                            )
+                        except BrokenExecutor:
+                            if not suspects:
+                                suspects.append(rows)  # it was given out, and did not run
+                            raise
+                        if suspects:
+                            suspects.popleft()
+                        running[future] = task
+                except BrokenExecutor as error:
+                    broken = error
+                done, _ = wait(running, return_when=FIRST_COMPLETED) if running else (set(), set())
+                dead: list[_Task] = []
+                for future in done:
+                    task = running.pop(future)
+                    raised = _error_of(future)
+                    if raised is None:
+                        deaths = 0
+                        batch, seconds = future.result()
+                        _require_whole(batch, task.rows, study)
+                        batches.learn(task.rows[1] - task.rows[0], seconds)
+                        yield batch, seconds
+                    elif isinstance(raised, BrokenExecutor):
+                        broken = raised
+                        dead.append(task)
+                    elif is_death_of_workers(raised):
+                        dead.append(task)
+                    else:
+                        raise _told(raised, task.rows)
+                if broken is not None:
+                    dead += running.values()
+                    running.clear()
+                    engine.renew(broken)
+                if dead or broken is not None:
+                    deaths += 1
+                    if deaths > _MOST_DEATHS:
+                        raise NumericalError(
+                            f"{deaths} times one after the other a process ended without a word, "
+                            "for want of memory perhaps. What is finished is kept: start again, "
+                            "with fewer jobs."
+                        )
+                for task in sorted(dead, key=lambda task: task.rows):
+                    start, stop = task.rows
+                    if not task.alone:
+                        suspects.append(task.rows)
+                    elif stop - start == 1:
+                        yield _lost(study, start), 0.0
+                    else:
+                        middle = (start + stop) // 2
+                        suspects.extendleft([(middle, stop), (start, middle)])
+        finally:
+            for future in running:
+                future.cancel()
+
+
+def _error_of(future: Future[Finished]) -> BaseException | None:
+    try:
+        return future.exception()
+    except CancelledError as error:
+        return error
+
+
+def _told(error: BaseException, rows: Rows) -> BaseException:
+    """Return what to raise for an error of a batch that is none of a sample."""
+    if isinstance(error, LbtSynthError | MemoryError):
+        return error
+    if isinstance(error, CancelledError):
+        told = NumericalError(
+            "the executor cancelled what was running: its scheduler is gone, perhaps. What is "
+            "finished is kept: start again."
+        )
+    else:
+        text = f"{type(error).__name__}: {error}".rstrip(".")
+        told = NumericalError(
+            f"rows {rows[0]} to {rows[1] - 1} could not be computed ({text}). What is finished is "
+            "kept. Every process needs the same lbt_synth as this one."
+        )
+    told.__cause__ = error
+    return told
+
+
+def _require_whole(batch: BatchResult, rows: Rows, study: Study) -> None:
+    """Refuse what a worker returned if it is not what was asked for."""
+    size = rows[1] - rows[0]
+    right = (
+        isinstance(batch, BatchResult)
+        and batch.start == rows[0]
+        and tuple(batch.columns) == study.result_columns
+        and all(np.shape(column) == (size,) for column in batch.columns.values())
+    )
+    if not right:
+        raise NumericalError(
+            f"the evaluation must return a BatchResult of rows {rows[0]} to {rows[1] - 1} with the "
+            "columns of the study, in their order; got something else."
+        )
+
+
+def _lost(study: Study, row: int) -> BatchResult:
+    """Return what is left of a row that ends its process."""
+    return BatchResult(
+        start=row,
+        columns={name: np.full(1, np.nan) for name in study.result_columns},
+        failures=tuple(
+            Failure(row=row, controller=controller.name, error=DIED, retry=True)
+            for controller in study.controllers
+        ),
+    )

@@ -1,0 +1,276 @@
+"""Read a study file and check all that can be known before any work."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import lbt_synth
+from lbt_synth.config import Config, load_config
+from lbt_synth.config.design_methods import DesignRequest, designed
+from lbt_synth.config.load import read_mapping, validated
+from lbt_synth.design import Design
+from lbt_synth.errors import ConfigError, LbtSynthError
+from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.studies.study.config_paths import Keys, is_integer, keys_of, require_number
+from lbt_synth.studies.study.distributions import (
+    Distribution,
+    Fixed,
+    Listed,
+    Normal,
+    Uniform,
+    equal_weights,
+    middle,
+)
+from lbt_synth.studies.study.reference_evaluation import closed_loop
+from lbt_synth.studies.study.sample import Sample, sample_of
+from lbt_synth.studies.study.schema import ParameterSection, StudySection
+from lbt_synth.studies.study.store import read_manifest, require_same, stored_design
+from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController
+
+_MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
+
+
+def load_study(
+    path: str | os.PathLike[str], *, directory: str | os.PathLike[str] | None = None
+) -> Study:
+    """Read a study file, check it and make the designs that are for the whole study.
+
+    Checked are the file, the configuration, the gain files, that every parameter is a number of
+    the configuration, and that the configuration takes the ends of each parameter, with the
+    others in the middle of their distributions.
+
+    Parameters
+    ----------
+    path : path-like
+        The file (YAML).
+    directory : path-like, optional
+        Directory of the study. If it was begun there, its designs are read instead of made anew.
+
+    Returns
+    -------
+    Study
+        The study.
+
+    Raises
+    ------
+    ConfigError
+        If the file or the configuration is refused; ``path`` on the error is that of the key.
+    GainFileError
+        If a gain file cannot be read.
+    SynthesisError
+        If a design cannot be made.
+    OutputError
+        If the directory is of another study, or a design in it was changed.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> study.samples, study.parameter_names[0]
+    (4096, 'atmosphere.seeing_arcsec')
+    >>> study.values(0, 2).shape[1] == len(study.parameter_names)
+    True
+    """
+    source = Path(path)
+    settings = validated(StudySection, read_mapping(source), source)
+    config_file = source.parent / settings.config
+    config = load_config(config_file)
+    if config.hardware.modes > _MOST_MODES:
+        raise ConfigError(
+            f"{config_file}: a study is of one or two axes; got a loop of {config.hardware.modes}."
+        )
+    names = list(settings.controllers)
+    _require_file_names(names, source)
+    gains: dict[str, tuple[Design, str]] = {}
+    files: dict[str, Path] = {}
+    for name, section in settings.controllers.items():
+        if section.file is not None:
+            files[name] = source.parent / section.file
+            gains[name] = load_with_digest(files[name])
+    study = Study(
+        source=source,
+        settings=settings,
+        config=config,
+        parameters=_parameters(settings, config, source),
+        controllers=(),
+        digest=_digest(settings, config, {name: digest for name, (_, digest) in gains.items()}),
+        inputs=(source, config_file, *files.values()),
+    )
+    samples = [(where, _checked(study, where, values)) for where, values in _corners(study)]
+    stored = _stored(study, directory)
+    controllers = []
+    for name, section in settings.controllers.items():
+        if section.file is not None:
+            entry = StudyController(
+                name=name, request=None, design=gains[name][0], origin=str(files[name])
+            )
+        else:
+            assert section.design is not None  # the schema wants one of the two
+            request = DesignRequest(method=section.design, options=section.options)
+            own = section.for_ == "sample"
+            design = None if own else stored.get(name) or _made(name, request, config, source)
+            words = "for each sample" if own else "for the configuration"
+            entry = StudyController(
+                name=name, request=request, design=design, origin=f"{request.text} {words}"
+            )
+        controllers.append(entry)
+        if entry.design is not None:
+            for where, sample in samples:
+                _require_fitting(entry.design, sample, f"{source}: controllers.{name}, {where}")
+    study = replace(study, controllers=tuple(controllers))
+    clash = set(study.parameter_names) & set(study.result_columns)
+    if clash:
+        name = min(clash)
+        raise ConfigError(
+            f"{source}: {name} is both a parameter and a result; give the controller "
+            f"{name.split('.')[0]} another name.",
+            path=f"controllers.{name.split('.')[0]}",
+        )
+    return study
+
+
+def _stored(study: Study, directory: str | os.PathLike[str] | None) -> dict[str, Design]:
+    """Return the designs that a directory has of a study."""
+    manifest = None if directory is None else read_manifest(Path(directory))
+    if directory is None or manifest is None:
+        return {}
+    require_same(manifest, study.digest, Path(directory))
+    found = {name: stored_design(Path(directory), name, manifest) for name in manifest["designs"]}
+    return {name: design for name, design in found.items() if design is not None}
+
+
+def _made(name: str, request: DesignRequest, config: Config, source: Path) -> Design:
+    try:
+        return designed(config, request)
+    except LbtSynthError as error:
+        error.args = (f"{source}: controllers.{name}: {error}",)
+        raise
+
+
+def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> str:
+    """Digest of what decides the results; not of the names of files, nor of the layout."""
+    said = settings.model_dump(by_alias=True, exclude={"config", "results"})
+    for section in said["controllers"].values():
+        del section["file"]
+    content = {
+        "version": lbt_synth.__version__,
+        "study": said,
+        "config": config.settings.model_dump(),
+        "gains": gains,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _require_file_names(names: list[str], source: Path) -> None:
+    """Refuse names that would give two controllers one file."""
+    seen: dict[str, str] = {}
+    for name in names:
+        other = seen.setdefault(name.casefold(), name)
+        if other != name:
+            raise ConfigError(
+                f"{source}: controllers.{name}: its files could not be told from those of {other}; "
+                "give a name that differs by more than its case.",
+                path=f"controllers.{name}",
+            )
+        if name.casefold().startswith("row_"):
+            raise ConfigError(
+                f"{source}: controllers.{name}: names that begin with row_ are those of samples "
+                "that are replayed; give another.",
+                path=f"controllers.{name}",
+            )
+
+
+def _parameters(settings: StudySection, config: Config, source: Path) -> tuple[Parameter, ...]:
+    full = config.settings.model_dump()
+    taken: dict[Keys | str, str] = {}
+    out = []
+    for name, section in settings.parameters.items():
+        key = f"parameters.{name}"
+        places: list[Keys] = []
+        try:
+            if name.split(".")[0] == "error":
+                _require_error_name(name, section)
+                taken[name] = name
+            else:
+                for place in (name, *section.also):
+                    require_number(full, place)
+                    keys = keys_of(place)
+                    other = taken.setdefault(keys, name)
+                    if other != name or keys in places:
+                        raise ConfigError(f"{place} is given twice, by {other} and {name}.")
+                    places.append(keys)
+            distribution = _distribution(section)
+            for keys in places:
+                if is_integer(full, keys) and isinstance(distribution, Uniform | Normal):
+                    raise ConfigError(
+                        "it is an integer, which takes a list of values; got a distribution of "
+                        "all numbers."
+                    )
+        except LbtSynthError as error:
+            raise ConfigError(f"{source}: {key}: {error}", path=key) from error
+        out.append(Parameter(name=name, places=tuple(places), distribution=distribution))
+    return tuple(out)
+
+
+def _require_error_name(name: str, section: ParameterSection) -> None:
+    if name not in ERRORS:
+        raise ConfigError(f"the errors of a loop are {' and '.join(ERRORS)}; got {name}.")
+    if section.also:
+        raise ConfigError("an error of the loop is in no configuration; leave also out.")
+
+
+def _distribution(section: ParameterSection) -> Distribution:
+    if section.fixed is not None:
+        return Fixed(value=section.fixed)
+    if section.uniform is not None:
+        return Uniform(low=section.uniform[0], high=section.uniform[1])
+    if section.normal is not None:
+        given = {k: v for k, v in section.normal.model_dump().items() if v is not None}
+        return Normal(**given)
+    assert section.list_ is not None  # the schema wants exactly one
+    weights = section.weights
+    return Listed(
+        values=tuple(section.list_),
+        weights=equal_weights(section.list_) if weights is None else tuple(weights),
+    )
+
+
+def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
+    """Yield the middle, then the ends of each parameter with the others in the middle."""
+    centre = [middle(parameter.distribution) for parameter in study.parameters]
+    yield "parameters in the middle", centre
+    for i, parameter in enumerate(study.parameters):
+        if not parameter.distribution.varies:
+            continue
+        for end in parameter.distribution.extremes(study.samples):
+            values = list(centre)
+            values[i] = end
+            yield f"parameters.{parameter.name} at {end:g}", values
+
+
+def _checked(study: Study, where: str, values: list[float]) -> Sample:
+    try:
+        sample = sample_of(study, np.array(values))
+    except LbtSynthError as error:
+        raise ConfigError(f"{study.source}: {where}: {error}", path=where.split(" ")[0]) from error
+    if sample.truth.drifts and study.settings.evaluation == "exact":
+        raise ConfigError(
+            f"{study.source}: a vibration of the truth drifts, so that there is no exact answer; "
+            "set evaluation: simulation.",
+            path="evaluation",
+        )
+    return sample
+
+
+def _require_fitting(design: Design, sample: Sample, where: str) -> None:
+    try:
+        closed_loop(sample, design)
+    except LbtSynthError as error:
+        raise ConfigError(f"{where}: {error}") from error

@@ -1,0 +1,59 @@
+"""Parquet: the only module that knows pyarrow (extra ``parquet``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from lbt_synth.errors import MissingExtraError, OutputError
+from lbt_synth.validation import FloatArray
+
+
+def require_parquet() -> None:
+    """Refuse to begin without pyarrow."""
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError(
+            'results: parquet needs pyarrow; try: pip install "lbt-synth[parquet]", or results: '
+            "csv.",
+            extra="parquet",
+        ) from error
+
+
+def write_parquet(
+    stream: BinaryIO, names: Sequence[str], blocks: Iterable[tuple[int, FloatArray]]
+) -> None:
+    """Write blocks of rows; the first column, the row, as an integer, the others as doubles.
+
+    Shapes: blocks (n, columns - 1).
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    kinds = [pa.int64(), *[pa.float64()] * (len(names) - 1)]
+    schema = pa.schema(list(zip(names, kinds, strict=True)))
+    with pq.ParquetWriter(stream, schema) as writer:
+        for start, values in blocks:
+            columns = [np.arange(start, start + len(values)), *values.T]
+            arrays = [pa.array(c, kind) for c, kind in zip(columns, kinds, strict=True)]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+
+
+def read_parquet(path: Path) -> dict[str, FloatArray]:
+    """Return all columns of a file."""
+    require_parquet()
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table: Any = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise OutputError(f"cannot read {path}: {error}.", path=path) from error
+    return {
+        name: np.asarray(table.column(name).to_numpy(), dtype=np.float64)
+        for name in table.column_names
+    }

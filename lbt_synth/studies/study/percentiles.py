@@ -1,0 +1,107 @@
+"""Percentiles and shares of samples, with intervals of confidence that assume no distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.validation import FloatArray
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Percentile:
+    """A percentile of a sample."""
+
+    percent: float  # Which one, in [0, 100]
+    value: float  # The percentile; nan where there is no sample
+    # low, high: Interval that holds the true percentile with a probability of 95 % at least; nan
+    # where the sample is too small for a limit on that side
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Share:
+    """A part of the samples."""
+
+    # count, total: Samples that are meant, and all
+    count: int
+    total: int
+    # low, high: Interval that holds the true probability with a probability of 95 % at least
+    low: float
+    high: float
+
+    @property
+    def value(self) -> float:
+        """The part, in [0, 1]; nan where there is no sample."""
+        return self.count / self.total if self.total else np.nan
+
+
+def percentiles(values: FloatArray, percents: Sequence[float]) -> tuple[Percentile, ...]:
+    """Percentiles of a sample and their intervals from order statistics.
+
+    Shapes: values (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.studies.study.percentiles import percentiles
+    >>> (middle,) = percentiles(np.arange(101.0), [50])
+    >>> middle.value, middle.low, middle.high
+    (50.0, 40.0, 60.0)
+    """
+    from scipy.stats import binom
+
+    ordered = np.sort(values)
+    n = len(ordered)
+    out = []
+    for percent in percents:
+        if n == 0:
+            out.append(Percentile(percent=percent, value=np.nan, low=np.nan, high=np.nan))
+            continue
+        tail = (1 - CONFIDENCE) / 2
+        first = int(binom.ppf(tail, n, percent / 100))
+        last = int(binom.ppf(1 - tail, n, percent / 100)) + 1
+        out.append(
+            Percentile(
+                percent=percent,
+                value=_interpolated(ordered, percent / 100),
+                low=float(ordered[first - 1]) if first >= 1 else np.nan,
+                high=float(ordered[last - 1]) if last <= n else np.nan,
+            )
+        )
+    return tuple(out)
+
+
+def _interpolated(ordered: FloatArray, fraction: float) -> float:
+    """Quantile by linear interpolation between order statistics, some of which may be inf."""
+    at = fraction * (len(ordered) - 1)
+    below = int(at)
+    low, weight = float(ordered[below]), at - below
+    if weight == 0 or low == ordered[below + 1]:
+        return low
+    return low + weight * (float(ordered[below + 1]) - low)
+
+
+def share(count: int, total: int) -> Share:
+    """Part of the samples, with the interval of Clopper and Pearson.
+
+    Examples
+    --------
+    >>> from lbt_synth.studies.study.percentiles import share
+    >>> none = share(0, 100)
+    >>> none.value, none.low, round(none.high, 4)
+    (0.0, 0.0, 0.0362)
+    """
+    from scipy.special import betaincinv
+
+    if total == 0:
+        return Share(count=0, total=0, low=np.nan, high=np.nan)
+    tail = (1 - CONFIDENCE) / 2
+    low = float(betaincinv(count, total - count + 1, tail)) if count else 0.0
+    high = float(betaincinv(count + 1, total - count, 1 - tail)) if count < total else 1.0
+    return Share(count=count, total=total, low=low, high=high)

@@ -1,0 +1,154 @@
+"""Samples evaluated one after the other by the library's own calls: slow, and what is true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lbt_synth.config.design_methods import designed
+from lbt_synth.design import Design
+from lbt_synth.errors import LbtSynthError
+from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, simulate, strehl
+from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
+from lbt_synth.studies.study.batch_result import BatchResult, Failure
+from lbt_synth.studies.study.sample import Sample, sample_of
+from lbt_synth.studies.study.study import Study, StudyController
+from lbt_synth.validation import FloatArray
+
+# what a sample may raise without being a fault of the study; LinAlgError is a ValueError
+EXPECTED_ERRORS = (LbtSynthError, ArithmeticError, ValueError)
+
+
+def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResult:
+    """Evaluate samples that follow each other.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    values : (b, parameters) ndarray
+        Rows of ``Study.values``.
+    start : int
+        Number of the first.
+
+    Returns
+    -------
+    BatchResult
+        A value of each of ``study.result_columns`` for each sample. A controller that has no
+        result is among the failures, and has nan; an unstable loop has ``stable`` 0 and nan
+        otherwise.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.studies.study.reference_evaluation import evaluate_samples
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> batch = evaluate_samples(study, study.values(0, 2), 0)
+    >>> batch.columns["kalman.strehl"].round(3).tolist(), batch.columns["kalman.stable"].tolist()
+    ([0.837, 0.821], [1.0, 1.0])
+    """
+    columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
+    failures: list[Failure] = []
+    for i, row_values in enumerate(values):
+        row = start + i
+        results, failed = evaluate_row(study, row_values, row)
+        failures += failed
+        for name, value in results.items():
+            columns[name][i] = value
+    return BatchResult(start=start, columns=columns, failures=tuple(failures))
+
+
+def evaluate_row(
+    study: Study, values: FloatArray, row: int
+) -> tuple[dict[str, float], tuple[Failure, ...]]:
+    """Evaluate one sample; results are by the names of their columns."""
+    try:
+        sample = sample_of(study, values)
+    except EXPECTED_ERRORS as error:
+        return {}, tuple(_failure(row, c, error) for c in study.controllers)
+    loops: dict[str, ClosedLoop] = {}
+    failures = []
+    for controller in study.controllers:
+        try:
+            loops[controller.name] = closed_loop(sample, design_for(controller, sample))
+        except EXPECTED_ERRORS as error:
+            failures.append(_failure(row, controller, error))
+    settle = settle_frames(study, loops)
+    out: dict[str, float] = {}
+    for controller in study.controllers:
+        name = controller.name
+        if name not in loops:
+            continue
+        loop = loops[name]
+        if not loop.is_stable:
+            out[f"{name}.stable"] = 0.0
+            continue
+        try:
+            if study.settings.evaluation == "exact":
+                found = exact(loop, sample)
+            else:
+                found = simulated(loop, sample, seed=study.seed_of(row), settle=settle)
+        except EXPECTED_ERRORS as error:
+            failures.append(_failure(row, controller, error))
+            continue
+        out |= {f"{name}.{column}": value for column, value in found.items()}
+        out[f"{name}.stable"] = 1.0
+    return out, tuple(failures)
+
+
+def design_for(controller: StudyController, sample: Sample) -> Design:
+    """Return a controller's design; for the sample, made from what it is told of it."""
+    if controller.design is not None:
+        return controller.design
+    assert controller.request is not None  # what is no file is designed
+    return designed(sample.config, controller.request)
+
+
+def closed_loop(sample: Sample, design: Design) -> ClosedLoop:
+    """Close the real loop of a sample around a design."""
+    return close_loop(sample.hardware, design.controller, sensor_gain=sample.truth.sensor_gain)
+
+
+def exact(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
+    """Return the exact residual of a stable loop by origin, and its Strehl ratio."""
+    budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
+    spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
+    return {
+        # the image is gone, as EnsembleResiduals.strehl has it
+        "strehl": strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0,
+        "residual_nm": budget.rms_nm,
+        "turbulence_nm": budget.turbulence_nm,
+        "vibration_nm": budget.vibration_nm,
+        "noise_nm": budget.noise_nm,
+    }
+
+
+def simulated(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
+    """Return the mean Strehl ratio and the residual of a stable loop, run as configured."""
+    section = sample.config.settings.simulation
+    run = simulate(
+        loop.controller,
+        sample.truth,
+        hardware=sample.hardware,
+        frames=section.frames,
+        cases=section.cases,
+        seed=seed,
+        settle_frames=settle,
+    )
+    return {
+        "strehl": float(np.mean(run.strehl(sample.config.imaging))),
+        "residual_nm": float(np.sqrt(np.mean(run.rms_nm**2))),
+    }
+
+
+def settle_frames(study: Study, loops: Mapping[str, ClosedLoop]) -> int:
+    """Return the frames to drop: the same for all controllers, so that they meet one weather."""
+    needed = [settling_frames(loop.spectral_radius) for loop in loops.values() if loop.is_stable]
+    return max([study.config.settings.simulation.settle_frames, *needed])
+
+
+def _failure(row: int, controller: StudyController, error: Exception) -> Failure:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return Failure(row=row, controller=controller.name, error=text)

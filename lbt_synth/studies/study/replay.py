@@ -1,0 +1,180 @@
+"""One row of a study again: its configuration, its designs, its results computed anew."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.config import save_config
+from lbt_synth.config.load import validated
+from lbt_synth.config.schema import FileSection
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import save_gain
+from lbt_synth.models import ARModel
+from lbt_synth.storage.atomic_files import refuse_replacing
+from lbt_synth.studies.study.batch_result import Failure
+from lbt_synth.studies.study.config_paths import nested_copy
+from lbt_synth.studies.study.output_files import stored_row
+from lbt_synth.studies.study.reference_evaluation import EXPECTED_ERRORS, design_for, evaluate_row
+from lbt_synth.studies.study.sample import Sample, sample_of
+from lbt_synth.studies.study.store import part_list, read_manifest, require_same, require_unchanged
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
+from lbt_synth.validation import integer
+
+_NOISELESS = (
+    "row {row} has no noise, which no configuration takes: there is none to simulate it with."
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Replay:
+    """A row of a study, computed anew.
+
+    Attributes
+    ----------
+    row : int
+        Its number.
+    parameters : dict of str to float
+        Its parameters.
+    stored : dict of str to float
+        Its results as the study has them; empty if it has none yet.
+    fresh : dict of str to float
+        Its results computed now, point by point; without what failed.
+    failures : tuple of Failure
+        What failed now.
+    files : tuple of pathlib.Path
+        What was written: the configuration, and the designs that are for this sample.
+    unwritten : str
+        Why there is no configuration of it; empty if there is one.
+    """
+
+    row: int
+    parameters: dict[str, float]
+    stored: dict[str, float]
+    fresh: dict[str, float]
+    failures: tuple[Failure, ...]
+    files: tuple[Path, ...]
+    unwritten: str = ""
+
+
+def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
+    """Compute one row of a study anew, and write it as a configuration.
+
+    ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with the
+    seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs for
+    each sample were told the delay and the noise of ``config``; they are ``row_N_NAME.fits``.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    directory : path-like
+        Its directory, finished or not.
+    row : int
+        The number of the row.
+
+    Returns
+    -------
+    Replay
+        Parameters, stored and fresh results.
+
+    Raises
+    ------
+    ProblemError
+        If the study has no such row, or its numbers make no configuration.
+    OutputError
+        If the directory is of another study, or cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = lbt.studies.replay_row(lbt.studies.load_study("examples/study.yaml"), folder, 3)
+    >>> [path.name for path in again.files], round(again.fresh["kalman.strehl"], 3)
+    (['row_3.yaml'], 0.832)
+    """
+    row = integer(row, "row", at_least=0)
+    if row >= study.samples:
+        raise ProblemError(f"the study has rows 0 to {study.samples - 1}; got row {row}.")
+    folder = Path(directory)
+    manifest = read_manifest(folder)
+    stored = {}
+    if manifest is not None:
+        require_same(manifest, study.digest, folder)
+        require_unchanged(folder, manifest)
+        stored = stored_row(folder, study, row, part_list(folder))
+    values = study.values(row, row + 1)[0]
+    fresh, failures = evaluate_row(study, values, row)
+    sample = sample_of(study, values)
+    return Replay(
+        row=row,
+        parameters=study.named(values),
+        stored=stored,
+        fresh=fresh,
+        failures=failures,
+        files=_written(study, folder, row, sample),
+        unwritten="" if sample.noise_factor > 0 else _NOISELESS.format(row=row),
+    )
+
+
+def _written(study: Study, folder: Path, row: int, sample: Sample) -> tuple[Path, ...]:
+    own = [controller for controller in study.controllers if controller.for_sample]
+    path = folder / f"row_{row}.yaml"
+    gains = {c.name: folder / f"row_{row}_{c.name}.fits" for c in own}
+    refuse_replacing([path, *gains.values()], study.inputs)
+    files = []
+    if sample.noise_factor > 0:
+        settings, comments = row_settings(study, row, sample)
+        files.append(save_config(path, settings, comments=comments))
+    for controller in own:
+        try:
+            design = design_for(controller, sample)
+        except EXPECTED_ERRORS:  # it is among the failures
+            continue
+        files.append(save_gain(gains[controller.name], design))
+    return tuple(files)
+
+
+def row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
+    """Return the configuration of the loop that a sample really meets, and comments on it."""
+    content = nested_copy(sample.config.settings.model_dump(exclude_unset=True))
+    comments = {
+        "": f"Row {row} of the study {study.source.name}: the loop that the sample really meets."
+    }
+    if sample.delay_error_frames != 0:
+        content["loop"]["delay_frames"] = sample.hardware.delay_frames
+        told = sample.config.hardware.delay_frames
+        comments["loop.delay_frames"] = f"designs were told {told:.12g} ({DELAY_ERROR})"
+    if sample.noise_factor != 1:
+        _put_noise(content, sample, comments)
+    content.setdefault("simulation", {})["seed"] = study.seed_of(row)
+    settings = validated(FileSection, content, study.config.source)
+    return settings, comments
+
+
+def _put_noise(content: dict[str, Any], sample: Sample, comments: dict[str, str]) -> None:
+    """Write the real noise in, and what the configuration computes from the one it was told."""
+    told = sample.config
+    for name in ("noise_mas", "pyramid"):
+        content["sensor"].pop(name, None)
+    content["sensor"]["noise_nm"] = np.asarray(sample.truth.noise_nm).tolist()
+    told_nm = ", ".join(f"{value:.12g}" for value in np.ravel(told.noise_nm))
+    comments["sensor.noise_nm"] = f"designs were told {told_nm} ({NOISE_FACTOR})"
+    given = told.settings.model.turbulence
+    kinds = {section.kind for section in (given if isinstance(given, list) else [given])}
+    if "ar2" in kinds:  # fitted above the noise that designs were told
+        sections = [_ar_section(model) for model in told.plant.turbulence]
+        same = all(section == sections[0] for section in sections)
+        content["model"]["turbulence"] = sections[0] if same else sections
+
+
+def _ar_section(model: ARModel) -> dict[str, Any]:
+    return {
+        "kind": "ar",
+        "coefficients": np.asarray(model.coefficients).tolist(),
+        "driving_rms_nm": model.driving_rms_nm,
+    }

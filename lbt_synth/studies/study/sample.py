@@ -1,0 +1,56 @@
+"""A sample: the configuration with its numbers put in, and the loop that it really meets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from lbt_synth.config import Config
+from lbt_synth.config.load import config_of, validated
+from lbt_synth.config.schema import FileSection
+from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.studies.study.config_paths import nested_copy, put
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
+from lbt_synth.validation import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sample:
+    """One sample of a study."""
+
+    config: Config  # What designs are told
+    hardware: LoopHardware  # The real loop: that of ``config`` with the delay error
+    truth: Truth  # What it really meets: that of ``config`` with the real noise
+    delay_error_frames: float  # Real delay less that of ``config`` [frames]
+    noise_factor: float  # Real noise over that of ``config``
+
+
+def sample_of(study: Study, values: Sequence[float] | FloatArray) -> Sample:
+    """Return the sample of a row of ``Study.values``."""
+    base = study.config
+    full = base.settings.model_dump()
+    content = nested_copy(base.settings.model_dump(exclude_unset=True))
+    for parameter, value in zip(study.parameters, values, strict=True):
+        for keys in parameter.places:
+            put(content, keys, float(value), full=full)
+    config = config_of(validated(FileSection, content, base.source), base.source)
+    delay_error = study.value_of(DELAY_ERROR, values, 0.0)
+    factor = study.value_of(NOISE_FACTOR, values, 1.0)
+    hardware, truth = config.hardware, config.truth
+    try:
+        if delay_error != 0:
+            hardware = replace(hardware, delay_frames=hardware.delay_frames + delay_error)
+        if factor != 1:
+            truth = replace(truth, noise_nm=truth.noise_nm * factor)
+    except ProblemError as error:
+        raise ConfigError(
+            f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}: {error}"
+        ) from error
+    return Sample(
+        config=config,
+        hardware=hardware,
+        truth=truth,
+        delay_error_frames=delay_error,
+        noise_factor=factor,
+    )

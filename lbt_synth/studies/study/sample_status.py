@@ -1,0 +1,112 @@
+"""What became of one controller on every sample: stable, unstable or failed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.validation import BoolArray, FloatArray, float_array
+
+PARTS = ("turbulence", "vibration", "noise")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outcomes:
+    """One controller on every sample."""
+
+    controller: str  # Its name
+    # (n,): strehl ratio; 0 where the loop is unstable, nan where the evaluation failed
+    strehl: FloatArray
+    # (n,): residual [nm rms]; inf where the loop is unstable, nan where the evaluation failed
+    residual_nm: FloatArray
+    evaluated: BoolArray  # (n,): where the evaluation did not fail
+    unstable: BoolArray  # (n,): where the loop is unstable
+    # (n,): parts of the residual [nm rms], as far as they are there
+    parts_nm: dict[str, FloatArray]
+
+    @property
+    def stable(self) -> BoolArray:
+        """Where the loop is stable, (n,)."""
+        return self.evaluated & ~self.unstable
+
+
+def column(columns: Mapping[str, Any], name: str, size: int | None = None) -> FloatArray:
+    """Return a column of the results, of a given length."""
+    if name not in columns:
+        raise ProblemError(
+            f"the results must have a column {name!r}; got {', '.join(map(repr, columns))}. "
+            "Check the names of parameters and controllers."
+        )
+    out = float_array(columns[name], f"column {name!r}")
+    if out.ndim != 1 or (size is not None and len(out) != size):
+        demand = "be 1-D" if size is None else f"have {size} rows, as the others"
+        raise DimensionError(f"column {name!r} must {demand}; got shape {out.shape}.")
+    return out
+
+
+def outcomes(columns: Mapping[str, Any], controller: str, size: int | None = None) -> Outcomes:
+    """Read the columns of a controller.
+
+    Shapes: columns (n,).
+
+    Examples
+    --------
+    >>> from lbt_synth.studies.study.sample_status import outcomes
+    >>> nan = float("nan")
+    >>> columns = {
+    ...     "a.stable": [1, 0, nan],
+    ...     "a.strehl": [0.8, nan, nan],
+    ...     "a.residual_nm": [50, nan, nan],
+    ... }
+    >>> outcomes(columns, "a").strehl
+    array([0.8, 0. , nan])
+    """
+    stable_column = column(columns, f"{controller}.stable", size)
+    size = len(stable_column)
+    evaluated = ~np.isnan(stable_column)
+    unstable = stable_column == 0
+    stable = stable_column == 1
+    odd = evaluated & ~unstable & ~stable
+    if np.any(odd):
+        row = int(np.argmax(odd))
+        raise ProblemError(
+            f"column '{controller}.stable' must be 1, 0 or nan; got {stable_column[row]:g} "
+            f"at index {row}."
+        )
+    strehl = column(columns, f"{controller}.strehl", size)
+    residual = column(columns, f"{controller}.residual_nm", size)
+    _require(controller, "strehl", strehl, stable, "within [0, 1]", most=1 + 1e-9)
+    _require(controller, "residual_nm", residual, stable, "at least 0", most=np.inf)
+    parts = {
+        part: column(columns, f"{controller}.{part}_nm", size)
+        for part in PARTS
+        if f"{controller}.{part}_nm" in columns
+    }
+    return Outcomes(
+        controller=controller,
+        strehl=np.where(stable, strehl, np.where(evaluated, 0.0, np.nan)),
+        residual_nm=np.where(stable, residual, np.where(evaluated, np.inf, np.nan)),
+        evaluated=evaluated,
+        unstable=unstable,
+        parts_nm=parts,
+    )
+
+
+def _require(
+    controller: str, name: str, values: FloatArray, where: BoolArray, demand: str, *, most: float
+) -> None:
+    """Refuse values of stable loops that are no numbers, or out of range."""
+    for wrong, error in (
+        (where & ~np.isfinite(values), NonFiniteError),
+        (where & ~((values >= 0) & (values <= most)), ProblemError),
+    ):
+        if np.any(wrong):
+            row = int(np.argmax(wrong))
+            raise error(
+                f"column '{controller}.{name}' must be finite and {demand} where the loop is "
+                f"stable; got {values[row]:g} at index {row}. Check the file of the results."
+            )

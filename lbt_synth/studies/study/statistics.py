@@ -1,0 +1,220 @@
+"""What a study says: each controller by itself, against the others, and what it depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import NonFiniteError, ProblemError
+from lbt_synth.studies.study.comparison import Comparison, Loss, compare, losses, mean_and_error
+from lbt_synth.studies.study.percentiles import Percentile, Share, percentiles, share
+from lbt_synth.studies.study.sample_status import Outcomes, column, outcomes
+from lbt_synth.studies.study.sensitivity import ControllerSensitivity, sensitivities
+from lbt_synth.studies.study.worst_samples import WorstRow, worst_rows
+from lbt_synth.validation import FloatArray, IntArray, integer, number
+
+PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
+LEVELS = (0.3, 0.5, 0.7, 0.8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControllerStatistics:
+    """One controller over all samples.
+
+    Attributes
+    ----------
+    controller : str
+        Its name.
+    samples : int
+        Samples on which it was evaluated.
+    failed : int
+        Samples on which the evaluation failed; they are in none of the following.
+    unstable : Share
+        Loops that are unstable. Their Strehl ratio counts as 0, their residual as infinite.
+    mean, mean_error : float
+        Mean of the Strehl ratio, and its standard error for independent samples.
+    strehl : tuple of Percentile
+        Percentiles of the Strehl ratio.
+    above : dict of float to Share
+        Samples whose Strehl ratio is above each level.
+    residual_nm : tuple of Percentile
+        Percentiles of the residual [nm rms].
+    parts_nm : dict of str to float
+        Median of each part of the residual over the stable loops [nm rms].
+    loss : Loss
+        Against the best controller of each sample.
+    worst : tuple of WorstRow
+        Samples on which it does worst.
+    """
+
+    controller: str
+    samples: int
+    failed: int
+    unstable: Share
+    mean: float
+    mean_error: float
+    strehl: tuple[Percentile, ...]
+    above: dict[float, Share]
+    residual_nm: tuple[Percentile, ...]
+    parts_nm: dict[str, float]
+    loss: Loss
+    worst: tuple[WorstRow, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StudyStatistics:
+    """What a study says.
+
+    Attributes
+    ----------
+    samples : int
+        Samples in the study so far.
+    parameters : tuple of str
+        Their names.
+    controllers : tuple of ControllerStatistics
+        Each by itself.
+    comparisons : tuple of Comparison
+        Each against each later one, on the same samples.
+    sensitivities : tuple of ControllerSensitivity
+        What each depends on.
+    """
+
+    samples: int
+    parameters: tuple[str, ...]
+    controllers: tuple[ControllerStatistics, ...]
+    comparisons: tuple[Comparison, ...]
+    sensitivities: tuple[ControllerSensitivity, ...]
+
+
+def study_statistics(
+    columns: Mapping[str, Any],
+    parameters: Sequence[str],
+    controllers: Sequence[str],
+    *,
+    levels: Sequence[float] = LEVELS,
+    worst: int = 10,
+) -> StudyStatistics:
+    """Statistics of a study's results.
+
+    Parameters
+    ----------
+    columns : mapping of str to (n,) array_like
+        Results: each parameter under its name and, for each controller, ``NAME.strehl`` (nan
+        where unstable or failed), ``NAME.residual_nm`` and ``NAME.stable`` (1, 0; nan where the
+        evaluation failed); ``NAME.turbulence_nm``, ``NAME.vibration_nm``, ``NAME.noise_nm`` and
+        ``row`` (number of the sample) as far as they are there.
+    parameters : sequence of str
+        Names of the parameters.
+    controllers : sequence of str
+        Names of the controllers.
+    levels : sequence of float, optional
+        Strehl ratios in [0, 1] to count the samples above of.
+    worst : int, optional
+        Worst samples to list for each controller.
+
+    Returns
+    -------
+    StudyStatistics
+        An unstable loop counts as a Strehl ratio of 0; failed evaluations are left out and
+        counted.
+
+    Raises
+    ------
+    ProblemError
+        If a column is missing or holds what cannot be, or a value is out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> gain = np.linspace(0.5, 1.5, 201)
+    >>> stable = (gain < 1.4).astype(float)
+    >>> columns = {
+    ...     "gain": gain,
+    ...     "a.stable": stable,
+    ...     "a.residual_nm": 100 / gain,
+    ...     "a.strehl": np.where(stable, 0.6 * gain, np.nan),
+    ... }
+    >>> found = lbt.studies.study_statistics(columns, ["gain"], ["a"])
+    >>> only = found.controllers[0]
+    >>> only.samples, only.unstable.count, round(only.strehl[3].value, 3)
+    (201, 21, 0.537)
+    >>> only.worst[0].row, only.worst[0].stable
+    (180, False)
+    """
+    _require_names(parameters, "parameters")
+    _require_names(controllers, "controllers")
+    if not controllers:
+        raise ProblemError("controllers must name one at least; got none.")
+    levels = [number(level, "levels", at_least=0, at_most=1) for level in levels]
+    worst = integer(worst, "worst", at_least=0)
+    size = len(column(columns, f"{controllers[0]}.stable"))
+    if not size:
+        raise ProblemError("the results must have at least one sample; got none.")
+    found = [outcomes(columns, name, size) for name in controllers]
+    values = {name: _finite(columns, name, size) for name in parameters}
+    rows = _row_numbers(columns, size)
+    return StudyStatistics(
+        samples=size,
+        parameters=tuple(parameters),
+        controllers=tuple(
+            _controller(each, loss, levels, worst_rows(each, rows, values, count=worst))
+            for each, loss in zip(found, losses(found), strict=True)
+        ),
+        comparisons=tuple(
+            compare(first, second)
+            for place, first in enumerate(found)
+            for second in found[place + 1 :]
+        ),
+        sensitivities=sensitivities(found, values),
+    )
+
+
+def _controller(
+    each: Outcomes, loss: Loss, levels: Sequence[float], worst: tuple[WorstRow, ...]
+) -> ControllerStatistics:
+    """One controller by itself."""
+    strehl = each.strehl[each.evaluated]
+    n = len(strehl)
+    mean, error = mean_and_error(strehl)
+    stable = each.stable
+    return ControllerStatistics(
+        controller=each.controller,
+        samples=n,
+        failed=len(each.strehl) - n,
+        unstable=share(int(np.count_nonzero(each.unstable)), n),
+        mean=mean,
+        mean_error=error,
+        strehl=percentiles(strehl, PERCENTS),
+        above={level: share(int(np.count_nonzero(strehl > level)), n) for level in levels},
+        residual_nm=percentiles(each.residual_nm[each.evaluated], PERCENTS),
+        parts_nm={
+            part: float(np.median(values[stable])) if stable.any() else np.nan
+            for part, values in each.parts_nm.items()
+        },
+        loss=loss,
+        worst=worst,
+    )
+
+
+def _require_names(names: Sequence[str], what: str) -> None:
+    if isinstance(names, str) or len(set(names)) != len(names):
+        raise ProblemError(f"{what} must be a list of different names; got {names!r}.")
+
+
+def _finite(columns: Mapping[str, Any], name: str, size: int) -> FloatArray:
+    values = column(columns, name, size)
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise NonFiniteError(f"column {name!r} must be finite; got {values[row]} at index {row}.")
+    return values
+
+
+def _row_numbers(columns: Mapping[str, Any], size: int) -> IntArray:
+    if "row" not in columns:
+        return np.arange(size)
+    return _finite(columns, "row", size).astype(np.int64)

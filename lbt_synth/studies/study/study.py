@@ -1,0 +1,159 @@
+"""A study: samples of a configuration, and the controllers that are tried on each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.config import Config
+from lbt_synth.config.design_methods import DesignRequest
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.studies.study.config_paths import Keys
+from lbt_synth.studies.study.distributions import Distribution
+from lbt_synth.studies.study.sampling import unit_points
+from lbt_synth.studies.study.schema import StudySection
+from lbt_synth.validation import FloatArray, integer
+
+DELAY_ERROR = "error.delay_frames"
+NOISE_FACTOR = "error.noise_factor"
+ERRORS = (DELAY_ERROR, NOISE_FACTOR)
+EXACT_COLUMNS = ("strehl", "residual_nm", "turbulence_nm", "vibration_nm", "noise_nm", "stable")
+SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameter:
+    """A number that is not the same in every sample."""
+
+    name: str  # Path in the configuration, ``error.delay_frames`` or ``error.noise_factor``
+    places: tuple[Keys, ...]  # Keys of every place that it is put to; none for the two errors
+    distribution: Distribution  # What it may be
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StudyController:
+    """A controller that is tried on each sample."""
+
+    name: str  # Its name in the columns
+    request: DesignRequest | None  # What to design; None for a gain file
+    design: Design | None  # The controller for all samples; None where each sample has its own
+    origin: str  # Where it comes from, for people
+
+    @property
+    def for_sample(self) -> bool:
+        """Whether each sample has its own design."""
+        return self.design is None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Study:
+    """A checked study; made by :func:`load_study`.
+
+    Attributes
+    ----------
+    source : pathlib.Path
+        The study file.
+    settings : StudySection
+        Its values, checked.
+    config : Config
+        The configuration as it stands.
+    parameters : tuple of Parameter
+        What varies, in the order of the file.
+    controllers : tuple of StudyController
+        What is tried, in the order of the file.
+    digest : str
+        SHA-256 of all that decides the results: settings, configuration, gain files, version of
+        the package.
+    inputs : tuple of pathlib.Path
+        Files that the study was read from.
+    """
+
+    source: Path
+    settings: StudySection
+    config: Config
+    parameters: tuple[Parameter, ...]
+    controllers: tuple[StudyController, ...]
+    digest: str
+    inputs: tuple[Path, ...]
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.settings.samples
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, the columns of :meth:`values`."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def result_columns(self) -> tuple[str, ...]:
+        """Names of the results, those of each controller together."""
+        exact = self.settings.evaluation == "exact"
+        return tuple(
+            f"{controller.name}.{name}"
+            for controller in self.controllers
+            for name in (EXACT_COLUMNS if exact else SIMULATED_COLUMNS)
+        )
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of all columns of the results: row, parameters, results."""
+        return ("row", *self.parameter_names, *self.result_columns)
+
+    def values(self, start: int = 0, stop: int | None = None) -> FloatArray:
+        """Return the parameters of samples ``start`` to ``stop``.
+
+        Parameters
+        ----------
+        start, stop : int, optional
+            Rows, the last not included; all by default.
+
+        Returns
+        -------
+        (stop - start, parameters) ndarray
+            The same for the same file, whoever asks for which rows.
+
+        Raises
+        ------
+        ProblemError
+            If there are no such rows.
+        """
+        start = integer(start, "start", at_least=0)
+        stop = self.samples if stop is None else integer(stop, "stop", at_least=start)
+        if stop > self.samples:
+            raise ProblemError(f"the study has {self.samples} samples; got rows up to {stop}.")
+        varying = [p for p in self.parameters if p.distribution.varies]
+        points = unit_points(
+            self.settings.sampling,
+            samples=self.samples,
+            dimensions=len(varying),
+            seed=self.settings.seed,
+            start=start,
+            stop=stop,
+        )
+        levels = iter(points.T)
+        out = np.empty((stop - start, len(self.parameters)))
+        for column, parameter in enumerate(self.parameters):
+            level = next(levels) if parameter.distribution.varies else np.zeros(stop - start)
+            out[:, column] = parameter.distribution.quantile(level)
+        return out
+
+    def seed_of(self, row: int) -> int:
+        """Return the seed of the simulation of one sample."""
+        drawn = np.random.SeedSequence(self.settings.seed, spawn_key=(row,)).generate_state(1)
+        return int(drawn[0])
+
+    def value_of(self, name: str, values: Sequence[float] | FloatArray, default: float) -> float:
+        """Return one parameter of a row of :meth:`values`, a default if it is none of them."""
+        names = self.parameter_names
+        return float(values[names.index(name)]) if name in names else default
+
+    def named(self, values: Sequence[float] | FloatArray) -> dict[str, Any]:
+        """Return a row of :meth:`values` by the names of the parameters."""
+        return dict(zip(self.parameter_names, np.asarray(values).tolist(), strict=True))

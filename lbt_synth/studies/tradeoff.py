@@ -1,0 +1,149 @@
+"""The trade-off between variance, norm and tolerated sensor gain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.design import FilterDesign, central, hinf, kalman, mixed
+from lbt_synth.design.mixed import require_taps
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.validation import choice, integer
+
+FAMILIES = ("mixed", "central")
+_MOST_POINTS = 200
+_CROWDING = 1.5  # points crowd where the norm is near its least
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TradeoffPoint:
+    """One filter of the trade-off.
+
+    Attributes
+    ----------
+    family : str
+        "mixed": least variance of all filters with this norm; "central": the H-infinity
+        filter whose norm this is.
+    gamma : float
+        H-infinity norm of its estimation error, recomputed.
+    gamma_ratio : float
+        The same over the least norm of any filter.
+    rms : float
+        Standard deviation of its estimation error, recomputed.
+    gain_low, gain_high : float
+        Sensor gains between which its loop is stable; nan for a problem without a loop.
+    modulus : float
+        Modulus margin of its loop; nan for a problem without a loop.
+    design : FilterDesign
+        The filter.
+    """
+
+    family: str
+    gamma: float
+    gamma_ratio: float
+    rms: float
+    gain_low: float
+    gain_high: float
+    modulus: float
+    design: FilterDesign
+
+
+def tradeoff(
+    problem: EstimationProblem,
+    *,
+    points: int = 9,
+    families: Sequence[str] = FAMILIES,
+    taps: int = 16,
+) -> Iterator[TradeoffPoint]:
+    """Return filters from the least norm to the least variance, and examine their loops.
+
+    The levels run from the least gamma to the norm of the Kalman filter, at which all
+    families meet.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; with a plant, each filter's loop is examined.
+    points : int, optional
+        Levels of the norm, 2 to 200.
+    families : sequence of {"mixed", "central"}, optional
+        Which filters to make at each level.
+    taps : int, optional
+        Length of the mixed filters' impulse response.
+
+    Returns
+    -------
+    iterator of TradeoffPoint
+        In the order of levels, then families; each is made when it is asked for.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+    SynthesisError
+        If a design fails.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.EstimationProblem(
+    ...     A=[[1.9, -0.99], [1.0, 0.0]],
+    ...     B=[[1.0, 0.0], [0.0, 0.0]],
+    ...     C=[[0.0, 1.0]],
+    ...     D=[[0.0, 3.0]],
+    ...     L=[[1.0, 0.0]],
+    ... )
+    >>> front = list(lbt.studies.tradeoff(line, points=3, families=["mixed"]))
+    >>> front[0].rms > front[1].rms > front[2].rms
+    True
+    """
+    require_problem(problem)
+    count = integer(points, "points", at_least=2)
+    if count > _MOST_POINTS:
+        raise ProblemError(f"points must be at most {_MOST_POINTS}; got {count}.")
+    length = require_taps(taps)
+    for family in families:
+        choice(family, "families", FAMILIES)
+    return _points(problem, count, tuple(families), length)
+
+
+def _points(
+    problem: EstimationProblem, count: int, families: tuple[str, ...], taps: int
+) -> Iterator[TradeoffPoint]:
+    least, best = hinf(problem, method="riccati"), kalman(problem)
+    assert least.gamma_least is not None  # of an H-infinity design
+    spread = max(best.gamma / least.gamma_least, 1.0)
+    for i, share in enumerate(np.linspace(0, 1, count) ** _CROWDING):
+        level = least.gamma_least * float(spread**share)
+        for family in families:
+            if i == 0:
+                design = least
+            elif i == count - 1:
+                design = best
+            elif family == "mixed":
+                design = mixed(problem, gamma=level, taps=taps)
+            else:
+                design = central(problem, gamma=level)
+            yield _point(design, family, least.gamma_least)
+
+
+def _point(design: FilterDesign, family: str, least: float) -> TradeoffPoint:
+    low = high = modulus = float("nan")
+    if design.hardware is not None:
+        margins = loop_margins(close_loop(design.hardware, design.controller))
+        low, high, modulus = margins.gain_low, margins.gain_high, margins.modulus
+    return TradeoffPoint(
+        family=family,
+        gamma=design.gamma,
+        gamma_ratio=max(design.gamma / least, 1.0),
+        rms=design.rms,
+        gain_low=low,
+        gain_high=high,
+        modulus=modulus,
+        design=design,
+    )
