@@ -117,8 +117,8 @@ def maps() -> dict[str, Row]:
         loop = lbt.close_loop(config.hardware, design.controller, sensor_gain=gain)
         return lbt.strehl(lbt.residual_budget(loop, met), config.imaging)
 
-    def mapped() -> lbt.studies.StrehlMap:
-        return lbt.studies.strehl_map(
+    def mapped() -> lbt.studies.RobustnessMap:
+        return lbt.studies.robustness_map(
             design, truth, config.imaging, errors_hz=errors, sensor_gains=gains
         )
 

@@ -10,6 +10,7 @@ from plants import LBT_YAML
 from ruamel.yaml import YAML
 
 import lbt_synth as lbt
+from lbt_synth.config.robust import robust_design
 
 GOOD = YAML(typ="safe", pure=True).load(LBT_YAML.read_text())
 
@@ -415,7 +416,7 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     robust = {"bands": [band], "functions": 8, "states": None, "modulus_margin": 0.3}
     content = small(design={"robust": robust})
     config = lbt.load_config(write(tmp_path, content))
-    lbt.config.robust_design(config)  # with the model's turbulence, as there is no atmosphere
+    robust_design(config)  # with the model's turbulence, as there is no atmosphere
     for change, text in (
         ({"turbulence": "frozen_flow"}, "atmosphere is missing: design.robust.turbulence"),
         (
@@ -425,8 +426,8 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     ):
         content["design"] = {"robust": {**robust, **change}}
         with pytest.raises(lbt.errors.ConfigError, match=text):
-            lbt.config.robust_design(lbt.load_config(write(tmp_path, content)))
+            robust_design(lbt.load_config(write(tmp_path, content)))
     content["design"] = {"robust": {**robust, "command_step_nm": 500.0}}
     content["model"]["turbulence"] = [AR, OTHER]
     with pytest.raises(lbt.errors.ConfigError, match="hold under one turbulence for all axes"):
-        lbt.config.robust_design(lbt.load_config(write(tmp_path, content)))
+        robust_design(lbt.load_config(write(tmp_path, content)))

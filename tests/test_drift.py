@@ -149,9 +149,9 @@ def test_what_needs_a_stationary_truth_refuses_it(config):
         lambda: lbt.loop.least_worst_residual(
             hw, truth, band_hz=(15, 25), rms_nm=100, direction=(1,)
         ),
-        lambda: lbt.studies.strehl_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
-        lambda: lbt.studies.limit_study({"kalman": design}, hw, truth, camera),
-        lambda: list(lbt.studies.frequency_robustness(plant, truth, camera, errors_hz=[0])),
+        lambda: lbt.studies.robustness_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
+        lambda: lbt.studies.limits({"kalman": design}, hw, truth, camera),
+        lambda: list(lbt.studies.robustness(plant, truth, camera, errors_hz=[0])),
         lambda: lbt.design.optimal_integrator(hw, truth),
     ):
         with pytest.raises(lbt.errors.ProblemError, match="drifts from 17 to 23 Hz. Simulate it"):

@@ -432,7 +432,7 @@ def test_study(config):
         "kalman": lbt.kalman(config.plant),
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, method="riccati"),
     }
-    study = lbt.studies.limit_study(
+    study = lbt.studies.limits(
         designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5]
     )
     assert study.band_hz == (16.5, 23.5)
@@ -453,9 +453,7 @@ def test_study(config):
 def test_study_of_an_unstable_design(config):
     designs = {"low": lbt.hinf(config.plant, gamma_ratio=1.05, method="riccati")}
     truth = replace(config.truth, sensor_gain=0.3)
-    study = lbt.studies.limit_study(
-        designs, config.hardware, truth, config.imaging, errors_hz=[-1, 1]
-    )
+    study = lbt.studies.limits(designs, config.hardware, truth, config.imaging, errors_hz=[-1, 1])
     (row,) = study.rows
     assert not row.stable
     assert np.isnan([row.residual_nm, row.strehl, row.worst_nm, row.above_limit_percent]).all()
@@ -538,13 +536,13 @@ def test_a_search_that_does_not_settle(monkeypatch):
 def test_bad_studies(config):
     good = (config.hardware, config.truth, config.imaging)
     with pytest.raises(lbt.errors.ProblemError, match="at least one design"):
-        lbt.studies.limit_study({}, *good)
+        lbt.studies.limits({}, *good)
     designs = {"kalman": lbt.kalman(config.plant)}
     with pytest.raises(lbt.errors.ProblemError, match="at least one error"):
-        lbt.studies.limit_study(designs, *good, errors_hz=[])
+        lbt.studies.limits(designs, *good, errors_hz=[])
     with pytest.raises(lbt.errors.ProblemError, match="must be above 0"):
-        lbt.studies.limit_study(designs, *good, errors_hz=[25.0])
-    still = lbt.studies.limit_study(designs, *good)
+        lbt.studies.limits(designs, *good, errors_hz=[25.0])
+    still = lbt.studies.limits(designs, *good)
     assert still.band is None
     with pytest.raises(lbt.errors.ProblemError, match="a vibration that moves"):
         lbt.report.figures.limits_figure(still)

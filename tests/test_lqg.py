@@ -278,7 +278,7 @@ def test_the_other_designs_and_analyses_take_a_moving_mirror():
         assert loop.is_stable
         assert lbt.residual_budget(loop, truth).rms_nm >= limit * (1 - 1e-9)
     assert lbt.loop.stable_sensor_gains(plant.hardware, made["integrator"].controller)[1] > 1
-    found = lbt.studies.strehl_map(
+    found = lbt.studies.robustness_map(
         made["lqg"],
         truth,
         lbt.Imaging(diameter_m=8.22),
@@ -325,9 +325,7 @@ def test_wrong_arguments_are_refused():
     with pytest.raises(lbt.errors.DimensionError, match="must have rank 2"):
         lbt.lqg(flat)
     with pytest.raises(lbt.errors.ProblemError, match="needs a TipTiltPlant"):
-        lbt.studies.mirror_study(
-            plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8)
-        )
+        lbt.studies.mirror(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
     with pytest.raises(lbt.errors.ProblemError, match="settles at once"):
         lbt.report.figures.mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
 
@@ -363,7 +361,7 @@ def test_the_example_has_a_mirror_for_design_and_loop():
     assert config.hardware.mirror is config.plant.hardware.mirror
     step = config.hardware.mirror.step_response()
     assert 3e-3 < step.settling_s < 6e-3
-    rows = lbt.studies.mirror_study(config.plant, config.truth, config.imaging)
+    rows = lbt.studies.mirror(config.plant, config.truth, config.imaging)
     by_name = {row.design: row for row in rows}
     assert not by_name["kalman, settled mirror"].stable
     assert by_name["lqg"].strehl > 0.8

@@ -58,7 +58,7 @@ def single(design, truth, imaging, error_hz, gain, delay_error=0.0):
 
 
 def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
-    found = lbt.studies.strehl_map(
+    found = lbt.studies.robustness_map(
         design, truth, imaging, errors_hz=errors, sensor_gains=gains, delay_errors_frames=delays
     )
     assert found.stable.any()
@@ -128,14 +128,14 @@ def test_axes_that_the_sensor_mixes(air):
 
 
 def test_unstable_points_are_nan(robust, settings):
-    found = lbt.studies.strehl_map(
+    found = lbt.studies.robustness_map(
         robust, settings.truth, settings.imaging, errors_hz=[-1, 0], sensor_gains=[0.3, 1.0, 3.0]
     )
     assert found.stable[0].tolist() == [False, True, False]
     assert np.isnan(found.strehl[0, [0, 2]]).all()
     assert np.isnan(found.residual_nm[0, [0, 2]]).all()
     assert np.isfinite(found.strehl[0, 1]).all()
-    none = lbt.studies.strehl_map(
+    none = lbt.studies.robustness_map(
         robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[0.1]
     )
     assert np.isnan(none.strehl).all()
@@ -143,7 +143,7 @@ def test_unstable_points_are_nan(robust, settings):
 
 def test_an_image_that_is_gone_has_no_strehl(robust, settings):
     _, high = lbt.loop.stable_sensor_gains(robust.hardware, robust.controller)
-    found = lbt.studies.strehl_map(
+    found = lbt.studies.robustness_map(
         robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[high * (1 - 1e-8)]
     )
     assert found.stable.all()
@@ -155,7 +155,7 @@ def test_order_and_neighbours_change_nothing(kalman, settings):
     """A point is the same alone, among others, in any order, and more of them than fit at once."""
 
     def mapped(errors, gains):
-        return lbt.studies.strehl_map(
+        return lbt.studies.robustness_map(
             kalman, settings.truth, settings.imaging, errors_hz=errors, sensor_gains=gains
         )
 
@@ -175,7 +175,7 @@ def test_turning_the_vibration_changes_nothing(kalman, air):
         truth = lbt.Truth(
             turbulence=air, vibrations=(sinusoid(direction=direction),), noise_nm=15.5
         )
-        return lbt.studies.strehl_map(
+        return lbt.studies.robustness_map(
             kalman, truth, CAMERA, errors_hz=[0, 2], sensor_gains=[0.5, 1]
         ).strehl
 
@@ -188,8 +188,10 @@ def test_the_sign_of_the_error_is_that_of_the_sweep(kalman, settings):
     moved = replace(
         settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
     )
-    below = lbt.studies.strehl_map(kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1])
-    above = lbt.studies.strehl_map(
+    below = lbt.studies.robustness_map(
+        kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1]
+    )
+    above = lbt.studies.robustness_map(
         kalman, settings.truth, settings.imaging, errors_hz=[1.5], sensor_gains=[1]
     )
     assert below.strehl == pytest.approx(above.strehl, rel=1e-12)
@@ -197,7 +199,7 @@ def test_the_sign_of_the_error_is_that_of_the_sweep(kalman, settings):
 
 def test_counts_points_as_they_are_done(kalman, settings):
     counts = []
-    lbt.studies.strehl_map(
+    lbt.studies.robustness_map(
         kalman,
         settings.truth,
         settings.imaging,
@@ -297,21 +299,21 @@ WRONG = [
 def test_wrong_axes_are_refused(kalman, settings, wrong, text):
     axes = {"errors_hz": [0], "sensor_gains": [1]} | wrong
     with pytest.raises(lbt.errors.ProblemError, match=text):
-        lbt.studies.strehl_map(kalman, settings.truth, settings.imaging, **axes)
+        lbt.studies.robustness_map(kalman, settings.truth, settings.imaging, **axes)
 
 
 def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
     axes = {"errors_hz": [0, 1], "sensor_gains": [1]}
     walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     with pytest.raises(lbt.errors.ProblemError, match="needs a design for a loop"):
-        lbt.studies.strehl_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
+        lbt.studies.robustness_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
     with pytest.raises(lbt.errors.ProblemError, match="needs a vibration in the truth"):
-        lbt.studies.strehl_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)
+        lbt.studies.robustness_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)
     with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
-        lbt.studies.strehl_map(lbt.kalman(axis_plant), settings.truth, settings.imaging, **axes)
+        lbt.studies.robustness_map(lbt.kalman(axis_plant), settings.truth, settings.imaging, **axes)
     three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
     with pytest.raises(lbt.errors.DimensionError, match="got a loop of 3 modes"):
-        lbt.studies.strehl_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
+        lbt.studies.robustness_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
 
 
 # --------------------------------------------------------------------------
@@ -321,13 +323,13 @@ def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
 def maps(kalman, robust, settings):
     axes = {"errors_hz": [2, 0, -2, 1], "sensor_gains": [1.5, 0.3, 0.8, 3.0]}
     return {
-        name: lbt.studies.strehl_map(design, settings.truth, settings.imaging, **axes)
+        name: lbt.studies.robustness_map(design, settings.truth, settings.imaging, **axes)
         for name, design in (("Kalman", kalman), ("H-infinity", robust))
     }
 
 
 def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
-    figure = lbt.report.figures.map_figure(maps)
+    figure = lbt.report.figures.robustness_map_figure(maps)
     left, right, bar = figure.axes
     assert [left.get_title(), right.get_title()] == ["Kalman", "H-infinity"]
     assert bar.get_ylabel() == "Strehl ratio [%]"
@@ -341,7 +343,7 @@ def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
 
 def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
     def mapped(design, gains, delays):
-        return lbt.studies.strehl_map(
+        return lbt.studies.robustness_map(
             design,
             settings.truth,
             settings.imaging,
@@ -350,20 +352,20 @@ def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, 
             delay_errors_frames=delays,
         )
 
-    figure = lbt.report.figures.map_figure(
+    figure = lbt.report.figures.robustness_map_figure(
         {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
     )
     assert len(figure.axes) == 5
     assert figure.axes[2].get_ylabel() == "delay error +0.1 frames\nsensor gain [-]"
     figure.savefig(tmp_path / "a.png")
-    nowhere = lbt.report.figures.map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
+    nowhere = lbt.report.figures.robustness_map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
     nowhere.savefig(tmp_path / "b.pdf")
 
 
 def test_map_figures_that_are_refused(maps, kalman, settings):
     with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
-        lbt.report.figures.map_figure({})
-    late = lbt.studies.strehl_map(
+        lbt.report.figures.robustness_map_figure({})
+    late = lbt.studies.robustness_map(
         kalman,
         settings.truth,
         settings.imaging,
@@ -374,4 +376,4 @@ def test_map_figures_that_are_refused(maps, kalman, settings):
     with pytest.raises(
         lbt.errors.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"
     ):
-        lbt.report.figures.map_figure({**maps, "late": late})
+        lbt.report.figures.robustness_map_figure({**maps, "late": late})

@@ -142,7 +142,7 @@ def test_command_without_gain_files_is_as_before(tmp_path, capsys, settings):
         capsys, "robustness", tmp_path / "few.yaml", "--sensor-gain", 0.8, "--json"
     )
     assert status == 0
-    rows = lbt.studies.frequency_robustness(
+    rows = lbt.studies.robustness(
         settings.plant,
         replace(settings.truth, sensor_gain=0.8),
         settings.imaging,

@@ -87,7 +87,7 @@ def test_sigma_of_the_paper_kalman_peaks_where_hinf_is_flatter():
 
 def test_robustness_rows(config):
     rows = list(
-        lbt.studies.frequency_robustness(
+        lbt.studies.robustness(
             config.plant, config.truth, config.imaging, errors_hz=[-3, 0, 3], gamma_ratio=1.2
         )
     )
@@ -109,7 +109,7 @@ def test_unstable_rows_say_so(config):
     from dataclasses import replace
 
     truth = replace(config.truth, sensor_gain=0.3)
-    (row,) = lbt.studies.frequency_robustness(
+    (row,) = lbt.studies.robustness(
         config.plant, truth, config.imaging, errors_hz=[0], methods=["hinf"], gamma_ratio=1.05
     )
     assert not row.stable
@@ -120,16 +120,12 @@ def test_the_study_refuses_what_it_cannot_do(config):
     turbulence = config.plant.turbulence[0]
     still = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=turbulence, noise_nm=10)
     with pytest.raises(lbt.errors.ProblemError, match="needs a vibration in the model"):
-        list(lbt.studies.frequency_robustness(still, config.truth, config.imaging, errors_hz=[0]))
+        list(lbt.studies.robustness(still, config.truth, config.imaging, errors_hz=[0]))
     with pytest.raises(lbt.errors.ProblemError, match="method must be one of"):
         list(
-            lbt.studies.frequency_robustness(
+            lbt.studies.robustness(
                 config.plant, config.truth, config.imaging, errors_hz=[0], methods=["magic"]
             )
         )
     with pytest.raises(lbt.errors.ProblemError, match="above 0"):
-        list(
-            lbt.studies.frequency_robustness(
-                config.plant, config.truth, config.imaging, errors_hz=[-25]
-            )
-        )
+        list(lbt.studies.robustness(config.plant, config.truth, config.imaging, errors_hz=[-25]))

@@ -53,9 +53,7 @@ def test_other_endings_are_refused(tmp_path, designs):
 
 def test_robustness_figure_draws_the_paper_beside(config):
     rows = list(
-        lbt.studies.frequency_robustness(
-            config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1]
-        )
+        lbt.studies.robustness(config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1])
     )
     (axis,) = lbt.report.figures.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
     assert legend(axis) == ["Kalman", "Kalman, paper", r"H$_\infty$"]
@@ -97,7 +95,7 @@ def test_robustness_figure_of_an_unstable_method(config):
 
     truth = replace(config.truth, sensor_gain=0.3)
     rows = list(
-        lbt.studies.frequency_robustness(
+        lbt.studies.robustness(
             config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05
         )
     )

@@ -73,7 +73,7 @@ def text(report, folder):
 
 
 def test_the_numbers_are_those_of_the_library(report, config, designs):
-    study = lbt.studies.limit_study(
+    study = lbt.studies.limits(
         designs,
         config.hardware,
         config.truth,
@@ -92,7 +92,7 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         assert one.margins == lbt.loop_margins(loop)
         low, high = lbt.loop.stable_sensor_gains(config.hardware, one.design.controller)
         assert one.sensor_gains == (pytest.approx((low, high), rel=1e-9),)
-        found = lbt.studies.strehl_map(
+        found = lbt.studies.robustness_map(
             one.design, config.truth, config.imaging, errors_hz=[-2.0, 0.0], sensor_gains=[0.5, 1.0]
         )
         at = [int(np.flatnonzero(one.map.errors_hz == e)[0]) for e in (-2.0, 0.0)]

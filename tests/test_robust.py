@@ -49,7 +49,7 @@ def test_the_example_holds_at_every_row_and_sensor_gain(example):
     config = lbt.load_config(EXAMPLE)
     camera = replace(config.imaging, other_modes=0.841)
     noise = replace(config.truth, noise_nm=15.5)
-    found = lbt.studies.strehl_map(
+    found = lbt.studies.robustness_map(
         example, noise, camera, errors_hz=np.arange(-7, 8) / 2, sensor_gains=[1, 0.7, 0.5, 0.358]
     )
     worst = 100 * np.min(found.strehl[0], axis=1)

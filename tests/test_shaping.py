@@ -581,7 +581,7 @@ def test_impossible_claims_of_a_gain_file_are_refused(small, tmp_path, change, m
         (lambda: lbt.robust(plant_of_one(), bands=[], sensor_gain=(1,)), r"must be \(low, high\)"),
         (lambda: lbt.robust(plant_of_one(), bands=[], scenarios=1.0), "scenarios must be a list"),
         (
-            lambda: lbt.studies.strehl_map(
+            lambda: lbt.studies.robustness_map(
                 None,
                 lbt.Truth(turbulence=None),
                 lbt.Imaging(diameter_m=8),

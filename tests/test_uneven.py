@@ -135,7 +135,9 @@ def test_the_map_is_the_budget_at_each_point(loops):
     truth = lbt.Truth(turbulence=[SLOW, TABLE], noise_nm=[15.5, 6.0], vibrations=LINES)
     design = lbt.integrator(both, gain=0.4)
     camera = lbt.Imaging(diameter_m=8.22)
-    found = lbt.studies.strehl_map(design, truth, camera, errors_hz=[0], sensor_gains=[0.6, 1.0])
+    found = lbt.studies.robustness_map(
+        design, truth, camera, errors_hz=[0], sensor_gains=[0.6, 1.0]
+    )
     for i, gain in enumerate([0.6, 1.0]):
         loop = lbt.close_loop(both, design.controller, sensor_gain=gain)
         real = lbt.Truth(

@@ -34,7 +34,7 @@ def study(plant: lbt.models.TipTiltPlant) -> None:
     for name, mirror in MIRRORS.items():
         here = moving(plant, mirror)
         settling = 0.0 if mirror is None else 1e3 * mirror.step_response().settling_s
-        rows = lbt.studies.mirror_study(here, CONFIG.truth, CONFIG.imaging)
+        rows = lbt.studies.mirror(here, CONFIG.truth, CONFIG.imaging)
         limit = lbt.loop.least_residual(here.hardware, CONFIG.truth).rms_nm
         cells = [
             f"{r.residual_nm:8.2f} {100 * r.strehl:6.2f} ({r.unsettled_nm:7.2f})"

@@ -43,7 +43,7 @@ def plant(turbulence: lbt.models.ARModel, damping: float, rms_nm: float) -> lbt.
 
 def worst_strehl(design: lbt.Design, errors=ERRORS) -> np.ndarray:
     """Worst Strehl ratio over the rows, at each sensor gain [%]; 0 where unstable."""
-    found = lbt.studies.strehl_map(design, TRUTH, CAMERA, errors_hz=errors, sensor_gains=GAINS)
+    found = lbt.studies.robustness_map(design, TRUTH, CAMERA, errors_hz=errors, sensor_gains=GAINS)
     return 100 * np.min(np.nan_to_num(found.strehl[0]), axis=1)
 
 
@@ -118,9 +118,7 @@ def main() -> None:
         "above limit [%]",
     ):
         table.add_column(heading, justify="left" if heading == "controller" else "right")
-    study = lbt.studies.limit_study(
-        every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS
-    )
+    study = lbt.studies.limits(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
     for (name, design), row in zip(every.items(), study.rows, strict=True):
         margins = lbt.loop_margins(lbt.close_loop(design.hardware, design.controller))
         table.add_row(
@@ -156,7 +154,7 @@ def draw(every: dict[str, lbt.Design], bands: dict[float, float]) -> None:
             for (name, design), style, colour in track(
                 list(zip(every.items(), styles, colours, strict=True)), transient=True
             ):
-                found = lbt.studies.strehl_map(
+                found = lbt.studies.robustness_map(
                     design, TRUTH, CAMERA, errors_hz=-shifts, sensor_gains=[gain]
                 )
                 axis.plot(20 + shifts, 100 * found.strehl[0, 0], ls=style, color=colour, label=name)

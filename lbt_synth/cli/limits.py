@@ -6,13 +6,13 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
+from lbt_synth import studies
 from lbt_synth.cli.output import Report, TableText, fixed, working
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.simulate import foreign_notes, named_designs
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, hinf, kalman, optimal_integrator
 from lbt_synth.report.figures import limits_figure
-from lbt_synth.studies import LimitStudy, limit_study
 
 
 def limits(arguments: Namespace) -> Report:
@@ -23,7 +23,7 @@ def limits(arguments: Namespace) -> Report:
     with working("comparing", quiet=arguments.json):
         designs = _made(config)
         designs |= {f"{name} (file)" if name in designs else name: d for name, d in given.items()}
-        study = limit_study(
+        study = studies.limits(
             designs,
             config.hardware,
             config.truth,
@@ -77,7 +77,7 @@ def _cells(record: dict[str, Any]) -> list[str]:
     ]
 
 
-def _data(study: LimitStudy, records: list[dict[str, Any]]) -> dict[str, Any]:
+def _data(study: studies.LimitStudy, records: list[dict[str, Any]]) -> dict[str, Any]:
     data: dict[str, Any] = {
         "rows": records,
         "limit_nm": None if study.limit is None else study.limit.rms_nm,
@@ -91,7 +91,7 @@ def _data(study: LimitStudy, records: list[dict[str, Any]]) -> dict[str, Any]:
     return data
 
 
-def _notes(study: LimitStudy) -> list[str]:
+def _notes(study: studies.LimitStudy) -> list[str]:
     if study.limit is None:
         return [
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
@@ -111,7 +111,9 @@ def _notes(study: LimitStudy) -> list[str]:
     return notes
 
 
-def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy) -> list[str]:
+def _design_notes(
+    config: Config, designs: dict[str, Design], study: studies.LimitStudy
+) -> list[str]:
     """Say what makes a row another comparison than it seems."""
     notes = []
     if config.truth.vibrations and not config.plant.vibrations:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from argparse import Namespace
 from dataclasses import asdict
 
+from lbt_synth import studies
 from lbt_synth.cli.output import Report, TableText, fixed, working
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.config import load_config
 from lbt_synth.errors import ConfigError
 from lbt_synth.loop import least_residual
 from lbt_synth.report.figures import mirror_figure
-from lbt_synth.studies import mirror_study
 from lbt_synth.studies.limits import limit_or_nan
 
 _FEW = 8
@@ -31,7 +31,7 @@ def mirror(arguments: Namespace) -> Report:
         )
     step = shell.step_response(arguments.tolerance)
     with working("designing", quiet=arguments.json):
-        rows = mirror_study(
+        rows = studies.mirror(
             config.plant,
             config.truth,
             config.imaging,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth import studies
 from lbt_synth.cli.output import Report, TableText, counting, fixed, progress
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.simulate import named_designs, real_truth
@@ -17,8 +18,8 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import stable_sensor_gains
 from lbt_synth.models.loop_hardware import same_mirror
-from lbt_synth.report.figures import map_figure, robustness_figure
-from lbt_synth.studies import StrehlMap, frequency_robustness, strehl_map
+from lbt_synth.report.figures import robustness_figure, robustness_map_figure
+from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.studies.robustness import METHODS
 from lbt_synth.validation import FloatArray, frozen, number
 
@@ -59,7 +60,7 @@ def _designed_anew(config: Config, arguments: Namespace) -> Report:
     errors = settings.robustness.errors_hz
     rows = list(
         progress(
-            frequency_robustness(
+            studies.robustness(
                 config.plant,
                 real_truth(config, arguments),
                 config.imaging,
@@ -126,7 +127,7 @@ def _maps(config: Config, arguments: Namespace) -> Report:
     total = len(designs) * errors.size * gains.size * len(delays)
     with counting(total=total, what="points", quiet=arguments.json) as count:
         for name, design in designs.items():
-            found = strehl_map(
+            found = robustness_map(
                 design,
                 config.truth,
                 config.imaging,
@@ -151,7 +152,7 @@ def _maps(config: Config, arguments: Namespace) -> Report:
         report,
         arguments.output,
         records=[record for name, found in maps.items() for record in _records(name, found)],
-        figure=lambda: map_figure(maps),
+        figure=lambda: robustness_map_figure(maps),
     )
     return report
 
@@ -209,7 +210,7 @@ def _alike(one: FloatArray, other: FloatArray) -> bool:
     return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, atol=1e-12 * size)
 
 
-def _intervals(design: Design, found: StrehlMap, believed: float) -> list[tuple[float, float]]:
+def _intervals(design: Design, found: RobustnessMap, believed: float) -> list[tuple[float, float]]:
     """Interval of stable real sensor gains at each delay error, nan if none is found."""
     assert design.hardware is not None  # _believed_gain has refused the others
     out = []
@@ -226,7 +227,7 @@ def _intervals(design: Design, found: StrehlMap, believed: float) -> list[tuple[
     return out
 
 
-def _summary(name: str, found: StrehlMap) -> TableText:
+def _summary(name: str, found: RobustnessMap) -> TableText:
     gains = found.sensor_gains
     if gains.size <= _FEW:
         shown = np.arange(gains.size)
@@ -268,7 +269,7 @@ def _summary(name: str, found: StrehlMap) -> TableText:
 def _map_notes(
     config: Config,
     designs: dict[str, Design],
-    maps: dict[str, StrehlMap],
+    maps: dict[str, RobustnessMap],
     intervals: dict[str, list[tuple[float, float]]],
 ) -> list[str]:
     notes = []
@@ -292,7 +293,7 @@ def _map_notes(
     return notes
 
 
-def _records(name: str, found: StrehlMap) -> list[dict[str, Any]]:
+def _records(name: str, found: RobustnessMap) -> list[dict[str, Any]]:
     return [
         {
             "file": name,

@@ -99,7 +99,7 @@ class LimitStudy:
     frequency_hz: float | None
 
 
-def limit_study(
+def limits(
     designs: Mapping[str, Design],
     hardware: LoopHardware,
     truth: Truth,
@@ -140,7 +140,7 @@ def limit_study(
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> study = lbt.studies.limit_study(
+    >>> study = lbt.studies.limits(
     ...     {"by hand": lbt.integrator(path, gain=0.5)},
     ...     path,
     ...     lbt.Truth(turbulence=slow, noise_nm=5.0),

@@ -38,7 +38,7 @@ class MirrorRow:
     unsettled_nm: float
 
 
-def mirror_study(
+def mirror(
     plant: TipTiltPlant,
     truth: Truth,
     imaging: Imaging,
@@ -85,7 +85,7 @@ def mirror_study(
     ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=60
     ... )
     >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5, mirror=shell)
-    >>> rows = lbt.studies.mirror_study(
+    >>> rows = lbt.studies.mirror(
     ...     plant, lbt.Truth(turbulence=slow, noise_nm=15.5), lbt.Imaging(diameter_m=8.22)
     ... )
     >>> [(row.design, row.stable) for row in rows][1::2]

@@ -49,7 +49,7 @@ class RobustnessRow:
     gamma: float
 
 
-def frequency_robustness(
+def robustness(
     plant: TipTiltPlant,
     truth: Truth,
     imaging: Imaging,
@@ -107,7 +107,7 @@ def frequency_robustness(
     ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797),),
     ... )
     >>> rows = list(
-    ...     lbt.studies.frequency_robustness(
+    ...     lbt.studies.robustness(
     ...         plant, truth, lbt.Imaging(diameter_m=8.22), errors_hz=[0, 3], methods=["kalman"]
     ...     )
     ... )

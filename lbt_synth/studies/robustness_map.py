@@ -19,7 +19,7 @@ _GAINS_AT_ONCE = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StrehlMap:
+class RobustnessMap:
     """Strehl ratio of a fixed design over what it may have been told wrongly.
 
     Attributes
@@ -47,7 +47,7 @@ class StrehlMap:
     stable: BoolArray
 
 
-def strehl_map(
+def robustness_map(
     design: Design,
     truth: Truth,
     imaging: Imaging,
@@ -56,7 +56,7 @@ def strehl_map(
     sensor_gains: Any,
     delay_errors_frames: Any = (0.0,),
     advance: Callable[[int], object] | None = None,
-) -> StrehlMap:
+) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
 
     Parameters
@@ -102,7 +102,7 @@ def strehl_map(
     ...     noise_nm=15.5,
     ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797),),
     ... )
-    >>> found = lbt.studies.strehl_map(
+    >>> found = lbt.studies.robustness_map(
     ...     lbt.kalman(plant),
     ...     truth,
     ...     lbt.Imaging(diameter_m=8.22),
@@ -161,7 +161,7 @@ def strehl_map(
             if advance is not None:
                 advance(part.size * errors.size)
     stable.setflags(write=False)
-    return StrehlMap(
+    return RobustnessMap(
         errors_hz=errors,
         sensor_gains=gains,
         delay_errors_frames=delays,

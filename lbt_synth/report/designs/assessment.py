@@ -26,7 +26,7 @@ from lbt_synth.loop import (
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, spectral_radii
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.studies import StrehlMap, strehl_map
+from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
 
 _GAINS = np.geomspace(0.01, 100.0, 400)  # where stable intervals are looked for
@@ -110,8 +110,8 @@ class DesignAssessment:
     error_norms: FloatArray | None
     rejection: FloatArray | None
     noise_transfer: FloatArray | None
-    curve: StrehlMap
-    map: StrehlMap
+    curve: RobustnessMap
+    map: RobustnessMap
 
     @property
     def certified(self) -> bool:
@@ -151,7 +151,7 @@ def assessed(
         loop_hardware=hardware,
     )
     curve, found = (
-        strehl_map(carrier, truth, imaging, errors_hz=errors_hz, sensor_gains=gains)
+        robustness_map(carrier, truth, imaging, errors_hz=errors_hz, sensor_gains=gains)
         for gains in ([truth.sensor_gain], np.asarray(sensor_gains) / assumed_gain)
     )
     return DesignAssessment(

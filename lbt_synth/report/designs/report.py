@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lbt_synth import studies
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -24,7 +25,7 @@ from lbt_synth.report.provenance import (
     time_of_making,
     versions,
 )
-from lbt_synth.studies import LimitRow, LimitStudy, limit_study
+from lbt_synth.studies import LimitRow, LimitStudy
 from lbt_synth.validation import FloatArray, frozen, instance
 
 _SOLVED = ("sdp", "lmi")  # routes of designs that a convex solver made
@@ -167,7 +168,7 @@ def design_report(
             )
         )
         count(1)
-    limits = limit_study(designs, hardware, truth, config.imaging, errors_hz=list(errors))
+    limits = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
     count(1)
     stable = [one for one in assessments if one.stable]
     settle = common_settling(

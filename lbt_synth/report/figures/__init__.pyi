@@ -7,6 +7,6 @@ from .identification import identification_figure as identification_figure
 from .limits import limits_figure as limits_figure
 from .mirror import mirror_figure as mirror_figure
 from .modal import modal_figure as modal_figure
-from .robustness_map import map_figure as map_figure
+from .robustness_map import robustness_map_figure as robustness_map_figure
 from .tracking import tracking_figure as tracking_figure
 from .tradeoff import tradeoff_figure as tradeoff_figure

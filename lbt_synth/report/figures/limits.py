@@ -36,7 +36,7 @@ def limits_figure(study: LimitStudy) -> Any:
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     >>> line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
-    >>> study = lbt.studies.limit_study(
+    >>> study = lbt.studies.limits(
     ...     {"by hand": lbt.integrator(path, gain=0.5)},
     ...     path,
     ...     lbt.Truth(turbulence=None, vibrations=(line,), noise_nm=5.0),

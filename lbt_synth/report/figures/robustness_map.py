@@ -10,12 +10,12 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.figures.map_cells import bands, cell_edges
 from lbt_synth.report.figures.style import house_style, new_figure
-from lbt_synth.studies import StrehlMap
+from lbt_synth.studies import RobustnessMap
 
 _LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
 
 
-def map_figure(maps: Mapping[str, StrehlMap]) -> Any:
+def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
     """Draw the Strehl ratio of designs over frequency error and sensor gain.
 
     Parameters
@@ -38,7 +38,7 @@ def map_figure(maps: Mapping[str, StrehlMap]) -> Any:
     --------
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> found = lbt.studies.strehl_map(
+    >>> found = lbt.studies.robustness_map(
     ...     lbt.integrator(path, gain=0.5),
     ...     lbt.Truth(turbulence=None),
     ...     lbt.Imaging(diameter_m=8.22),
@@ -46,7 +46,7 @@ def map_figure(maps: Mapping[str, StrehlMap]) -> Any:
     ...     sensor_gains=[1, 3],
     ... )
     >>> len(
-    ...     lbt.report.figures.map_figure({"integrator": found}).axes
+    ...     lbt.report.figures.robustness_map_figure({"integrator": found}).axes
     ... )  # one panel and the colour bar
     2
     """
@@ -79,7 +79,7 @@ def map_figure(maps: Mapping[str, StrehlMap]) -> Any:
     return figure
 
 
-def _limits(maps: Mapping[str, StrehlMap]) -> tuple[float, float]:
+def _limits(maps: Mapping[str, RobustnessMap]) -> tuple[float, float]:
     """Return the ends of the colour scale [%], the same for all panels."""
     values = 100 * np.concatenate([found.strehl.ravel() for found in maps.values()])
     values = values[np.isfinite(values)]
@@ -89,7 +89,7 @@ def _limits(maps: Mapping[str, StrehlMap]) -> tuple[float, float]:
     return (low, high) if high - low > 1 else (low - 0.5, high + 0.5)
 
 
-def _panel(panel: Any, found: StrehlMap, row: int, low: float, high: float) -> Any:
+def _panel(panel: Any, found: RobustnessMap, row: int, low: float, high: float) -> Any:
     across, up = np.argsort(found.errors_hz), np.argsort(found.sensor_gains)
     errors, gains = found.errors_hz[across], found.sensor_gains[up]
     percent = 100 * found.strehl[row][np.ix_(up, across)]

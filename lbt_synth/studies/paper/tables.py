@@ -12,7 +12,7 @@ from lbt_synth.loop import close_loop, residual_budget, strehl
 from lbt_synth.models import Truth
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.published import TABLE_II, TABLE_III
-from lbt_synth.studies.robustness import RobustnessRow, frequency_robustness
+from lbt_synth.studies.robustness import RobustnessRow, robustness
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +83,7 @@ def table_iii() -> Iterator[RobustnessRow]:
             (given.kalman_plant(), "kalman", None),
             (given.hinf_plant(), "hinf", given.HINF_GAMMA * given.NOISE_NM),
         ):
-            yield from frequency_robustness(
+            yield from robustness(
                 plant,
                 given.PAPER_TRUTH,
                 given.imaging(),
