@@ -5,7 +5,7 @@ from __future__ import annotations
 import hypothesis
 import matplotlib as mpl
 import pytest
-from plants import LBT_YAML, lbt_axis_plant
+from support.plants import LBT_YAML, lbt_axis_plant
 
 import lbt_synth as lbt
 

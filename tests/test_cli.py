@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from plants import LBT_YAML
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main

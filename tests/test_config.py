@@ -6,8 +6,8 @@ import copy
 
 import numpy as np
 import pytest
-from plants import LBT_YAML
 from ruamel.yaml import YAML
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.config.robust import robust_design

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import slycot
-from darex import EXAMPLES, example_2_1, example_2_4
+from support.darex import EXAMPLES, example_2_1, example_2_4
 
 import lbt_synth as lbt
 

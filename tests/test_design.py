@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import lbt_axis_plant, random_problem
+from support.plants import lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
 

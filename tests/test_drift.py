@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import LBT_YAML, lbt_axis_plant
 from ruamel.yaml import YAML
 from scipy.signal import hilbert
+from support.plants import LBT_YAML, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import ROOT
+from support.plants import ROOT
 
 import lbt_synth as lbt
 from lbt_synth.report.figures.identification import _apart

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compiled import STRICT, Compiled, compiler
-from exports import bare_design, lbt_config, lbt_designs, relative
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.compiled import STRICT, Compiled, compiler
+from support.exports import bare_design, lbt_config, lbt_designs, relative
 
 import lbt_synth as lbt
 from lbt_synth.interop.rehearsal import WrittenTerms, rehearsed_error

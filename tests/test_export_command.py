@@ -9,9 +9,9 @@ import re
 import numpy as np
 import pytest
 from astropy.io import fits
-from compiled import Compiled
-from exports import lbt_config, lbt_designs, transfer_functions
 from scipy.io import loadmat
+from support.compiled import Compiled
+from support.exports import lbt_config, lbt_designs, transfer_functions
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main

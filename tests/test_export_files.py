@@ -8,10 +8,10 @@ from math import comb
 
 import numpy as np
 import pytest
-from exports import bare_design, lbt_config, lbt_designs, relative, transfer_functions
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import loadmat
+from support.exports import bare_design, lbt_config, lbt_designs, relative, transfer_functions
 
 import lbt_synth as lbt
 from lbt_synth.interop.iir.polynomials import axis_polynomials

@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from plants import lbt_axis_plant
+from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.files.gain_file import store

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import ROOT
 from scipy.integrate import quad
 from scipy.signal import lfilter
+from support.plants import ROOT
 from test_identification import RATE, loop_of
 
 import lbt_synth as lbt

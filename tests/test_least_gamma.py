@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import lbt_axis_plant, random_problem
+from support.plants import lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from plants import LBT_YAML, lbt_axis_plant
+from support.plants import LBT_YAML, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main

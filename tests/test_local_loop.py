@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import ROOT, lbt_axis_plant
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from support.plants import ROOT, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.models.lifted_mirror import lifted_mirror, settled_mirror

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import ROOT, lbt_axis_plant
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
+from support.plants import ROOT, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.lqg_design import estimation_plant, loop_powers

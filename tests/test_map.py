@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plants import LBT_YAML
 from scipy.special import j0
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.linear.quadrature import adaptive_integral, gauss_panels

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from plants import LBT_YAML
+from support.plants import LBT_YAML
 from test_cli import run
 from test_map import single
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import LBT_YAML, lbt_axis_plant, random_problem
 from scipy.optimize import minimize
+from support.plants import LBT_YAML, lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance

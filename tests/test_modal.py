@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import lbt_axis_plant
+from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import lbt_axis_plant
 from scipy.linalg import solve_discrete_lyapunov
+from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.modal import certificate as certificates

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from plants import ROOT
+from support.plants import ROOT
 
 CASES = {
     "a test that passes": ("def test_it(): pass", 0),

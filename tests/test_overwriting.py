@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from plants import LBT_YAML
+from support.plants import LBT_YAML
 from test_cli import run
 
 import lbt_synth as lbt

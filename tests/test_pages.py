@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from pages import HOSTILE, Reader, every_mark, whole_page
+from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
 from lbt_synth.report.page.blocks import Listing, Page, Paragraph, Section

@@ -9,8 +9,8 @@ import json
 
 import numpy as np
 import pytest
-from plants import LBT_YAML, lbt_axis_plant
 from ruamel.yaml import YAML
+from support.plants import LBT_YAML, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 import pytest
-from plants import ROOT
+from support.plants import ROOT
 
 import lbt_synth as lbt
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from replays import (
+from support.replays import (
     CAMERA,
     CASES,
     FLAT,

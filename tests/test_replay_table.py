@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from replays import (
+from support.replays import (
     CAMERA,
     CASES,
     GOOD,

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pages import Reader
-from plants import LBT_YAML, lbt_axis_plant
+from support.pages import Reader
+from support.plants import LBT_YAML, lbt_axis_plant
 from test_cli import run
 
 import lbt_synth as lbt

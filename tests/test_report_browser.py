@@ -7,9 +7,9 @@ import re
 import time
 
 import pytest
-from pages import HOSTILE, every_mark, whole_page
-from plants import LBT_YAML
-from study_pages import page_of, results
+from support.pages import HOSTILE, every_mark, whole_page
+from support.plants import LBT_YAML
+from support.study_pages import page_of, results
 
 import lbt_synth as lbt
 from lbt_synth.report.page.html import page_html

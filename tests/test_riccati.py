@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 import slycot
-from darex import example_2_5
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import ROOT, lbt_axis_plant, random_problem
+from support.darex import example_2_5
+from support.plants import ROOT, lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
 from lbt_synth.linear.riccati.filtering import kalman_riccati

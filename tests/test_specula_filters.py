@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exports import relative
-from plants import LBT_YAML, ROOT
-from specula_filters import noise_series, simulated
+from support.exports import relative
+from support.plants import LBT_YAML, ROOT
+from support.specula_filters import noise_series, simulated
 
 import lbt_synth as lbt
 
 pytestmark = pytest.mark.e2e
 
 DOUBLE, SINGLE = 0, 1
-SCRIPT = Path(__file__).with_name("specula_filters.py")
+SCRIPT = Path(__file__).parent / "support" / "specula_filters.py"
 
 
 @pytest.fixture(scope="module")

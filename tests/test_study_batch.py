@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from studies import BASE, LBT_TEXT, study_file
+from support.studies import BASE, LBT_TEXT, study_file
 
 import lbt_synth as lbt
 from lbt_synth.studies.study import batch

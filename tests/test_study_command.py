@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from studies import study_file
+from support.studies import study_file
 from test_campaign import alive, wait_for
 from test_cli import run
 from test_study_run import TWO, assert_whole, quick, table

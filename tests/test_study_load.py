@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plants import ROOT
 from scipy import stats
-from studies import BASE, LBT_TEXT, loaded, study_file
+from support.plants import ROOT
+from support.studies import BASE, LBT_TEXT, loaded, study_file
 
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError, GainFileError, ProblemError

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plants import ROOT
-from study_pages import CONTROLLERS, INFO, PARAMETERS, page_of, results
+from support.plants import ROOT
+from support.study_pages import CONTROLLERS, INFO, PARAMETERS, page_of, results
 
 import lbt_synth as lbt
 from lbt_synth.report.page.blocks import Listing, Notice, Paragraph

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from studies import LBT_TEXT, loaded
+from support.studies import LBT_TEXT, loaded
 
 import lbt_synth as lbt
 from lbt_synth.errors import MissingExtraError, NumericalError, OutputError, ProblemError

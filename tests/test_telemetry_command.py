@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from plants import LBT_YAML
+from support.plants import LBT_YAML
 from test_cli import run
 from test_telemetry import full, same
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import lbt_axis_plant
+from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.files.telemetry.time_filters import integrator_gains, time_filters

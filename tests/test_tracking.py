@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import lbt_axis_plant
+from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.identification.tracking.glitches import glitches
@@ -843,7 +843,7 @@ def test_tracking_is_within_two_points_of_knowing(damping):
     """17 to 23 Hz in a minute; docs/tracking.md prints the numbers."""
     from importlib.util import module_from_spec, spec_from_file_location
 
-    from plants import ROOT
+    from support.plants import ROOT
 
     spec = spec_from_file_location("tracking_study", ROOT / "docs" / "measure" / "tracking.py")
     study = module_from_spec(spec)

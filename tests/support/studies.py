@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
-from plants import LBT_YAML
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 

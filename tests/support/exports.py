@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 from astropy.io import fits
-from plants import LBT_YAML
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 

@@ -8,7 +8,7 @@ import numpy as np
 
 import lbt_synth as lbt
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 LBT_YAML = ROOT / "examples" / "lbt.yaml"
 
 
