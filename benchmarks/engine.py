@@ -83,7 +83,7 @@ def least_gamma_riccati() -> dict[int, Row]:
     rows = {}
     for lines in (1, 4, 12, 20):
         p = plant(lines)
-        rows[p.n_states] = {"ours_s": seconds(lambda q=p: lbt.hinf(q, method="riccati"), 7)}
+        rows[p.n_states] = {"ours_s": seconds(lambda q=p: lbt.hinf(q, route="riccati"), 7)}
     rows[26]["bar_s"] = 0.05
     return with_growth(rows)
 

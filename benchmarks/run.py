@@ -98,8 +98,8 @@ def synthesis() -> dict[str, Row]:
         name: {"ours_s": seconds(call, 5)}
         for name, call in (
             ("Kalman, Riccati", lambda: lbt.kalman(plant)),
-            ("Kalman, SDP", lambda: lbt.kalman(plant, method="sdp")),
-            ("H-infinity 1.2, Riccati", lambda: lbt.hinf(plant, gamma_ratio=1.2, method="riccati")),
+            ("Kalman, SDP", lambda: lbt.kalman(plant, route="sdp")),
+            ("H-infinity 1.2, Riccati", lambda: lbt.hinf(plant, gamma_ratio=1.2, route="riccati")),
             ("H-infinity 1.2, LMI", lambda: lbt.hinf(plant, gamma_ratio=1.2)),
         )
     }

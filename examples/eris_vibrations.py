@@ -159,7 +159,7 @@ def designs(plant: lbt.models.TipTiltPlant, met: Disturbance) -> dict[str, lbt.D
     return {
         "integrator": lbt.design.model_integrator(plant),
         "Kalman": lbt.kalman(plant),
-        "H-infinity": lbt.hinf(plant, gamma_ratio=1.2, method="riccati"),
+        "H-infinity": lbt.hinf(plant, gamma_ratio=1.2, route="riccati"),
         "robust": lbt.robust(plant, bands=BANDS, turbulence=table),
     }
 

@@ -91,7 +91,9 @@ def test_verification_that_fails_has_status_1(tmp_path, capsys, monkeypatch, gai
     def strict(self):
         found = honest(self)
         checks = tuple(
-            lbt.design.Check(name=c.name, value=c.limit + 1, limit=c.limit, method=c.method)
+            lbt.design.Check(
+                name=c.name, value=c.limit + 1, limit=c.limit, computed_by=c.computed_by
+            )
             for c in found.checks
         )
         return lbt.design.Certificate(

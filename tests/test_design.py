@@ -20,7 +20,7 @@ KALMAN_NM, LEAST_GAMMA_NM = 135.958, 155.5373
 
 def test_the_numbers_of_the_lbt(axis_plant):
     assert lbt.kalman(axis_plant).rms == pytest.approx(KALMAN_NM, rel=1e-5)
-    least = {m: lbt.hinf(axis_plant, method=m).gamma for m in ("lmi", "riccati")}
+    least = {m: lbt.hinf(axis_plant, route=m).gamma for m in ("lmi", "riccati")}
     assert least["riccati"] == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
     assert least["lmi"] == pytest.approx(least["riccati"], rel=1e-6)
 
@@ -28,7 +28,7 @@ def test_the_numbers_of_the_lbt(axis_plant):
 @pytest.mark.parametrize("modes", [1, 2])
 def test_kalman_by_sdp_agrees_with_the_riccati_equation(modes):
     plant = lbt_axis_plant(modes=modes)
-    riccati, sdp = (lbt.kalman(plant, method=m) for m in ("riccati", "sdp"))
+    riccati, sdp = (lbt.kalman(plant, route=m) for m in ("riccati", "sdp"))
     for name in ("gain_predictor", "gain_filter"):
         one, other = getattr(riccati, name), getattr(sdp, name)
         assert np.linalg.norm(one - other) / np.linalg.norm(one) < 1e-6
@@ -38,7 +38,7 @@ def test_kalman_by_sdp_agrees_with_the_riccati_equation(modes):
 @pytest.mark.parametrize("ratio", [1.02, 1.2, 2.0])
 def test_hinf_by_lmi_is_the_central_filter_of_the_riccati_equation(axis_plant, ratio):
     gamma = ratio * LEAST_GAMMA_NM
-    lmi, riccati = (lbt.hinf(axis_plant, gamma=gamma, method=m) for m in ("lmi", "riccati"))
+    lmi, riccati = (lbt.hinf(axis_plant, gamma=gamma, route=m) for m in ("lmi", "riccati"))
     difference = np.linalg.norm(lmi.gain_predictor - riccati.gain_predictor)
     assert difference / np.linalg.norm(riccati.gain_predictor) < 1e-6
     assert lmi.gamma <= gamma
@@ -49,9 +49,9 @@ def test_hinf_by_lmi_is_the_central_filter_of_the_riccati_equation(axis_plant, r
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 4), q=st.integers(1, 2), l=st.integers(1, 2))
 def test_both_routes_agree_on_problems_without_a_telescope(seed, n, q, l):
     problem = random_problem(np.random.default_rng(seed), n, q, l=l)
-    kalman, sdp = lbt.kalman(problem), lbt.kalman(problem, method="sdp")
+    kalman, sdp = lbt.kalman(problem), lbt.kalman(problem, route="sdp")
     assert sdp.rms == pytest.approx(kalman.rms, rel=1e-5)
-    riccati, lmi = lbt.hinf(problem, method="riccati"), lbt.hinf(problem)
+    riccati, lmi = lbt.hinf(problem, route="riccati"), lbt.hinf(problem)
     assert lmi.gamma == pytest.approx(riccati.gamma, rel=1e-5)
     # each filter is the best by its own measure
     assert kalman.rms <= riccati.rms * (1 + 1e-9)
@@ -83,7 +83,7 @@ def test_kalman_gains_with_correlated_noise():
 def test_scalar_hinf_against_a_search():
     """Of all gains of a scalar predictor, none beats the least gamma."""
     problem = lbt.EstimationProblem(A=0.95, B=[[2.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    least = lbt.hinf(problem, method="riccati").gamma
+    least = lbt.hinf(problem, route="riccati").gamma
     gains = np.linspace(0.05, 1.9, 1_000_001)
     norms = np.hypot(2.0, gains) / (1 - np.abs(0.95 - gains))
     assert least == pytest.approx(norms.min(), rel=1e-5)
@@ -91,7 +91,7 @@ def test_scalar_hinf_against_a_search():
 
 
 def test_at_the_least_gamma_the_error_is_all_pass(axis_plant):
-    design = lbt.hinf(axis_plant, method="riccati")
+    design = lbt.hinf(axis_plant, route="riccati")
     error = axis_plant.error_system(design.gain_predictor)
     sigma = lbt.linear.largest_singular_values(error, np.linspace(0.1, 400, 200))
     assert np.ptp(sigma) / sigma.mean() < 1e-4
@@ -107,11 +107,11 @@ def test_hinf_costs_sensor_gain_robustness(axis_plant):
 
 
 def test_gamma_below_the_least_names_the_least(axis_plant):
-    for method in ("lmi", "riccati"):
+    for route in ("lmi", "riccati"):
         with pytest.raises(
             lbt.errors.InfeasibleError, match=r"at least 155\.537.*got 150"
         ) as caught:
-            lbt.hinf(axis_plant, gamma=150, method=method)
+            lbt.hinf(axis_plant, gamma=150, route=route)
         assert caught.value.gamma == 150
         assert caught.value.gamma_least == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
 
@@ -123,7 +123,7 @@ def test_gamma_below_the_least_names_the_least(axis_plant):
         ({"gamma": -1}, "gamma must be above 0"),
         ({"gamma": np.nan}, "gamma must be finite"),
         ({"gamma_ratio": 0.9}, "gamma_ratio must be at least 1; got 0.9"),
-        ({"method": "magic"}, "method must be one of lmi, riccati; got 'magic'"),
+        ({"route": "magic"}, "route must be one of lmi, riccati; got 'magic'"),
     ],
 )
 def test_wrong_arguments_are_refused(axis_plant, arguments, text):
@@ -166,7 +166,7 @@ def test_an_unstable_optimal_filter_does_not_leave_the_library(monkeypatch, axis
 
     monkeypatch.setattr(module, "_RiccatiRoute", Liar)
     with pytest.raises(lbt.errors.CertificateError, match="spectral radius of the filter"):
-        lbt.hinf(axis_plant, gamma_ratio=1.2, method="riccati")
+        lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
 
 
 def test_certificate_checks_are_independent(axis_plant):
@@ -209,7 +209,7 @@ def test_units_do_not_matter():
     metre = lbt.EstimationProblem(A=nano.A, B=nano.B * 1e-9, C=nano.C, D=nano.D * 1e-9, L=nano.L)
     for make in (
         lbt.kalman,
-        lambda p: lbt.kalman(p, method="sdp"),
+        lambda p: lbt.kalman(p, route="sdp"),
         lambda p: lbt.hinf(p, gamma_ratio=1.2),
     ):
         one, other = make(nano), make(metre)
@@ -224,10 +224,10 @@ def test_least_gamma_over_six_decades_of_noise(noise_nm):
     plant = lbt.EstimationProblem(
         A=base.A, B=base.B, C=base.C, D=base.D * noise_nm / 15.5, L=base.L
     )
-    riccati, lmi = lbt.hinf(plant, method="riccati"), lbt.hinf(plant)
+    riccati, lmi = lbt.hinf(plant, route="riccati"), lbt.hinf(plant)
     assert riccati.gamma == pytest.approx(riccati.gamma_least, rel=1e-6)
     assert lmi.gamma == pytest.approx(riccati.gamma, rel=1e-6)
-    assert lbt.hinf(plant, method="riccati", gamma_ratio=1.2).certificate.passed
+    assert lbt.hinf(plant, route="riccati", gamma_ratio=1.2).certificate.passed
 
 
 def test_unstable_modes_that_no_noise_drives():
@@ -237,8 +237,8 @@ def test_unstable_modes_that_no_noise_drives():
         A=np.diag([2.0, 0.5]), B=[[0.0, 0], [1, 0]], C=[[1.0, 1]], D=[[0, 1.0]], L=[[1.0, 1]]
     )
     for problem, least in ((alone, 2.0), (pair, 2.828427)):
-        for method in ("riccati", "lmi"):
-            assert lbt.hinf(problem, method=method).gamma == pytest.approx(least, rel=1e-6)
+        for route in ("riccati", "lmi"):
+            assert lbt.hinf(problem, route=route).gamma == pytest.approx(least, rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", [33, 5, 8, 13, 21])
@@ -247,7 +247,7 @@ def test_many_sensors_of_one_state_at_the_least_gamma(seed):
     C = rng.standard_normal((3, 1))
     D = np.hstack([np.zeros((3, 1)), rng.standard_normal((3, 3))])
     problem = lbt.EstimationProblem(A=1.2, B=[[1.0, 0, 0, 0]], C=C, D=D, L=1.0)
-    design = lbt.hinf(problem, method="riccati")
+    design = lbt.hinf(problem, route="riccati")
     assert design.gamma == pytest.approx(design.gamma_least, rel=1e-8)
 
 
@@ -265,8 +265,8 @@ def test_weakly_driven_modes_and_odd_units_are_not_refused():
 
 def test_a_very_large_bound_is_the_kalman_filter(axis_plant):
     kalman = lbt.kalman(axis_plant)
-    for method in ("lmi", "riccati"):
-        design = lbt.hinf(axis_plant, gamma_ratio=1e6, method=method)
+    for route in ("lmi", "riccati"):
+        design = lbt.hinf(axis_plant, gamma_ratio=1e6, route=route)
         assert design.rms == pytest.approx(kalman.rms, rel=1e-6)
     with pytest.raises(lbt.errors.ProblemError, match="at most"):
         lbt.hinf(axis_plant, gamma=1e300)
@@ -277,7 +277,7 @@ def test_a_filter_below_the_infeasible_level_does_not_leave_the_library(monkeypa
     honest = module.infeasible_level
     monkeypatch.setattr(module, "infeasible_level", lambda *parts: 1.001 * honest(*parts))
     with pytest.raises(lbt.errors.NumericalError, match="no filter should have a norm below"):
-        lbt.hinf(axis_plant, method="riccati")
+        lbt.hinf(axis_plant, route="riccati")
 
 
 def test_only_problems_are_designed_for():

@@ -196,7 +196,7 @@ def test_the_comment_says_where_it_comes_from(tmp_path, designs):
     "evil", ["*/ int main(void) {} /*", "x\\\n*/", "??/", "*\n/ #error", "\u202e*/", 'a"b', "\x00"]
 )
 def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
-    check = lbt.design.Check(name=evil, value=0.0, limit=1.0, method=evil)
+    check = lbt.design.Check(name=evil, value=0.0, limit=1.0, computed_by=evil)
     design = replace(
         designs["integrator"],
         method=evil,

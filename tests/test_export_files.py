@@ -39,7 +39,7 @@ def test_what_no_format_takes(tmp_path, designs, file):
     export, target = EXPORTS[file], tmp_path / file
     with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got int"):
         export(target, 3)
-    failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, method="guess")
+    failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, computed_by="guess")
     with pytest.raises(lbt.errors.CertificateError, match="this one failed: rms") as caught:
         export(
             target,

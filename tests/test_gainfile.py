@@ -23,7 +23,7 @@ def every_design():
     bare = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0, dt_s=0.1)
     return {
         "kalman": lbt.kalman(plant),
-        "hinf": lbt.hinf(plant, gamma_ratio=1.3, method="riccati"),
+        "hinf": lbt.hinf(plant, gamma_ratio=1.3, route="riccati"),
         "full": lbt.kalman(plant.full()),
         "bare": lbt.kalman(bare),
         "integrator": lbt.integrator(plant.hardware, gain=0.3),

@@ -62,7 +62,7 @@ def test_fixed_lag_smoothing():
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 3))
 def test_more_measurements_lower_the_least_gamma(seed, n):
     p = uncorrelated(random_problem(np.random.default_rng(seed), n))
-    least = [lbt.hinf(p, horizon=h, method="riccati").gamma_least for h in (-1, 0, 1, 2)]
+    least = [lbt.hinf(p, horizon=h, route="riccati").gamma_least for h in (-1, 0, 1, 2)]
     for earlier, later in itertools.pairwise(least):
         assert earlier <= later * (1 + 1e-9)
 
@@ -72,7 +72,7 @@ def test_more_measurements_lower_the_least_gamma(seed, n):
 def test_hinf_filter_form_against_its_own_riccati_condition(seed, n):
     """Hassibi, Sayed, Kailath: the filter of a level exists iff P^-1 + C'R^-1 C - L'L / g^2 > 0."""
     p = uncorrelated(random_problem(np.random.default_rng(seed), n))
-    least = lbt.hinf(p, horizon=0, method="riccati").gamma_least
+    least = lbt.hinf(p, horizon=0, route="riccati").gamma_least
 
     def exists(gamma):
         outputs = np.vstack([p.C, p.L])
@@ -110,7 +110,7 @@ def test_a_horizon_is_a_delay_of_the_loop(method):
     """Plant with delay 2, filter or two-step prediction: the loops of delay 1 and 3."""
     make = {
         "kalman": lbt.kalman,
-        "hinf": lambda p, **k: lbt.hinf(p, gamma_ratio=1.2, method="riccati", **k),
+        "hinf": lambda p, **k: lbt.hinf(p, gamma_ratio=1.2, route="riccati", **k),
     }[method]
     for horizon, delay in ((0, 1), (2, 3), (3, 4)):
         shifted = make(lbt_axis_plant(), horizon=horizon)

@@ -40,7 +40,7 @@ def test_scalar_closed_forms(a, horizon):
     for q in (1.0, 1e-4, 1e4):
         for r in (1.0, 1e-4, 25.0):
             exact = closed_form(a, q, r, horizon)
-            design = lbt.hinf(scalar(a, q, r), horizon=horizon, method="riccati")
+            design = lbt.hinf(scalar(a, q, r), horizon=horizon, route="riccati")
             assert design.gamma_least == pytest.approx(exact, rel=1e-8)
             assert design.gamma_infeasible == pytest.approx(exact, rel=1e-8)
 
@@ -58,7 +58,7 @@ def test_scalar_closed_forms_by_lmi(horizon):
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 5), q=st.integers(1, 2), l=st.integers(1, 2))
 def test_the_bracket_is_closed(seed, n, q, l):
     problem = random_problem(np.random.default_rng(seed), n, q, l=l)
-    riccati = lbt.hinf(problem, method="riccati")
+    riccati = lbt.hinf(problem, route="riccati")
     assert riccati.gamma_infeasible <= riccati.gamma_least
     assert riccati.gamma_least / riccati.gamma_infeasible - 1 < 1e-8
     assert riccati.gamma <= riccati.gamma_least * (1 + 1e-12)
@@ -71,7 +71,7 @@ def test_the_bracket_is_closed(seed, n, q, l):
 def test_both_routes_agree_on_the_lbt():
     for modes in (1, 2):
         plant = lbt_axis_plant(modes=modes)
-        riccati, lmi = lbt.hinf(plant, method="riccati"), lbt.hinf(plant)
+        riccati, lmi = lbt.hinf(plant, route="riccati"), lbt.hinf(plant)
         assert riccati.gamma_least / riccati.gamma_infeasible - 1 < 1e-10
         assert lmi.gamma_least == pytest.approx(riccati.gamma_least, rel=1e-7)
         assert lmi.gamma_infeasible == pytest.approx(riccati.gamma_least, rel=1e-7)
@@ -104,7 +104,7 @@ def whole_lmi_is_feasible(problem, gamma):
 @pytest.mark.parametrize("seed", range(6))
 def test_the_bracket_against_the_textbook_inequality(seed):
     problem = random_problem(np.random.default_rng(seed), 3)
-    design = lbt.hinf(problem, method="riccati")
+    design = lbt.hinf(problem, route="riccati")
     assert whole_lmi_is_feasible(problem, 1.01 * design.gamma_least)
     assert not whole_lmi_is_feasible(problem, 0.99 * design.gamma_infeasible)
 
@@ -112,7 +112,7 @@ def test_the_bracket_against_the_textbook_inequality(seed):
 def test_the_witness_is_a_signal_that_no_measurement_shows(axis_plant):
     """Play the burst: y stays zero, and z has gamma times the energy of w."""
     p = axis_plant
-    design = lbt.hinf(p, method="riccati")
+    design = lbt.hinf(p, route="riccati")
     x, w = design.witness.states, design.witness.disturbances
     size = np.linalg.norm(p.C, 2) * np.linalg.norm(x, 2) + np.linalg.norm(p.D, 2) * np.linalg.norm(
         w, 2
@@ -136,13 +136,13 @@ def test_no_witness_proves_too_much(seed, n, r):
     states = rng.standard_normal((n, r)) * rng.choice([0.0, 1e-3, 1.0])
     disturbances = rng.standard_normal((problem.B.shape[1], r))
     witness = lbt.linear.Witness(states=states, disturbances=disturbances)
-    least = lbt.hinf(problem, method="riccati").gamma_least
+    least = lbt.hinf(problem, route="riccati").gamma_least
     assert lbt.linear.infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
     assert least <= kalman.gamma * (1 + 1e-9)
 
 
 def test_a_forged_claim_is_found_out(axis_plant):
-    design = lbt.hinf(axis_plant, gamma_ratio=1.2, method="riccati")
+    design = lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
     assert design.recertified().passed
     forged = dataclasses.replace(design, gamma_infeasible=1.001 * design.gamma_infeasible)
     failed = [check.name for check in forged.recertified().checks if not check.passed]
@@ -171,7 +171,7 @@ def test_states_without_error_prove_nothing():
     )
     free = lbt.linear.Witness(states=[[0.0], [1.0]], disturbances=[[1e-6], [0.0]])
     assert not lbt.design.certify_infeasible(p, 1e5, free).passed
-    least = lbt.hinf(p, method="riccati").gamma_least
+    least = lbt.hinf(p, route="riccati").gamma_least
     assert least == pytest.approx(1.34536, abs=1e-5)
     extended = lbt.mixed(p, gamma_ratio=1.01, taps=3).problem
     memory = np.eye(extended.n_states)[:, -2:]
@@ -183,7 +183,7 @@ def test_states_without_error_prove_nothing():
 
 
 def test_claims_need_a_proof_and_must_fit_the_filter(axis_plant):
-    design = lbt.hinf(axis_plant, gamma_ratio=1.2, method="riccati")
+    design = lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
     bare = dataclasses.replace(design, witness=None)
     assert not bare.recertified().passed
     with pytest.raises(lbt.errors.DimensionError, match="states must be a matrix"):
@@ -209,6 +209,6 @@ def test_the_bracket_does_not_depend_on_the_units_of_states(seed):
         D=problem.D,
         L=problem.L / units,
     )
-    one, other = (lbt.hinf(p, method="riccati") for p in (problem, scaled))
+    one, other = (lbt.hinf(p, route="riccati") for p in (problem, scaled))
     assert other.gamma_least == pytest.approx(one.gamma_least, rel=1e-8)
     assert other.gamma_infeasible == pytest.approx(one.gamma_infeasible, rel=1e-8)

@@ -268,7 +268,7 @@ def test_the_other_designs_and_analyses_take_a_moving_mirror():
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
     made = {
         "kalman": lbt.kalman(plant),
-        "hinf": lbt.hinf(plant, gamma_ratio=1.3, method="riccati"),
+        "hinf": lbt.hinf(plant, gamma_ratio=1.3, route="riccati"),
         "integrator": lbt.design.optimal_integrator(plant.hardware, truth),
         "lqg": lbt.lqg(plant),
     }

@@ -23,7 +23,7 @@ def plant():
 
 @pytest.fixture(scope="module")
 def ends(plant):
-    return lbt.hinf(plant, method="riccati"), lbt.kalman(plant)
+    return lbt.hinf(plant, route="riccati"), lbt.kalman(plant)
 
 
 @pytest.mark.parametrize("ratio", [1.01, 1.05, 1.1, 1.2])
@@ -97,7 +97,7 @@ def test_no_gain_of_the_plants_own_order_does_better(plant, ends):
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 4), q=st.integers(1, 2), l=st.integers(1, 2))
 def test_bounds_hold_on_any_problem(seed, n, q, l):
     problem = random_problem(np.random.default_rng(seed), n, q, l=l)
-    least, kalman = lbt.hinf(problem, method="riccati"), lbt.kalman(problem)
+    least, kalman = lbt.hinf(problem, route="riccati"), lbt.kalman(problem)
     bound = 0.5 * (least.gamma_least + kalman.gamma)
     design = lbt.mixed(problem, gamma=bound, taps=6)
     assert design.gamma <= bound * (1 + 1e-6)

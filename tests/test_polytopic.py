@@ -85,7 +85,7 @@ def test_guarantee_and_search_meet_for_any_filter(modes, shift):
     )
     for filtered in (
         predictor(lbt.kalman(other)),
-        predictor(lbt.hinf(other, gamma_ratio=1.3, method="riccati")),
+        predictor(lbt.hinf(other, gamma_ratio=1.3, route="riccati")),
     ):
         for norm, gap in (("hinf", 1e-8), ("h2", 6e-5)):
             found, where = worst_found(interval, filtered, norm)
@@ -140,7 +140,7 @@ def test_a_wider_interval_has_a_larger_bound(made, norm):
 
 
 def test_no_interval_is_the_nominal_design(plant, made):
-    least, kalman = lbt.hinf(plant, method="riccati"), lbt.kalman(plant)
+    least, kalman = lbt.hinf(plant, route="riccati"), lbt.kalman(plant)
     assert made["hinf", 0.0].bound_guaranteed == pytest.approx(least.gamma_least, rel=1e-6)
     assert made["h2", 0.0].bound_guaranteed == pytest.approx(kalman.rms, rel=1e-6)
     assert made["h2", 0.0].gamma == pytest.approx(kalman.gamma, rel=1e-2)
@@ -148,7 +148,7 @@ def test_no_interval_is_the_nominal_design(plant, made):
 
 def test_it_beats_the_nominal_filters_on_the_interval(plant, made):
     nominal = {
-        "hinf": lbt.hinf(plant, method="riccati"),
+        "hinf": lbt.hinf(plant, route="riccati"),
         "h2": lbt.kalman(plant),
     }
     for norm, factor in (("hinf", 3.0), ("h2", 1.01)):
@@ -218,7 +218,7 @@ def test_states_that_are_sums_of_others(plant):
 def test_another_horizon_is_another_delay(plant):
     design = lbt.design.polytopic(plant, half_width_hz=0.5, horizon=2)
     assert design.hardware.delay_frames == 3
-    assert design.bound_guaranteed > lbt.hinf(plant, horizon=2, method="riccati").gamma_least
+    assert design.bound_guaranteed > lbt.hinf(plant, horizon=2, route="riccati").gamma_least
 
 
 def test_wrong_demands(plant):
@@ -337,7 +337,7 @@ def test_the_prior_filter_is_the_best_on_average(plant):
 
     best = lbt.kalman(spread)
     assert mean(predictor(best)) == pytest.approx(best.rms**2, rel=1e-8)
-    for other in (lbt.kalman(plant), lbt.hinf(plant, method="riccati"), lbt.kalman(plants[0])):
+    for other in (lbt.kalman(plant), lbt.hinf(plant, route="riccati"), lbt.kalman(plants[0])):
         assert mean(predictor(other)) > 1.005 * best.rms**2
 
 

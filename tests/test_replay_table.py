@@ -55,7 +55,7 @@ def two_different_axes():
 
 def test_the_table():
     plant, ran, y, z = two_different_axes()
-    kalman, hinf = lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.2, method="riccati")
+    kalman, hinf = lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.2, route="riccati")
     given_ = {"Kalman": kalman, "H-infinity": hinf.controller}
     table = lbt.identification.prediction_against_data(
         plant, z, given_, measurements=y, running=ran, imaging=CAMERA

@@ -320,7 +320,7 @@ def test_a_design_that_was_tampered_with_fails(config, designs):
         kalman,
         gain_predictor=1.1 * np.asarray(kalman.gain_predictor),
         certificate=Certificate(
-            checks=(Check(name="believe me", value=0, limit=1, method="none"),),
+            checks=(Check(name="believe me", value=0, limit=1, computed_by="none"),),
             gamma=1.0,
             rms_per_output=np.ones(2),
         ),

@@ -32,7 +32,7 @@ def test_time_filters_give_the_commands_of_the_controller(kind):
     controller = {
         "integrator": lambda: lbt.integrator(plant.hardware, gain=0.3),
         "projected": lambda: lbt.integrator(skew, gain=0.3),
-        "hinf": lambda: lbt.hinf(plant, gamma_ratio=1.2, method="riccati"),
+        "hinf": lambda: lbt.hinf(plant, gamma_ratio=1.2, route="riccati"),
     }.get(kind, lambda: lbt.kalman(plant))().controller
     filters = time_filters(controller)
     y = np.random.default_rng(0).standard_normal((120, controller.B.shape[1]))

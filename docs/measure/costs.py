@@ -19,7 +19,7 @@ def ratios() -> None:
     """Properties of the filter over the ratio of gamma to the least one."""
     designs = {"kalman": lbt.kalman(PLANT)}
     designs |= {
-        f"hinf {ratio}": lbt.hinf(PLANT, gamma_ratio=ratio, method="riccati")
+        f"hinf {ratio}": lbt.hinf(PLANT, gamma_ratio=ratio, route="riccati")
         for ratio in (1.0, 1.01, 1.05, 1.1, 1.2, 1.3, 1.5)
     }
     for name, design in designs.items():

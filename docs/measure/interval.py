@@ -53,8 +53,8 @@ def main() -> None:
     for half in (0.2, 1.0, 2.0, 4.0):
         interval = FrequencyInterval(plant=PLANT, half_width_hz=half)
         designs = {
-            "hinf, least gamma": predictor(lbt.hinf(PLANT, method="riccati")),
-            "hinf, ratio 1.2": predictor(lbt.hinf(PLANT, gamma_ratio=1.2, method="riccati")),
+            "hinf, least gamma": predictor(lbt.hinf(PLANT, route="riccati")),
+            "hinf, ratio 1.2": predictor(lbt.hinf(PLANT, gamma_ratio=1.2, route="riccati")),
             "kalman": predictor(lbt.kalman(PLANT)),
         }
         for lines in (5, 15):
@@ -66,7 +66,7 @@ def main() -> None:
         }
         for lines in (5, 9):
             plant = mixture(interval, lines, covering=True)
-            designs[f"hinf, {lines} covering"] = predictor(lbt.hinf(plant, method="riccati"))
+            designs[f"hinf, {lines} covering"] = predictor(lbt.hinf(plant, route="riccati"))
         designs |= {f"polytopic {norm}": design.predictor for norm, design in made.items()}
         print(f"20 Hz +- {half:g} Hz: worst norm (guaranteed) and worst rms [nm], mean rms, states")
         for name, filtered in designs.items():
@@ -86,7 +86,7 @@ def main() -> None:
                 f"{design.bound_guaranteed:.3f}, found {design.worst_achieved:.3f}"
             )
         refuted = [
-            lbt.hinf(mixture(interval, lines, covering=False), method="riccati").gamma_infeasible
+            lbt.hinf(mixture(interval, lines, covering=False), route="riccati").gamma_infeasible
             for lines in (2, 3, 5, 9)
         ]
         print(f"  no filter of any order reaches {max(level or 0.0 for level in refuted):.2f}")

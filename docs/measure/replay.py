@@ -84,7 +84,7 @@ def tables() -> None:
     print("a model that is right")
     designs = {
         "Kalman": lbt.kalman(model),
-        "H-infinity, 1.2 gamma_min": lbt.hinf(model, gamma_ratio=1.2, method="riccati"),
+        "H-infinity, 1.2 gamma_min": lbt.hinf(model, gamma_ratio=1.2, route="riccati"),
     }
     known = {"measurements": y[2:], "running": ran, "imaging": CAMERA}
     table = lbt.identification.prediction_against_data(model, z[2:], designs, **known)
@@ -162,7 +162,7 @@ def times() -> None:
     z = open_loop(y, u, model.hardware)[2:]
     four = [lbt.integrator(model.hardware, gain=gain).controller for gain in (0.2, 0.5)]
     four += [lbt.kalman(model).controller]
-    four += [lbt.hinf(model, gamma_ratio=1.2, method="riccati").controller]
+    four += [lbt.hinf(model, gamma_ratio=1.2, route="riccati").controller]
 
     def best(call) -> float:
         spent = []

@@ -107,7 +107,7 @@ def eliminated() -> None:
         p = plant(5e-3, order=2, lines=lines)
         start = kalman_riccati(p)
         scale = float(np.sqrt(p.L @ start.P @ p.L.T)[0, 0])
-        truth = lbt.hinf(p, method="riccati").gamma_requested
+        truth = lbt.hinf(p, route="riccati").gamma_requested
         began = time.perf_counter()
         ours = least_gamma_lmi(p, coordinates=start.P, scale=scale)
         middle = time.perf_counter()
@@ -127,7 +127,7 @@ def agreement() -> None:
     for ratio in (1.05, 1.2, 1.5):
         p = plant(5e-3, order=1, lines=1)
         start = kalman_riccati(p)
-        level = ratio * lbt.hinf(p, method="riccati").gamma_requested
+        level = ratio * lbt.hinf(p, route="riccati").gamma_requested
         by_riccati = gamma_riccati(p, level).gain_predictor
         by_lmi = hinf_lmi(p, level, coordinates=start.P, scale=level).gain_predictor
         error = np.linalg.norm(by_lmi - by_riccati) / np.linalg.norm(by_riccati)

@@ -69,7 +69,7 @@ def main() -> None:
     designs = {
         "integrator": lbt.integrator(config.hardware, gain=0.4),
         "kalman": lbt.kalman(config.plant),
-        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, method="riccati"),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
     }
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -35,7 +35,7 @@ from lbt_synth.interop import frame_cost
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import require_writable
-from lbt_synth.studies.limits import model_distance, shaped_distance
+from lbt_synth.studies.limits import model_limit, shaped_limit
 from lbt_synth.validation import FloatArray
 
 _SMALL_MODULUS = 0.3
@@ -161,7 +161,7 @@ def _description(made: Design) -> Report:
         ]
         data |= {"rms": made.rms, "gamma": made.gamma}
         if made.hardware is not None:
-            limit_nm, above = model_distance(made)
+            limit_nm, above = model_limit(made)
             facts += [
                 ("least residual of any linear controller", limit_nm, unit),
                 (f"{error} above it", round(above, 6) + 0.0, "%"),
@@ -195,7 +195,7 @@ def _description(made: Design) -> Report:
         facts.append(("states of one mode, past commands included", made.states_per_mode, ""))
         if made.is_reduced:
             facts.append(("objective above the long parameter's", 100 * made.loss, "%"))
-        limit_nm, above = shaped_distance(made)
+        limit_nm, above = shaped_limit(made)
         if not np.isnan(limit_nm):
             facts += [
                 ("least worst residual over its bands, all modes", limit_nm, unit),
@@ -326,8 +326,8 @@ def _digits(level: float | None) -> str:
 def _check_table(certificate: Certificate) -> TableText:
     return TableText(
         title="Certificate",
-        headings=("check", "value", "limit", "passed", "method"),
-        rows=[(c.name, c.value, c.limit, c.passed, c.method) for c in certificate.checks],
+        headings=("check", "value", "limit", "passed", "computed by"),
+        rows=[(c.name, c.value, c.limit, c.passed, c.computed_by) for c in certificate.checks],
     )
 
 

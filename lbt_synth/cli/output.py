@@ -27,7 +27,7 @@ from rich.table import Table
 from rich.text import Text
 
 _WIDE = 200
-_WORDS = ("unit", "method", "origin")  # columns of words, set flush left
+_WORDS = ("unit", "method", "computed by", "origin")  # columns of words, set flush left
 
 
 @dataclass(kw_only=True)

@@ -70,7 +70,7 @@ def designed(config: Config, request: DesignRequest) -> Design:
     method, options = request.method, request.options
     defaults, horizon = config.settings.design, options.get("horizon", 1)
     if method == "kalman":
-        return kalman(config.plant, horizon=horizon, method=options.get("route", "riccati"))
+        return kalman(config.plant, horizon=horizon, route=options.get("route", "riccati"))
     if method == "integrator":
         if "gain" in options:
             return integrator(config.hardware, gain=options["gain"])
@@ -104,5 +104,5 @@ def designed(config: Config, request: DesignRequest) -> Design:
         gamma=gamma,
         gamma_ratio=ratio,
         horizon=horizon,
-        method=options.get("route"),
+        route=options.get("route"),
     )

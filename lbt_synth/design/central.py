@@ -52,7 +52,7 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     """
     require_problem(problem)
     bound = number(gamma, "gamma", above=0)
-    least = hinf(problem, method="riccati")
+    least = hinf(problem, route="riccati")
     assert least.gamma_least is not None  # of an H-infinity design
     require_reachable(bound, least.gamma_least)
     gains = CentralFamily(problem, least).member(lambda norm, _: norm - bound)

@@ -42,14 +42,14 @@ class Check:
         What was checked.
     value, limit : float
         What was measured, and what it must stay below.
-    method : str
-        How it was measured.
+    computed_by : str
+        How the value was computed.
     """
 
     name: str
     value: float
     limit: float
-    method: str
+    computed_by: str
 
     @property
     def passed(self) -> bool:
@@ -164,7 +164,7 @@ def certify_filter(
                 name="norm of the estimation error",
                 value=norm.upper,
                 limit=gamma * (1 + NORM_TOLERANCE),
-                method="level sets on the symplectic pencil",
+                computed_by="level sets on the symplectic pencil",
             )
         )
     if least_variance:
@@ -176,7 +176,7 @@ def certify_filter(
                 name="distance from the least-variance gain",
                 value=float(np.linalg.norm(gain - optimal, 2)) / size if size > 0 else 0.0,
                 limit=GAIN_TOLERANCE,
-                method="gain recomputed from the Lyapunov covariance",
+                computed_by="gain recomputed from the Lyapunov covariance",
             )
         )
     return replace(certificate, checks=tuple(checks))
@@ -205,7 +205,7 @@ def _examined(
             name="residual of the Lyapunov equation",
             value=lyapunov_residual(error.A, drive, P),
             limit=RESIDUAL_TOLERANCE,
-            method="relative, 1-norm",
+            computed_by="relative, 1-norm",
         )
     )
     variances = np.diag(error.C @ P @ error.C.T)
@@ -218,7 +218,7 @@ def _examined(
             name="singular values above the norm",
             value=excess,
             limit=NORM_TOLERANCE,
-            method=f"{_GRID} frequencies against level sets",
+            computed_by=f"{_GRID} frequencies against level sets",
         )
     )
     certificate = Certificate(
@@ -238,7 +238,7 @@ def _variance_both_ways(error: StateSpace, variance: float) -> Check:
         name="variance, against its adjoint equation",
         value=abs(variance - adjoint) / size if size > 0 else 0.0,
         limit=VARIANCE_TOLERANCE,
-        method="relative, two Lyapunov equations",
+        computed_by="relative, two Lyapunov equations",
     )
 
 
@@ -293,7 +293,7 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
         name="infeasible level over the level proved, less 1",
         value=claimed / max(proved, 1e-300) - 1,
         limit=INFEASIBLE_TOLERANCE,
-        method="disturbances that no measurement shows",
+        computed_by="disturbances that no measurement shows",
     )
 
 
@@ -331,7 +331,7 @@ def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
 
 
 def _stability(name: str, radius: float) -> Check:
-    return Check(name=name, value=radius, limit=1 - STABILITY_MARGIN, method="eigenvalues")
+    return Check(name=name, value=radius, limit=1 - STABILITY_MARGIN, computed_by="eigenvalues")
 
 
 def controller_distance(one: Controller, other: Controller) -> float:

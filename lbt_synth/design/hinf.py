@@ -53,7 +53,7 @@ def hinf(
     gamma: float | None = None,
     gamma_ratio: float | None = None,
     horizon: int = 1,
-    method: str | None = None,
+    route: str | None = None,
 ) -> FilterDesign:
     """Design an H-infinity filter of an estimation problem.
 
@@ -72,7 +72,7 @@ def hinf(
     horizon : int, optional
         Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
         filter (a-posteriori), 2 and more predict further, as ``problem.ahead``.
-    method : {"lmi", "riccati"}, optional
+    route : {"lmi", "riccati"}, optional
         Linear matrix inequality, or the gamma-Riccati equation. For a given
         bound both give the central filter. By default the inequality up to 20 states, and
         the equation beyond: the inequality takes minutes there.
@@ -102,14 +102,14 @@ def hinf(
     --------
     >>> import lbt_synth as lbt
     >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> design = lbt.hinf(walk, gamma_ratio=1.2, method="riccati")
+    >>> design = lbt.hinf(walk, gamma_ratio=1.2, route="riccati")
     >>> design.gamma <= design.gamma_requested
     True
     """
     require_problem(problem)
-    if method is None:
-        method = "lmi" if problem.A.shape[0] <= _LARGEST_LMI else "riccati"
-    choice(method, "method", ("lmi", "riccati"))
+    if route is None:
+        route = "lmi" if problem.A.shape[0] <= _LARGEST_LMI else "riccati"
+    choice(route, "route", ("lmi", "riccati"))
     if gamma is not None and gamma_ratio is not None:
         raise ProblemError(
             "give gamma or gamma_ratio, not both; "
@@ -127,7 +127,7 @@ def hinf(
         )
     problem = problem.ahead(horizon)
     start = kalman_riccati(problem)
-    synthesis = _LmiRoute(problem, start) if method == "lmi" else _RiccatiRoute(problem, start)
+    synthesis = _LmiRoute(problem, start) if route == "lmi" else _RiccatiRoute(problem, start)
     gains, witness = synthesis.least()
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = least
@@ -143,7 +143,7 @@ def hinf(
         gains.gain_predictor,
         gains.gain_filter,
         method="hinf",
-        solver=SolverReport(route=method, status=gains.status, iterations=gains.iterations),
+        solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
         gamma_requested=max(requested, least),
         gamma_least=least,
         gamma_infeasible=infeasible,
@@ -246,7 +246,7 @@ def _verified_bracket(
     if not error.spectral_radius < 1:
         raise NumericalError(
             "the filter of the least gamma is not stable; expected a spectral radius below 1, got "
-            f"{error.spectral_radius:.9g}. Try the other method, or scale the states.",
+            f"{error.spectral_radius:.9g}. Try the other route, or scale the states.",
             status=gains.status,
         )
     least = hinf_norm(error).upper
@@ -259,7 +259,7 @@ def _verified_bracket(
 def _contradiction(infeasible: float, achieved: float) -> NumericalError:
     return NumericalError(
         f"no filter should have a norm below {infeasible:.9g}, yet one achieves {achieved:.9g}. "
-        "Try the other method, or scale the states to similar sizes.",
+        "Try the other route, or scale the states to similar sizes.",
         status="contradiction",
     )
 

@@ -11,9 +11,7 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.validation import choice
 
 
-def kalman(
-    problem: EstimationProblem, *, horizon: int = 1, method: str = "riccati"
-) -> FilterDesign:
+def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccati") -> FilterDesign:
     """Design the steady-state Kalman filter of an estimation problem.
 
     Parameters
@@ -23,7 +21,7 @@ def kalman(
     horizon : int, optional
         Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
         filter, 2 and more predict further, as ``problem.ahead``.
-    method : {"riccati", "sdp"}, optional
+    route : {"riccati", "sdp"}, optional
         The Riccati equation, or a semidefinite programme (independent of it but
         for the coordinates it is solved in).
 
@@ -50,10 +48,10 @@ def kalman(
     (0.618033989, True)
     """
     require_problem(problem)
-    choice(method, "method", ("riccati", "sdp"))
+    choice(route, "route", ("riccati", "sdp"))
     problem = problem.ahead(horizon)
     solution = kalman_riccati(problem)
-    if method == "riccati":
+    if route == "riccati":
         return filter_design(
             problem,
             solution.gain_predictor,

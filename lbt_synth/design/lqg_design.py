@@ -148,7 +148,7 @@ class LqgDesign(EstimatorDesign):
                     ),
                 ),
                 limit=_SAME,
-                method="matrices assembled anew",
+                computed_by="matrices assembled anew",
             )
         )
         checks.append(certify_loop(self.problem.hardware, self.controller))
@@ -182,7 +182,7 @@ class LqgDesign(EstimatorDesign):
             name="distance from the least-cost regulator",
             value=worst,
             limit=GAIN_TOLERANCE,
-            method="gains recomputed from a Lyapunov equation",
+            computed_by="gains recomputed from a Lyapunov equation",
         )
 
     def _costs(self, rms: float) -> list[Check]:
@@ -198,7 +198,7 @@ class LqgDesign(EstimatorDesign):
                 name=name,
                 value=abs(found / claimed - 1) if claimed > 0 else found,
                 limit=VARIANCE_TOLERANCE,
-                method="relative, Lyapunov equation of the whole loop",
+                computed_by="relative, Lyapunov equation of the whole loop",
             )
             for name, found, claimed in pairs
         ]

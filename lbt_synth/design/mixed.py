@@ -101,7 +101,7 @@ def mixed(
     ...     D=[[0.0, 3.0]],
     ...     L=[[1.0, 0.0]],
     ... )
-    >>> central = lbt.hinf(line, gamma_ratio=1.1, method="riccati")
+    >>> central = lbt.hinf(line, gamma_ratio=1.1, route="riccati")
     >>> best = lbt.mixed(line, gamma=central.gamma)
     >>> best.gamma <= central.gamma * (1 + 1e-6) and best.rms < central.rms
     True
@@ -114,7 +114,7 @@ def mixed(
         )
     length = require_taps(taps)
     problem = problem.ahead(horizon)
-    least, best = hinf(problem, method="riccati"), kalman(problem)
+    least, best = hinf(problem, route="riccati"), kalman(problem)
     assert least.gamma_least is not None  # of an H-infinity design
     if rms is not None:
         bound = number(rms, "rms", above=0)

@@ -208,7 +208,7 @@ def _certified(design: PolytopicDesign) -> Certificate:
             name="bound over the interval, recomputed",
             value=worst_guaranteed(interval, predictor, norm),
             limit=design.bound_guaranteed * (1 + NORM_TOLERANCE),
-            method="envelope of all plants, level sets"
+            computed_by="envelope of all plants, level sets"
             if norm == "hinf"
             else "branch and bound, Lyapunov equations",
         ),
@@ -216,31 +216,31 @@ def _certified(design: PolytopicDesign) -> Certificate:
             name="worst error found over the bound, less 1",
             value=found / design.bound_guaranteed - 1,
             limit=NORM_TOLERANCE,
-            method=search,
+            computed_by=search,
         ),
         Check(
             name="worst error found over the one stated, less 1",
             value=found / design.worst_achieved - 1,
             limit=NORM_TOLERANCE,
-            method=search,
+            computed_by=search,
         ),
         Check(
             name="worst error stated, against that at its frequency",
             value=abs(there / design.worst_achieved - 1),
             limit=NORM_TOLERANCE,
-            method="relative, one error system",
+            computed_by="relative, one error system",
         ),
         Check(
             name="distance of that frequency beyond the interval",
             value=outside - interval.half_width_hz,
             limit=1e-9 * interval.high_hz,
-            method="Hz",
+            computed_by="Hz",
         ),
         Check(
             name="controller, against the one made of the filter",
             value=controller_distance(design.controller, made),
             limit=NORM_TOLERANCE,
-            method="relative, largest entry",
+            computed_by="relative, largest entry",
         ),
         certify_loop(interval.plant.hardware, design.controller),
     ]

@@ -264,7 +264,7 @@ def certify_design(design: FilterDesign) -> Certificate:
                 name="standard deviation of the estimation error",
                 value=certificate.rms,
                 limit=design.rms_requested * (1 + NORM_TOLERANCE),
-                method="Lyapunov equation",
+                computed_by="Lyapunov equation",
             )
         )
     if design.gamma_infeasible is not None:
@@ -273,7 +273,7 @@ def certify_design(design: FilterDesign) -> Certificate:
                 name="infeasible level over the norm achieved, less 1",
                 value=design.gamma_infeasible / certificate.gamma - 1,
                 limit=INFEASIBLE_TOLERANCE,
-                method="level sets on the symplectic pencil",
+                computed_by="level sets on the symplectic pencil",
             )
         )
         # a claim without a proof is not believed
@@ -308,6 +308,6 @@ def filter_design(
         **demands,
     )
     certificate = design.recertified().require(
-        "Try the other method, or scale the states to similar sizes."
+        "Try the other route, or scale the states to similar sizes."
     )
     return replace(design, certificate=certificate)

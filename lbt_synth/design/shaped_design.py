@@ -135,7 +135,7 @@ class ShapedDesign(Design):
                 name="controller against its parameters",
                 value=controller_distance(self.controller, whole),
                 limit=_SAME,
-                method="matrices assembled anew",
+                computed_by="matrices assembled anew",
             ),
             certify_loop(hardware, self.controller),
         ]
@@ -155,7 +155,7 @@ class ShapedDesign(Design):
             name="whole loop against its modes",
             value=float(np.max(np.abs(whole - single))),
             limit=1e-6,
-            method=f"sensitivity at {f.size} frequencies",
+            computed_by=f"sensitivity at {f.size} frequencies",
         )
 
 
@@ -168,7 +168,7 @@ def _mode_checks(
             name="spectral radius of the parameter",
             value=radius,
             limit=1 - 1e-9,
-            method="eigenvalues",
+            computed_by="eigenvalues",
         )
     ]
     if not checks[0].passed:
@@ -184,7 +184,7 @@ def _mode_checks(
             name="root of the objective, against the one claimed [nm]",
             value=found,
             limit=objective_nm * (1 + _RMS_TOLERANCE),
-            method="closed loops in state space",
+            computed_by="closed loops in state space",
         )
     )
     return checks

@@ -132,9 +132,9 @@ def _design(
     if method == "kalman":
         filtered = kalman(plant)
     elif gamma is not None:
-        filtered = hinf(plant, gamma=gamma, method="riccati")
+        filtered = hinf(plant, gamma=gamma, route="riccati")
     else:
-        filtered = hinf(plant, gamma_ratio=gamma_ratio, method="riccati")
+        filtered = hinf(plant, gamma_ratio=gamma_ratio, route="riccati")
     return filtered, filtered.gamma
 
 

@@ -122,10 +122,10 @@ class Examined:
         )
 
 
-def _worst(name: str, values: FloatArray, limit: float, method: str) -> Check:
+def _worst(name: str, values: FloatArray, limit: float, computed_by: str) -> Check:
     """Check of the worst of all modes."""
     failing = np.flatnonzero(~(values < limit))
     value = float(np.max(values)) if not np.isnan(values).any() else float("nan")
     if failing.size:
         name = f"{name} ({modes_named(failing)})"
-    return Check(name=name, value=value, limit=limit, method=method)
+    return Check(name=name, value=value, limit=limit, computed_by=computed_by)

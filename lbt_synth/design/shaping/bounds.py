@@ -72,7 +72,7 @@ class ModulusMargin:
                 name="peak of the sensitivity",
                 value=hinf_norm(loop.sensitivity).upper,
                 limit=1 / self.at_least,
-                method=LEVEL_SETS,
+                computed_by=LEVEL_SETS,
             ),
         )
 
@@ -121,7 +121,7 @@ class NoisePeak:
                 name="peak of the noise transfer",
                 value=hinf_norm(loop.at(1.0).noise_propagation()).upper,
                 limit=self.at_most,
-                method=LEVEL_SETS,
+                computed_by=LEVEL_SETS,
             ),
         )
 
@@ -196,7 +196,7 @@ class Attenuation(Band):
                 name=f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}",
                 value=band_norm(rejection, self.low_hz, self.high_hz).upper,
                 limit=self.at_most,
-                method="level sets, all of the band",
+                computed_by="level sets, all of the band",
             ),
         )
 
@@ -284,7 +284,7 @@ class CommandRms:
                 name=f"command {'step' if self.rate else 'stroke'} [nm rms]",
                 value=float(np.sqrt(variance)),
                 limit=self.at_most_nm,
-                method="adaptive quadrature",
+                computed_by="adaptive quadrature",
             ),
         )
 

@@ -83,7 +83,7 @@ class SensorGainRange:
                     StateSpace(A=T.A, B=T.B, C=sign * T.C, D=sign * T.D, dt_s=T.dt_s)
                 ),
                 limit=bound,
-                method=LEVEL_SETS,
+                computed_by=LEVEL_SETS,
             )
             for sign, bound in self._bounds()
         )
@@ -164,7 +164,7 @@ class DelayError:
                 name=f"loop change by a delay of {other:g} frames",
                 value=hinf_norm(through_taps(loop.parameter, taps)).upper,
                 limit=1.0,
-                method=LEVEL_SETS,
+                computed_by=LEVEL_SETS,
             )
             for other, taps in self._differences(loop.hardware)
         )
@@ -221,6 +221,6 @@ class MirrorUncertainty(Band):
                 value=self.relative
                 * band_norm(loop.complementary, self.low_hz, self.high_hz).upper,
                 limit=1.0,
-                method="level sets, all of the band",
+                computed_by="level sets, all of the band",
             ),
         )

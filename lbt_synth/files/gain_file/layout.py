@@ -301,7 +301,7 @@ def _pack_certificate(certificate: Certificate) -> Meta:
         "gamma": None if math.isnan(certificate.gamma) else certificate.gamma,
         "rms_per_output": certificate.rms_per_output.tolist(),
         "checks": [
-            {"name": c.name, "value": c.value, "limit": c.limit, "method": c.method}
+            {"name": c.name, "value": c.value, "limit": c.limit, "computed_by": c.computed_by}
             for c in certificate.checks
         ],
     }
@@ -309,7 +309,15 @@ def _pack_certificate(certificate: Certificate) -> Meta:
 
 def _unpack_certificate(meta: Meta) -> Certificate:
     return Certificate(
-        checks=tuple(Check(**check) for check in meta["checks"]),
+        checks=tuple(_unpack_check(check) for check in meta["checks"]),
         gamma=np.nan if meta["gamma"] is None else float(meta["gamma"]),
         rms_per_output=frozen(np.array(meta["rms_per_output"], dtype=np.float64)),
     )
+
+
+def _unpack_check(meta: Meta) -> Check:
+    """Return a check; files of version 0.1 call ``computed_by`` ``method``."""
+    values = dict(meta)
+    if "method" in values:
+        values["computed_by"] = values.pop("method")
+    return Check(**values)

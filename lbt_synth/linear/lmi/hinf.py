@@ -41,7 +41,7 @@ def least_gamma_lmi(
     if status not in USABLE or P.value is None or gamma_squared.value is None:
         raise NumericalError(
             f"the least gamma's semidefinite programme ended as {status!r}; expected an optimum. "
-            'Try method="riccati".',
+            'Try route="riccati".',
             status=status,
         )
     level = float(gamma_squared.value)
@@ -68,7 +68,7 @@ def hinf_lmi(
     if status not in USABLE or P.value is None:
         raise NumericalError(
             f"the semidefinite programme of the H-infinity filter ended as {status!r}; expected "
-            'an optimum. Try method="riccati".',
+            'an optimum. Try route="riccati".',
             status=status,
         )
     return _unpacked(frame, P.value, level, status, iterations)

@@ -30,7 +30,7 @@ def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: fl
     if status not in USABLE or P.value is None:
         raise NumericalError(
             f"the semidefinite programme of the Kalman filter ended as {status!r}; expected "
-            'an optimum. Try method="riccati".',
+            'an optimum. Try route="riccati".',
             status=status,
         )
     information = np.linalg.inv((P.value + P.value.T) / 2)

@@ -114,7 +114,7 @@ class GammaEquation:
         if residual > _RESIDUAL_LIMIT:
             raise NumericalError(
                 f"the gamma-Riccati equation at gamma = {gamma:.9g} was solved only to a relative "
-                f"residual of {residual:.3g}; expected {_RESIDUAL_LIMIT:g}. Try method='lmi', or "
+                f"residual of {residual:.3g}; expected {_RESIDUAL_LIMIT:g}. Try route='lmi', or "
                 "scale the states to similar sizes.",
                 status="residual",
                 residual=residual,

@@ -88,7 +88,7 @@ def certificate_table(one: DesignAssessment) -> Table:
     """Return the checks of one design."""
     return Table(
         caption=f"Certificate of {one.name}",
-        headings=("check", "value", "must stay below", "result", "how it was measured"),
+        headings=("check", "value", "must stay below", "result", "computed by"),
         rows=tuple(
             (
                 check.name,
@@ -97,7 +97,7 @@ def certificate_table(one: DesignAssessment) -> Table:
                 Cell(text="passed", tone="good")
                 if check.passed
                 else Cell(text="FAILED", tone="bad"),
-                check.method,
+                check.computed_by,
             )
             for check in one.checks
         ),
