@@ -71,7 +71,7 @@ study: $(VENV)/.ready    ## the long numerical studies
 	$(BIN)/pytest -m study tests
 
 bench: $(VENV)/.ready    ## speed against peers, as ratios within one run
-	$(BIN)/python benchmarks/run.py
+	$(BIN)/python benchmarks/speed.py
 
 docs: $(VENV)/.ready     ## the documentation, warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html

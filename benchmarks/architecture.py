@@ -1,4 +1,4 @@
-"""What things cost and buy: run with ``python docs/measure/costs.py`` from the repository."""
+"""What things cost and buy: run with ``python benchmarks/architecture.py`` from the repository."""
 
 import subprocess
 import sys

@@ -1,6 +1,6 @@
 """Screenshot of a report at the width of a desk, and its size.
 
-    python docs/measure/report_page.py out/report.html docs/figures/report.png
+    python benchmarks/report.py out/report.html docs/figures/report.png
 
 Needs Debian's chromium and chromium-driver, and selenium (the dependency group browser).
 """

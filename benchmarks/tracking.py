@@ -1,6 +1,6 @@
 """The tables and the figure of docs/tracking.md.
 
-Run with ``python docs/measure/tracking.py`` from the repository (ten minutes). With a directory
+Run with ``python benchmarks/tracking.py`` from the repository (ten minutes). With a directory
 as its argument it writes the figure there.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 import lbt_synth as lbt
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.simulation.run import step_loop
-from lbt_synth.models.plant import with_vibrations
+from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.report.figures.style import save_figure
 
 CONFIG = lbt.load_config("examples/lbt.yaml")

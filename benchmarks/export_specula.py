@@ -2,7 +2,7 @@
 
 Needs the extra ``e2e`` (``make e2e`` installs it); from the repository::
 
-    python docs/measure/specula_filter.py {double,single} GAIN.fits [TRANSFER_FUNCTIONS.fits]
+    python benchmarks/export_specula.py {double,single} GAIN.fits [TRANSFER_FUNCTIONS.fits]
 
 The gain file is given to SsrFilter, the transfer functions (``lbt-synth export --format iir``)
 to IirFilter. Printed: the largest difference of the commands over the largest command, in the
@@ -15,7 +15,7 @@ import numpy as np
 
 sys.path.insert(0, "tests")  # what drives SPECULA is what the tests use
 
-from specula_filters import commands, noise_series, relative, simulated
+from support.specula_filters import commands, noise_series, relative, simulated
 
 import lbt_synth as lbt
 

@@ -1,6 +1,6 @@
 """Five controllers and the limit, over the vibration's frequency and the sensor gain.
 
-Run with ``python docs/measure/story.py`` from the repository (some minutes). Prints the table
+Run with ``python benchmarks/robustness.py`` from the repository (some minutes). Prints the table
 of docs/robustness.md and writes its figure to docs/figures/robustness_story.png.
 """
 

@@ -1,4 +1,4 @@
-"""How the routes to a filter compare: run with ``python docs/measure/solvers.py``."""
+"""How the routes to a filter compare: run with ``python benchmarks/decisions_design.py``."""
 
 import time
 import warnings

@@ -1,7 +1,7 @@
 """Rates of studies, their overhead and memory; figures of docs/study.md.
 
-python docs/measure/study_rates.py             # some ten minutes on two quiet processors
-python docs/measure/study_rates.py --quick     # a tenth of the samples
+python benchmarks/study_rates.py             # some ten minutes on two quiet processors
+python benchmarks/study_rates.py --quick     # a tenth of the samples
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import lbt_synth as lbt
 
 ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 HEAD = f"version: 1\nconfig: {EXAMPLES / 'lbt.yaml'}\nseed: 1\nresults: parquet\n"
 POINTS = """
 parameters:

@@ -1,6 +1,6 @@
 """Fit Table III's H-infinity column with other fixed parameters.
 
-Run with ``python docs/measure/identifiability.py`` from the repository (some minutes).
+Run with ``python benchmarks/paper.py`` from the repository (some minutes).
 """
 
 import sys

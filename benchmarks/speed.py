@@ -19,11 +19,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import control
 import numpy as np
-from engine import SIZED
-from ensemble import ENSEMBLE
 from harness import Row, machine, paired, seconds
-from modal import MODAL
-from realtime import REALTIME
+from speed_ensemble import ENSEMBLE
+from speed_export import REALTIME
+from speed_linear import SIZED
+from speed_modal import MODAL
 
 import lbt_synth as lbt
 

@@ -1,4 +1,4 @@
-"""Prediction against data: run with ``python docs/measure/replay.py`` from the repository."""
+"""Prediction against data: run with ``python benchmarks/prediction.py`` from the repository."""
 
 import time
 

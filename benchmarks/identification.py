@@ -1,7 +1,7 @@
 """Identification of random closed loops: lines found, filters designed, gains, times.
 
-    python docs/measure/identification.py [--records 200] [--jobs 2] [--seconds 60]
-    python docs/measure/identification.py --times
+    python benchmarks/identification.py [--records 200] [--jobs 2] [--seconds 60]
+    python benchmarks/identification.py --times
 
 One axis at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain 0.4 to
 1, noise 2 to 30 nm a frame (evenly in its logarithm). Even records: second-order turbulence of
@@ -22,7 +22,7 @@ from functools import partial
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.models.resonance import coefficients
+from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
 NEAR_HZ = 0.1

@@ -1,7 +1,7 @@
 """Run the commands of the pages again, and hold what they print against the pages.
 
-    python docs/measure/consoles.py docs/tutorial.md            # prints the lines that differ
-    python docs/measure/consoles.py --write docs/tutorial.md    # and corrects their numbers
+    python benchmarks/console_blocks.py docs/tutorial.md            # prints the lines that differ
+    python benchmarks/console_blocks.py --write docs/tutorial.md    # and corrects their numbers
 
 Only lines that have the same words are compared; the numbers may be others.
 """
@@ -16,7 +16,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 ROUNDING, TOLERANCE = 1e-9, 2e-6
 NUMBER = re.compile(r"(?<![A-Za-z_])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 

@@ -1,6 +1,6 @@
 """Figures on shaping that docs/decisions.md cites.
 
-Run with ``python docs/measure/shaping.py`` from the repository (a minute or two).
+Run with ``python benchmarks/robustness_shaping.py`` from the repository (a minute or two).
 """
 
 import time
@@ -11,8 +11,8 @@ from scipy.linalg import solve_discrete_lyapunov
 import lbt_synth as lbt
 from lbt_synth.design.shaping.basis import Basis, laguerre_basis, orthonormal_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.exact_evaluation import mode_loop
 from lbt_synth.design.shaping.reduction import Solved, reduced, solved
+from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.linear import Controller
 
 RATE_HZ, NOISE_NM = 800.0, 15.5

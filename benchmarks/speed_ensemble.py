@@ -80,7 +80,7 @@ def told_designs() -> dict[int, Row]:
         values = study.values(0, count)
         row = paired(
             lambda v=values: lbt.studies.evaluate_samples(study, v, 0),
-            lambda v=values: point.evaluate_samples(study, v[:FEW], 0),
+            lambda v=values: point.evaluate_rows(study, v[:FEW], 0),
             3,
         )
         rows[count] = _scaled(row, count)

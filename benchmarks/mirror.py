@@ -1,6 +1,6 @@
 """The tables and figures of docs/mirror.md.
 
-Run with ``python docs/measure/mirror.py`` from the repository (some 30 seconds). With a
+Run with ``python benchmarks/mirror.py`` from the repository (some 30 seconds). With a
 directory as its argument it writes the figures there.
 """
 

@@ -1,6 +1,6 @@
 """Figures of telemetry files: sizes, and how exactly the AOT standard carries a controller.
 
-Run with ``python docs/measure/telemetry.py`` from the repository; it needs the extra ``aot``.
+Run with ``python benchmarks/telemetry.py`` from the repository; it needs the extra ``aot``.
 """
 
 from __future__ import annotations

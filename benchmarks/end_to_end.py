@@ -1,6 +1,6 @@
 """End-to-end figures quoted in the documentation: leak, gain with the vibration, the clamp, OMGI.
 
-Needs the extra e2e; run with ``python docs/measure/end_to_end.py leak|gain|noise|omgi [CACHE]``.
+Needs the extra e2e; run with ``python benchmarks/end_to_end.py leak|gain|noise|omgi [CACHE]``.
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Filters over an interval of vibration frequencies: the worst norm and the worst rms of each.
 
-Run as ``python docs/measure/interval.py``; one axis of the example with a damping of 0.01.
+Run as ``python benchmarks/decisions_polytopic.py``; one axis of the example with a damping of 0.01.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
-from lbt_synth.models.frequency_interval import FrequencyInterval
+from lbt_synth.models.plant.frequency_interval import FrequencyInterval
 
 SLOW = lbt.models.ARModel(
     coefficients=[0.9886], driving_rms_nm=591.6 * np.sqrt(1 - 0.9886**2), frame_rate_hz=800

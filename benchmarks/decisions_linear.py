@@ -1,4 +1,4 @@
-"""How accurate the engine is, and what its choices buy: ``python docs/measure/engine.py``.
+"""How accurate the engine is, and what its choices buy: ``python benchmarks/decisions_linear.py``.
 
 Needs the test dependencies (SLICOT through slycot, mpmath).
 """
@@ -15,8 +15,8 @@ import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance
 
 sys.path.insert(0, "tests")
-from darex import EXAMPLES, example_2_1, example_2_4
-from plants import lbt_axis_plant
+from support.darex import EXAMPLES, example_2_1, example_2_4
+from support.plants import lbt_axis_plant
 from test_darex import error_in_digits, exact_solution, peers, relative
 from test_norms import random_system
 

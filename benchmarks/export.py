@@ -1,4 +1,4 @@
-"""What exports lose: run with ``python docs/measure/exports.py`` from the repository."""
+"""What exports lose: run with ``python benchmarks/export.py`` from the repository."""
 
 import sys
 import tempfile
@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.interop.c import text as c_text
+from lbt_synth.interop.c import code as c_text
 
 sys.path.insert(0, "benchmarks")  # the timing is that of the benchmark
 
-from realtime import frame
+from speed_export import frame
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
 

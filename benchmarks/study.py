@@ -1,6 +1,6 @@
 """What a study costs besides its evaluation: processor time a sample, and memory.
 
-``python docs/measure/study_machinery.py [samples] [jobs]``; the evaluation costs nothing.
+``python benchmarks/study.py [samples] [jobs]``; the evaluation costs nothing.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main(samples: int = 1_000_000, jobs: int = 1) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "study.yaml").write_text(STUDY.format(samples=samples))
-        source = Path(__file__).parents[2] / "examples" / "lbt.yaml"
+        source = Path(__file__).parents[1] / "examples" / "lbt.yaml"
         (folder / "lbt.yaml").write_bytes(source.read_bytes())
         study = lbt.studies.load_study(folder / "study.yaml")
         before = time.process_time()
