@@ -44,7 +44,7 @@ def kalman(settings):
 
 @pytest.fixture(scope="module")
 def robust(settings):
-    return lbt.hinf(settings.plant, gamma_ratio=1.2, method="riccati")
+    return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
 
 
 def single(design, truth, imaging, error_hz, gain, delay_error=0.0):

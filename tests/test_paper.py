@@ -19,13 +19,13 @@ def table_iii():
 
 
 def test_table_iii_kalman_column(table_iii):
-    entries = [e for e in compute.compared(table_iii) if e.method == "kalman"]
+    entries = [e for e in compute.compare_with_paper(table_iii) if e.method == "kalman"]
     assert len(entries) == 15
     assert compute.rms_difference(entries) < 1.0
 
 
 def test_table_iii_hinf_column(table_iii):
-    entries = [e for e in compute.compared(table_iii) if e.method == "hinf"]
+    entries = [e for e in compute.compare_with_paper(table_iii) if e.method == "hinf"]
     assert len(entries) == 15
     assert compute.rms_difference(entries) < 1.0
 

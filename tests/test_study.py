@@ -89,7 +89,7 @@ def test_designs_of_random_plants(capsys):
     for _ in range(1000):
         plant = random_plant(rng)
         assert lbt.kalman(plant).certificate.passed
-        design = lbt.hinf(plant, gamma_ratio=1.2, method="riccati")
+        design = lbt.hinf(plant, gamma_ratio=1.2, route="riccati")
         assert design.certificate.passed
         gaps.append(design.gamma_least / design.gamma_infeasible - 1)
     with capsys.disabled():

@@ -7,7 +7,7 @@ import pytest
 from support.studies import BASE, LBT_TEXT, study_file
 
 import lbt_synth as lbt
-from lbt_synth.studies.study import batch
+from lbt_synth.studies.study import batch_evaluation
 from lbt_synth.studies.study import reference_evaluation as point
 from lbt_synth.studies.study.sample_arrays import changes_beliefs_only, changes_numbers_only
 
@@ -25,7 +25,7 @@ def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
     )
     values = study.values(0, count)
     found = lbt.studies.evaluate_samples(study, values, 0)
-    single = point.evaluate_samples(study, values, 0)
+    single = point.evaluate_rows(study, values, 0)
     assert found.columns.keys() == single.columns.keys()
     for name, expected in single.columns.items():
         assert found.columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
@@ -69,7 +69,7 @@ def test_filters_told_their_samples(tmp_path, monkeypatch):
     study = lbt.studies.load_study(
         study_file(tmp_path, base=LBT_TEXT, controllers=TOLD, parameters=WEATHER)
     )
-    single = point.evaluate_samples(study, study.values(0, 6), 0)
+    single = point.evaluate_rows(study, study.values(0, 6), 0)
     rows = counted(monkeypatch)
     found = lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
     assert rows == [3]  # all of them at once, and one by itself
@@ -215,7 +215,7 @@ def test_samples_that_the_configuration_refuses(tmp_path):
     values[2, 0] = -5.0
     values[4, 1] = 0.0
     found = lbt.studies.evaluate_samples(study, values, 100)
-    single = point.evaluate_samples(study, values, 100)
+    single = point.evaluate_rows(study, values, 100)
     assert [(f.row, f.controller) for f in found.failures] == [
         (102, "slow"),
         (102, "kalman"),

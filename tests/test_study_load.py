@@ -15,7 +15,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import ConfigError, GainFileError, ProblemError
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.studies.study.distributions import Listed
-from lbt_synth.studies.study.sample import sample_of
+from lbt_synth.studies.study.sample import make_sample
 
 ONE = "truth.vibrations[0].rms_nm"
 
@@ -119,7 +119,7 @@ def test_a_sample_is_a_configuration(tmp_path):
     )
     for values in study.values(0, 4):
         named = study.named(values)
-        sample = sample_of(study, values)
+        sample = make_sample(study, values)
         settings = sample.config.settings
         assert settings.atmosphere.seeing_arcsec == named["atmosphere.seeing_arcsec"]
         assert settings.imaging.wavelength_um == 1.65
@@ -524,7 +524,7 @@ def test_simulated_samples(tmp_path):
     batch = lbt.studies.evaluate_samples(study, study.values(3, 5), 3)
     assert batch.columns["c.stable"].tolist() == [0, 0]
     for i, row in enumerate((3, 4)):
-        sample = sample_of(study, study.values(row, row + 1)[0])
+        sample = make_sample(study, study.values(row, row + 1)[0])
         loops = [
             lbt.close_loop(
                 sample.hardware, c.design.controller, sensor_gain=sample.truth.sensor_gain
@@ -539,11 +539,11 @@ def test_simulated_samples(tmp_path):
                 hardware=sample.hardware,
                 frames=400,
                 cases=1,
-                seed=study.seed_of(row),
+                seed=study.simulation_seed(row),
                 settle_frames=settle,
             )
             assert batch.columns[f"{name}.strehl"][i] == run.strehl(study.config.imaging).mean()
-    assert study.seed_of(3) != study.seed_of(4)
+    assert study.simulation_seed(3) != study.simulation_seed(4)
 
 
 def test_the_example():

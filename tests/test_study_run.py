@@ -16,9 +16,9 @@ from support.studies import LBT_TEXT, loaded
 
 import lbt_synth as lbt
 from lbt_synth.errors import MissingExtraError, NumericalError, OutputError, ProblemError
-from lbt_synth.studies.study.batches import Batches
+from lbt_synth.studies.study.batch_queue import BatchQueue
 from lbt_synth.studies.study.engine import DIED
-from lbt_synth.studies.study.store import missing_rows, part_list
+from lbt_synth.studies.study.store import list_parts, missing_rows
 
 ONE = "truth.vibrations[0].rms_nm"
 TWO = "{a: {design: kalman}, b: {design: integrator, gain: 0.4}}"
@@ -34,7 +34,7 @@ def quick(study, values, start):
 @pytest.fixture
 def small_batches(monkeypatch):
     """As if every row took long: batches are shares of what is left."""
-    monkeypatch.setattr("lbt_synth.studies.study.batches._CRUMB_SECONDS", 0.0)
+    monkeypatch.setattr("lbt_synth.studies.study.batch_queue._CRUMB_SECONDS", 0.0)
 
 
 def output(tmp_path, name="out"):
@@ -128,9 +128,9 @@ def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         lbt.studies.run_study(study, folder, evaluate=stops)
-    parts = [(part.start, part.stop) for part in part_list(folder)]
+    parts = [(part.start, part.stop) for part in list_parts(folder)]
     assert parts == seen[:3]
-    part_list(folder)[1].path.unlink()  # a hole
+    list_parts(folder)[1].path.unlink()  # a hole
     seen.clear()
 
     def watches(study, values, start):
@@ -156,7 +156,7 @@ def sizes_of(batches, seconds):
 
 
 def test_batches_follow_what_is_measured():
-    given = sizes_of(Batches([(0, 10), (20, 1_000_000)], 2), lambda rows: 1e-4 * rows)
+    given = sizes_of(BatchQueue([(0, 10), (20, 1_000_000)], 2), lambda rows: 1e-4 * rows)
     assert given[:2] == [(0, 4), (4, 10)]  # to the end of a range
     assert [start for start, _ in given[3:]] == [stop for _, stop in given[2:-1]]
     assert given[2][0] == 20
@@ -169,7 +169,7 @@ def test_batches_follow_what_is_measured():
 
 
 def test_batches_are_longer_where_each_costs_something():
-    given = sizes_of(Batches([(0, 1_000_000)], 2), lambda rows: 0.5 + 1e-4 * rows)
+    given = sizes_of(BatchQueue([(0, 1_000_000)], 2), lambda rows: 0.5 + 1e-4 * rows)
     sizes = [stop - start for start, stop in given]
     assert max(sizes) == 65_536
     assert len(sizes) < 45  # twenty seconds of a hundred, and shares at the end
@@ -177,15 +177,15 @@ def test_batches_are_longer_where_each_costs_something():
 
 def test_the_first_batch_may_be_slow():
     seconds = iter([30.0])
-    given = sizes_of(Batches([(0, 10_000)], 2), lambda rows: next(seconds, 1e-3 * rows))
+    given = sizes_of(BatchQueue([(0, 10_000)], 2), lambda rows: next(seconds, 1e-3 * rows))
     assert max(stop - start for start, stop in given) == 1500
     assert len(given) < 30
 
 
 def test_slow_rows_come_one_by_one():
-    given = sizes_of(Batches([(0, 40)], 2), lambda rows: 10.0 * rows)
+    given = sizes_of(BatchQueue([(0, 40)], 2), lambda rows: 10.0 * rows)
     assert [stop - start for start, stop in given] == [4] + [1] * 36
-    long = Batches([(0, 10**8)], 2)
+    long = BatchQueue([(0, 10**8)], 2)
     for rows in (100, 1000):
         long.learn(rows, 1e-3 * rows)
     assert long.next() == (0, 4000)  # at most four times what was measured
@@ -242,7 +242,7 @@ def test_other_studies_and_damage_are_refused(tmp_path):
     with pytest.raises(OutputError, match=r"parts of a study without its study\.json"):
         lbt.studies.run_study(study, folder)
     (folder / "study.json").write_text(manifest)
-    part = part_list(folder)[0].path
+    part = list_parts(folder)[0].path
     content = part.read_bytes()
     for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
         part.write_bytes(damage)
@@ -408,7 +408,7 @@ def test_an_executor_that_breaks_keeps_what_is_finished(tmp_path, kind, message)
     Breaks.calls, Breaks.kind = 0, kind
     with Breaks(1) as pool, pytest.raises(NumericalError, match=message):
         lbt.studies.run_study(study, folder, executor=pool, evaluate=quick)
-    assert 1 <= len(part_list(folder)) <= 3
+    assert 1 <= len(list_parts(folder)) <= 3
     lbt.studies.run_study(study, folder, evaluate=quick)
     assert_whole(folder, study)
 
@@ -556,7 +556,7 @@ def test_a_row_of_an_unfinished_study(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         lbt.studies.run_study(study, folder, evaluate=stops)
-    last = part_list(folder)[-1].stop - 1
+    last = list_parts(folder)[-1].stop - 1
     stored = lbt.studies.replay_row(study, folder, last).stored
     values = study.values(last, last + 1)
     assert stored["slow.strehl"] == quick(study, values, last).columns["slow.strehl"][0]

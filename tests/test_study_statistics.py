@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.stats import qmc
 
 import lbt_synth as lbt
-from lbt_synth.studies.study.conditional import conditional_curve
+from lbt_synth.studies.study.conditional_curve import conditional_curve
 from lbt_synth.studies.study.percentiles import percentiles, share
 from lbt_synth.studies.study.summary import (
     comparison_table,

@@ -9,7 +9,7 @@ from .robustness import RobustnessRow as RobustnessRow
 from .robustness import robustness as robustness
 from .robustness_map import RobustnessMap as RobustnessMap
 from .robustness_map import robustness_map as robustness_map
-from .study.batch import evaluate_samples as evaluate_samples
+from .study.batch_evaluation import evaluate_samples as evaluate_samples
 from .study.batch_result import BatchResult as BatchResult
 from .study.batch_result import Failure as Failure
 from .study.estimate import Estimate as Estimate

@@ -11,8 +11,8 @@ import numpy as np
 
 from lbt_synth.design import Design, EstimatorDesign, LqgDesign, ShapedDesign
 from lbt_synth.design.shaping import ResidualVariance, VibrationBand
-from lbt_synth.design.shaping.exact_evaluation import mode_hardware, mode_loop
 from lbt_synth.design.shaping.objectives import leaves
+from lbt_synth.design.shaping.single_mode_loop import mode_hardware, mode_loop
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.loop import (
     BandLimit,
@@ -24,7 +24,7 @@ from lbt_synth.loop import (
     residual_budget,
     strehl,
 )
-from lbt_synth.loop.least_residuals.residual import least_model_residual
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import FullStatePlant, LoopHardware, SinusoidalVibration, TipTiltPlant, Truth
 from lbt_synth.models.truth import stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen, number
@@ -155,9 +155,9 @@ def limits(
     if not errors:
         raise ProblemError("errors_hz must hold at least one error; got none.")
     vibrations = stationary_vibrations(truth.vibrations)
-    shifts = _shifts(truth, errors)
+    shifts = _frequency_shifts(truth, errors)
     limit = _limit_or_none(lambda: least_residual(hardware, truth))
-    band_hz = _band(truth, shifts)
+    band_hz = _error_band(truth, shifts)
     band = None
     if band_hz is not None:
         line = vibrations[0]
@@ -168,7 +168,7 @@ def limits(
         )
     rows, curves = [], []
     for name, design in designs.items():
-        row, curve = _examined(name, design, hardware, truth, imaging, shifts)
+        row, curve = _evaluate_design(name, design, hardware, truth, imaging, shifts)
         if limit is not None:
             row = replace(row, above_limit_percent=above_percent(row.residual_nm, limit.rms_nm))
         if band is not None:
@@ -188,7 +188,7 @@ def limits(
     )
 
 
-def _shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
+def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
     """Return true frequencies less those of the truth; the model's error is their opposite."""
     if not truth.vibrations:
         return np.zeros(0)
@@ -198,14 +198,14 @@ def _shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
     return np.asarray(np.unique(np.concatenate([grid, moved, inside]) + 0.0))
 
 
-def _band(truth: Truth, shifts: FloatArray) -> tuple[float, float] | None:
+def _error_band(truth: Truth, shifts: FloatArray) -> tuple[float, float] | None:
     lines = truth.vibrations
     if len(lines) != 1 or not isinstance(lines[0], SinusoidalVibration) or shifts.size < 2:
         return None
     return lines[0].frequency_hz + float(shifts[0]), lines[0].frequency_hz + float(shifts[-1])
 
 
-def _examined(
+def _evaluate_design(
     name: str,
     design: Design,
     hardware: LoopHardware,
@@ -268,7 +268,7 @@ def _limit_or_none(limit: Callable[[], T]) -> T | None:
         return None
 
 
-def model_distance(design: EstimatorDesign) -> tuple[float, float]:
+def model_limit(design: EstimatorDesign) -> tuple[float, float]:
     """Limit of a filter's own model [nm rms] and how far its error is above it [%].
 
     nan where the limit cannot be computed; the second also for a fractional delay or a mirror
@@ -284,7 +284,7 @@ def model_distance(design: EstimatorDesign) -> tuple[float, float]:
     return limit_nm, above_percent(design.rms, limit_nm) if exact else float("nan")
 
 
-def shaped_distance(design: ShapedDesign) -> tuple[float, float]:
+def shaped_limit(design: ShapedDesign) -> tuple[float, float]:
     """Limit of a shaped design's own spectra [nm rms], and how far its residual is above it [%].
 
     At unit sensor gain and over all modes. The residual is the variance plus the worst of the

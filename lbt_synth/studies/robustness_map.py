@@ -126,9 +126,9 @@ def robustness_map(
         raise DimensionError(
             f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
         )
-    errors = _axis(errors_hz, "errors_hz")
-    gains = _axis(sensor_gains, "sensor_gains", above=0)
-    delays = _axis(
+    errors = _checked_axis(errors_hz, "errors_hz")
+    gains = _checked_axis(sensor_gains, "sensor_gains", above=0)
+    delays = _checked_axis(
         delay_errors_frames,
         "delay_errors_frames",
         at_least=1 - hardware.delay_frames,
@@ -136,7 +136,7 @@ def robustness_map(
         hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
         "lie between 1 and 100.",
     )
-    lines = _moved_lines(truth, errors, hardware)
+    lines = _shift_vibrations(truth, errors, hardware)
     shape = (delays.size, gains.size, errors.size)
     strehls, residuals = np.full(shape, np.nan), np.full(shape, np.nan)
     stable = np.zeros(shape[:2], dtype=np.bool_)
@@ -171,7 +171,7 @@ def robustness_map(
     )
 
 
-def _axis(values: Any, name: str, **bounds: Any) -> FloatArray:
+def _checked_axis(values: Any, name: str, **bounds: Any) -> FloatArray:
     """Values of one axis of the map, each within its bounds and there once."""
     axis = real_array(values, name)
     if axis.ndim != 1 or axis.size == 0:
@@ -183,7 +183,7 @@ def _axis(values: Any, name: str, **bounds: Any) -> FloatArray:
     return axis
 
 
-def _moved_lines(
+def _shift_vibrations(
     truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
 ) -> list[EnsembleVibration]:
     """Vibrations that lie below what the design believes, one frequency an error."""

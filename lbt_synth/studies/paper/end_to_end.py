@@ -14,7 +14,7 @@ import numpy as np
 from lbt_synth.design import Design, hinf, integrator, kalman
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.interop import EndToEndSetup, calibrate
-from lbt_synth.interop.specula.cases import case_of, run_case
+from lbt_synth.interop.specula.json_cases import make_case, run_case
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
@@ -31,7 +31,7 @@ _FILTERS = ("kalman", "hinf")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Planned:
+class PlannedRow:
     """One row of a table for one controller: cases that differ in their seed only."""
 
     table: str  # "II" or "III"
@@ -101,7 +101,7 @@ def plan_tables(
     seeds: Sequence[int] = (0, 1, 2),
     row_seeds: Sequence[int] = (0,),
     tables: Sequence[str] = ("II", "III"),
-) -> list[Planned]:
+) -> list[PlannedRow]:
     """Lay out both tables for a system.
 
     The filters are those of :func:`~lbt_synth.studies.paper.tables.paper_filters`, designed anew
@@ -117,20 +117,20 @@ def plan_tables(
             f"{given.DELAY_FRAMES:g} frames; got {hardware.frame_rate_hz:g} Hz and "
             f"{hardware.delay_frames:g} frames."
         )
-    rows: list[Planned] = []
+    rows: list[PlannedRow] = []
     fixed = dict(designs or {})
     for name, design in fixed.items():
         setup.controller(design)  # refuses a filter of another loop or of other sizes
         if name in ("classical", *_FILTERS):
             raise ProblemError(f"the name {name} is taken by the paper's own; rename the file.")
     if "II" in tables:
-        rows += _table_ii(setup, fixed, seeds)
+        rows += _plan_table_ii(setup, fixed, seeds)
     if "III" in tables:
-        rows += _table_iii(setup, fixed, seeds, row_seeds)
+        rows += _plan_table_iii(setup, fixed, seeds, row_seeds)
     return rows
 
 
-class _Row(NamedTuple):
+class _TableRow(NamedTuple):
     """What the controllers of one row have in common."""
 
     table: str
@@ -150,12 +150,12 @@ class _Row(NamedTuple):
         return None if self.error_hz is None else given.VIBRATION_HZ - self.error_hz
 
 
-def _table_ii(
+def _plan_table_ii(
     setup: EndToEndSetup, fixed: Mapping[str, Design], seeds: Sequence[int]
-) -> Iterator[Planned]:
+) -> Iterator[PlannedRow]:
     for published in TABLE_II:
         shaken = published.vibration
-        row = _Row(
+        row = _TableRow(
             table="II",
             label="vibration" if shaken else "no vibration",
             error_hz=0.0 if shaken else None,
@@ -164,48 +164,52 @@ def _table_ii(
         )
         gain = CLASSICAL_GAIN_VIBRATION if shaken else CLASSICAL_GAIN
         classical = integrator(setup.system.hardware, gain=gain).controller
-        yield _planned(setup, row, "classical", classical, published.classical)
-        yield from _filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
-        yield from _fixed(setup, row, fixed)
+        yield _plan_row(setup, row, "classical", classical, published.classical)
+        yield from _plan_filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
+        yield from _plan_designs(setup, row, fixed)
 
 
-def _table_iii(
+def _plan_table_iii(
     setup: EndToEndSetup,
     fixed: Mapping[str, Design],
     seeds: Sequence[int],
     row_seeds: Sequence[int],
-) -> Iterator[Planned]:
+) -> Iterator[PlannedRow]:
     for published in TABLE_III:
         error = published.model_hz - given.VIBRATION_HZ
-        row = _Row(
+        row = _TableRow(
             table="III",
             label=f"{published.model_hz:.1f} Hz",
             error_hz=error,
             model_hz=published.model_hz,
             seeds=seeds if error == 0 else row_seeds,
         )
-        yield from _filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
-        yield from _fixed(setup, row, fixed)
+        yield from _plan_filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
+        yield from _plan_designs(setup, row, fixed)
 
 
-def _filters(setup: EndToEndSetup, row: _Row, published: Mapping[str, float]) -> Iterator[Planned]:
+def _plan_filters(
+    setup: EndToEndSetup, row: _TableRow, published: Mapping[str, float]
+) -> Iterator[PlannedRow]:
     for method, paper in published.items():
         controller = _paper_filter(method, row.model_hz)
-        yield _planned(setup, row, method, controller, paper)
+        yield _plan_row(setup, row, method, controller, paper)
 
 
-def _fixed(setup: EndToEndSetup, row: _Row, designs: Mapping[str, Design]) -> Iterator[Planned]:
+def _plan_designs(
+    setup: EndToEndSetup, row: _TableRow, designs: Mapping[str, Design]
+) -> Iterator[PlannedRow]:
     for name, design in designs.items():
-        yield _planned(setup, row, name, design.controller, float("nan"))
+        yield _plan_row(setup, row, name, design.controller, float("nan"))
 
 
-def _planned(
+def _plan_row(
     setup: EndToEndSetup,
-    row: _Row,
+    row: _TableRow,
     method: str,
     controller: Controller,
     paper: float,
-) -> Planned:
+) -> PlannedRow:
     tuned = method in _FILTERS
     true_hz = row.truth_hz if tuned else row.moved_hz
     lines: tuple[SinusoidalVibration, ...] = ()
@@ -215,7 +219,7 @@ def _planned(
         lines = (replace(shake, frequency_hz=true_hz),)
     met = "none" if true_hz is None else f"{true_hz:g}hz"
     name = f"{method}-{row.model_hz:g}hz" if tuned else method
-    return Planned(
+    return PlannedRow(
         table=row.table,
         label=row.label,
         method=method,
@@ -224,7 +228,7 @@ def _planned(
         controller=controller,
         truth=replace(given.PAPER_TRUTH, vibrations=lines),
         cases={
-            f"{name}-vibration-{met}-seed-{seed}": case_of(
+            f"{name}-vibration-{met}-seed-{seed}": make_case(
                 setup,
                 controller,
                 vibrations=lines,
@@ -240,7 +244,7 @@ def _paper_filter(method: str, model_hz: float) -> Controller:
     plant = retuned_plant(plant, model_hz - given.VIBRATION_HZ, hold="driving")
     if method == "kalman":
         return kalman(plant).controller
-    return hinf(plant, gamma=given.HINF_GAMMA * given.NOISE_NM, method="riccati").controller
+    return hinf(plant, gamma=given.HINF_GAMMA * given.NOISE_NM, route="riccati").controller
 
 
 def end_to_end_tables(
@@ -314,7 +318,7 @@ def end_to_end_tables(
 
 def run_tables(
     setup: EndToEndSetup,
-    rows: Sequence[Planned],
+    rows: Sequence[PlannedRow],
     directory: str | os.PathLike[str],
     *,
     jobs: int = 1,
@@ -332,16 +336,16 @@ def run_tables(
         executor=executor,
         progress=progress,
     )
-    return entries(rows, results, setup)
+    return make_entries(rows, results, setup)
 
 
-def all_cases(rows: Iterable[Planned]) -> dict[str, dict[str, Any]]:
+def all_cases(rows: Iterable[PlannedRow]) -> dict[str, dict[str, Any]]:
     """Return the cases of all rows, each once."""
     return {name: case for row in rows for name, case in row.cases.items()}
 
 
-def entries(
-    rows: Iterable[Planned], results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
+def make_entries(
+    rows: Iterable[PlannedRow], results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
 ) -> list[EndToEndEntry]:
     """Return the tables from the results of their cases."""
     out = []
@@ -355,7 +359,7 @@ def entries(
                 error_hz=row.error_hz,
                 paper=row.paper,
                 strehls=tuple(100 * one["strehl"] for one in found),
-                modal=_mean([_predicted(row, one, setup) for one in found]),
+                modal=_mean([_predict_strehl(row, one, setup) for one in found]),
                 optical_gain=_mean([one["tip_tilt_gain"] for one in found]),
                 tip_rms_nm=_mean([one["tip_rms_nm"] ** 2 for one in found]) ** 0.5,
                 tilt_rms_nm=_mean([one["tilt_rms_nm"] ** 2 for one in found]) ** 0.5,
@@ -369,7 +373,7 @@ def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values))
 
 
-def _predicted(row: Planned, result: Mapping[str, Any], setup: EndToEndSetup) -> float:
+def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndSetup) -> float:
     system = setup.system
     gain = result["tip_tilt_gain"]
     if gain <= 0:
@@ -388,7 +392,7 @@ def _predicted(row: Planned, result: Mapping[str, Any], setup: EndToEndSetup) ->
         return 0.0
 
 
-def modal_distance(table: Iterable[EndToEndEntry], method: str) -> float:
+def rms_modal_difference(table: Iterable[EndToEndEntry], method: str) -> float:
     """Root mean square of end-to-end less modal over Table III, for one controller [points]."""
     apart = [e.strehl - e.modal for e in table if e.table == "III" and e.method == method]
     return float(np.sqrt(np.mean(np.square(apart))))

@@ -16,7 +16,7 @@ from lbt_synth.studies.robustness import RobustnessRow, robustness
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class TableEntry:
     """One entry of a table, ours beside the paper's [% Strehl]."""
 
     table: str  # "II" or "III"
@@ -32,7 +32,7 @@ class Comparison:
         return self.ours - self.paper
 
 
-def rms_difference(entries: list[Comparison]) -> float:
+def rms_difference(entries: list[TableEntry]) -> float:
     """Root mean square of the differences [points]."""
     return float(np.sqrt(np.mean([entry.difference**2 for entry in entries])))
 
@@ -45,7 +45,7 @@ def paper_filters() -> tuple[FilterDesign, FilterDesign]:
     )
 
 
-def table_ii() -> list[Comparison]:
+def table_ii() -> list[TableEntry]:
     """Table II: three controllers without and with the vibration."""
     kalman_design, hinf_design = paper_filters()
     hardware = given.kalman_plant().hardware
@@ -65,7 +65,7 @@ def table_ii() -> list[Comparison]:
             ("hinf", hinf_design, row.hinf),
         ):
             out.append(
-                Comparison(
+                TableEntry(
                     table="II",
                     label="vibration" if row.vibration else "no vibration",
                     method=method,
@@ -93,7 +93,7 @@ def table_iii() -> Iterator[RobustnessRow]:
             )
 
 
-def compared(rows: list[RobustnessRow]) -> list[Comparison]:
+def compare_with_paper(rows: list[RobustnessRow]) -> list[TableEntry]:
     """Put rows of :func:`table_iii` beside the paper's."""
     published = {
         (method, row.model_hz): getattr(row, method)
@@ -104,7 +104,7 @@ def compared(rows: list[RobustnessRow]) -> list[Comparison]:
     for row in rows:
         frequency = given.VIBRATION_HZ + row.error_hz
         out.append(
-            Comparison(
+            TableEntry(
                 table="III",
                 label=f"{frequency:.1f} Hz",
                 method=row.method,

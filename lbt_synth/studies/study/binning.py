@@ -27,7 +27,7 @@ class BinnedMap:
     samples: FloatArray  # (ny, nx): samples in each cell
 
 
-def cumulative(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return points of the cumulative distribution of a sample, more of them in its tails.
 
     Shapes: values (n,) -> level (k,), part (k,).
@@ -35,8 +35,8 @@ def cumulative(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.studies.study.binning import cumulative
-    >>> level, part = cumulative(np.array([0.0, 0.0, 0.5, 1.0]))
+    >>> from lbt_synth.studies.study.binning import cumulative_points
+    >>> level, part = cumulative_points(np.array([0.0, 0.0, 0.5, 1.0]))
     >>> level, part
     (array([0. , 0.5, 1. ]), array([0.5 , 0.75, 1.  ]))
     """
@@ -63,7 +63,7 @@ def histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return edges, counts / len(values)
 
 
-def values_of(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Return the values of a list and the part of the sample of each; None if it is no list."""
     if not is_list(np.sort(values)):
         return None
@@ -86,13 +86,13 @@ def binned_map(x: FloatArray, y: FloatArray, result: FloatArray) -> BinnedMap:
     (array([10., 20.]), array([0.1, 0.2]))
     """
     cells = len(x) / _PER_CELL
-    lists = [values_of(x), values_of(y)]
+    lists = [value_shares(x), value_shares(y)]
     for found in lists:
         cells /= len(found[0]) if found is not None else 1
     free = sum(found is None for found in lists)
     width = int(np.clip(cells ** (1 / free), 3, _CELLS)) if free else 0
-    columns, x_places = _places(x, lists[0], width)
-    rows, y_places = _places(y, lists[1], width)
+    columns, x_places = _assign_cells(x, lists[0], width)
+    rows, y_places = _assign_cells(y, lists[1], width)
     cell = y_places * len(columns) + x_places
     size = len(rows) * len(columns)
     samples = np.bincount(cell, minlength=size).astype(np.float64)
@@ -108,7 +108,7 @@ def binned_map(x: FloatArray, y: FloatArray, result: FloatArray) -> BinnedMap:
     )
 
 
-def _places(
+def _assign_cells(
     values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
 ) -> tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.int64]]]:
     """Centres of the cells along one axis, and the cell of each sample."""

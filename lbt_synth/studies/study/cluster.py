@@ -27,7 +27,7 @@ class Cluster:
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Cluster]:
+def connect_cluster(address: str) -> Iterator[Cluster]:
     """Connect to a Dask scheduler whose workers have this version of the package."""
     try:
         from distributed import Client
@@ -46,7 +46,7 @@ def connected(address: str) -> Iterator[Cluster]:
             f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
             "such as tcp://host:8786; start one with dask scheduler, and dask worker."
         ) from error
-    with _silent(), client:
+    with _silence_logging(), client:
         try:
             client.wait_for_workers(1, timeout=_TIMEOUT_S)
         except TimeoutError as error:
@@ -59,7 +59,7 @@ def connected(address: str) -> Iterator[Cluster]:
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
+def _silence_logging() -> Iterator[None]:
     """Let nothing be logged: a lost scheduler is told by an error, not by tracebacks."""
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.studies.study.controller_samples import ControllerSamples
 from lbt_synth.studies.study.percentiles import Percentile, Share, percentiles, share
-from lbt_synth.studies.study.sample_status import Outcomes
 from lbt_synth.validation import FloatArray
 
 DIFFERENCES = (5.0, 25.0, 50.0, 75.0, 95.0)
@@ -47,7 +47,7 @@ def mean_and_error(values: FloatArray) -> tuple[float, float]:
     return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan
 
 
-def compare(first: Outcomes, second: Outcomes) -> Comparison:
+def compare(first: ControllerSamples, second: ControllerSamples) -> Comparison:
     """Compare two controllers sample by sample."""
     both = first.evaluated & second.evaluated
     difference = first.strehl[both] - second.strehl[both]
@@ -64,7 +64,7 @@ def compare(first: Outcomes, second: Outcomes) -> Comparison:
     )
 
 
-def losses_of(controllers: Sequence[Outcomes]) -> tuple[FloatArray, ...]:
+def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray, ...]:
     """Return the best Strehl ratio of each sample less that of each controller.
 
     Shapes: returns list of (m,).
@@ -74,12 +74,12 @@ def losses_of(controllers: Sequence[Outcomes]) -> tuple[FloatArray, ...]:
     return tuple(best - each.strehl[whole] for each in controllers)
 
 
-def losses(controllers: Sequence[Outcomes]) -> tuple[Loss, ...]:
+def losses(controllers: Sequence[ControllerSamples]) -> tuple[Loss, ...]:
     """Loss of each controller against the best one of each sample."""
     return tuple(
         Loss(
             best=share(int(np.count_nonzero(loss == 0)), len(loss)),
             loss=percentiles(loss, (50.0, 95.0, 99.0)),
         )
-        for loss in losses_of(controllers)
+        for loss in sample_losses(controllers)
     )

@@ -13,13 +13,13 @@ Keys = tuple[str | int, ...]
 _PART = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
 
 
-def keys_of(path: str) -> Keys:
+def parse_path(path: str) -> Keys:
     """Return the keys of a path.
 
     Examples
     --------
-    >>> from lbt_synth.studies.study.config_paths import keys_of
-    >>> keys_of("truth.vibrations[0].frequency_hz")
+    >>> from lbt_synth.studies.study.config_paths import parse_path
+    >>> parse_path("truth.vibrations[0].frequency_hz")
     ('truth', 'vibrations', 0, 'frequency_hz')
     """
     keys: list[str | int] = []
@@ -40,11 +40,11 @@ def require_number(content: Mapping[str, Any], path: str) -> None:
     here: Any = content
     parent: Any = {}
     walked = ""
-    for key in keys_of(path):
+    for key in parse_path(path):
         place = walked or "the configuration"
         if isinstance(key, int):
             if not isinstance(here, list):
-                raise ConfigError(f"{path}: {place} is no list; {_seen(here)}.")
+                raise ConfigError(f"{path}: {place} is no list; {_describe(here)}.")
             if key >= len(here):
                 raise ConfigError(
                     f"{path}: {place} has {len(here)} entr{'y' if len(here) == 1 else 'ies'}, "
@@ -53,7 +53,7 @@ def require_number(content: Mapping[str, Any], path: str) -> None:
             walked += f"[{key}]"
         else:
             if not isinstance(here, dict):
-                raise ConfigError(f"{path}: {place} has no keys; {_seen(here)}.")
+                raise ConfigError(f"{path}: {place} has no keys; {_describe(here)}.")
             if key not in here:
                 close = difflib.get_close_matches(key, list(here), n=1, cutoff=0.6)
                 hint = f"did you mean {close[0]}? " if close else ""
@@ -70,10 +70,10 @@ def require_number(content: Mapping[str, Any], path: str) -> None:
             f"{path} is not set in the configuration, so it cannot be varied.{others}"
         )
     if isinstance(here, bool | str) or not isinstance(here, int | float):
-        raise ConfigError(f"{path} must lead to a number of the configuration; {_seen(here)}.")
+        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(here)}.")
 
 
-def _seen(value: Any) -> str:
+def _describe(value: Any) -> str:
     if isinstance(value, dict):
         return f"it is a section with {', '.join(sorted(value))}"
     if isinstance(value, list):
@@ -95,7 +95,9 @@ def number_at(content: Mapping[str, Any], keys: Keys) -> float | int:
     return number
 
 
-def put(content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]) -> None:
+def set_number(
+    content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]
+) -> None:
     """Put a number at its place, which :func:`require_number` lets pass in ``full``.
 
     Sections on the way that are not there are made, lists are taken from ``full``, the same
@@ -106,7 +108,7 @@ def put(content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str,
     for key in keys[:-1]:
         whole = whole[key]
         if isinstance(here, dict) and key not in here:
-            here[key] = _copied(whole) if isinstance(whole, list) else {}
+            here[key] = _copy_nested(whole) if isinstance(whole, list) else {}
         here = here[key]
     stays = isinstance(whole[keys[-1]], int) and float(value).is_integer()
     here[keys[-1]] = int(value) if stays else float(value)
@@ -114,12 +116,12 @@ def put(content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str,
 
 def nested_copy(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy whose sections and lists may be changed."""
-    return {key: _copied(value) for key, value in content.items()}
+    return {key: _copy_nested(value) for key, value in content.items()}
 
 
-def _copied(value: Any) -> Any:
+def _copy_nested(value: Any) -> Any:
     if isinstance(value, Mapping):
         return nested_copy(value)
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_copied(item) for item in value]
+        return [_copy_nested(item) for item in value]
     return value

@@ -198,7 +198,7 @@ class Listed:
         return min(self.values), max(self.values)
 
 
-def middle(distribution: Distribution) -> float:
+def median(distribution: Distribution) -> float:
     """Return the median."""
     return float(distribution.quantile(np.array([0.5]))[0])
 

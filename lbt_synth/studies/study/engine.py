@@ -21,15 +21,15 @@ import numpy as np
 
 from lbt_synth.errors import LbtSynthError, NumericalError
 from lbt_synth.storage.worker_processes import WorkerPool, one_thread_each
+from lbt_synth.studies.study.batch_queue import BatchQueue
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
-from lbt_synth.studies.study.batches import Batches
 from lbt_synth.studies.study.cluster import is_death_of_workers
-from lbt_synth.studies.study.store import Rows
+from lbt_synth.studies.study.store import RowRange
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
 Evaluate = Callable[[Study, FloatArray, int], BatchResult]
-Finished = tuple[BatchResult, float]  # and the seconds that it took
+TimedBatch = tuple[BatchResult, float]  # and the seconds that it took
 
 DIED = "its process ended without a word: killed, or for want of memory"
 _MOST_DEATHS = 40  # one after the other, without a batch that comes back
@@ -38,11 +38,11 @@ _SPARE = 2  # batches in flight for each worker, so that none waits
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    rows: Rows
+    rows: RowRange
     alone: bool
 
 
-class _Inline(Executor):
+class _InlineExecutor(Executor):
     """Runs what it is given in this process, at once."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -83,9 +83,9 @@ class _Workers:
 
 
 @contextmanager
-def _workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
+def _open_workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
     if executor is not None or jobs == 1:
-        yield _Workers(executor or _Inline(), None, jobs)
+        yield _Workers(executor or _InlineExecutor(), None, jobs)
         return
     with one_thread_each():
         pool = WorkerPool(jobs)
@@ -98,7 +98,7 @@ def _workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
         workers.end(at_once=False)
 
 
-def computed(evaluate: Evaluate, study: Study, values: FloatArray, start: int) -> Finished:
+def evaluate_timed(evaluate: Evaluate, study: Study, values: FloatArray, start: int) -> TimedBatch:
     """Evaluate a batch, and time it; this is what a worker runs."""
     before = time.perf_counter()
     batch = evaluate(study, values, start)
@@ -107,25 +107,25 @@ def computed(evaluate: Evaluate, study: Study, values: FloatArray, start: int) -
 
 def run_batches(
     study: Study,
-    ranges: Sequence[Rows],
+    ranges: Sequence[RowRange],
     *,
     evaluate: Evaluate,
     jobs: int = 1,
     executor: Executor | None = None,
     workers: int | None = None,
-) -> Generator[Finished, None, None]:
+) -> Generator[TimedBatch, None, None]:
     """Yield the results of all rows of some ranges, in the order in which they come.
 
     Where a process dies, what was in flight is run again, each batch alone; one that kills its
     process again is halved, down to single rows, which fail. Shapes: ranges list of (int, int).
     """
     count = workers or jobs
-    batches = Batches(ranges, count)
+    batches = BatchQueue(ranges, count)
     most = 1 if executor is None and jobs == 1 else _SPARE * count
-    running: dict[Future[Finished], _Task] = {}
-    suspects: deque[Rows] = deque()
+    running: dict[Future[TimedBatch], _Task] = {}
+    suspects: deque[RowRange] = deque()
     deaths = 0
-    with _workers(jobs, executor) as engine:
+    with _open_workers(jobs, executor) as engine:
         try:
             while batches.left or suspects or running:
                 broken: BaseException | None = None
@@ -138,7 +138,7 @@ def run_batches(
                         values = study.values(*rows)
                         try:
                             future = engine.executor.submit(
-                                computed, evaluate, study, values, rows[0]
+                                evaluate_timed, evaluate, study, values, rows[0]
                             )
                         except BrokenExecutor:
                             if not suspects:
@@ -153,7 +153,7 @@ def run_batches(
                 dead: list[_Task] = []
                 for future in done:
                     task = running.pop(future)
-                    raised = _error_of(future)
+                    raised = _future_error(future)
                     if raised is None:
                         deaths = 0
                         batch, seconds = future.result()
@@ -166,7 +166,7 @@ def run_batches(
                     elif is_death_of_workers(raised):
                         dead.append(task)
                     else:
-                        raise _told(raised, task.rows)
+                        raise _error_to_raise(raised, task.rows)
                 if broken is not None:
                     dead += running.values()
                     running.clear()
@@ -184,7 +184,7 @@ def run_batches(
                     if not task.alone:
                         suspects.append(task.rows)
                     elif stop - start == 1:
-                        yield _lost(study, start), 0.0
+                        yield _failed_row(study, start), 0.0
                     else:
                         middle = (start + stop) // 2
                         suspects.extendleft([(middle, stop), (start, middle)])
@@ -193,14 +193,14 @@ def run_batches(
                 future.cancel()
 
 
-def _error_of(future: Future[Finished]) -> BaseException | None:
+def _future_error(future: Future[TimedBatch]) -> BaseException | None:
     try:
         return future.exception()
     except CancelledError as error:
         return error
 
 
-def _told(error: BaseException, rows: Rows) -> BaseException:
+def _error_to_raise(error: BaseException, rows: RowRange) -> BaseException:
     """Return what to raise for an error of a batch that is none of a sample."""
     if isinstance(error, LbtSynthError | MemoryError):
         return error
@@ -219,7 +219,7 @@ def _told(error: BaseException, rows: Rows) -> BaseException:
     return told
 
 
-def _require_whole(batch: BatchResult, rows: Rows, study: Study) -> None:
+def _require_whole(batch: BatchResult, rows: RowRange, study: Study) -> None:
     """Refuse what a worker returned if it is not what was asked for."""
     size = rows[1] - rows[0]
     right = (
@@ -235,7 +235,7 @@ def _require_whole(batch: BatchResult, rows: Rows, study: Study) -> None:
         )
 
 
-def _lost(study: Study, row: int) -> BatchResult:
+def _failed_row(study: Study, row: int) -> BatchResult:
     """Return what is left of a row that ends its process."""
     return BatchResult(
         start=row,

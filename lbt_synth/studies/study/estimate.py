@@ -6,7 +6,7 @@ import os
 import time
 from dataclasses import dataclass
 
-from lbt_synth.studies.study.batch import evaluate_samples
+from lbt_synth.studies.study.batch_evaluation import evaluate_samples
 from lbt_synth.studies.study.engine import Evaluate
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import integer

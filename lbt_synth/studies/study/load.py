@@ -18,7 +18,7 @@ from lbt_synth.config.load import read_mapping, validated
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError
 from lbt_synth.files.gain_file.store import load_with_digest
-from lbt_synth.studies.study.config_paths import Keys, is_integer, keys_of, require_number
+from lbt_synth.studies.study.config_paths import Keys, is_integer, parse_path, require_number
 from lbt_synth.studies.study.distributions import (
     Distribution,
     Fixed,
@@ -26,12 +26,12 @@ from lbt_synth.studies.study.distributions import (
     Normal,
     Uniform,
     equal_weights,
-    middle,
+    median,
 )
-from lbt_synth.studies.study.reference_evaluation import closed_loop
-from lbt_synth.studies.study.sample import Sample, sample_of
+from lbt_synth.studies.study.reference_evaluation import close_sample_loop
+from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.schema import ParameterSection, StudySection
-from lbt_synth.studies.study.store import read_manifest, require_same, stored_design
+from lbt_synth.studies.study.store import read_manifest, require_same_study, stored_design
 from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController
 
 _MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
@@ -103,8 +103,8 @@ def load_study(
         digest=_digest(settings, config, {name: digest for name, (_, digest) in gains.items()}),
         inputs=(source, config_file, *files.values()),
     )
-    samples = [(where, _checked(study, where, values)) for where, values in _corners(study)]
-    stored = _stored(study, directory)
+    samples = [(where, _checked_sample(study, where, values)) for where, values in _corners(study)]
+    stored = _read_designs(study, directory)
     controllers = []
     for name, section in settings.controllers.items():
         if section.file is not None:
@@ -115,7 +115,9 @@ def load_study(
             assert section.design is not None  # the schema wants one of the two
             request = DesignRequest(method=section.design, options=section.options)
             own = section.for_ == "sample"
-            design = None if own else stored.get(name) or _made(name, request, config, source)
+            design = (
+                None if own else stored.get(name) or _make_design(name, request, config, source)
+            )
             words = "for each sample" if own else "for the configuration"
             entry = StudyController(
                 name=name, request=request, design=design, origin=f"{request.text} {words}"
@@ -136,17 +138,17 @@ def load_study(
     return study
 
 
-def _stored(study: Study, directory: str | os.PathLike[str] | None) -> dict[str, Design]:
+def _read_designs(study: Study, directory: str | os.PathLike[str] | None) -> dict[str, Design]:
     """Return the designs that a directory has of a study."""
     manifest = None if directory is None else read_manifest(Path(directory))
     if directory is None or manifest is None:
         return {}
-    require_same(manifest, study.digest, Path(directory))
+    require_same_study(manifest, study.digest, Path(directory))
     found = {name: stored_design(Path(directory), name, manifest) for name in manifest["designs"]}
     return {name: design for name, design in found.items() if design is not None}
 
 
-def _made(name: str, request: DesignRequest, config: Config, source: Path) -> Design:
+def _make_design(name: str, request: DesignRequest, config: Config, source: Path) -> Design:
     try:
         return designed(config, request)
     except LbtSynthError as error:
@@ -201,7 +203,7 @@ def _parameters(settings: StudySection, config: Config, source: Path) -> tuple[P
             else:
                 for place in (name, *section.also):
                     require_number(full, place)
-                    keys = keys_of(place)
+                    keys = parse_path(place)
                     other = taken.setdefault(keys, name)
                     if other != name or keys in places:
                         raise ConfigError(f"{place} is given twice, by {other} and {name}.")
@@ -244,7 +246,7 @@ def _distribution(section: ParameterSection) -> Distribution:
 
 def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
     """Yield the middle, then the ends of each parameter with the others in the middle."""
-    centre = [middle(parameter.distribution) for parameter in study.parameters]
+    centre = [median(parameter.distribution) for parameter in study.parameters]
     yield "parameters in the middle", centre
     for i, parameter in enumerate(study.parameters):
         if not parameter.distribution.varies:
@@ -255,9 +257,9 @@ def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
             yield f"parameters.{parameter.name} at {end:g}", values
 
 
-def _checked(study: Study, where: str, values: list[float]) -> Sample:
+def _checked_sample(study: Study, where: str, values: list[float]) -> Sample:
     try:
-        sample = sample_of(study, np.array(values))
+        sample = make_sample(study, np.array(values))
     except LbtSynthError as error:
         raise ConfigError(f"{study.source}: {where}: {error}", path=where.split(" ")[0]) from error
     if sample.truth.drifts and study.settings.evaluation == "exact":
@@ -271,6 +273,6 @@ def _checked(study: Study, where: str, values: list[float]) -> Sample:
 
 def _require_fitting(design: Design, sample: Sample, where: str) -> None:
     try:
-        closed_loop(sample, design)
+        close_sample_loop(sample, design)
     except LbtSynthError as error:
         raise ConfigError(f"{where}: {error}") from error

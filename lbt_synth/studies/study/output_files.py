@@ -14,7 +14,7 @@ from lbt_synth.storage.atomic_files import write_atomically, writing_atomically
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.parquet import read_parquet, write_parquet
-from lbt_synth.studies.study.store import FAILED, Part, blocks, read_part
+from lbt_synth.studies.study.store import FAILED, Part, read_blocks, read_part
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
@@ -36,7 +36,7 @@ def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
     path = results_path(folder, study)
     with writing_atomically(path) as stream:
         if study.settings.results == "parquet":
-            write_parquet(stream, study.columns, _tables(study, parts))
+            write_parquet(stream, study.columns, _table_blocks(study, parts))
             return path
         stream.write((",".join(study.columns) + "\n").encode())
         line = ",".join(
@@ -46,15 +46,15 @@ def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
                 *[_RESULT] * len(study.result_columns),
             ]
         )
-        for start, values in _tables(study, parts):
+        for start, values in _table_blocks(study, parts):
             rows = enumerate(values.tolist(), start)
             stream.write("".join([f"{line % (row, *cells)}\n" for row, cells in rows]).encode())
     return path
 
 
-def _tables(study: Study, parts: Sequence[Part]) -> Iterator[tuple[int, FloatArray]]:
+def _table_blocks(study: Study, parts: Sequence[Part]) -> Iterator[tuple[int, FloatArray]]:
     """Yield parameters and results together."""
-    for start, results in blocks(list(parts), study, _BLOCK_ROWS):
+    for start, results in read_blocks(list(parts), study, _BLOCK_ROWS):
         yield start, np.hstack([study.values(start, start + len(results)), results])
 
 
@@ -108,7 +108,7 @@ def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict
     return found
 
 
-def stored_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dict[str, float]:
+def read_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dict[str, float]:
     """Return the results of one row, as far as they are there."""
     for part in parts:
         if part.start <= row < part.stop:

@@ -69,7 +69,7 @@ def percentiles(values: FloatArray, percents: Sequence[float]) -> tuple[Percenti
         out.append(
             Percentile(
                 percent=percent,
-                value=_interpolated(ordered, percent / 100),
+                value=_interpolate(ordered, percent / 100),
                 low=float(ordered[first - 1]) if first >= 1 else np.nan,
                 high=float(ordered[last - 1]) if last <= n else np.nan,
             )
@@ -77,7 +77,7 @@ def percentiles(values: FloatArray, percents: Sequence[float]) -> tuple[Percenti
     return tuple(out)
 
 
-def _interpolated(ordered: FloatArray, fraction: float) -> float:
+def _interpolate(ordered: FloatArray, fraction: float) -> float:
     """Quantile by linear interpolation between order statistics, some of which may be inf."""
     at = fraction * (len(ordered) - 1)
     below = int(at)

@@ -13,7 +13,7 @@ from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, simulate, st
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
-from lbt_synth.studies.study.sample import Sample, sample_of
+from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.study import Study, StudyController
 from lbt_synth.validation import FloatArray
 
@@ -21,7 +21,7 @@ from lbt_synth.validation import FloatArray
 EXPECTED_ERRORS = (LbtSynthError, ArithmeticError, ValueError)
 
 
-def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResult:
+def evaluate_rows(study: Study, values: FloatArray, start: int) -> BatchResult:
     """Evaluate samples that follow each other.
 
     Parameters
@@ -43,9 +43,9 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.studies.study.reference_evaluation import evaluate_samples
+    >>> from lbt_synth.studies.study.reference_evaluation import evaluate_rows
     >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> batch = evaluate_samples(study, study.values(0, 2), 0)
+    >>> batch = evaluate_rows(study, study.values(0, 2), 0)
     >>> batch.columns["kalman.strehl"].round(3).tolist(), batch.columns["kalman.stable"].tolist()
     ([0.837, 0.821], [1.0, 1.0])
     """
@@ -65,17 +65,19 @@ def evaluate_row(
 ) -> tuple[dict[str, float], tuple[Failure, ...]]:
     """Evaluate one sample; results are by the names of their columns."""
     try:
-        sample = sample_of(study, values)
+        sample = make_sample(study, values)
     except EXPECTED_ERRORS as error:
         return {}, tuple(_failure(row, c, error) for c in study.controllers)
     loops: dict[str, ClosedLoop] = {}
     failures = []
     for controller in study.controllers:
         try:
-            loops[controller.name] = closed_loop(sample, design_for(controller, sample))
+            loops[controller.name] = close_sample_loop(
+                sample, design_for_sample(controller, sample)
+            )
         except EXPECTED_ERRORS as error:
             failures.append(_failure(row, controller, error))
-    settle = settle_frames(study, loops)
+    settle = _settle_frames(study, loops)
     out: dict[str, float] = {}
     for controller in study.controllers:
         name = controller.name
@@ -87,9 +89,9 @@ def evaluate_row(
             continue
         try:
             if study.settings.evaluation == "exact":
-                found = exact(loop, sample)
+                found = _evaluate_exactly(loop, sample)
             else:
-                found = simulated(loop, sample, seed=study.seed_of(row), settle=settle)
+                found = _simulate(loop, sample, seed=study.simulation_seed(row), settle=settle)
         except EXPECTED_ERRORS as error:
             failures.append(_failure(row, controller, error))
             continue
@@ -98,7 +100,7 @@ def evaluate_row(
     return out, tuple(failures)
 
 
-def design_for(controller: StudyController, sample: Sample) -> Design:
+def design_for_sample(controller: StudyController, sample: Sample) -> Design:
     """Return a controller's design; for the sample, made from what it is told of it."""
     if controller.design is not None:
         return controller.design
@@ -106,12 +108,12 @@ def design_for(controller: StudyController, sample: Sample) -> Design:
     return designed(sample.config, controller.request)
 
 
-def closed_loop(sample: Sample, design: Design) -> ClosedLoop:
+def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
     """Close the real loop of a sample around a design."""
     return close_loop(sample.hardware, design.controller, sensor_gain=sample.truth.sensor_gain)
 
 
-def exact(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
+def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
     """Return the exact residual of a stable loop by origin, and its Strehl ratio."""
     budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
     spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
@@ -125,7 +127,7 @@ def exact(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
     }
 
 
-def simulated(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
+def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
     """Return the mean Strehl ratio and the residual of a stable loop, run as configured."""
     section = sample.config.settings.simulation
     run = simulate(
@@ -143,7 +145,7 @@ def simulated(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> di
     }
 
 
-def settle_frames(study: Study, loops: Mapping[str, ClosedLoop]) -> int:
+def _settle_frames(study: Study, loops: Mapping[str, ClosedLoop]) -> int:
     """Return the frames to drop: the same for all controllers, so that they meet one weather."""
     needed = [settling_frames(loop.spectral_radius) for loop in loops.values() if loop.is_stable]
     return max([study.config.settings.simulation.settle_frames, *needed])

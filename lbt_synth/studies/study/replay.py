@@ -18,10 +18,19 @@ from lbt_synth.models import ARModel
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.config_paths import nested_copy
-from lbt_synth.studies.study.output_files import stored_row
-from lbt_synth.studies.study.reference_evaluation import EXPECTED_ERRORS, design_for, evaluate_row
-from lbt_synth.studies.study.sample import Sample, sample_of
-from lbt_synth.studies.study.store import part_list, read_manifest, require_same, require_unchanged
+from lbt_synth.studies.study.output_files import read_row
+from lbt_synth.studies.study.reference_evaluation import (
+    EXPECTED_ERRORS,
+    design_for_sample,
+    evaluate_row,
+)
+from lbt_synth.studies.study.sample import Sample, make_sample
+from lbt_synth.studies.study.store import (
+    list_parts,
+    read_manifest,
+    require_same_study,
+    require_unchanged,
+)
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import integer
 
@@ -104,24 +113,24 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     manifest = read_manifest(folder)
     stored = {}
     if manifest is not None:
-        require_same(manifest, study.digest, folder)
+        require_same_study(manifest, study.digest, folder)
         require_unchanged(folder, manifest)
-        stored = stored_row(folder, study, row, part_list(folder))
+        stored = read_row(folder, study, row, list_parts(folder))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
-    sample = sample_of(study, values)
+    sample = make_sample(study, values)
     return Replay(
         row=row,
         parameters=study.named(values),
         stored=stored,
         fresh=fresh,
         failures=failures,
-        files=_written(study, folder, row, sample),
+        files=_write_files(study, folder, row, sample),
         unwritten="" if sample.noise_factor > 0 else _NOISELESS.format(row=row),
     )
 
 
-def _written(study: Study, folder: Path, row: int, sample: Sample) -> tuple[Path, ...]:
+def _write_files(study: Study, folder: Path, row: int, sample: Sample) -> tuple[Path, ...]:
     own = [controller for controller in study.controllers if controller.for_sample]
     path = folder / f"row_{row}.yaml"
     gains = {c.name: folder / f"row_{row}_{c.name}.fits" for c in own}
@@ -132,7 +141,7 @@ def _written(study: Study, folder: Path, row: int, sample: Sample) -> tuple[Path
         files.append(save_config(path, settings, comments=comments))
     for controller in own:
         try:
-            design = design_for(controller, sample)
+            design = design_for_sample(controller, sample)
         except EXPECTED_ERRORS:  # it is among the failures
             continue
         files.append(save_gain(gains[controller.name], design))
@@ -150,13 +159,13 @@ def row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, d
         told = sample.config.hardware.delay_frames
         comments["loop.delay_frames"] = f"designs were told {told:.12g} ({DELAY_ERROR})"
     if sample.noise_factor != 1:
-        _put_noise(content, sample, comments)
-    content.setdefault("simulation", {})["seed"] = study.seed_of(row)
+        _set_noise(content, sample, comments)
+    content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)
     settings = validated(FileSection, content, study.config.source)
     return settings, comments
 
 
-def _put_noise(content: dict[str, Any], sample: Sample, comments: dict[str, str]) -> None:
+def _set_noise(content: dict[str, Any], sample: Sample, comments: dict[str, str]) -> None:
     """Write the real noise in, and what the configuration computes from the one it was told."""
     told = sample.config
     for name in ("noise_mas", "pyramid"):

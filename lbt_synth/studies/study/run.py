@@ -15,7 +15,7 @@ import lbt_synth
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.worker_processes import alone_in
-from lbt_synth.studies.study.batch import evaluate_samples
+from lbt_synth.studies.study.batch_evaluation import evaluate_samples
 from lbt_synth.studies.study.engine import Evaluate, run_batches
 from lbt_synth.studies.study.output_files import (
     read_results,
@@ -32,13 +32,13 @@ from lbt_synth.studies.study.store import (
     PRINT,
     Part,
     file_digest,
+    list_parts,
     missing_rows,
-    part_list,
     read_manifest,
     read_part,
     remove_parts,
-    remove_remains,
-    require_same,
+    remove_unfinished_files,
+    require_same_study,
     require_unchanged,
     stored_design,
     write_designs,
@@ -52,7 +52,7 @@ _MOST_JOBS = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Whole:
+class FinishedStudy:
     """All results of a study."""
 
     columns: dict[str, FloatArray]  # (n,): all columns by their names
@@ -100,7 +100,7 @@ def run_study(
     workers: int | None = None,
     evaluate: Evaluate = evaluate_samples,
     progress: Callable[[int], None] | None = None,
-    whole: Callable[[Whole], None] | None = None,
+    whole: Callable[[FinishedStudy], None] | None = None,
 ) -> StudyRun:
     """Run what is missing of a study, and write its results.
 
@@ -173,11 +173,11 @@ def run_study(
     folder = Path(directory)
     if study.settings.results == "parquet":
         require_parquet()
-    refuse_replacing(written_files(folder, study), study.inputs)
+    refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
     with alone_in(folder, "study"):
-        remove_remains(folder, [path.name for path in written_files(folder, study)])
-        manifest = _begun(folder, study)
+        remove_unfinished_files(folder, [path.name for path in output_paths(folder, study)])
+        manifest = _begin(folder, study)
         tables = (results_path(folder, study), folder / FAILED)
         finished = bool(manifest["finished"]) and all(path.exists() for path in tables)
         if finished:
@@ -191,7 +191,7 @@ def run_study(
             if manifest["finished"]:  # until its tables are those of all parts again
                 manifest = manifest | {"finished": False, "tables": {}}
                 write_manifest(folder, manifest)
-            computed = _complete(
+            computed = _compute_missing(
                 study,
                 folder,
                 parts,
@@ -202,14 +202,14 @@ def run_study(
                 progress=progress,
             )
             computing_s = time.perf_counter() - began
-            manifest = _written(folder, study, manifest, computed, began, whole)
+            manifest = _write_tables(folder, study, manifest, computed, began, whole)
         else:
             if progress is not None:
                 progress(study.samples)
             if whole is not None:
                 columns = read_results(folder, study)
                 spent = manifest["computing_seconds"]
-                whole(Whole(columns=columns, computing_s=spent, new=False))
+                whole(FinishedStudy(columns=columns, computing_s=spent, new=False))
     return StudyRun(
         directory=folder,
         results=results_path(folder, study),
@@ -223,7 +223,7 @@ def run_study(
     )
 
 
-def written_files(folder: Path, study: Study) -> list[Path]:
+def output_paths(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, but for its parts."""
     made = [c.name for c in study.controllers if c.request is not None and c.design is not None]
     tables = [results_path(folder, study).name, FAILED, PAGE, PRINT]
@@ -231,21 +231,21 @@ def written_files(folder: Path, study: Study) -> list[Path]:
     return [folder / name for name in names]
 
 
-def _begun(folder: Path, study: Study) -> dict[str, Any]:
+def _begin(folder: Path, study: Study) -> dict[str, Any]:
     """Return the manifest of a directory, of a new study if there is none."""
     manifest = read_manifest(folder)
     if manifest is not None:
-        require_same(manifest, study.digest, folder)
+        require_same_study(manifest, study.digest, folder)
         for name in manifest["designs"]:
             stored_design(folder, name, manifest)
-    elif part_list(folder):
+    elif list_parts(folder):
         raise OutputError(
             f"{folder} holds parts of a study without its {MANIFEST}. Name another directory, or "
             f"delete {folder / PARTS}.",
             path=folder,
         )
     else:
-        for path in written_files(folder, study):
+        for path in output_paths(folder, study):
             if path.exists():
                 raise OutputError(
                     f"{path} is of no study that was begun there, and would be replaced. Name "
@@ -280,7 +280,7 @@ def _begun(folder: Path, study: Study) -> dict[str, Any]:
 def _usable_parts(folder: Path, study: Study) -> list[Part]:
     """Return the parts that need not be computed again; those that are to be are removed."""
     usable = []
-    for part in part_list(folder):
+    for part in list_parts(folder):
         failures = read_part(part, study)[1]
         if any(failure.retry for failure in failures):  # a single row, see the engine
             part.path.unlink()
@@ -289,7 +289,7 @@ def _usable_parts(folder: Path, study: Study) -> list[Part]:
     return usable
 
 
-def _complete(
+def _compute_missing(
     study: Study,
     folder: Path,
     parts: Sequence[Part],
@@ -316,22 +316,24 @@ def _complete(
     return wanted
 
 
-def _written(
+def _write_tables(
     folder: Path,
     study: Study,
     manifest: dict[str, Any],
     computed: int,
     began: float,
-    whole: Callable[[Whole], None] | None,
+    whole: Callable[[FinishedStudy], None] | None,
 ) -> dict[str, Any]:
     """Write the results of all parts, then the manifest, then remove the parts."""
-    parts = part_list(folder)
+    parts = list_parts(folder)
     recorded = [read_part(part, study)[1:] for part in parts]
     failures = [failure for failed, _ in recorded for failure in failed]
     spent = sum(seconds for _, seconds in recorded)
     tables = (write_results(folder, study, parts), write_failures(folder, failures))
     if whole is not None:
-        whole(Whole(columns=read_results(folder, study, parts), computing_s=spent, new=True))
+        whole(
+            FinishedStudy(columns=read_results(folder, study, parts), computing_s=spent, new=True)
+        )
     retry = sum(failure.retry for failure in failures)
     manifest = manifest | {
         "finished": True,

@@ -10,7 +10,7 @@ from lbt_synth.config.load import config_of, validated
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.studies.study.config_paths import nested_copy, put
+from lbt_synth.studies.study.config_paths import nested_copy, set_number
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray
 
@@ -26,17 +26,17 @@ class Sample:
     noise_factor: float  # Real noise over that of ``config``
 
 
-def sample_of(study: Study, values: Sequence[float] | FloatArray) -> Sample:
+def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
     """Return the sample of a row of ``Study.values``."""
     base = study.config
     full = base.settings.model_dump()
     content = nested_copy(base.settings.model_dump(exclude_unset=True))
     for parameter, value in zip(study.parameters, values, strict=True):
         for keys in parameter.places:
-            put(content, keys, float(value), full=full)
+            set_number(content, keys, float(value), full=full)
     config = config_of(validated(FileSection, content, base.source), base.source)
-    delay_error = study.value_of(DELAY_ERROR, values, 0.0)
-    factor = study.value_of(NOISE_FACTOR, values, 1.0)
+    delay_error = study.parameter_value(DELAY_ERROR, values, 0.0)
+    factor = study.parameter_value(NOISE_FACTOR, values, 1.0)
     hardware, truth = config.hardware, config.truth
     try:
         if delay_error != 0:

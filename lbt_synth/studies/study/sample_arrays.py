@@ -15,7 +15,7 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.config.axes import axes_of, directions_of
-from lbt_synth.config.builders import lines_of, noise_of, rms_nm
+from lbt_synth.config.plant_and_truth import lines_of, noise_of, rms_nm
 from lbt_synth.config.required_sections import nm_of_mas
 from lbt_synth.config.schema import SensorSection
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
@@ -27,10 +27,10 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
 BELIEVED_GAIN = ("model", "sensor_gain")
-TOLD_DELAY = ("loop", "delay_frames")
+BELIEVED_DELAY = ("loop", "delay_frames")
 _GAIN = ("truth", "sensor_gain")
-_LINE = ("frequency_hz", "rms_nm", "rms_mas", "damping")
-_SENSOR = (
+_VIBRATION_NUMBERS = ("frequency_hz", "rms_nm", "rms_mas", "damping")
+_NOISE_NUMBERS = (
     ("sensor", "noise_nm"),
     ("sensor", "noise_mas"),
     ("sensor", "pyramid", "photons"),
@@ -41,7 +41,7 @@ _LONGEST_DELAY = 100.0  # frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rows:
+class SampleArrays:
     """Values of some samples of one group, by the places that they are put to."""
 
     config: Config  # The configuration of one of the samples
@@ -49,9 +49,9 @@ class Rows:
     places: dict[Keys, FloatArray]  # (b,): values at each place that varies
     errors: dict[str, FloatArray]  # (b,): values of the parameters that are in no configuration
 
-    def taken(self, which: IntArray) -> Rows:
+    def take(self, which: IntArray) -> SampleArrays:
         """Return some of the samples."""
-        return Rows(
+        return SampleArrays(
             config=self.config,
             count=which.size,
             places={keys: values[which] for keys, values in self.places.items()},
@@ -70,10 +70,10 @@ class Rows:
             return None
         return FrozenFlows(atmosphere=self.config.atmosphere, **varying)
 
-    def told_noise(self) -> FloatArray:
+    def believed_noise(self) -> FloatArray:
         """Noise that designs are told [nm], (b, 1) or (b, q)."""
         settings = self.config.settings
-        varying = [keys for keys in _SENSOR if keys in self.places]
+        varying = [keys for keys in _NOISE_NUMBERS if keys in self.places]
         if not varying:
             return np.broadcast_to(
                 self.config.noise_nm, (self.count, np.size(self.config.noise_nm))
@@ -93,21 +93,21 @@ class Rows:
             found.append(np.ravel(noise_of(settings.model_copy(update={"sensor": sensor}))))
         return np.asarray(found)[which.reshape(-1)]
 
-    def told_delay(self) -> FloatArray:
+    def believed_delay(self) -> FloatArray:
         """Delay that designs are told [frames], (b,)."""
-        told = self.number(*TOLD_DELAY)
+        told = self.number(*BELIEVED_DELAY)
         return np.full(self.count, self.config.hardware.delay_frames) if told is None else told
 
     def real_delay(self) -> FloatArray:
         """Delay of the real loops [frames], (b,)."""
-        return np.asarray(self.told_delay() + self.errors.get(DELAY_ERROR, 0.0))
+        return np.asarray(self.believed_delay() + self.errors.get(DELAY_ERROR, 0.0))
 
     def lines(self, owner: str, sections: Sequence[Any]) -> Iterator[tuple[dict[str, Any], str]]:
         """Yield numbers and directions of the vibrations of a list, with the section's key."""
         settings = self.config.settings
         for i, section in enumerate(sections):
             key = f"{owner}.vibrations[{i}]"
-            given = {name: self.number(owner, "vibrations", i, name) for name in _LINE}
+            given = {name: self.number(owner, "vibrations", i, name) for name in _VIBRATION_NUMBERS}
             rms = given["rms_nm"]
             if given["rms_mas"] is not None:
                 rms = given["rms_mas"] * nm_of_mas(settings, 1.0, f"{key}.rms_mas")
@@ -138,10 +138,10 @@ class Rows:
         return LoopEnsemble(
             sensor_gain=truth.sensor_gain if gain is None else gain / config.sensor_gain,
             delay_frames=self.real_delay(),
-            noise_nm=self.told_noise() * self._noise_factor(),
+            noise_nm=self.believed_noise() * self._noise_factor(),
             turbulence=turbulence,
             vibrations=tuple(
-                EnsembleVibration(**numbers) for numbers, _ in self.lines(*_true_sections(config))
+                EnsembleVibration(**numbers) for numbers, _ in self.lines(*_true_vibrations(config))
             ),
             loops=self.count,
         )
@@ -151,7 +151,7 @@ class Rows:
         good = np.ones(self.count, dtype=np.bool_)
         nyquist = self.config.hardware.frame_rate_hz / 2
         for keys, values in self.places.items():
-            if keys == TOLD_DELAY:
+            if keys == BELIEVED_DELAY:
                 good &= (values >= 1) & (values <= _LONGEST_DELAY)
             elif keys == ("sensor", "pyramid", "read_noise_electrons"):
                 good &= values >= 0
@@ -166,7 +166,7 @@ class Rows:
         return np.broadcast_to(self.errors.get(NOISE_FACTOR, 1.0), (self.count,))[:, None]
 
 
-def _true_sections(config: Config) -> tuple[str, Sequence[Any]]:
+def _true_vibrations(config: Config) -> tuple[str, Sequence[Any]]:
     """Return where the true vibrations stand, and their sections."""
     settings = config.settings
     if isinstance(settings.truth.vibrations, list):
@@ -177,16 +177,16 @@ def _true_sections(config: Config) -> tuple[str, Sequence[Any]]:
 def changes_numbers_only(study: Study, keys: Keys) -> bool:
     """Whether a parameter at a place only changes numbers of what the loops meet."""
     settings = study.config.settings
-    if keys in (_GAIN, TOLD_DELAY):
+    if keys in (_GAIN, BELIEVED_DELAY):
         return True  # a list has other places, such as truth.sensor_gain[0]
-    if keys in _SENSOR:
+    if keys in _NOISE_NUMBERS:
         return not (
             settings.true_turbulence == "model" and turbulence_kinds(study.config) & {"ar2"}
         )
     if keys[0] == "atmosphere":
         return keys[1] in WEATHER and settings.true_turbulence != "model"
-    owner, sections = _true_sections(study.config)
-    return is_line(keys, owner) and all(
+    owner, sections = _true_vibrations(study.config)
+    return is_vibration_number(keys, owner) and all(
         getattr(section, "spread_hz", None) is None for section in sections
     )
 
@@ -198,15 +198,15 @@ def changes_beliefs_only(study: Study, keys: Keys) -> bool:
         # the real sensor is its matrix times truth.sensor_gain, whatever designs believe
         return not isinstance(settings.truth.sensor_gain, list)
     return (
-        is_line(keys, "model")
+        is_vibration_number(keys, "model")
         and isinstance(settings.truth.vibrations, list)
         and all(section.spread_hz is None for section in settings.model.vibrations or ())
     )
 
 
-def is_line(keys: Keys, owner: str) -> bool:
+def is_vibration_number(keys: Keys, owner: str) -> bool:
     """Whether a place is a number of a vibration in a section."""
-    return len(keys) == 4 and keys[:2] == (owner, "vibrations") and keys[3] in _LINE
+    return len(keys) == 4 and keys[:2] == (owner, "vibrations") and keys[3] in _VIBRATION_NUMBERS
 
 
 def turbulence_kinds(config: Config) -> set[str]:
@@ -215,7 +215,7 @@ def turbulence_kinds(config: Config) -> set[str]:
     return {section.kind for section in (given if isinstance(given, list) else [given])}
 
 
-def rows_of(study: Study, sample: Sample, values: FloatArray) -> Rows:
+def make_sample_arrays(study: Study, sample: Sample, values: FloatArray) -> SampleArrays:
     """Return the values of the samples of a group, of which one is given whole."""
     places: dict[Keys, FloatArray] = {}
     errors: dict[str, FloatArray] = {}
@@ -224,4 +224,4 @@ def rows_of(study: Study, sample: Sample, values: FloatArray) -> Rows:
             errors[parameter.name] = column
         for keys in parameter.places:
             places[keys] = column
-    return Rows(config=sample.config, count=len(values), places=places, errors=errors)
+    return SampleArrays(config=sample.config, count=len(values), places=places, errors=errors)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.config.builders import believed_gains
+from lbt_synth.config.plant_and_truth import believed_gains
 from lbt_synth.config.schema import Ar1Section
 from lbt_synth.design.modal import ModalFilters, modal_filters
 from lbt_synth.models import ARModel, ModalTurbulence, Vibration
-from lbt_synth.models.turbulence import ar1_flows
+from lbt_synth.models.turbulence.ar_models import ar1_flows
 from lbt_synth.studies.study.config_paths import Keys
 from lbt_synth.studies.study.sample_arrays import (
     BELIEVED_GAIN,
     WEATHER,
-    Rows,
-    is_line,
+    SampleArrays,
+    is_vibration_number,
     turbulence_kinds,
 )
 from lbt_synth.studies.study.study import Study, StudyController
@@ -24,7 +24,7 @@ from lbt_synth.validation import FloatArray
 Matrices = tuple[FloatArray, ...]
 
 
-def designs_filters(controller: StudyController) -> bool:
+def is_kalman_for_sample(controller: StudyController) -> bool:
     """Whether a controller is a Kalman filter that is designed for each sample."""
     request = controller.request
     if request is None or controller.design is not None:
@@ -32,7 +32,7 @@ def designs_filters(controller: StudyController) -> bool:
     return request.method == "kalman" and not request.options
 
 
-def designs_by_axis(config: Config) -> bool:
+def has_independent_axes(config: Config) -> bool:
     """Whether the Kalman filter of a configuration is one of each axis by itself."""
     hardware, settings = config.hardware, config.settings
     diagonal = all(
@@ -46,27 +46,27 @@ def designs_by_axis(config: Config) -> bool:
     return diagonal and unit and aligned and plain and settings.sensor.matrix is None
 
 
-def changes_numbers_of_designs(study: Study, keys: Keys) -> bool:
+def changes_design_numbers_only(study: Study, keys: Keys) -> bool:
     """Whether a parameter at a place only changes numbers of the designs of axes."""
     kinds = turbulence_kinds(study.config)
     if keys[0] == "atmosphere":
         return keys[1] in WEATHER and "ar2" not in kinds
     if keys[0] == "sensor":
         return "ar2" not in kinds
-    return keys[0] == "truth" or keys == BELIEVED_GAIN or is_line(keys, "model")
+    return keys[0] == "truth" or keys == BELIEVED_GAIN or is_vibration_number(keys, "model")
 
 
-def designed_for_samples(rows: Rows) -> Matrices:
+def design_for_samples(rows: SampleArrays) -> Matrices:
     """Design a Kalman filter for each sample and axis."""
     config, count = rows.config, rows.count
     hardware = config.hardware
     axes = hardware.modes
-    noise = np.broadcast_to(rows.told_noise(), (count, axes))
+    noise = np.broadcast_to(rows.believed_noise(), (count, axes))
     gains = _believed_gains(rows)
-    numbers = _lines_by_axis(rows)
+    numbers = _vibrations_by_axis(rows)
     designs: list[ModalFilters] = []
     for axis in range(axes):
-        same = axis > 0 and _same_axis(rows, numbers, noise, gains, axis)
+        same = axis > 0 and _is_like_first_axis(rows, numbers, noise, gains, axis)
         if same:
             designs.append(designs[0])
             continue
@@ -85,17 +85,17 @@ def designed_for_samples(rows: Rows) -> Matrices:
                 mirror=hardware.mirror,
             )
         )
-    return _side_by_side(designs)
+    return _combine_axes(designs)
 
 
-def _believed_gains(rows: Rows) -> FloatArray:
+def _believed_gains(rows: SampleArrays) -> FloatArray:
     """Sensor gain of each axis that designs believe in, (b, axes)."""
     given = rows.number(*BELIEVED_GAIN)
     each = believed_gains(rows.config.settings) if given is None else given[:, None]
     return np.broadcast_to(each, (rows.count, rows.config.hardware.modes))
 
 
-def _lines_by_axis(rows: Rows) -> list[FloatArray]:
+def _vibrations_by_axis(rows: SampleArrays) -> list[FloatArray]:
     """Frequency, damping and rms of the vibrations of each axis that designs believe in.
 
     One array (lines, b, 3) an axis.
@@ -110,8 +110,8 @@ def _lines_by_axis(rows: Rows) -> list[FloatArray]:
     return [np.array(lines).reshape(len(lines), rows.count, 3) for lines in found]
 
 
-def _same_axis(
-    rows: Rows, numbers: list[FloatArray], noise: FloatArray, gains: FloatArray, axis: int
+def _is_like_first_axis(
+    rows: SampleArrays, numbers: list[FloatArray], noise: FloatArray, gains: FloatArray, axis: int
 ) -> bool:
     """Whether an axis is designed for the same as the first."""
     settings = rows.config.settings
@@ -124,7 +124,7 @@ def _same_axis(
     )
 
 
-def _turbulence(rows: Rows, axis: int) -> ModalTurbulence:
+def _turbulence(rows: SampleArrays, axis: int) -> ModalTurbulence:
     """Turbulence of one axis that designs believe in, one process a sample."""
     config: Config = rows.config
     given = config.settings.model.turbulence
@@ -144,7 +144,7 @@ def _turbulence(rows: Rows, axis: int) -> ModalTurbulence:
     )
 
 
-def _side_by_side(designs: list[ModalFilters]) -> Matrices:
+def _combine_axes(designs: list[ModalFilters]) -> Matrices:
     """Put the controllers of all axes into one, in textbook form."""
     sizes = [design.A.shape[1] for design in designs]
     count, axes, states = len(designs[0].A), len(designs), sum(sizes)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.studies.study.conditional import ConditionalCurve, conditional_curve
-from lbt_synth.studies.study.sample_status import Outcomes
+from lbt_synth.studies.study.conditional_curve import ConditionalCurve, conditional_curve
+from lbt_synth.studies.study.controller_samples import ControllerSamples
 from lbt_synth.studies.study.variance_index import (
     FEWEST,
     NO_INDEX,
@@ -68,7 +68,7 @@ class ControllerSensitivity:
 
 
 def sensitivities(
-    controllers: Sequence[Outcomes], parameters: Mapping[str, FloatArray]
+    controllers: Sequence[ControllerSamples], parameters: Mapping[str, FloatArray]
 ) -> tuple[ControllerSensitivity, ...]:
     """Dependence of each controller's Strehl ratio on each parameter. Shapes: parameters (n,)."""
     ranks = [_ranks(each) for each in controllers]
@@ -89,7 +89,11 @@ def sensitivities(
 
 
 def _sensitivity(
-    name: str, ordered: FloatArray, controller: Outcomes, order: IntArray, ranks: FloatArray
+    name: str,
+    ordered: FloatArray,
+    controller: ControllerSamples,
+    order: IntArray,
+    ranks: FloatArray,
 ) -> ParameterSensitivity:
     """One parameter, the samples in order of it."""
     index, curve = NO_INDEX, None
@@ -110,7 +114,7 @@ def _sensitivity(
     )
 
 
-def _ranks(controller: Outcomes) -> FloatArray:
+def _ranks(controller: ControllerSamples) -> FloatArray:
     """Ranks of the Strehl ratio, the mean one for ties; nan where the evaluation failed."""
     from scipy.stats import rankdata
 

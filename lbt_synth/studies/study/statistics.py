@@ -10,8 +10,12 @@ import numpy as np
 
 from lbt_synth.errors import NonFiniteError, ProblemError
 from lbt_synth.studies.study.comparison import Comparison, Loss, compare, losses, mean_and_error
+from lbt_synth.studies.study.controller_samples import (
+    ControllerSamples,
+    read_column,
+    read_controller_samples,
+)
 from lbt_synth.studies.study.percentiles import Percentile, Share, percentiles, share
-from lbt_synth.studies.study.sample_status import Outcomes, column, outcomes
 from lbt_synth.studies.study.sensitivity import ControllerSensitivity, sensitivities
 from lbt_synth.studies.study.worst_samples import WorstRow, worst_rows
 from lbt_synth.validation import FloatArray, IntArray, integer, number
@@ -151,10 +155,10 @@ def study_statistics(
         raise ProblemError("controllers must name one at least; got none.")
     levels = [number(level, "levels", at_least=0, at_most=1) for level in levels]
     worst = integer(worst, "worst", at_least=0)
-    size = len(column(columns, f"{controllers[0]}.stable"))
+    size = len(read_column(columns, f"{controllers[0]}.stable"))
     if not size:
         raise ProblemError("the results must have at least one sample; got none.")
-    found = [outcomes(columns, name, size) for name in controllers]
+    found = [read_controller_samples(columns, name, size) for name in controllers]
     values = {name: _finite(columns, name, size) for name in parameters}
     rows = _row_numbers(columns, size)
     return StudyStatistics(
@@ -174,7 +178,7 @@ def study_statistics(
 
 
 def _controller(
-    each: Outcomes, loss: Loss, levels: Sequence[float], worst: tuple[WorstRow, ...]
+    each: ControllerSamples, loss: Loss, levels: Sequence[float], worst: tuple[WorstRow, ...]
 ) -> ControllerStatistics:
     """One controller by itself."""
     strehl = each.strehl[each.evaluated]
@@ -206,7 +210,7 @@ def _require_names(names: Sequence[str], what: str) -> None:
 
 
 def _finite(columns: Mapping[str, Any], name: str, size: int) -> FloatArray:
-    values = column(columns, name, size)
+    values = read_column(columns, name, size)
     wrong = ~np.isfinite(values)
     if wrong.any():
         row = int(np.argmax(wrong))

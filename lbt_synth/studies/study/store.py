@@ -33,8 +33,8 @@ SCHEMA, SCHEMA_VERSION = "lbt_synth study", 1
 MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
-_REMAINS = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # what files.write_atomically writes first
-_NEEDED: dict[str, type | tuple[type, ...]] = {
+_UNFINISHED = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # what files.write_atomically writes first
+_MANIFEST_KINDS: dict[str, type | tuple[type, ...]] = {
     "digest": str,
     "designs": dict,
     "tables": dict,
@@ -44,7 +44,7 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "seconds": (int, float),
     "computing_seconds": (int, float),
 }
-Rows = tuple[int, int]
+RowRange = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +72,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         not isinstance(content, dict)
         or content.get("schema") != SCHEMA
         or content.get("schema_version") != SCHEMA_VERSION
-        or any(not isinstance(content.get(name), kind) for name, kind in _NEEDED.items())
+        or any(not isinstance(content.get(name), kind) for name, kind in _MANIFEST_KINDS.items())
     ):
         raise OutputError(
             f"{path} is no manifest of a study that this version reads. Name another directory.",
@@ -81,7 +81,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     return content
 
 
-def require_same(manifest: Mapping[str, Any], digest: str, folder: Path) -> None:
+def require_same_study(manifest: Mapping[str, Any], digest: str, folder: Path) -> None:
     """Refuse a directory of another study than that of a digest."""
     if manifest["digest"] == digest:
         return
@@ -127,7 +127,7 @@ def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
     write_atomically(folder / MANIFEST, text.encode() + b"\n")
 
 
-def part_list(folder: Path) -> list[Part]:
+def list_parts(folder: Path) -> list[Part]:
     """Return the parts that are there, in the order of their rows."""
     parts = []
     with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -146,7 +146,7 @@ def part_list(folder: Path) -> list[Part]:
     return parts
 
 
-def missing_rows(parts: list[Part], samples: int) -> list[Rows]:
+def missing_rows(parts: list[Part], samples: int) -> list[RowRange]:
     """Return the ranges of rows that no part has."""
     out, reached = [], 0
     for part in parts:
@@ -185,9 +185,9 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
         whole = meta["digest"] == archive.digest(arrays, meta)
         seconds = float(meta["seconds"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _damaged(path) from error
+        raise _damage_error(path) from error
     if not whole or results.shape != (part.stop - part.start, len(study.result_columns)):
-        raise _damaged(path)
+        raise _damage_error(path)
     if meta["study"] != study.digest:
         raise OutputError(
             f"{path} is of another study. Name another directory, or delete it.", path=path
@@ -195,11 +195,11 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
     return results, failures, seconds
 
 
-def _damaged(path: Path) -> OutputError:
+def _damage_error(path: Path) -> OutputError:
     return OutputError(f"{path} is damaged. Delete it, and its rows are computed again.", path=path)
 
 
-def blocks(parts: list[Part], study: Study, size: int) -> Iterator[tuple[int, FloatArray]]:
+def read_blocks(parts: list[Part], study: Study, size: int) -> Iterator[tuple[int, FloatArray]]:
     """Yield the results of all parts again in blocks of so many rows, the last one shorter."""
     held: list[FloatArray] = []
     start, rows = 0, 0
@@ -216,12 +216,12 @@ def blocks(parts: list[Part], study: Study, size: int) -> Iterator[tuple[int, Fl
         yield start, np.concatenate(held)
 
 
-def remove_remains(folder: Path, names: Collection[str]) -> None:
+def remove_unfinished_files(folder: Path, names: Collection[str]) -> None:
     """Remove what a process that was killed had begun to write: parts, and files of some names."""
     for place in (folder, folder / PARTS):
         with contextlib.suppress(OSError):
             for path in list(place.iterdir()):
-                found = _REMAINS.fullmatch(path.name)
+                found = _UNFINISHED.fullmatch(path.name)
                 if found is not None and (_PART.fullmatch(found[1]) or found[1] in names):
                     path.unlink()
 
@@ -249,7 +249,7 @@ def require_unchanged(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 def remove_parts(folder: Path) -> None:
     """Remove the parts, and their directory if nothing else is in it."""
-    for part in part_list(folder):
+    for part in list_parts(folder):
         part.path.unlink(missing_ok=True)
     with contextlib.suppress(OSError):
         (folder / PARTS).rmdir()

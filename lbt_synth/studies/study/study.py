@@ -144,12 +144,14 @@ class Study:
             out[:, column] = parameter.distribution.quantile(level)
         return out
 
-    def seed_of(self, row: int) -> int:
+    def simulation_seed(self, row: int) -> int:
         """Return the seed of the simulation of one sample."""
         drawn = np.random.SeedSequence(self.settings.seed, spawn_key=(row,)).generate_state(1)
         return int(drawn[0])
 
-    def value_of(self, name: str, values: Sequence[float] | FloatArray, default: float) -> float:
+    def parameter_value(
+        self, name: str, values: Sequence[float] | FloatArray, default: float
+    ) -> float:
         """Return one parameter of a row of :meth:`values`, a default if it is none of them."""
         names = self.parameter_names
         return float(values[names.index(name)]) if name in names else default

@@ -39,7 +39,7 @@ def value_starts(ordered: FloatArray) -> IntArray:
     return np.concatenate(([0], 1 + np.flatnonzero(np.diff(ordered)))).astype(np.int64)
 
 
-def even_starts(n: int, groups: int) -> IntArray:
+def group_starts(n: int, groups: int) -> IntArray:
     """First place of each of so many groups of equal size, to one."""
     return (np.arange(groups) * n // groups).astype(np.int64)
 
@@ -92,7 +92,7 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
         rest, ends = spread - _means(spread, starts), None
     else:
         groups = round(n ** (1 / 3))
-        starts = even_starts(n, groups if n >= _COARSE[1] else min(groups, _COARSE[0]))
+        starts = group_starts(n, groups if n >= _COARSE[1] else min(groups, _COARSE[0]))
         coefficients = 2 * len(starts)
         fit, ends = _lines(spread, starts)
         rest = spread - fit

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.studies.study.sample_status import Outcomes
+from lbt_synth.studies.study.controller_samples import ControllerSamples
 from lbt_synth.validation import FloatArray, IntArray
 
 
@@ -23,7 +23,7 @@ class WorstRow:
 
 
 def worst_rows(
-    controller: Outcomes,
+    controller: ControllerSamples,
     rows: IntArray,
     parameters: Mapping[str, FloatArray],
     *,

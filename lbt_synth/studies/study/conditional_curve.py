@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.studies.study.comparison import mean_and_error
-from lbt_synth.studies.study.variance_index import even_starts, is_list, value_starts
+from lbt_synth.studies.study.variance_index import group_starts, is_list, value_starts
 from lbt_synth.validation import BoolArray, FloatArray, frozen
 
 _GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # so many groups below that many samples
@@ -55,7 +55,7 @@ def conditional_curve(
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.studies.study.conditional import conditional_curve
+    >>> from lbt_synth.studies.study.conditional_curve import conditional_curve
     >>> gains = np.repeat([0.5, 1.0], 100)
     >>> curve = conditional_curve(gains, 0.8 * gains, gains < 0)
     >>> curve.mean, round(curve.swing()[0], 6)
@@ -67,7 +67,7 @@ def conditional_curve(
         starts = value_starts(ordered)
     else:
         groups = next((k for limit, k in _GROUPS if n < limit), _MOST_GROUPS)
-        starts = even_starts(n, groups)
+        starts = group_starts(n, groups)
     rows = []
     for first, last in zip(starts, np.append(starts[1:], n), strict=True):
         inside, here = ordered[first:last], strehl[first:last]

@@ -15,7 +15,7 @@ PARTS = ("turbulence", "vibration", "noise")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outcomes:
+class ControllerSamples:
     """One controller on every sample."""
 
     controller: str  # Its name
@@ -34,7 +34,7 @@ class Outcomes:
         return self.evaluated & ~self.unstable
 
 
-def column(columns: Mapping[str, Any], name: str, size: int | None = None) -> FloatArray:
+def read_column(columns: Mapping[str, Any], name: str, size: int | None = None) -> FloatArray:
     """Return a column of the results, of a given length."""
     if name not in columns:
         raise ProblemError(
@@ -48,24 +48,26 @@ def column(columns: Mapping[str, Any], name: str, size: int | None = None) -> Fl
     return out
 
 
-def outcomes(columns: Mapping[str, Any], controller: str, size: int | None = None) -> Outcomes:
+def read_controller_samples(
+    columns: Mapping[str, Any], controller: str, size: int | None = None
+) -> ControllerSamples:
     """Read the columns of a controller.
 
     Shapes: columns (n,).
 
     Examples
     --------
-    >>> from lbt_synth.studies.study.sample_status import outcomes
+    >>> from lbt_synth.studies.study.controller_samples import read_controller_samples
     >>> nan = float("nan")
     >>> columns = {
     ...     "a.stable": [1, 0, nan],
     ...     "a.strehl": [0.8, nan, nan],
     ...     "a.residual_nm": [50, nan, nan],
     ... }
-    >>> outcomes(columns, "a").strehl
+    >>> read_controller_samples(columns, "a").strehl
     array([0.8, 0. , nan])
     """
-    stable_column = column(columns, f"{controller}.stable", size)
+    stable_column = read_column(columns, f"{controller}.stable", size)
     size = len(stable_column)
     evaluated = ~np.isnan(stable_column)
     unstable = stable_column == 0
@@ -77,16 +79,16 @@ def outcomes(columns: Mapping[str, Any], controller: str, size: int | None = Non
             f"column '{controller}.stable' must be 1, 0 or nan; got {stable_column[row]:g} "
             f"at index {row}."
         )
-    strehl = column(columns, f"{controller}.strehl", size)
-    residual = column(columns, f"{controller}.residual_nm", size)
+    strehl = read_column(columns, f"{controller}.strehl", size)
+    residual = read_column(columns, f"{controller}.residual_nm", size)
     _require(controller, "strehl", strehl, stable, "within [0, 1]", most=1 + 1e-9)
     _require(controller, "residual_nm", residual, stable, "at least 0", most=np.inf)
     parts = {
-        part: column(columns, f"{controller}.{part}_nm", size)
+        part: read_column(columns, f"{controller}.{part}_nm", size)
         for part in PARTS
         if f"{controller}.{part}_nm" in columns
     }
-    return Outcomes(
+    return ControllerSamples(
         controller=controller,
         strehl=np.where(stable, strehl, np.where(evaluated, 0.0, np.nan)),
         residual_nm=np.where(stable, residual, np.where(evaluated, np.inf, np.nan)),

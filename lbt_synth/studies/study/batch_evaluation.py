@@ -9,22 +9,22 @@ import numpy as np
 
 from lbt_synth.errors import CertificateError
 from lbt_synth.loop import EnsembleResiduals
-from lbt_synth.loop.ensemble.residuals import residuals_of_matrices, textbook_matrices
+from lbt_synth.loop.ensemble.evaluation import residuals_of_matrices, textbook_matrices
 from lbt_synth.studies.study import reference_evaluation as point
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.config_paths import Keys
-from lbt_synth.studies.study.sample import sample_of
+from lbt_synth.studies.study.sample import make_sample
 from lbt_synth.studies.study.sample_arrays import (
-    TOLD_DELAY,
+    BELIEVED_DELAY,
     changes_beliefs_only,
     changes_numbers_only,
-    rows_of,
+    make_sample_arrays,
 )
 from lbt_synth.studies.study.sample_designs import (
-    changes_numbers_of_designs,
-    designed_for_samples,
-    designs_by_axis,
-    designs_filters,
+    changes_design_numbers_only,
+    design_for_samples,
+    has_independent_axes,
+    is_kalman_for_sample,
 )
 from lbt_synth.studies.study.study import Study, StudyController
 from lbt_synth.validation import FloatArray, IntArray
@@ -76,7 +76,7 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     left: dict[int, list[StudyController]] = {}  # what is done point by point, by sample
     for controller in study.controllers:
         done = np.zeros(len(values), dtype=np.bool_)
-        for rows, found, strehl in _evaluated_together(study, controller, values):
+        for rows, found, strehl in _evaluate_groups(study, controller, values):
             done[rows] = True
             results = {
                 "strehl": strehl,
@@ -107,7 +107,7 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     return BatchResult(start=start, columns=columns, failures=tuple(failures))
 
 
-def _evaluated_together(
+def _evaluate_groups(
     study: Study, controller: StudyController, values: FloatArray
 ) -> Iterator[tuple[IntArray, EnsembleResiduals, FloatArray]]:
     """Yield what could be evaluated together: rows, residuals, Strehl ratios."""
@@ -119,30 +119,30 @@ def _evaluated_together(
         def together(keys: Keys) -> bool:
             return _changes_numbers(study, keys)
 
-    elif designs_filters(controller):
+    elif is_kalman_for_sample(controller):
         matrices = None
 
         def together(keys: Keys) -> bool:
             return (
-                keys != TOLD_DELAY
+                keys != BELIEVED_DELAY
                 and _changes_numbers(study, keys)
-                and changes_numbers_of_designs(study, keys)
+                and changes_design_numbers_only(study, keys)
             )
 
     else:
         return
-    for group in _groups(study, values, together):
+    for group in _find_groups(study, values, together):
         try:
-            sample = sample_of(study, values[group[0]])
-            if matrices is None and not designs_by_axis(sample.config):
+            sample = make_sample(study, values[group[0]])
+            if matrices is None and not has_independent_axes(sample.config):
                 continue
-            rows = rows_of(study, sample, values[group])
+            rows = make_sample_arrays(study, sample, values[group])
             good = rows.valid()
-            rows, group = rows.taken(np.flatnonzero(good)), group[good]
+            rows, group = rows.take(np.flatnonzero(good)), group[good]
             if not group.size:
                 continue
             with np.errstate(over="raise", divide="raise", invalid="raise"):
-                own = designed_for_samples(rows) if matrices is None else matrices
+                own = design_for_samples(rows) if matrices is None else matrices
                 found = residuals_of_matrices(own, sample.hardware, rows.ensemble())
             strehl = found.strehl(sample.config.imaging)
         except point.EXPECTED_ERRORS:
@@ -176,7 +176,7 @@ def _require_agreement(
             )
 
 
-def _groups(
+def _find_groups(
     study: Study, values: FloatArray, together: Callable[[Keys], bool]
 ) -> Iterator[IntArray]:
     """Yield the samples that can be evaluated together."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from lbt_synth.studies.study.store import Rows
+from lbt_synth.studies.study.store import RowRange
 
 _FIRST_ROWS = 4
 _MOST_ROWS = 65_536
@@ -17,7 +17,7 @@ _CRUMB_SECONDS = 0.1  # towards the end, no batch is shorter
 _MOST_PARTS = 4000  # a long study has longer batches rather than more files than that
 
 
-class Batches:
+class BatchQueue:
     """Rows that are still to be computed, given out batch after batch.
 
     Parameters
@@ -28,7 +28,7 @@ class Batches:
         How many batches run at once.
     """
 
-    def __init__(self, ranges: Sequence[Rows], workers: int) -> None:
+    def __init__(self, ranges: Sequence[RowRange], workers: int) -> None:
         self._ranges = deque(ranges)
         self._workers = workers
         self._small: tuple[int, float] | None = None  # rows and seconds of the smallest batch
@@ -36,7 +36,7 @@ class Batches:
         self._least_s = float("inf")  # of all batches
         self.left = sum(stop - start for start, stop in ranges)
 
-    def next(self) -> Rows:
+    def next(self) -> RowRange:
         """Return the rows of the next batch."""
         start, end = self._ranges[0]
         stop = min(end, start + self._size())
