@@ -8,6 +8,3 @@ The two may differ, and most studies ask what happens when they do.
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-# A function that shares its module's name hides the module, whichever is imported first.
-from lbt_synth.models.modal_turbulence import modal_turbulence as modal_turbulence  # noqa: E402

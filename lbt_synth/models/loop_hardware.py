@@ -7,8 +7,8 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.lifted_mirror import MirrorSystem, lifted_mirror, settled_mirror
-from lbt_synth.models.mirror import PositionLoop
+from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, lifted_mirror, settled_mirror
+from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.validation import FloatArray, frozen, instance, matrix, number
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.models.units import nm_per_mas
-from lbt_synth.models.zernike import noll_orders
 from lbt_synth.validation import FloatArray, frozen, number
 
 

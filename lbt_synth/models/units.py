@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lbt_synth.models.atmosphere import ARCSEC_RAD
+from lbt_synth.models.turbulence.atmosphere import ARCSEC_RAD
 from lbt_synth.validation import number
 
 

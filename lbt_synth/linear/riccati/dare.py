@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
-from lbt_synth.linear.riccati.diagnosis import require_stabilising
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.routes import ROUTES
+from lbt_synth.linear.riccati.solvability import require_stabilising
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,

@@ -10,7 +10,7 @@ from lbt_synth.errors import DetectabilityError
 from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.filter_gains import decorrelated
 from lbt_synth.linear.riccati.dare import solve_dare
-from lbt_synth.linear.riccati.diagnosis import unstable_hidden_mode
+from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
 from lbt_synth.validation import FloatArray, frozen
 
 

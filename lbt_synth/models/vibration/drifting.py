@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.ar import variance_ratios
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.ar_model import variance_ratios
+from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.validation import FloatArray, number, real_array
 
 

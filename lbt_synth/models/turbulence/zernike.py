@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import jv
 
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.models.atmosphere import Atmosphere, kolmogorov_constant_nm2
+from lbt_synth.models.turbulence.atmosphere import Atmosphere, kolmogorov_constant_nm2
 from lbt_synth.validation import FloatArray, IntArray, frozen, integer
 
 _FURTHEST = 30  # times the order plus 2: where the integral goes over to its tail
@@ -66,7 +66,7 @@ def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.zernike import zernike_variances
+    >>> from lbt_synth.models.turbulence.zernike import zernike_variances
     >>> air = lbt.Atmosphere(
     ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
     ... )

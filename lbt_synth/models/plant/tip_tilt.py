@@ -22,17 +22,17 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
-from lbt_synth.models.ar import ARModel
-from lbt_synth.models.full_state_plant import FullStatePlant
+from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.loop_hardware import LoopHardware
-from lbt_synth.models.mirror import PositionLoop
-from lbt_synth.models.plant_checks import (
+from lbt_synth.models.mirror.position_loop import PositionLoop
+from lbt_synth.models.plant.full_state import FullStatePlant
+from lbt_synth.models.plant.part_checks import (
     checked_vibrations,
     measurement_gains,
     noise_factor,
     per_mode,
 )
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.validation import FloatArray, frozen, integer, number
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.ar import ARModel, variance_ratios
-from lbt_synth.models.resonance import coefficient_rows
+from lbt_synth.models.ar_model import ARModel, variance_ratios
+from lbt_synth.models.resonance_spectrum import coefficient_rows
 from lbt_synth.validation import FloatArray, choice, number, real_array
 
 

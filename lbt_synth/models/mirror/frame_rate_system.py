@@ -18,7 +18,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.state_space import bordered_scaling
-from lbt_synth.models.mirror import PositionLoop
+from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
 
 _WHOLE = 1e-9  # by which the ratio of the rates may miss an integer, relative

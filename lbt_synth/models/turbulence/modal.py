@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.ar import ARModel, variance_ratios
-from lbt_synth.models.atmosphere import Atmosphere
-from lbt_synth.models.turbulence import le_roux_pole
-from lbt_synth.models.zernike import noll_orders, zernike_variances
+from lbt_synth.models.ar_model import ARModel, variance_ratios
+from lbt_synth.models.turbulence.ar_models import le_roux_pole
+from lbt_synth.models.turbulence.atmosphere import Atmosphere
+from lbt_synth.models.turbulence.zernike import noll_orders, zernike_variances
 from lbt_synth.validation import (
     FloatArray,
     frozen,

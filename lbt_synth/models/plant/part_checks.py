@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.ar import ARModel
+from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.loop_hardware import LoopHardware
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.validation import FloatArray, definite, frozen, number, real_array
 
 

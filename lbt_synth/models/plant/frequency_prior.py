@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.plant import TipTiltPlant, require_no_memory, with_vibrations
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.plant.tip_tilt import TipTiltPlant, require_no_memory, with_vibrations
+from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.validation import FloatArray, integer, number, real_array
 
 _MOST_LINES = 64

@@ -14,10 +14,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.models.ar import ARModel
-from lbt_synth.models.atmosphere import Atmosphere
-from lbt_synth.models.frozen_flows import FrozenFlows
-from lbt_synth.models.resonance import coefficients, log_density
+from lbt_synth.models.ar_model import ARModel
+from lbt_synth.models.resonance_spectrum import coefficients, log_density
+from lbt_synth.models.turbulence.atmosphere import Atmosphere
+from lbt_synth.models.turbulence.frozen_flows import FrozenFlows
 from lbt_synth.validation import FloatArray, frozen, integer, number
 
 
@@ -113,7 +113,7 @@ def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.turbulence import ar1_flows
+    >>> from lbt_synth.models.turbulence.ar_models import ar1_flows
     >>> air = lbt.Atmosphere(
     ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
     ... )

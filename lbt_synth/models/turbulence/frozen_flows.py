@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.atmosphere import (
+from lbt_synth.models.turbulence.atmosphere import (
     Atmosphere,
     LogSpline,
     tilt_spline,
@@ -90,7 +90,7 @@ class FrozenFlows:
         """Return the number of loops p."""
         return int(self.seeing_arcsec.size)
 
-    def taken(self, rows: IntArray) -> FrozenFlows:
+    def take(self, rows: IntArray) -> FrozenFlows:
         """Return the flows of some loops."""
         outer = None if self.outer_scale_m is None else self.outer_scale_m[rows]
         return FrozenFlows(

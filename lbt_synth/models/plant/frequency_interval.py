@@ -12,8 +12,8 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.models.plant import TipTiltPlant, require_no_memory
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.plant.tip_tilt import TipTiltPlant, require_no_memory
+from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.validation import FloatArray, number
 
 

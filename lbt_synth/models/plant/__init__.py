@@ -1,0 +1,1 @@
+"""Plants: the estimation problems that filters are designed for."""

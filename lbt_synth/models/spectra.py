@@ -1,0 +1,144 @@
+"""Power spectra: what they all have in common, tables and sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.ar_model import ARModel
+from lbt_synth.validation import FloatArray, frozen, real_array, sequence
+
+
+@runtime_checkable
+class Spectrum(Protocol):
+    """Anything with a one-sided power spectrum [nm^2/Hz]: Atmosphere, ARModel, a table."""
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """Return the spectrum at frequencies [Hz]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TabulatedSpectrum:
+    """A measured one-sided spectrum, interpolated linearly, zero outside its range.
+
+    Parameters
+    ----------
+    frequency_hz : (f,) array_like
+        Increasing frequencies [Hz].
+    density_nm2_hz : (f,) array_like
+        Spectrum [nm^2/Hz], at least 0.
+
+    Raises
+    ------
+    ProblemError
+        If the table is not finite, not increasing or negative.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> flat = lbt.models.TabulatedSpectrum(frequency_hz=[10, 20], density_nm2_hz=[4, 4])
+    >>> [float(v) for v in flat.psd([5, 15, 25])]
+    [0.0, 4.0, 0.0]
+    """
+
+    frequency_hz: FloatArray
+    density_nm2_hz: FloatArray
+
+    def __post_init__(self) -> None:
+        f = real_array(self.frequency_hz, "frequency_hz")
+        s = real_array(self.density_nm2_hz, "density_nm2_hz")
+        if f.ndim != 1 or f.shape != s.shape or f.size < 2:
+            raise DimensionError(
+                "frequency_hz and density_nm2_hz must be lists of the same length, at least 2; "
+                f"got {f.shape} and {s.shape}."
+            )
+        if np.any(np.diff(f) <= 0) or f[0] < 0:
+            raise ProblemError("frequency_hz must increase from at least 0; it does not.")
+        if np.any(s < 0):
+            raise ProblemError(f"density_nm2_hz must be at least 0; got {np.min(s):.6g}.")
+        object.__setattr__(self, "frequency_hz", f)
+        object.__setattr__(self, "density_nm2_hz", s)
+
+    @property
+    def breakpoints_hz(self) -> FloatArray:
+        """Frequencies where the spectrum has kinks [Hz]."""
+        return self.frequency_hz
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """Return the spectrum at frequencies [Hz] by linear interpolation [nm^2/Hz]."""
+        x = real_array(frequency_hz, "frequency_hz")
+        return np.asarray(np.interp(x, self.frequency_hz, self.density_nm2_hz, left=0, right=0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SumSpectrum:
+    """The spectrum of several independent disturbances together.
+
+    Parameters
+    ----------
+    parts : sequence of Spectrum
+        Their spectra, at least one; spectra that are sums themselves are taken apart.
+
+    Raises
+    ------
+    ProblemError
+        If there is none, or one has no method ``psd(frequency_hz)``.
+
+    Examples
+    --------
+    A measured spectrum upon turbulence that it does not hold:
+
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=10, diameter_m=8)
+    >>> hum = lbt.models.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])
+    >>> [float(v) for v in lbt.models.SumSpectrum(parts=[air, hum]).psd([50.0]).round(1)]
+    [100.0]
+    """
+
+    parts: tuple[Spectrum, ...]
+
+    def __post_init__(self) -> None:
+        given = sequence(self.parts, "parts")
+        for part in given:
+            if not isinstance(part, Spectrum):
+                raise ProblemError(
+                    f"parts must have a method psd(frequency_hz); got {type(part).__name__}."
+                )
+        if not given:
+            raise ProblemError("parts must hold at least one spectrum; got none.")
+        flat: list[Spectrum] = []
+        for part in given:
+            flat += part.parts if isinstance(part, SumSpectrum) else (part,)
+        object.__setattr__(self, "parts", tuple(flat))
+
+    @property
+    def breakpoints_hz(self) -> FloatArray:
+        """Frequencies where one of the parts says that it has kinks [Hz]."""
+        kinks = [breakpoints_below(part, np.inf) for part in self.parts]
+        return frozen(np.unique(np.concatenate(kinks)))
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """Return the spectrum at frequencies [Hz], the sum of the parts' [nm^2/Hz]."""
+        x = real_array(frequency_hz, "frequency_hz")
+        return np.asarray(sum(part.psd(x) for part in self.parts), dtype=np.float64)
+
+
+def breakpoints_below(spectrum: Spectrum, limit_hz: float) -> FloatArray:
+    """Frequencies in (0, limit) at which a spectrum says that it has kinks [Hz]."""
+    points = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
+    return points[(points > 0) & (points < limit_hz)]
+
+
+def spectrum_key(spectrum: Spectrum | None) -> object:
+    """Return what two equal spectra share: the numbers of an AR model, else which object it is."""
+    if isinstance(spectrum, ARModel):
+        return (
+            spectrum.coefficients.tobytes(),
+            repr(spectrum.driving_rms_nm),
+            spectrum.frame_rate_hz,
+        )
+    return id(spectrum)

@@ -1,0 +1,1 @@
+"""Turbulence: its spectra, and auto-regressive models of them."""

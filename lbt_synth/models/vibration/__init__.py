@@ -1,0 +1,1 @@
+"""Vibrations: one module for each kind."""

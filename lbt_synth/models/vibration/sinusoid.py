@@ -1,0 +1,55 @@
+"""A vibration that is a pure sinusoid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.models.vibration.resonance import Vibration
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SinusoidalVibration:
+    """A vibration that is a pure sinusoid.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Frequency [Hz].
+    rms_nm : float
+        Standard deviation, amplitude / sqrt(2), along its direction [nm rms wavefront].
+    direction : tuple of float, optional
+        Direction over the modes, made a unit vector.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> round(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797).amplitude_nm, 1)
+    1127.1
+    """
+
+    frequency_hz: float
+    rms_nm: float
+    direction: tuple[float, ...] = (1.0, 0.0)
+
+    def __post_init__(self) -> None:
+        # a line has the same frequency, rms and direction; its damping plays no part
+        line = Vibration(
+            frequency_hz=self.frequency_hz,
+            damping=0.5,
+            rms_nm=self.rms_nm,
+            direction=self.direction,
+        )
+        for name in ("frequency_hz", "rms_nm", "direction"):
+            object.__setattr__(self, name, getattr(line, name))
+
+    @property
+    def amplitude_nm(self) -> float:
+        """Peak displacement [nm rms wavefront]."""
+        return float(np.sqrt(2) * self.rms_nm)
