@@ -12,10 +12,10 @@ from scipy.optimize import approx_fprime
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.identification.fit.line_candidates import candidates
+from lbt_synth.identification.fit.line_candidates import find_candidates
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.whittle import GAIN, Likelihood
-from lbt_synth.models.resonance import coefficients, log_density, log_roll_off
+from lbt_synth.models.resonance_spectrum import coefficients, log_density, log_roll_off
 
 RATE = 1000.0
 FRAMES = 16_384
@@ -203,7 +203,7 @@ def test_scan_finds_a_line_and_nothing_in_noise() -> None:
     for amplitude, count in ((0.0, 0), (0.3, 1)):
         y = noise + amplitude * np.sin(2 * np.pi * 77.7 * np.arange(n) / RATE)
         data = loop_periodogram(y, None, frame_rate_hz=RATE, stretches=[(0, n)])
-        found = candidates(
+        found = find_candidates(
             data, data.power(1.0), flat[: data.frequency_hz.size], least=14.0, most=5
         )
         assert len(found) == count

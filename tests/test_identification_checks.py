@@ -11,7 +11,7 @@ from test_identification import RATE, loop_of
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.fit.checks import cut
+from lbt_synth.identification.fit.jumps import cut_around
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.whiteness import whiteness
 
@@ -79,8 +79,8 @@ def test_commands_in_other_units_are_doubted(factor: float) -> None:
 
 
 def test_stretches_are_cut() -> None:
-    assert cut([(0, 100), (200, 300)], [50, 200]) == [(0, 47), (53, 100), (203, 300)]
-    assert cut([(0, 4)], [1]) == []
+    assert cut_around([(0, 100), (200, 300)], [50, 200]) == [(0, 47), (53, 100), (203, 300)]
+    assert cut_around([(0, 4)], [1]) == []
 
 
 @pytest.mark.parametrize("told", [1.0, 2.5, 3.0])

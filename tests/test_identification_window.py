@@ -16,7 +16,7 @@ from test_identification import RATE, loop_of
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.window import TAPER, WIDE, log_smearing
+from lbt_synth.identification.fit.taper import TAPER, WIDE, log_smearing
 
 
 def correlation(t: float) -> float:

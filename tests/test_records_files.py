@@ -100,7 +100,7 @@ def test_telemetry_of_ours(tmp_path):
     )
     run = lbt.simulate(lbt.integrator(path, gain=0.2).controller, truth, hardware=path, frames=99)
     for name in ("a.fits", "a.npz"):
-        file = lbt.files.save_telemetry(tmp_path / name, lbt.files.telemetry_of(run, path))
+        file = lbt.files.save_telemetry(tmp_path / name, lbt.files.telemetry_from_simulation(run, path))
         seen = lbt.load_record(file)
         assert np.array_equal(seen.measurements, run.measurements[0])
         assert np.array_equal(seen.mirror_taps, path.mirror_taps)

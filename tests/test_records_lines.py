@@ -101,14 +101,14 @@ def test_lines_that_both_feel_are_found_and_no_others():
             0.5 * shared[1] + 0.5 * rng.standard_normal(frames),
         ]
     )
-    found = lbt.identification.lines_of_accelerometer(a, z, RATE)
+    found = lbt.identification.accelerometer_lines(a, z, RATE)
     assert len(found) == 2
     for line, truth in zip(found, (20.0, 47.3), strict=True):
         assert abs(line.frequency_hz - truth) < 3 * line.frequency_error_hz
         assert 0 < line.frequency_error_hz < 0.6
         assert "false alarm 0.001" in line.source
     # the other axis of a wavefront feels nothing
-    both = lbt.identification.lines_of_accelerometer(
+    both = lbt.identification.accelerometer_lines(
         a, np.column_stack([15 * rng.standard_normal(frames), z]), RATE
     )
     assert [line.frequency_hz for line in both] == pytest.approx(
@@ -124,7 +124,7 @@ def test_false_alarms_are_as_rare_as_stated():
         a = lfilter([1.0], [1, -0.9], rng.standard_normal(8192))
         z = lfilter([1.0], [1, -1.2, 0.9], rng.standard_normal((8192, 2)), axis=0)
         hits += bool(
-            lbt.identification.lines_of_accelerometer(
+            lbt.identification.accelerometer_lines(
                 a, z, RATE, segment_frames=256, false_alarm=0.2, lowest_hz=4
             )
         )
@@ -137,7 +137,7 @@ def test_the_coherence_is_that_of_scipy():
     rng = np.random.default_rng(8)
     line = resonance(61.7, 0.002, frames, 6)
     a, z = line + rng.standard_normal(frames), 3 * line + rng.standard_normal(frames)
-    (found,) = lbt.identification.lines_of_accelerometer(a, z, RATE, segment_frames=2000)
+    (found,) = lbt.identification.accelerometer_lines(a, z, RATE, segment_frames=2000)
     f, c = coherence(np.diff(a), np.diff(z), fs=RATE, nperseg=2000, noverlap=0)
     assert abs(f[np.argmax(c)] - found.frequency_hz) <= f[1]
 
@@ -150,13 +150,13 @@ def test_segments_with_holes_are_left_out():
     usable = np.ones(frames, dtype=bool)
     usable[10_000:10_500] = False
     z[10_000:10_500] = 1e6  # fillers may be anything
-    (line,) = lbt.identification.lines_of_accelerometer(a, z, RATE, usable=usable)
+    (line,) = lbt.identification.accelerometer_lines(a, z, RATE, usable=usable)
     assert abs(line.frequency_hz - 25) < 0.3
     usable[:-8000] = False
     with pytest.raises(
         lbt.errors.ProblemError, match="at least 8 segments of 1249 usable frames; got 6"
     ):
-        lbt.identification.lines_of_accelerometer(a, z, RATE, usable=usable)
+        lbt.identification.accelerometer_lines(a, z, RATE, usable=usable)
 
 
 @pytest.mark.parametrize(
@@ -175,4 +175,4 @@ def test_segments_with_holes_are_left_out():
 def test_accelerations_that_are_refused(change, words):
     given = {"accelerations": np.ones(100), "measurement": np.ones(100), "frame_rate_hz": RATE}
     with pytest.raises(lbt.errors.ProblemError, match=words):
-        lbt.identification.lines_of_accelerometer(**{**given, **change})
+        lbt.identification.accelerometer_lines(**{**given, **change})

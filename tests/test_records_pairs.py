@@ -197,7 +197,7 @@ def test_telemetry_takes_an_obstruction_and_refuses_averages(tmp_path, series):
         hardware=path,
         frames=99,
     )
-    file = lbt.files.save_telemetry(tmp_path / "a.fits", lbt.files.telemetry_of(run, path))
+    file = lbt.files.save_telemetry(tmp_path / "a.fits", lbt.files.telemetry_from_simulation(run, path))
     assert lbt.load_record(file, obstruction=0.3).obstruction == 0.3
     with pytest.raises(lbt.errors.ProblemError, match="averages are of a spectrum"):
         lbt.load_record(file, averages=3)

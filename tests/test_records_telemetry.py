@@ -116,7 +116,7 @@ def test_telemetry_of_a_simulation_with_matrices(axes):
     truth = lbt.Truth(turbulence=SLOW, sensor_gain=0.7)
     design = lbt.integrator(path, gain=0.1)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=400, seed=5)
-    seen = lbt.identification.record_of(lbt.files.telemetry_of(run, path))
+    seen = lbt.identification.record_from_telemetry(lbt.files.telemetry_from_simulation(run, path))
     assert seen.axes == axes
     first = len(path.mirror_taps)
     z = seen.pseudo_open_loop(0.7)[first:]
@@ -133,16 +133,16 @@ def test_modes_of_many():
     with pytest.raises(
         lbt.errors.ProblemError, match=r"has 5 modes; say which are tip and tilt: modes="
     ):
-        lbt.identification.record_of(many)
-    seen = lbt.identification.record_of(many, modes=(1, 0))
+        lbt.identification.record_from_telemetry(many)
+    seen = lbt.identification.record_from_telemetry(many, modes=(1, 0))
     assert np.array_equal(seen.measurements, y[:, [1, 0]])
     assert np.array_equal(seen.commands, u[:, [1, 0]])
     assert "axes are modes 1, 0 of 5" in seen.health.notes
     assert (seen.diameter_m, seen.source) == (8.0, "night")
-    assert lbt.identification.record_of(many, modes=[3]).axes == 1
+    assert lbt.identification.record_from_telemetry(many, modes=[3]).axes == 1
     for bad in ((0, 0), (5,), (0, 1, 2), ()):
         with pytest.raises(lbt.errors.ProblemError, match="one or two different modes below 5"):
-            lbt.identification.record_of(many, modes=bad)
+            lbt.identification.record_from_telemetry(many, modes=bad)
 
 
 def test_slopes_with_their_modes_and_without():
@@ -151,7 +151,7 @@ def test_slopes_with_their_modes_and_without():
     phase = rng.standard_normal((60, 3))
     slopes = phase @ S.T
     R = np.linalg.pinv(S)
-    seen = lbt.identification.record_of(
+    seen = lbt.identification.record_from_telemetry(
         telemetry(
             measurements=slopes @ R.T,
             slopes=slopes,
@@ -163,7 +163,7 @@ def test_slopes_with_their_modes_and_without():
     )
     assert np.allclose(seen.measurements, phase[:, :2])
     # a reconstructor of another gain is taken out
-    half = lbt.identification.record_of(
+    half = lbt.identification.record_from_telemetry(
         telemetry(
             measurements=slopes @ R.T / 2,
             slopes=slopes,
@@ -177,11 +177,13 @@ def test_slopes_with_their_modes_and_without():
     with pytest.raises(
         lbt.errors.ProblemError, match=r"slopes without modal coefficients.*slopes @ R.T"
     ):
-        lbt.identification.record_of(
+        lbt.identification.record_from_telemetry(
             telemetry(measurements=slopes, interaction_matrix=S, commands=phase), modes=(0, 1)
         )
     with pytest.raises(lbt.errors.ProblemError, match="slopes without modal coefficients"):
-        lbt.identification.record_of(telemetry(measurements=slopes, influence_matrix=np.eye(2)))
+        lbt.identification.record_from_telemetry(
+            telemetry(measurements=slopes, influence_matrix=np.eye(2))
+        )
 
 
 @pytest.mark.parametrize(
@@ -202,11 +204,11 @@ def test_slopes_with_their_modes_and_without():
 )
 def test_telemetry_that_is_refused(telemetry_changes, options, words):
     with pytest.raises(lbt.errors.ProblemError, match=words):
-        lbt.identification.record_of(telemetry(**telemetry_changes), **options)
+        lbt.identification.record_from_telemetry(telemetry(**telemetry_changes), **options)
 
 
 def test_what_telemetry_does_not_tell_is_given():
-    seen = lbt.identification.record_of(
+    seen = lbt.identification.record_from_telemetry(
         telemetry(measurement_unit="px", command_unit="V", delay_frames=None),
         delay_frames=2.5,
         diameter_m=8.0,
@@ -216,8 +218,10 @@ def test_what_telemetry_does_not_tell_is_given():
     assert seen.delay_frames == 2.5
     assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * telemetry().measurements)
     assert np.array_equal(seen.commands, telemetry().commands)
-    other = lbt.identification.record_of(telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5)
+    other = lbt.identification.record_from_telemetry(
+        telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5
+    )
     assert (other.delay_frames, other.diameter_m) == (3.0, 6.5)
     assert "delay_frames 3 was given; the telemetry has 2" in other.health.notes
     with pytest.raises(lbt.errors.ProblemError, match="expected a Telemetry"):
-        lbt.identification.record_of("night.fits")
+        lbt.identification.record_from_telemetry("night.fits")

@@ -23,7 +23,7 @@ from support.replays import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.estimate import residual_estimate
+from lbt_synth.identification.prediction.residual_estimate import estimate_residual
 
 
 @pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
@@ -132,7 +132,7 @@ def test_the_standard_errors_are_those_of_many_nights():
         x = np.column_stack([a_series(model, 1500, rng, 200) for _ in range(2)]) @ mixing.T
         w = rng.standard_normal((1500, 2)) @ np.sqrt(noise)
         one, other = (
-            residual_estimate(
+            estimate_residual(
                 (part * x + w)[rows], stretches, noise_nm2=noise, noise_error_nm4=np.zeros((2, 2))
             )
             for part in (1.0, 0.4)

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.identification.tracking.glitches import glitches
-from lbt_synth.identification.tracking.trend import extrapolated
+from lbt_synth.identification.tracking.glitches import find_glitches
+from lbt_synth.identification.tracking.trend import extrapolate
+from lbt_synth.loop.simulation.block_filtering import last_state
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
-from lbt_synth.loop.simulation.long_series import last_state
 from lbt_synth.loop.simulation.run import step_loop
-from lbt_synth.models.plant import with_vibrations
+from lbt_synth.models.plant.tip_tilt import with_vibrations
 
 SHELL = lbt.models.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
 AIR = lbt.models.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
@@ -291,12 +291,12 @@ def test_a_filter_of_another_sensor_gain_is_told_by_its_own():
 # --------------------------------------------------------------------------
 def test_a_straight_line_is_continued():
     t = np.arange(6.0)
-    frequency, slope, error = extrapolated(t, 17 + 0.1 * t, 7.5)
+    frequency, slope, error = extrapolate(t, 17 + 0.1 * t, 7.5)
     assert (frequency, slope) == (pytest.approx(17.75), pytest.approx(0.1))
     assert error < 1e-12
-    assert extrapolated(t, np.full(6, 17.0), 7.5)[0] == 17
+    assert extrapolate(t, np.full(6, 17.0), 7.5)[0] == 17
     for few in (1, 3):
-        frequency, slope, _ = extrapolated(t[:few], 17 + 0.1 * t[:few], 7.5)
+        frequency, slope, _ = extrapolate(t[:few], 17 + 0.1 * t[:few], 7.5)
         assert frequency == 17 + 0.1 * t[few - 1]
         assert np.isnan(slope)
 
@@ -305,10 +305,10 @@ def test_a_straight_line_is_continued():
 def test_the_trend_knows_no_origin_of_time(shift, scale, seed):
     t = np.arange(8.0)
     f = 20 + 0.05 * t + 0.05 * np.random.default_rng(seed).standard_normal(8)
-    plain = extrapolated(t, f, 10.0, overlap=2)
-    moved = extrapolated(t + shift, 3 + f, 10.0 + shift, overlap=2)
+    plain = extrapolate(t, f, 10.0, overlap=2)
+    moved = extrapolate(t + shift, 3 + f, 10.0 + shift, overlap=2)
     assert moved == pytest.approx((plain[0] + 3, plain[1], plain[2]), rel=1e-7, abs=1e-9)
-    slower = extrapolated(scale * t, f, scale * 10.0, overlap=2)
+    slower = extrapolate(scale * t, f, scale * 10.0, overlap=2)
     assert slower == pytest.approx((plain[0], plain[1] / scale, plain[2] / scale), rel=1e-7)
 
 
@@ -318,9 +318,9 @@ def test_an_outlier_is_no_trend_but_two_are_another():
     for wrong in (3, 7):
         spoilt = f.copy()
         spoilt[wrong] += 1.5
-        assert extrapolated(t, spoilt, 9.0)[0] == pytest.approx(17.9, abs=0.02)
+        assert extrapolate(t, spoilt, 9.0)[0] == pytest.approx(17.9, abs=0.02)
     spoilt[6:] = 20.0
-    frequency, slope, _ = extrapolated(t, spoilt, 9.0)
+    frequency, slope, _ = extrapolate(t, spoilt, 9.0)
     assert frequency == 20
     assert np.isnan(slope)
 
@@ -329,11 +329,11 @@ def test_the_error_of_the_slope_is_that_of_least_squares_and_limits_it():
     rng = np.random.default_rng(4)
     t = np.arange(8.0)
     f = 20 + 0.3 * rng.standard_normal(8)
-    frequency, slope, error = extrapolated(t, f, 12.0)
+    frequency, slope, error = extrapolate(t, f, 12.0)
     fit, covariance = np.polyfit(t, f, 1, cov=True)
     assert slope == pytest.approx(fit[0])
     assert error == pytest.approx(np.sqrt(covariance[0, 0]))
-    assert extrapolated(t, f, 12.0, overlap=4)[2] == pytest.approx(2 * error)
+    assert extrapolate(t, f, 12.0, overlap=4)[2] == pytest.approx(2 * error)
     weight = slope**2 / (slope**2 + error**2)
     expected = f[-1] + weight * (np.polyval(fit, 12.0) - f[-1])
     assert frequency == pytest.approx(expected)
@@ -722,11 +722,11 @@ def test_clean_windows_have_no_outliers(frames):
     swing = 500 * np.sin(0.15 * np.arange(frames))[:, None]
     for _ in range(100):
         series = swing + 15 * rng.standard_normal((frames, 2))
-        assert not glitches(series).any()
+        assert not find_glitches(series).any()
         series[frames // 2, 1] += 3000
-        assert np.flatnonzero(glitches(series)).tolist() == [frames // 2]
-    assert not glitches(swing).any()
-    assert not glitches(np.zeros((frames, 1))).any()
+        assert np.flatnonzero(find_glitches(series)).tolist() == [frames // 2]
+    assert not find_glitches(swing).any()
+    assert not find_glitches(np.zeros((frames, 1))).any()
 
 
 def test_glitches_that_come_often_keep_the_filter():

@@ -12,10 +12,10 @@ from lbt_synth.design import Design, hinf, kalman, lqg
 from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.prediction.rows import PredictionTable
+from lbt_synth.identification.prediction.comparison import prediction_against_data
 from lbt_synth.identification.prediction.stretches import split_halves
-from lbt_synth.identification.prediction.table import prediction_against_data
-from lbt_synth.identification.records.build import require_length
+from lbt_synth.identification.prediction.table import PredictionTable
+from lbt_synth.identification.records.from_arrays import require_length
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import Imaging, close_loop
@@ -159,7 +159,7 @@ def design_from_record(
     held_out = prediction_against_data(
         plant,
         record.pseudo_open_loop(half.sensor_gains),
-        {name: _designed(plant, method, gamma_ratio)},
+        {name: _design(plant, method, gamma_ratio)},
         fit=fit,
         test=test,
         measurements=None if record.commands is None else record.measurements,
@@ -169,7 +169,7 @@ def design_from_record(
     )
     step()
     model = identify(record, start=half, **found)
-    design = _designed(model.plant(), method, gamma_ratio)
+    design = _design(model.plant(), method, gamma_ratio)
     step()
     return RecordedDesign(
         model=model,
@@ -177,11 +177,11 @@ def design_from_record(
         half_model=half,
         held_out=held_out,
         name=name,
-        notes=_doubts(model, half, design),
+        notes=_check_gains(model, half, design),
     )
 
 
-def _doubts(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:
+def _check_gains(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:
     """Return warnings of sensor gains that do not agree; refuse loops that would not hold."""
     out = []
     for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
@@ -204,7 +204,7 @@ def _doubts(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tu
     return tuple(out)
 
 
-def _designed(plant: TipTiltPlant, method: str, gamma_ratio: float) -> Design:
+def _design(plant: TipTiltPlant, method: str, gamma_ratio: float) -> Design:
     if method == "kalman":
         return kalman(plant)
     if method == "hinf":

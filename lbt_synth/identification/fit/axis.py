@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.fit.description import WIDE_DAMPING, covariance_of, described
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.order_search import Rules, grow, other_gain
+from lbt_synth.identification.fit.order_search import Rules, gain_ambiguity, search_model
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
     loop_periodogram,
+)
+from lbt_synth.identification.fit.physical_parameters import (
+    WIDE_DAMPING,
+    describe_axis,
+    parameter_covariance,
 )
 from lbt_synth.identification.fit.whittle import GAIN
 from lbt_synth.validation import FloatArray, instance, integer, number, real_array
@@ -226,7 +230,7 @@ def identify_spectrum(
     if np.any(density <= 0):
         raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density):.6g}.")
     if averages is None:
-        many = scattered(density) or 1.0
+        many = estimate_averages(density) or 1.0
     else:
         many = number(averages, "averages", above=0)
     zero = np.zeros_like(f)
@@ -242,7 +246,7 @@ def identify_spectrum(
     return identify_periodogram(data, sensor_gain=1.0, **options)
 
 
-def scattered(density: FloatArray) -> float | None:
+def estimate_averages(density: FloatArray) -> float | None:
     """Shape of the gamma distribution that a density scatters with about a smooth curve.
 
     None if it is above what anybody averages: whatever the model leaves would count as evidence
@@ -298,31 +302,31 @@ def identify_periodogram(
         most_lines=integer(most_lines, "most_lines", at_least=0),
         announced=tuple(announced),
     )
-    grown = grow(data, rules, None if start is None else start.grown)
+    grown = search_model(data, rules, None if start is None else start.fitted_model)
     if sensor_gain is not None:
         relative = given_error / sensor_gain
         note = "given" if data.closed else "given: the series is divided by it"
         if data.duration_s is None:
             note = "1: of a spectrum it has no meaning"
-        return described(data, rules, grown, relative or None, note, known=relative)
+        return describe_axis(data, rules, grown, relative or None, note, known=relative)
     if not data.closed:
         note = "1: of an open loop it has no meaning"
-        return described(data, rules, grown, None, note, known=0.0)
-    variance = float(covariance_of(grown)[GAIN, GAIN])
+        return describe_axis(data, rules, grown, None, note, known=0.0)
+    variance = float(parameter_covariance(grown)[GAIN, GAIN])
     error = float(np.sqrt(variance)) if variance > 0 else float("inf")
-    narrow = grown.narrow(WIDE_DAMPING)
+    narrow = grown.drop_wide(WIDE_DAMPING)
     if len(narrow.parts) < len(grown.parts) and error <= GAIN_ERROR:
         # such a model may stand for another gain
-        away = other_gain(data, rules, grown)
+        away = gain_ambiguity(data, rules, grown)
         if away > _APART * error:
             error = away
     if error <= GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
-        return described(data, rules, grown, error, f"found in the closed loop's data{poor}")
+        return describe_axis(data, rules, grown, error, f"found in the closed loop's data{poor}")
     rules = replace(rules, gain=assumed)
     by = f" by {100 * error:.0f} %" if error < 1 else ""
     note = (
         f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
-    return described(data, rules, grow(data, rules, grown), None, note, known=0.0)
+    return describe_axis(data, rules, search_model(data, rules, grown), None, note, known=0.0)

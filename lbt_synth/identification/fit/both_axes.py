@@ -12,12 +12,18 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification.fit.axis import (
     LOWEST_LINE_HZ,
     MOST_LINES,
+    estimate_averages,
     identify_axis,
     identify_spectrum,
-    scattered,
 )
-from lbt_synth.identification.fit.checks import Jump, better_delay, cut, jumps, steps
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
+from lbt_synth.identification.fit.jumps import (
+    Jump,
+    better_delay,
+    cut_around,
+    find_correction_jumps,
+    find_jumps,
+)
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
@@ -118,7 +124,7 @@ def identify(
         "most_lines": most_lines,
     }
     if isinstance(record, SpectrumRecord):
-        return _of_spectra(record, frame_rate_hz, delay_frames, options)
+        return _identify_spectra(record, frame_rate_hz, delay_frames, options)
     instance(record, LoopRecord)
     if frame_rate_hz is not None and frame_rate_hz != record.frame_rate_hz:
         raise ProblemError(
@@ -134,7 +140,7 @@ def identify(
     count = record.axes
     if start is not None and len(start.axes) != count:
         raise ProblemError(f"start must have {count} axes; got {len(start.axes)}.")
-    gains = _gains(sensor_gain, count)
+    gains = _gain_per_axis(sensor_gain, count)
     corrections = None
     if record.commands is not None:
         if delay is None:
@@ -143,7 +149,7 @@ def identify(
                 "without one. Try record.with_delay(...)."
             )
         corrections = record.corrections()
-    pieces = list(record.stretches() if stretches is None else _pieces(stretches, record))
+    pieces = list(record.stretches() if stretches is None else _check_stretches(stretches, record))
     dead = [i for i in range(count) if np.ptp(record.measurements[record.usable, i]) == 0]
     if dead and record.usable.any():
         raise ProblemError(
@@ -174,22 +180,28 @@ def identify(
 
     notes: list[str] = []
     if corrections is not None:
-        early = _merged([jump for i in range(count) for jump in steps(corrections[:, i], pieces)])
+        early = merge_jumps(
+            [
+                jump
+                for i in range(count)
+                for jump in find_correction_jumps(corrections[:, i], pieces)
+            ]
+        )
         if early:
-            notes.append(_told(early, "commands"))
-            pieces = _cut(pieces, early)
+            notes.append(_describe_jumps(early, "commands"))
+            pieces = _cut_at_jumps(pieces, early)
     axes = [one(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
-    broken = _jumps(record, axes, pieces)
+    broken = _find_jumps(record, axes, pieces)
     if broken:
-        notes.append(_told(broken, "pseudo-open loop"))
+        notes.append(_describe_jumps(broken, "pseudo-open loop"))
         if len(broken) <= _MOST_JUMPS:
-            pieces = _cut(pieces, broken)
+            pieces = _cut_at_jumps(pieces, broken)
             axes = [one(i, gains[i], axes[i]) for i in range(count)]
     told = [i for i in range(count) if axes[i].sensor_gain_error is not None]
     if count > 1 and told and all(gain is None for gain in gains):
-        axes, note = _pooled(axes, told, one)
+        axes, note = _pool_gains(axes, told, one)
         notes.append(note)
-    notes += _doubts(record, axes, told, pieces)
+    notes += _find_doubts(record, axes, told, pieces)
     notes += [
         f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and the "
         "rest of the model suffers"
@@ -207,7 +219,7 @@ def identify(
     )
 
 
-def _of_spectra(
+def _identify_spectra(
     record: SpectrumRecord,
     frame_rate_hz: float | None,
     delay_frames: float | None,
@@ -235,7 +247,7 @@ def _of_spectra(
             f"the density of axis {i} does not scatter as periodograms do (smoothed, interpolated "
             "or computed?) and was taken for one of them. Give averages to find weaker lines"
             for i, column in enumerate(record.density_nm2_hz.T)
-            if scattered(column[inside]) is None
+            if estimate_averages(column[inside]) is None
         ]
     return IdentifiedModel(
         axes=tuple(axes),
@@ -245,7 +257,9 @@ def _of_spectra(
     )
 
 
-def _pieces(stretches: Sequence[tuple[int, int]], record: LoopRecord) -> list[tuple[int, int]]:
+def _check_stretches(
+    stretches: Sequence[tuple[int, int]], record: LoopRecord
+) -> list[tuple[int, int]]:
     """Return stretches that lie apart and hold usable frames only."""
     out = sorted((int(a), int(b)) for a, b in stretches)
     for i, (a, b) in enumerate(out):
@@ -257,17 +271,17 @@ def _pieces(stretches: Sequence[tuple[int, int]], record: LoopRecord) -> list[tu
     return out
 
 
-def _jumps(
+def _find_jumps(
     record: LoopRecord, axes: Sequence[IdentifiedAxis], pieces: Sequence[tuple[int, int]]
 ) -> list[Jump]:
     """Return the jumps of all axes, each place once."""
     series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
-    return _merged(
-        [jump for i, axis in enumerate(axes) for jump in jumps(series[:, i], axis, pieces)]
+    return merge_jumps(
+        [jump for i, axis in enumerate(axes) for jump in find_jumps(series[:, i], axis, pieces)]
     )
 
 
-def _merged(found: Sequence[Jump]) -> list[Jump]:
+def merge_jumps(found: Sequence[Jump]) -> list[Jump]:
     """Return jumps by rising frame, each place once."""
     out: list[Jump] = []
     for jump in sorted(found, key=lambda jump: jump.frame):
@@ -276,12 +290,16 @@ def _merged(found: Sequence[Jump]) -> list[Jump]:
     return out
 
 
-def _cut(pieces: list[tuple[int, int]], broken: Sequence[Jump]) -> list[tuple[int, int]]:
+def _cut_at_jumps(pieces: list[tuple[int, int]], broken: Sequence[Jump]) -> list[tuple[int, int]]:
     """Cut the stretches at jumps, if there are few."""
-    return cut(pieces, [jump.frame for jump in broken]) if len(broken) <= _MOST_JUMPS else pieces
+    return (
+        cut_around(pieces, [jump.frame for jump in broken])
+        if len(broken) <= _MOST_JUMPS
+        else pieces
+    )
 
 
-def _told(broken: Sequence[Jump], of: str) -> str:
+def _describe_jumps(broken: Sequence[Jump], of: str) -> str:
     """Return what is said of jumps."""
     first = max(broken, key=lambda jump: jump.size)
     text = (
@@ -293,7 +311,7 @@ def _told(broken: Sequence[Jump], of: str) -> str:
     return f"{text}; too many to cut the record there, and the model suffers"
 
 
-def _doubts(
+def _find_doubts(
     record: LoopRecord,
     axes: Sequence[IdentifiedAxis],
     told: Sequence[int],
@@ -322,7 +340,7 @@ def _doubts(
     return out
 
 
-def _gains(given: Any, count: int) -> list[float | None]:
+def _gain_per_axis(given: Any, count: int) -> list[float | None]:
     """One gain an axis, or None."""
     if given is None:
         return [None] * count
@@ -335,7 +353,7 @@ def _gains(given: Any, count: int) -> list[float | None]:
     return [float(v) for v in np.broadcast_to(values, (count,))]
 
 
-def _pooled(
+def _pool_gains(
     axes: list[IdentifiedAxis],
     told: list[int],
     one: Callable[[int, float | None, IdentifiedAxis | None, float], IdentifiedAxis],

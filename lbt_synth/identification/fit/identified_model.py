@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from lbt_synth.identification.fit.parameters import Grown
+from lbt_synth.identification.fit.parameters import FittedModel
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whiteness import Whiteness
 from lbt_synth.models import (
@@ -158,7 +158,7 @@ class IdentifiedAxis:
     background_nm2_hz: FloatArray
     frame_rate_hz: float
     resolution_hz: float
-    grown: Grown
+    fitted_model: FittedModel
     data: LoopPeriodogram
 
     @property

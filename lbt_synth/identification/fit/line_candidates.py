@@ -24,7 +24,7 @@ class Candidate:
     gain: float
 
 
-def candidates(
+def find_candidates(
     data: LoopPeriodogram, power: FloatArray, model: FloatArray, *, least: float, most: int
 ) -> list[Candidate]:
     """Bands with the most significant excess of power over a model.
@@ -60,11 +60,11 @@ def candidates(
         if any(start < b + reach and stop > a - reach for a, b in taken):
             continue
         taken.append((start, stop))
-        out.append(shape_of(data, power, model, start, stop, worth))
+        out.append(measure_excess(data, power, model, start, stop, worth))
     return out
 
 
-def shape_of(
+def measure_excess(
     data: LoopPeriodogram,
     power: FloatArray,
     model: FloatArray,

@@ -17,32 +17,32 @@ import numpy as np
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit.line_candidates import (
     Candidate,
-    candidates,
-    shape_of,
+    find_candidates,
+    measure_excess,
     smooth_background,
 )
 from lbt_synth.identification.fit.parameters import (
     NO_CORNER,
-    Grown,
+    FittedModel,
     Layout,
     Part,
-    dropped,
+    drop_part,
     has_corner,
-    without,
+    remove_component,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import (
     CORNER,
     FIRST,
     GAIN,
-    Fitted,
     Likelihood,
+    Minimum,
+    add_observed_information,
     damping_parameter,
     damping_ratio,
-    fit,
-    observed,
+    minimise,
 )
-from lbt_synth.models.resonance import PARAMETERS
+from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import BoolArray, FloatArray
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)
@@ -67,18 +67,20 @@ class Rules:
     announced: Sequence[tuple[float, float]] = ()  # Lines known beforehand
 
 
-def grow(data: LoopPeriodogram, rules: Rules, start: Grown | None = None) -> Grown:
+def search_model(
+    data: LoopPeriodogram, rules: Rules, start: FittedModel | None = None
+) -> FittedModel:
     """Find the model of one axis."""
     search = _Search(data, rules)
-    return search.measured(search.grown(start))
+    return search.measured(search.fitted_model(start))
 
 
-def kept(data: LoopPeriodogram, rules: Rules, model: Grown) -> Grown | None:
+def refit_model(data: LoopPeriodogram, rules: Rules, model: FittedModel) -> FittedModel | None:
     """Fit the parts of a model to other data, no more and no less; None if that fails."""
     return _Search(data, rules).refitted(model)
 
 
-def other_gain(data: LoopPeriodogram, rules: Rules, best: Grown) -> float:
+def gain_ambiguity(data: LoopPeriodogram, rules: Rules, best: FittedModel) -> float:
     """Find how far another model with another sensor gain is, that is nearly as likely.
 
     Wide resonances can stand for what a wrong gain leaves. Models are grown at other gains,
@@ -92,7 +94,7 @@ def other_gain(data: LoopPeriodogram, rules: Rules, best: Grown) -> float:
             continue
         fixed = _Search(data, replace(rules, gain=trial))
         try:
-            other = fixed.grown(None, rounds=_FEW_ROUNDS)
+            other = fixed.fitted_model(None, rounds=_FEW_ROUNDS)
             made = free.fitted(other.theta, other.parts)
         except NumericalError:
             continue
@@ -109,7 +111,7 @@ class _Search:
         self.need = self.layout.price
         self.free_gain = rules.gain is None and data.closed
 
-    def grown(self, start: Grown | None, *, rounds: int = _MOST_ROUNDS) -> Grown:
+    def fitted_model(self, start: FittedModel | None, *, rounds: int = _MOST_ROUNDS) -> FittedModel:
         """Find the model: grow, move, prune."""
         current = None if start is None else self.refitted(start)
         if current is None:
@@ -123,7 +125,7 @@ class _Search:
             current = better
         return self.named(self.pruned(self.plain(current)))
 
-    def asked(self, grown: Grown, i: int, *, earlier: bool = False) -> float:
+    def asked(self, grown: FittedModel, i: int, *, earlier: bool = False) -> float:
         """Return what a component must add to the logarithm of the likelihood.
 
         Less, where its place was not searched for: a line that was announced, or one of a pair
@@ -141,10 +143,10 @@ class _Search:
                         return _SPLIT
         return self.need
 
-    def begun(self) -> Grown:
+    def begun(self) -> FittedModel:
         """Background and first lines, from the best of several sensor gains."""
         gains = _STARTING_GAINS if self.free_gain else (self.rules.gain or 1.0,)
-        best: Grown | None = None
+        best: FittedModel | None = None
         why: NumericalError | None = None
         for gain in gains:
             try:
@@ -161,7 +163,7 @@ class _Search:
             raise why
         return best
 
-    def _background(self, gain: float) -> Grown:
+    def _background(self, gain: float) -> FittedModel:
         """Turbulence and noise, fitted to medians over bands: lines hardly touch them."""
         data = self.data
         f, d, weight = smooth_background(data.power(gain), data.frequency_hz, data.count)
@@ -173,14 +175,14 @@ class _Search:
         total = float(np.sum(np.diff(f) * (d[1:] + d[:-1]) / 2))
         slow = max(total - white, 0.1 * white)
         parts = (Part(line=False),)
-        best: Fitted | None = None
+        best: Minimum | None = None
         why: NumericalError | None = None
         for corner in (0.5, 5.0):
             theta = np.array(
                 [
                     np.log(gain),
                     np.log(white),
-                    self.layout.plain_corner(),
+                    self.layout.starting_corner(),
                     np.log(corner * self.layout.angle),
                     np.log(0.5),
                     np.log(slow),
@@ -189,7 +191,9 @@ class _Search:
             free = np.ones(theta.size, dtype=bool)
             free[GAIN] = False
             try:
-                got = fit(Likelihood(smooth), theta, self.layout.priors(theta, parts), free=free)
+                got = minimise(
+                    Likelihood(smooth), theta, self.layout.priors(theta, parts), free=free
+                )
             except NumericalError as error:
                 why = error
                 continue
@@ -198,9 +202,11 @@ class _Search:
         if best is None:
             assert why is not None
             raise why
-        return Grown(fitted=best, parts=parts)
+        return FittedModel(fitted=best, parts=parts)
 
-    def _with(self, ground: Grown, found: list[Candidate]) -> tuple[FloatArray, tuple[Part, ...]]:
+    def _with(
+        self, ground: FittedModel, found: list[Candidate]
+    ) -> tuple[FloatArray, tuple[Part, ...]]:
         """Parameters and parts with candidates added."""
         theta, parts = [ground.theta], list(ground.parts)
         for c in found:
@@ -234,7 +240,7 @@ class _Search:
                     best, least = trial, found
         return best
 
-    def announced(self, current: Grown) -> Grown:
+    def announced(self, current: FittedModel) -> FittedModel:
         """Return the model with the lines that are known beforehand, those that are worth it.
 
         A line that is there already, within three errors, is taken for the announced one.
@@ -263,14 +269,16 @@ class _Search:
         except NumericalError:
             return current
 
-    def excesses(self, current: Grown, *, first: bool = False) -> list[Candidate]:
+    def excesses(self, current: FittedModel, *, first: bool = False) -> list[Candidate]:
         """Bands with too much power: the few best, or at first all clear ones."""
         theta = current.theta
         power = self.data.power(float(np.exp(theta[GAIN])))
         room = self._room(current)
         if room <= 0:
             return []
-        found = candidates(self.data, power, self.full.model(theta), least=self.need, most=room)
+        found = find_candidates(
+            self.data, power, self.full.model(theta), least=self.need, most=room
+        )
         slow = sum(not part.line for part in current.parts)
         full = slow >= _MOST_TURBULENCES
         found = [c for c in found if not (full and c.frequency_hz < self.rules.lowest_line_hz)]
@@ -278,11 +286,11 @@ class _Search:
             return [c for c in found if c.gain > max(2 * self.need, 0.02 * found[0].gain)]
         return [c for c in found if c.gain > 0.25 * found[0].gain]
 
-    def _room(self, current: Grown) -> int:
+    def _room(self, current: FittedModel) -> int:
         """How many lines more there may be."""
         return self.rules.most_lines - sum(part.line for part in current.parts)
 
-    def named(self, current: Grown) -> Grown:
+    def named(self, current: FittedModel) -> FittedModel:
         """Let the first component be the turbulence, where a resonance took its place."""
         theta, lowest = current.theta, self.rules.lowest_line_hz * self.layout.angle
         slow = [
@@ -311,7 +319,7 @@ class _Search:
             return current
         return made if self.cost(made) < self.cost(current) + self.need else current
 
-    def extended(self, current: Grown, found: list[Candidate]) -> Grown | None:
+    def extended(self, current: FittedModel, found: list[Candidate]) -> FittedModel | None:
         """Return the model with the candidates that are worth it; None if none is."""
         while found:
             try:
@@ -323,7 +331,7 @@ class _Search:
             found = found[: len(found) // 2]
         return None
 
-    def plain(self, current: Grown) -> Grown:
+    def plain(self, current: FittedModel) -> FittedModel:
         """Return the model without the roll-off of the turbulence, if that is not worth it."""
         theta = current.theta.copy()
         if not has_corner(theta):
@@ -336,7 +344,7 @@ class _Search:
         worth = less.fitted.contrast - current.fitted.contrast
         return less if worth < self.need / PARAMETERS else current
 
-    def moved(self, current: Grown) -> Grown | None:
+    def moved(self, current: FittedModel) -> FittedModel | None:
         """Return the model with a line begun anew, or split in two; None if none is better."""
         data, theta = self.data, current.theta
         power = data.power(float(np.exp(theta[GAIN])))
@@ -345,10 +353,10 @@ class _Search:
                 continue
             at = FIRST + PARAMETERS * i
             centre, half = self.layout.place(theta, i)
-            rest = self.full.model(without(theta, i))
+            rest = self.full.model(remove_component(theta, i))
             reach = max(10 * half, 20 * self.layout.step)
             start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
-            seen = shape_of(data, power, rest, int(start), int(stop))
+            seen = measure_excess(data, power, rest, int(start), int(stop))
             trials = []
             centred = self._centred(theta, i)
             if abs(centred[at] - theta[at]) * centre > 0.4 * self.layout.step:
@@ -377,28 +385,28 @@ class _Search:
                     return made
         return None
 
-    def cost(self, grown: Grown) -> float:
+    def cost(self, grown: FittedModel) -> float:
         """Contrast and what the criterion asks for all parts."""
         return grown.fitted.contrast + sum(
             self.asked(grown, i, earlier=True) for i in range(1, len(grown.parts))
         )
 
-    def refitted(self, start: Grown) -> Grown | None:
+    def refitted(self, start: FittedModel) -> FittedModel | None:
         """Fit a model from elsewhere to these data; None if it does not settle."""
         theta = start.theta.copy()
         if not self.free_gain:
             theta[GAIN] = np.log(self.rules.gain or 1.0)
         if not has_corner(theta):
-            theta[CORNER] = self.layout.plain_corner()
+            theta[CORNER] = self.layout.starting_corner()
         try:
             return self.fitted(theta, start.parts)
         except NumericalError:
             return None
 
-    def fitted(self, theta: FloatArray, parts: tuple[Part, ...]) -> Grown:
+    def fitted(self, theta: FloatArray, parts: tuple[Part, ...]) -> FittedModel:
         """Fit all parameters; what leaves the band below the Nyquist frequency is dropped."""
         merged = Likelihood(self.data.merged(self.layout.groups(theta, parts)))
-        got = fit(merged, theta, self.layout.priors(theta, parts), free=self._free(theta))
+        got = minimise(merged, theta, self.layout.priors(theta, parts), free=self._free(theta))
         gone = [
             i for i in range(1, len(parts)) if got.parameters[FIRST + PARAMETERS * i] >= _HIGHEST
         ]
@@ -406,21 +414,21 @@ class _Search:
             left = [i for i in range(len(parts)) if i not in gone]
             kept = got.parameters
             for i in reversed(gone):
-                kept = without(kept, i)
+                kept = remove_component(kept, i)
             return self.fitted(kept, tuple(parts[i] for i in left))
         got = replace(got, contrast=self.full.contrast(got.parameters))
-        return Grown(fitted=got, parts=parts)
+        return FittedModel(fitted=got, parts=parts)
 
-    def measured(self, grown: Grown) -> Grown:
+    def measured(self, grown: FittedModel) -> FittedModel:
         """Return the model with what each part adds, and its exact information."""
         theta, parts = grown.theta, grown.parts
-        less = [self.full.contrast(without(theta, i)) for i in range(1, len(parts))]
+        less = [self.full.contrast(remove_component(theta, i)) for i in range(1, len(parts))]
         adds = [float("inf"), *(value - grown.fitted.contrast for value in less)]
         merged = Likelihood(self.data.merged(self.layout.groups(theta, parts)))
-        exact = observed(
+        exact = add_observed_information(
             merged, grown.fitted, self.layout.priors(theta, parts), free=self._free(theta)
         )
-        return replace(grown, fitted=exact, adds=tuple(adds))
+        return replace(grown, fitted=exact, evidence=tuple(adds))
 
     def _free(self, theta: FloatArray) -> BoolArray:
         free = np.ones(theta.size, dtype=np.bool_)
@@ -428,13 +436,13 @@ class _Search:
         free[CORNER] = has_corner(theta)
         return free
 
-    def pruned(self, grown: Grown) -> Grown:
+    def pruned(self, grown: FittedModel) -> FittedModel:
         """Drop what adds less than it must, the least first."""
         while len(grown.parts) > 1:
             base = grown.fitted.contrast
             trials = []
             for i in range(len(grown.parts)):
-                less = dropped(grown, i)
+                less = drop_part(grown, i)
                 if less is None:
                     continue
                 asked = self.asked(grown, i)

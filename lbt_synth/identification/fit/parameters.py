@@ -11,12 +11,12 @@ from lbt_synth.identification.fit.whittle import (
     CORNER,
     FIRST,
     GAIN,
-    Fitted,
+    Minimum,
     Priors,
     damping_parameter,
     damping_ratio,
 )
-from lbt_synth.models.resonance import PARAMETERS
+from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray, IntArray
 
 _GAIN_PRIOR = (np.log(0.7), 1.0)
@@ -44,26 +44,26 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Grown:
+class FittedModel:
     """A fitted model with the meaning of its parts."""
 
-    fitted: Fitted  # The minimum; its contrast is that of all values, without priors
+    fitted: Minimum  # The minimum; its contrast is that of all values, without priors
     parts: tuple[Part, ...]  # One a component
     # What each component adds to the logarithm of the likelihood, the others refitted or not
-    adds: tuple[float, ...] = field(default=())
+    evidence: tuple[float, ...] = field(default=())
 
     @property
     def theta(self) -> FloatArray:
         """The parameters."""
         return self.fitted.parameters
 
-    def narrow(self, most: float) -> Grown:
+    def drop_wide(self, most: float) -> FittedModel:
         """Return the model without resonances of a larger damping ratio; not fitted again."""
         theta, parts = self.theta, list(self.parts)
         for i in reversed(range(1, len(parts))):
             place = FIRST + PARAMETERS * i + 1
             if parts[i].line and damping_ratio(self.theta[place], first=False) > most:
-                theta = without(theta, i)
+                theta = remove_component(theta, i)
                 del parts[i]
         return replace(self, fitted=replace(self.fitted, parameters=theta), parts=tuple(parts))
 
@@ -73,20 +73,20 @@ def has_corner(theta: FloatArray) -> bool:
     return bool(theta[CORNER] < np.log(NO_CORNER))
 
 
-def without(theta: FloatArray, i: int) -> FloatArray:
+def remove_component(theta: FloatArray, i: int) -> FloatArray:
     """Parameters without a component."""
     at = FIRST + PARAMETERS * i
     return np.delete(theta, slice(at, at + PARAMETERS))
 
 
-def dropped(grown: Grown, i: int) -> tuple[FloatArray, tuple[Part, ...]] | None:
+def drop_part(grown: FittedModel, i: int) -> tuple[FloatArray, tuple[Part, ...]] | None:
     """Parameters and parts without a component; another turbulence takes the place of the first.
 
     None if there is no other.
     """
     theta, parts = grown.theta, grown.parts
     if i > 0:
-        return without(theta, i), parts[:i] + parts[i + 1 :]
+        return remove_component(theta, i), parts[:i] + parts[i + 1 :]
     others = [j for j, part in enumerate(parts) if j > 0 and not part.line]
     if not others:
         return None
@@ -96,7 +96,7 @@ def dropped(grown: Grown, i: int) -> tuple[FloatArray, tuple[Part, ...]] | None:
     promoted[FIRST : FIRST + PARAMETERS] = theta[at : at + PARAMETERS]
     ratio = damping_ratio(theta[at + 1], first=False)
     promoted[FIRST + 1] = damping_parameter(ratio, first=True)
-    return without(promoted, j), parts[:j] + parts[j + 1 :]
+    return remove_component(promoted, j), parts[:j] + parts[j + 1 :]
 
 
 class Layout:
@@ -127,7 +127,7 @@ class Layout:
         odds = damping_parameter(damping, first=False)
         return np.array([np.log(frequency_hz * self.angle), odds, np.log(variance)])
 
-    def plain_corner(self) -> float:
+    def starting_corner(self) -> float:
         """Parameter of a corner to begin with."""
         return float(_CORNER[0] + np.log(self.angle))
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.identification.fit.window import tukey
+from lbt_synth.identification.fit.taper import tukey
 from lbt_synth.validation import FloatArray, IntArray
 
 _FLOOR = 1e-12  # of the mean density: below, there is nothing but rounding

@@ -22,8 +22,8 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, half_angle_square
-from lbt_synth.identification.fit.window import FAR, WIDE, log_smearing
-from lbt_synth.models.resonance import PARAMETERS, log_density, log_roll_off
+from lbt_synth.identification.fit.taper import FAR, WIDE, log_smearing
+from lbt_synth.models.resonance_spectrum import PARAMETERS, log_density, log_roll_off
 from lbt_synth.validation import BoolArray, FloatArray
 
 GAIN, NOISE, CORNER, FIRST = 0, 1, 2, 3  # places in the vector of parameters
@@ -43,7 +43,7 @@ class Priors:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fitted:
+class Minimum:
     """A minimum of the likelihood."""
 
     # (p,): logarithms of sensor gain, noise variance, corner of the first component's roll-off, and
@@ -167,14 +167,14 @@ class Likelihood:
         return value, gradient, information
 
 
-def fit(
+def minimise(
     likelihood: Likelihood,
     start: FloatArray,
     priors: Priors,
     *,
     free: BoolArray,
     steps: int = 40,
-) -> Fitted:
+) -> Minimum:
     """Minimise L from a start, by scoring steps within a trust region.
 
     Shapes: start (p,), free (p,).
@@ -225,7 +225,7 @@ def fit(
         )
     information = np.zeros((start.size, start.size))
     information[np.ix_(moves, moves)] = reduced
-    return Fitted(
+    return Minimum(
         parameters=theta,
         contrast=likelihood.contrast(theta),
         information=information,
@@ -233,7 +233,9 @@ def fit(
     )
 
 
-def observed(likelihood: Likelihood, fitted: Fitted, priors: Priors, *, free: BoolArray) -> Fitted:
+def add_observed_information(
+    likelihood: Likelihood, fitted: Minimum, priors: Priors, *, free: BoolArray
+) -> Minimum:
     """Return a minimum with the exact second derivatives of L, by differences of its gradient.
 
     Where they are not positive definite, the expected ones stay.

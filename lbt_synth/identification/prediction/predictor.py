@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import qr
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.prediction.residual import inverse_sensor, usable_series
+from lbt_synth.identification.prediction.residual import check_series, inverse_sensor
 from lbt_synth.linear import Controller
 from lbt_synth.loop import youla_controller
 from lbt_synth.models import LoopHardware
@@ -119,7 +119,7 @@ def least_squares_predictor(
             "a predictor needs a command for every mode, and an influence matrix that can be "
             f"inverted; got {N.shape} of rank {np.linalg.matrix_rank(N)}."
         )
-    series, parts = usable_series(open_loop, n, stretches)
+    series, parts = check_series(open_loop, n, stretches)
     blocks = [_regression(series[a:b], hardware.mirror_taps, count) for a, b in parts]
     X = np.concatenate([block[0] for block in blocks])  # (rows, n, taps)
     Z = np.concatenate([block[1] for block in blocks])  # (rows, n)
@@ -133,13 +133,13 @@ def least_squares_predictor(
     coefficients, fitted = np.zeros((n, n, count)), np.zeros(n)
     for i in range(n):
         seen = slice(None) if coupled else slice(i, i + 1)
-        found, fitted[i] = _least_squares(X[:, seen].reshape(len(X), -1), Z[:, i], share)
+        found, fitted[i] = _solve_least_squares(X[:, seen].reshape(len(X), -1), Z[:, i], share)
         coefficients[i, seen] = found.reshape(-1, count)
     return LeastSquaresPredictor(
         coefficients=frozen(coefficients),
         fitted_nm2=frozen(fitted),
         frames=len(X),
-        controller=_controller(hardware, coefficients, back, gain),
+        controller=_build_controller(hardware, coefficients, back, gain),
     )
 
 
@@ -157,7 +157,7 @@ def _regression(
     return np.asarray(late), part[m - 1 + count :]
 
 
-def _least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[FloatArray, float]:
+def _solve_least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[FloatArray, float]:
     """Coefficients of least squares, of least norm, and the mean square that is left."""
     unknowns = X.shape[1]
     together = np.column_stack([X, z])
@@ -173,7 +173,7 @@ def _least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[FloatArr
     return np.asarray(found), float(rest @ rest / len(X))
 
 
-def _controller(
+def _build_controller(
     hardware: LoopHardware, coefficients: FloatArray, back: FloatArray, gain: float
 ) -> Controller:
     """Make the controller from y to u of a filter of z: the newest values of z are its states."""

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.prediction.estimate import ResidualEstimate, residual_estimate
+from lbt_synth.identification.prediction.residual_estimate import (
+    ResidualEstimate,
+    estimate_residual,
+)
 from lbt_synth.identification.prediction.stretches import Stretches, checked_stretches
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, close_loop, filter_series
@@ -19,7 +22,7 @@ from lbt_synth.validation import FloatArray, float_array, instance, integer, num
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ReplayData:
+class PredictionData:
     """A recorded pseudo-open-loop series that fits a loop, and what is known of its noise."""
 
     open_loop: FloatArray  # (frames, n): the series z(k) [nm]; finite in the stretches
@@ -100,7 +103,7 @@ def replayed_residual(
     """
     instance(hardware, LoopHardware)
     deviation = _per_measurement(noise_nm, "noise_nm", hardware.n_measurements)
-    data = replay_data(
+    data = prediction_data(
         open_loop,
         hardware,
         noise_nm2=np.diag(deviation**2),
@@ -110,14 +113,14 @@ def replayed_residual(
     )
     loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
     loop.require_stable()
-    default = settling(loop)
+    default = frames_to_settle(loop)
     settle = (
         default if settle_frames is None else integer(settle_frames, "settle_frames", at_least=0)
     )
-    return replayed(data, loop, settle)
+    return predict_residual(data, loop, settle)
 
 
-def replay_data(
+def prediction_data(
     open_loop: Any,
     hardware: LoopHardware,
     *,
@@ -125,7 +128,7 @@ def replay_data(
     noise_error_nm: Any,
     sensor_gain: float,
     stretches: Any,
-) -> ReplayData:
+) -> PredictionData:
     """Check a recorded series against a loop, and refer the noise to the modes.
 
     ``noise_nm2`` is the covariance of the measurements' noise, (q, q). The errors of their
@@ -134,13 +137,13 @@ def replay_data(
     """
     instance(hardware, LoopHardware)
     gain = number(sensor_gain, "sensor_gain", above=0)
-    series, parts = usable_series(open_loop, hardware.modes, stretches)
+    series, parts = check_series(open_loop, hardware.modes, stretches)
     back = inverse_sensor(hardware) / gain
     error = _per_measurement(noise_error_nm, "noise_error_nm", hardware.n_measurements)
     deviation = np.sqrt(np.diag(noise_nm2))
     # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2
     slope = 2 * back * (back @ noise_nm2) / np.where(deviation > 0, deviation, np.inf)
-    return ReplayData(
+    return PredictionData(
         open_loop=series,
         stretches=parts,
         noise_nm2=back @ noise_nm2 @ back.T,
@@ -148,7 +151,7 @@ def replay_data(
     )
 
 
-def usable_series(
+def check_series(
     open_loop: Any, modes: int, stretches: Any, name: str = "open_loop"
 ) -> tuple[FloatArray, Stretches]:
     """Return a series (frames, modes) that is finite within its stretches, and the stretches."""
@@ -185,20 +188,20 @@ def _per_measurement(value: Any, name: str, count: int) -> FloatArray:
     return np.broadcast_to(out, (count,))
 
 
-def settling(loop: ClosedLoop) -> int:
+def frames_to_settle(loop: ClosedLoop) -> int:
     """Frames until a loop has forgotten how it began."""
     return max(settling_frames(loop.spectral_radius), loop.system.n_states)
 
 
-def replayed(data: ReplayData, loop: ClosedLoop, settle: int) -> ResidualEstimate:
+def predict_residual(data: PredictionData, loop: ClosedLoop, settle: int) -> ResidualEstimate:
     """Replay a stable loop on recorded data."""
-    kept = settled_stretches(data.stretches, settle)
+    kept = drop_settling(data.stretches, settle)
     # z(k) for phi_tot(k-1), and no noise: the residual of frame k-1 is e(k)
     path = loop.rejection()
     parts = [
         filter_series(path, data.open_loop[start - settle : stop])[settle:] for start, stop in kept
     ]
-    return residual_estimate(
+    return estimate_residual(
         np.concatenate(parts),
         kept,
         noise_nm2=data.noise_nm2,
@@ -206,7 +209,7 @@ def replayed(data: ReplayData, loop: ClosedLoop, settle: int) -> ResidualEstimat
     )
 
 
-def settled_stretches(stretches: Stretches, settle: int) -> Stretches:
+def drop_settling(stretches: Stretches, settle: int) -> Stretches:
     """Return what is left of stretches after settling."""
     kept = tuple((start + settle, stop) for start, stop in stretches if stop - start > settle)
     if not kept:

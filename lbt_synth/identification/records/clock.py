@@ -8,7 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.records.frame_grid import frames_of_times, line_rate, within_bounds
+from lbt_synth.identification.records.frame_grid import (
+    fit_rate,
+    frames_from_times,
+    require_few_holes,
+)
 from lbt_synth.validation import FloatArray, IntArray, number, real_array
 
 _MOST_APART = 5e-3  # by which a stated rate may ever differ from that of the times
@@ -41,14 +45,14 @@ def clock_of(
     rate = None if frame_rate_hz is None else number(frame_rate_hz, "frame_rate_hz", above=0)
     notes: list[str] = []
     frame = np.arange(rows)
-    times = None if times_s is None else _rising(times_s, "times_s", rows)
+    times = None if times_s is None else _check_rising(times_s, "times_s", rows)
     if frame_numbers is not None:
-        frame = _counted(_rising(frame_numbers, "frame_numbers", rows))
+        frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
     if times is not None and rows > 1:
         if frame_numbers is None:
-            frame, said = frames_of_times(times, rate)
+            frame, said = frames_from_times(times, rate)
             notes += [said] if said else []
-        found = line_rate(times, frame)
+        found = fit_rate(times, frame)
         if rate is None:
             rate = found
             notes.append(f"frame rate {rate:.9g} Hz, from the times")
@@ -60,11 +64,11 @@ def clock_of(
                     "frame_rate_hz."
                 )
         else:
-            notes += _compared(rate, found, times, frame)
+            notes += _compare_rates(rate, found, times, frame)
     if rate is None:
         raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
     frames = int(frame[-1]) + 1
-    within_bounds(frames, rows)
+    require_few_holes(frames, rows)
     return Clock(frame_rate_hz=rate, frame_of_row=frame, frames=frames, notes=tuple(notes))
 
 
@@ -84,7 +88,7 @@ def first_per_frame(
     return keep, np.array(torn, dtype=np.int64), int(np.sum(~first))
 
 
-def _compared(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:
+def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:
     """Say how far a stated rate is from that of the times; refuse what they do not allow."""
     span = max(int(frame[-1]), 1)
     loose = float(np.ptp((times - times[0]) * found - frame))  # rounding, jitter
@@ -103,7 +107,7 @@ def _compared(rate: float, found: float, times: FloatArray, frame: IntArray) -> 
     return []
 
 
-def _rising(values: FloatArray, name: str, rows: int) -> FloatArray:
+def _check_rising(values: FloatArray, name: str, rows: int) -> FloatArray:
     out = real_array(values, name)
     if out.shape != (rows,):
         raise DimensionError(
@@ -119,7 +123,7 @@ def _rising(values: FloatArray, name: str, rows: int) -> FloatArray:
     return out
 
 
-def _counted(numbers: FloatArray) -> IntArray:
+def _frames_from_counter(numbers: FloatArray) -> IntArray:
     if not np.array_equal(numbers, np.round(numbers)):
         raise ProblemError("frame_numbers must be whole numbers; got fractions.")
     steps = np.diff(numbers)
@@ -129,5 +133,5 @@ def _counted(numbers: FloatArray) -> IntArray:
             "frame_numbers must mostly rise by 1 a row; got a median step of "
             f"{np.median(steps):.6g}. A record of every second frame is one of half the rate."
         )
-    within_bounds(float(numbers[-1]) - float(numbers[0]) + 1, len(numbers))
+    require_few_holes(float(numbers[-1]) - float(numbers[0]) + 1, len(numbers))
     return np.asarray(numbers - numbers[0], dtype=np.int64)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import TelemetryError
-from lbt_synth.identification.records.units import FREQUENCIES, TIMES, density_unit, unit_word
+from lbt_synth.identification.records.units import FREQUENCIES, TIMES, density_unit, unit_name
 from lbt_synth.validation import FloatArray
 
 ROLES = {
@@ -103,13 +103,13 @@ class Column:
     unit: str | None = None  # Its unit
 
 
-def column(
+def parse_column(
     name: str, values: FloatArray, *, unit: str | None = None, axis: int | None = None
 ) -> Column:
     """Read a name: its unit in brackets or behind an underscore, its axis, and what it is."""
     plain, named_unit = _split_unit(name.strip())
     given = (unit or "").strip()
-    if given and named_unit and _known(given) != _known(named_unit):
+    if given and named_unit and _unit_key(given) != _unit_key(named_unit):
         raise TelemetryError(f"{name} has the unit {given!r} in the header: which is right?")
     role, named_axis = _split_axis(re.sub(r"[\s\-.]+", "_", plain.lower()).strip("_"))
     return Column(
@@ -121,18 +121,18 @@ def column(
     )
 
 
-def indexed(name: str, values: FloatArray, *, unit: str | None = None) -> list[Column]:
+def array_columns(name: str, values: FloatArray, *, unit: str | None = None) -> list[Column]:
     """Columns of an array (frames, n) of one name."""
     if values.shape[1] == 1:
-        return [column(name, values[:, 0], unit=unit)]
-    base = column(name, values[:, 0], unit=unit)
+        return [parse_column(name, values[:, 0], unit=unit)]
+    base = parse_column(name, values[:, 0], unit=unit)
     return [
         replace(base, name=f"{name}[{i}]", values=values[:, i], axis=i)
         for i in range(values.shape[1])
     ]
 
 
-def paired(columns: list[Column]) -> list[Column]:
+def pair_x_and_y(columns: list[Column]) -> list[Column]:
     """Take x and y that stand together for two axes; x of a clock is none."""
     plain = [_split_unit(each.name.strip())[0].lower() for each in columns]
     if plain.count("x") != 1 or plain.count("y") != 1:
@@ -151,8 +151,8 @@ def rises(values: FloatArray) -> bool:
     return len(values) >= _CLOCK_ROWS and bool(np.all(np.diff(values) > 0))
 
 
-def _known(unit: str) -> object:
-    return unit_word(unit) or density_unit(unit) or unit.lower()
+def _unit_key(unit: str) -> object:
+    return unit_name(unit) or density_unit(unit) or unit.lower()
 
 
 def _split_unit(name: str) -> tuple[str, str | None]:
@@ -161,7 +161,7 @@ def _split_unit(name: str) -> tuple[str, str | None]:
     lower = name.lower()
     for at in [i for i, sign in enumerate(lower) if sign == "_"]:
         tail = lower[at + 1 :]
-        known = unit_word(tail) or density_unit(tail) or tail in TIMES or tail in FREQUENCIES
+        known = unit_name(tail) or density_unit(tail) or tail in TIMES or tail in FREQUENCIES
         if known and at > 0:
             return name[:at], name[at + 1 :]
     return name, None
@@ -181,7 +181,7 @@ def _split_axis(name: str) -> tuple[str | None, int | None]:
     return (role, _AXES[axis]) if role in _OF_AXES else (None, None)
 
 
-def fact_of(key: str) -> str | None:
+def recognise_fact(key: str) -> str | None:
     """Return the fact that a header's keyword, or the name of a number, stands for."""
     word = re.sub(r"[\s\-.]+", "_", key.strip().lower())
     return next((fact for fact, names in FACTS.items() if word in names), None)

@@ -15,7 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.errors import TelemetryError
-from lbt_synth.identification.records.columns import Column, column, fact_of, indexed, paired
+from lbt_synth.identification.records.columns import (
+    Column,
+    array_columns,
+    pair_x_and_y,
+    parse_column,
+    recognise_fact,
+)
 from lbt_synth.identification.records.csv_file import read_csv
 from lbt_synth.storage.array_file import reason
 from lbt_synth.validation import FloatArray
@@ -45,7 +51,7 @@ class Contents:
         """Add what a place of the file says."""
         self.facts.setdefault(fact, {})[where] = value
 
-    def tell_number(self, fact: str, value: Any, where: str) -> None:
+    def add_number(self, fact: str, value: Any, where: str) -> None:
         """Add a number, perhaps written as a text; say so where it is none."""
         if isinstance(value, str) and fact in _SUFFIXES:
             value = re.sub(_SUFFIXES[fact], "", value.strip(), flags=re.I)
@@ -70,16 +76,18 @@ class Contents:
             numbers = numbers.T
             said = f"{name or 'the array'} {values.shape}: its longer side was taken for the frames"
             self.notes.append(said)
-        self.columns += indexed(name, numbers, unit=unit)
+        self.columns += array_columns(name, numbers, unit=unit)
 
 
 def read_contents(path: Path, content: bytes) -> Contents:
     """Read a file of a known ending."""
     ending = path.suffix.lower()
-    reader = {**dict.fromkeys(FITS, _fits), ".npy": _npy, ".npz": _npz}.get(ending, _text)
+    reader = {**dict.fromkeys(FITS, _read_fits), ".npy": _read_npy, ".npz": _read_npz}.get(
+        ending, _read_text
+    )
     try:
         out = reader(content)
-        out.columns = paired(out.columns)
+        out.columns = pair_x_and_y(out.columns)
     except TelemetryError as error:
         raise TelemetryError(f"{path}: {error}", path=path) from error
     except Exception as error:  # foreign bytes: the decoders raise whatever they like
@@ -89,7 +97,7 @@ def read_contents(path: Path, content: bytes) -> Contents:
     return out
 
 
-def _fits(content: bytes) -> Contents:
+def _read_fits(content: bytes) -> Contents:
     from astropy.io import fits
 
     out = Contents()
@@ -102,33 +110,33 @@ def _fits(content: bytes) -> Contents:
                 name = unit.name if unit.name and unit.name != "PRIMARY" else ""
                 where = name or f"HDU {place}"
                 for card in unit.header.cards:
-                    _tell_card(out, card, where)
+                    _add_card(out, card, where)
                 if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
-                    _table(out, unit)
+                    _add_table(out, unit)
                 elif unit.is_image and unit.data is not None:
                     own, blank = unit.header.get("BUNIT"), unit.header.get("BLANK")
                     zero = float(unit.header.get("BZERO", 0.0))  # reading the data drops it
-                    data = _native(unit.data)
+                    data = _native_order(unit.data)
                     if blank is not None and data.dtype.kind in "iu":
                         data = np.where(data == blank + zero, np.nan, data)
                     out.add(name, data, str(own) if own is not None else None)
     return out
 
 
-def _tell_card(out: Contents, card: Any, where: str) -> None:
+def _add_card(out: Contents, card: Any, where: str) -> None:
     keyword = str(card.keyword)
-    fact = fact_of(keyword)
+    fact = recognise_fact(keyword)
     if keyword == _DELAY_CARD and _IN_FRAMES.search(str(card.comment)):
         fact = "delay_frames"
     elif keyword == _DELAY_CARD:
         out.notes.append("DELAY of the header was not taken: it does not say that it is in frames")
     if fact is not None and fact != "unit" and not isinstance(card.value, bool):
-        out.tell_number(fact, card.value, f"{keyword} of {where}")
+        out.add_number(fact, card.value, f"{keyword} of {where}")
 
 
-def _table(out: Contents, unit: Any) -> None:
+def _add_table(out: Contents, unit: Any) -> None:
     for described in unit.columns:
-        data = _native(np.asarray(unit.data[described.name]))
+        data = _native_order(np.asarray(unit.data[described.name]))
         if described.null is not None and data.dtype.kind in "iuf":
             scale, zero = (
                 default if each in (None, "") else float(each)
@@ -139,25 +147,25 @@ def _table(out: Contents, unit: Any) -> None:
         out.add(described.name, data, described.unit)
 
 
-def _native(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _native_order(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return data.astype(data.dtype.newbyteorder("="))
 
 
-def _npy(content: bytes) -> Contents:
+def _read_npy(content: bytes) -> Contents:
     out = Contents()
     if not content.startswith(b"\x93NUMPY"):
         raise ValueError("it does not begin as an NPY file does; it is damaged, or another kind")
-    _named(out, "", _plain(np.load(io.BytesIO(content), allow_pickle=False)))
+    _add_named(out, "", _plain(np.load(io.BytesIO(content), allow_pickle=False)))
     return out
 
 
-def _npz(content: bytes) -> Contents:
+def _read_npz(content: bytes) -> Contents:
     out = Contents()
     if not is_zipfile(io.BytesIO(content)):
         raise ValueError("it is no ZIP archive; it is damaged, or of another kind")
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         for name in archive.files:
-            _named(out, name, _plain(archive[name]))
+            _add_named(out, name, _plain(archive[name]))
     return out
 
 
@@ -165,42 +173,42 @@ def _plain(array: Any) -> npt.NDArray[Any]:
     return np.asarray(array)
 
 
-def _named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
+def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
     """Add an array, a field of a structured one each, or a number or text as a fact."""
     if array.dtype.names:
         for each in array.dtype.names:
             out.add(each, array[each])
         return
-    fact, text = fact_of(name), array.dtype.kind in "US"
+    fact, text = recognise_fact(name), array.dtype.kind in "US"
     if array.size == 1 and (array.ndim == 0 or text or fact is not None):
         value = array.reshape(-1)[0]
         if fact == "unit":
             out.tell(fact, str(value), name)
         elif fact is not None:
-            out.tell_number(fact, value, name)
+            out.add_number(fact, value, name)
         else:
             out.notes.append(f"not used: {name}, a single value")
         return
     out.add(name, array)
 
 
-def _text(content: bytes) -> Contents:
+def _read_text(content: bytes) -> Contents:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise TelemetryError("it is no text in UTF-8.") from error
     table = read_csv(text)
     out = Contents(notes=list(table.notes))
-    out.columns = [column(n, v) for n, v in zip(table.names, table.values.T, strict=True)]
-    _tell_comments(out, table.comments)
+    out.columns = [parse_column(n, v) for n, v in zip(table.names, table.values.T, strict=True)]
+    _add_comments(out, table.comments)
     return out
 
 
-def _tell_comments(out: Contents, comments: Iterable[str]) -> None:
+def _add_comments(out: Contents, comments: Iterable[str]) -> None:
     """Read lines such as ``# frame_rate_hz = 1000``."""
     for line in comments:
         match = re.match(r"^\s*([A-Za-z][\w .\-]*?)\s*[:=]\s*(\S.*?)\s*$", line)
-        if match is None or (fact := fact_of(match[1])) is None:
+        if match is None or (fact := recognise_fact(match[1])) is None:
             continue
         where = f"the comment {match[1].strip()}"
         if fact == "unit" and " " in match[2]:
@@ -208,4 +216,4 @@ def _tell_comments(out: Contents, comments: Iterable[str]) -> None:
         elif fact == "unit":
             out.tell(fact, match[2], where)
         else:
-            out.tell_number(fact, match[2], where)
+            out.add_number(fact, match[2], where)

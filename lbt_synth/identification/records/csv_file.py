@@ -50,7 +50,7 @@ def read_csv(text: str) -> TextTable:
         numbers.append(number)
     if not lines:
         raise TelemetryError("it has no rows.")
-    sign = _delimiter(lines[0])
+    sign = _find_delimiter(lines[0])
     notes: list[str] = []
     decimal = (
         sign in {";", "\t"}
@@ -60,39 +60,41 @@ def read_csv(text: str) -> TextTable:
     if decimal:
         notes.append("commas were taken for decimal points")
         lines = [lines[0], *(line.replace(",", ".") for line in lines[1:])]
-    first = _cells(lines[0], sign)
-    heading = any(_number(cell.replace(",", ".") if decimal else cell) is None for cell in first)
+    first = _split_cells(lines[0], sign)
+    heading = any(
+        _parse_number(cell.replace(",", ".") if decimal else cell) is None for cell in first
+    )
     names = [cell.strip().strip('"') for cell in first] if heading else [""] * len(first)
     if heading:
         lines, numbers = lines[1:], numbers[1:]
     elif decimal:
         lines[0] = lines[0].replace(",", ".")
     if not heading and last_comment:
-        above = [cell.strip() for cell in _cells(last_comment, sign)]
-        if len(above) == len(first) and all(cell and _number(cell) is None for cell in above):
+        above = [cell.strip() for cell in _split_cells(last_comment, sign)]
+        if len(above) == len(first) and all(cell and _parse_number(cell) is None for cell in above):
             names = above
     if not lines:
         raise TelemetryError("it has a heading and no rows.")
     return TextTable(
         names=names,
-        values=_values(lines, numbers, sign, len(first)),
+        values=_parse_rows(lines, numbers, sign, len(first)),
         comments=comments,
         notes=notes,
     )
 
 
-def _delimiter(line: str) -> str | None:
+def _find_delimiter(line: str) -> str | None:
     """Sign between the cells, by the first row; None for blanks, or for a single column."""
     return next((sign for sign in _DELIMITERS if sign in line), None)
 
 
-def _cells(line: str, sign: str | None) -> list[str]:
+def _split_cells(line: str, sign: str | None) -> list[str]:
     if sign is None:
         return line.split()
     return next(csv.reader(io.StringIO(line), delimiter=sign))
 
 
-def _number(cell: str) -> float | None:
+def _parse_number(cell: str) -> float | None:
     word = cell.strip().lower()
     if word in _GAPS:
         return float("nan")
@@ -102,7 +104,7 @@ def _number(cell: str) -> float | None:
         return None
 
 
-def _values(lines: list[str], numbers: list[int], sign: str | None, width: int) -> FloatArray:
+def _parse_rows(lines: list[str], numbers: list[int], sign: str | None, width: int) -> FloatArray:
     try:  # the quick way, which knows no gaps
         out = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2)
         if out.shape == (len(lines), width):
@@ -111,11 +113,11 @@ def _values(lines: list[str], numbers: list[int], sign: str | None, width: int) 
         pass
     rows = np.empty((len(lines), width))
     for i, (line, number) in enumerate(zip(lines, numbers, strict=True)):
-        cells = _cells(line, sign)
+        cells = _split_cells(line, sign)
         if len(cells) != width:
             raise TelemetryError(f"line {number} must have {width} cells; got {len(cells)}.")
         for j, cell in enumerate(cells):
-            value = _number(cell)
+            value = _parse_number(cell)
             if value is None:
                 raise TelemetryError(
                     f"cell {j + 1} of line {number} must be a number; got {cell.strip()!r}."

@@ -39,7 +39,7 @@ def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
     return np.asarray(np.column_stack([starts, stops])[good[starts]], dtype=np.int64)
 
 
-def stuck(series: FloatArray, good: BoolArray) -> BoolArray:
+def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     """Frames of a value that is held for longer than chance or quantisation hold it."""
     out = np.zeros(len(series), dtype=np.bool_)
     if not good.any():
@@ -47,7 +47,7 @@ def stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     each = equal_runs(series, good)
     lengths = each[:, 1] - each[:, 0]
     repeated = float(np.mean(lengths > 1))  # chance that a value is seen again
-    if _quantised(series[good]):
+    if _is_quantised(series[good]):
         # a slow series stays on a level longer than the mean run tells: the largest such chance
         longer = np.cumsum(np.bincount(lengths)[::-1])[::-1]  # runs of at least that length
         many = longer[1:] >= _MANY_RUNS
@@ -64,7 +64,7 @@ def stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     return out
 
 
-def _quantised(values: FloatArray) -> bool:
+def _is_quantised(values: FloatArray) -> bool:
     """Whether all values are whole multiples of a step that is not tiny."""
     steps = np.abs(np.diff(values))
     steps = steps[steps > 0]
@@ -77,7 +77,7 @@ def _quantised(values: FloatArray) -> bool:
     return bool(np.all(np.abs(counts - np.round(counts)) < 1e-3))
 
 
-def saturated(series: FloatArray, good: BoolArray) -> BoolArray:
+def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     """Frames at an end of the range that is reached far more often than what is next to it.
 
     The end of a sinusoid's range is reached often, too, but not by a factor of 4 more often
@@ -93,9 +93,9 @@ def saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     tolerance = _SAME_LEVEL * span
     for sign in (1.0, -1.0):
         end = float(np.max(sign * values))
-        near, ends = _levels(sign * values[sign * values > end - 0.25 * span], tolerance)
+        near, ends = _sort_levels(sign * values[sign * values > end - 0.25 * span], tolerance)
         if len(ends) <= _LEVELS:  # of coarse numbers there are few
-            near, ends = _levels(sign * values, tolerance)
+            near, ends = _sort_levels(sign * values, tolerance)
         counts = np.diff(np.concatenate([[0], ends, [near.size]]))[: _LEVELS + 1]
         inside = int(np.max(counts[1:], initial=1))
         if counts[0] >= max(_LEAST_AT_LIMIT, _LIMIT_RATIO * inside):
@@ -103,13 +103,13 @@ def saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     return out
 
 
-def _levels(values: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:
+def _sort_levels(values: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:
     """Return the values from the largest on, and where a next level begins."""
     near = np.sort(values)[::-1]
     return near, np.flatnonzero(-np.diff(near) > tolerance) + 1
 
 
-def outliers(series: FloatArray, good: BoolArray) -> BoolArray:
+def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
     """Frames whose second difference is beyond what the series around shows.
 
     The scale is the median deviation of the second differences, that of the whole record or

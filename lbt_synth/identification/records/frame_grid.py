@@ -22,7 +22,7 @@ _BLOCKS = 16  # of rows, whose mean distance from the grid is compared
 _SEARCH = 60
 
 
-def frames_of_times(times: FloatArray, rate: float | None) -> tuple[IntArray, str]:
+def frames_from_times(times: FloatArray, rate: float | None) -> tuple[IntArray, str]:
     """Return the frame of each row, from 0, and a note (empty for none).
 
     Rounded to a quantum q, the times of frames without a hole stay within ``q rate`` of a
@@ -34,17 +34,17 @@ def frames_of_times(times: FloatArray, rate: float | None) -> tuple[IntArray, st
     if rising.size == 0:
         raise ProblemError("times_s must rise; all rows have the same time.")
     period = float(np.median(rising)) if rate is None else 1 / rate
-    within_bounds(float(times[-1] - times[0]) / period + 1, len(times))
+    require_few_holes(float(times[-1] - times[0]) / period + 1, len(times))
     if rising.size == len(steps) and np.ptp(steps) < 2 * _CLEAR * float(np.median(steps)):
         # no frame is missing, whatever the rate is: that is compared afterwards
         return np.arange(len(times)), ""
     quantum = _quantum(times, steps)
     if rate is None:
-        return _by_steps(times, steps, period, quantum), ""
-    return _by_rate(times, steps, rate, quantum)
+        return _lay_by_steps(times, steps, period, quantum), ""
+    return _lay_by_rate(times, steps, rate, quantum)
 
 
-def within_bounds(frames: float, rows: int) -> None:
+def require_few_holes(frames: float, rows: int) -> None:
     """Refuse a record that would be nearly all holes."""
     if frames > (1 + MOST_HOLES) * rows:
         raise ProblemError(
@@ -68,26 +68,26 @@ def _quantum(times: FloatArray, steps: FloatArray) -> float:
     return float(times[-1] - times[0]) / float(counts.sum())
 
 
-def _apart(times: FloatArray, rate: float) -> FloatArray:
+def _grid_distance(times: FloatArray, rate: float) -> FloatArray:
     """Return how far rows without a hole are from a grid, (rows,) [frames]."""
     return np.asarray((times - times[0]) * rate - np.arange(len(times)))
 
 
-def _narrowest(times: FloatArray) -> tuple[float, float]:
+def _closest_rate(times: FloatArray) -> tuple[float, float]:
     """Return the rate that all rows without a hole are closest to, and their spread [frames]."""
-    rate = line_rate(times, np.arange(len(times)))
+    rate = fit_rate(times, np.arange(len(times)))
     low, high = (rate * (1 + sign * 2 / len(times)) for sign in (-1, 1))
     for _ in range(_SEARCH):  # the spread is convex in the rate
         one, two = low + (high - low) / 3, high - (high - low) / 3
-        if np.ptp(_apart(times, one)) < np.ptp(_apart(times, two)):
+        if np.ptp(_grid_distance(times, one)) < np.ptp(_grid_distance(times, two)):
             high = two
         else:
             low = one
     rate = (low + high) / 2
-    return rate, float(np.ptp(_apart(times, rate)))
+    return rate, float(np.ptp(_grid_distance(times, rate)))
 
 
-def _by_steps(times: FloatArray, steps: FloatArray, period: float, quantum: float) -> IntArray:
+def _lay_by_steps(times: FloatArray, steps: FloatArray, period: float, quantum: float) -> IntArray:
     """Lay rows by the steps in time, where the rate is not known."""
     counts = np.round(steps / period)
     if np.any(np.abs(steps / period - counts) >= _CLEAR):
@@ -98,7 +98,7 @@ def _by_steps(times: FloatArray, steps: FloatArray, period: float, quantum: floa
             "of frames, or leave the times away."
         )
     if quantum > _COARSE * period and int(np.sum(counts != 1)) >= _FEW:
-        rate, spread = _narrowest(times)
+        rate, spread = _closest_rate(times)
         if spread <= quantum * rate + _WHOLE + _slack(times, rate):
             raise ProblemError(
                 f"the steps in time, whole multiples of {quantum:.6g} s, are those of missing or "
@@ -112,23 +112,23 @@ def _slack(times: FloatArray, rate: float) -> float:
     return 1e-6 + 16 * rate * float(np.spacing(np.max(np.abs(times))))
 
 
-def _by_rate(
+def _lay_by_rate(
     times: FloatArray, steps: FloatArray, rate: float, quantum: float
 ) -> tuple[IntArray, str]:
     """Lay rows on the grid of a known rate."""
     rows, slack = len(times), _slack(times, rate)
     step = quantum * rate  # frames
-    placed, gap, second = _nearest(times, steps, rate)
+    placed, gap, second = _part_in_widest_gap(times, steps, rate)
     coarse = step > _COARSE and abs(1 - step) * rows > _EXACT
     if coarse:
-        complete = _complete(_apart(times, rate), step, slack)
+        complete = _is_complete(_grid_distance(times, rate), step, slack)
         if not complete and gap < _LEAST_GAP:  # a rate that is stated with few digits
-            found, spread = _narrowest(times)
+            found, spread = _closest_rate(times)
             complete = abs(found / rate - 1) * rows < 0.5 and spread <= step + slack
         note = f"times are rounded to {quantum:.6g} s"
         if complete:
             alone = step >= _ABOVE or placed is None or np.array_equal(placed, np.arange(rows))
-            if alone and not _hides(_apart(times, rate), step, slack):
+            if alone and not _may_hide_frame(_grid_distance(times, rate), step, slack):
                 return np.arange(rows), note
             raise ProblemError(
                 f"times_s in steps of {quantum:.6g} s cannot tell rounding from missing or "
@@ -136,21 +136,21 @@ def _by_rate(
                 "leave the times away."
             )
         # the frames begin in the gap that rounding leaves: another one that wide would do, too
-        if placed is None or second >= 1 - step + _finest(step) - slack:
+        if placed is None or second >= 1 - step + _finest_distance(step) - slack:
             raise ProblemError(
                 f"times_s in steps of {quantum:.6g} s leave the grid of {rate:.9g} Hz by up to "
-                f"{np.ptp(_apart(times, rate)):.3g} frames, and cannot tell which frames are "
+                f"{np.ptp(_grid_distance(times, rate)):.3g} frames, and cannot tell which frames are "
                 "missing or repeated. Give a counter of frames, or cut the record there."
             )
     if placed is not None:
         return placed, ""
-    return _by_steps(times, steps, 1 / rate, 0.0), ""
+    return _lay_by_steps(times, steps, 1 / rate, 0.0), ""
 
 
-def _complete(apart: FloatArray, step: float, slack: float) -> bool:
+def _is_complete(apart: FloatArray, step: float, slack: float) -> bool:
     """Whether rounding alone explains how far the rows are from the grid."""
     spread = float(np.ptp(apart))
-    if spread <= step - _finest(step) + slack:
+    if spread <= step - _finest_distance(step) + slack:
         return True
     # ties may be rounded up and down: then both ends are reached, and nothing moves
     if spread > step + slack or len(apart) < 4 * _BLOCKS:
@@ -159,23 +159,23 @@ def _complete(apart: FloatArray, step: float, slack: float) -> bool:
     return max(means) - min(means) < 0.5
 
 
-def _finest(step: float) -> float:
+def _finest_distance(step: float) -> float:
     """Return what the distances from the grid are multiples of; rounding reaches one end only."""
     part = Fraction(step).limit_denominator(_DENOMINATOR)
     return 1 / part.denominator if abs(float(part) - step) < 1e-9 else 0.0
 
 
-def _hides(apart: FloatArray, step: float, slack: float) -> bool:
+def _may_hide_frame(apart: FloatArray, step: float, slack: float) -> bool:
     """Whether a frame may be missing and rounding hide it, but for the ends of the record."""
     high, low = np.maximum.accumulate, np.minimum.accumulate
     top = np.maximum(high(apart)[:-1], high(apart[::-1])[::-1][1:] - 1)
     bottom = np.minimum(low(apart)[:-1], low(apart[::-1])[::-1][1:] - 1)
     end = 1 + len(apart) // _BLOCKS
-    hidden = (top - bottom)[end:-end] <= step - _finest(step) + slack
+    hidden = (top - bottom)[end:-end] <= step - _finest_distance(step) + slack
     return bool(hidden.any())
 
 
-def _nearest(
+def _part_in_widest_gap(
     times: FloatArray, steps: FloatArray, rate: float
 ) -> tuple[IntArray | None, float, float]:
     """Return frames parted in the widest gap (None where it is narrow), and the two widest."""
@@ -193,7 +193,7 @@ def _nearest(
     return np.asarray(frame - frame[0], dtype=np.int64), gap, second
 
 
-def line_rate(times: FloatArray, frame: IntArray) -> float:
+def fit_rate(times: FloatArray, frame: IntArray) -> float:
     """Return the rate by a straight line through times and frames, to nine digits."""
     t, n = times - times.mean(), frame - frame.mean()
     slope = float(n @ t)

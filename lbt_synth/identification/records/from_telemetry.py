@@ -9,9 +9,9 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry
-from lbt_synth.identification.records.build import loop_record
+from lbt_synth.identification.records.from_arrays import loop_record
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.units import unit_word
+from lbt_synth.identification.records.units import unit_name
 from lbt_synth.models import PositionLoop
 from lbt_synth.validation import FloatArray, instance, integer, number, sequence
 
@@ -20,7 +20,7 @@ _CONDITION = 1e8
 _SAME_RATE = 1e-6
 
 
-def record_of(
+def record_from_telemetry(
     telemetry: Telemetry,
     *,
     modes: Sequence[int] | None = None,
@@ -80,7 +80,9 @@ def record_of(
     ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
     ... )
     >>> run = lbt.simulate(lazy.controller, shake, hardware=path, frames=200)
-    >>> seen = lbt.identification.record_of(lbt.files.telemetry_of(run, path))
+    >>> seen = lbt.identification.record_from_telemetry(
+    ...     lbt.files.telemetry_from_simulation(run, path)
+    ... )
     >>> error = seen.pseudo_open_loop()[3:] - run.total_nm[0, 2:-1]  # no noise
     >>> bool(abs(error).max() < 1e-9)
     True
@@ -94,7 +96,7 @@ def record_of(
                 f"frame_rate_hz must be that of the telemetry, {own:.9g} Hz; got {rate:.9g} Hz."
             )
     n, q, m = telemetry.modes, telemetry.measurements.shape[1], telemetry.commands.shape[1]
-    chosen = _chosen(modes, n)
+    chosen = _check_modes(modes, n)
     y, y_unit = _modal_measurements(telemetry, chosen, unit, notes)
     u, u_unit = _modal_commands(telemetry, chosen, command_unit or unit, notes)
     for word, given in (
@@ -127,7 +129,7 @@ def record_of(
     )
 
 
-def _chosen(modes: Any, n: int) -> list[int]:
+def _check_modes(modes: Any, n: int) -> list[int]:
     if modes is None:
         if n > 2:
             raise ProblemError(
@@ -151,12 +153,12 @@ def _modal_measurements(
         response = None if seen.reconstructor is None else seen.reconstructor @ response
     if response is None:
         if q != n:
-            raise ProblemError(_slopes(q, n))
-        return y[:, chosen], _stated(seen.measurement_unit, unit, "measurements")
+            raise ProblemError(_slopes_message(q, n))
+        return y[:, chosen], _choose_unit(seen.measurement_unit, unit, "measurements")
     if np.array_equal(response, np.eye(n)):
-        return y[:, chosen], _stated(seen.measurement_unit, unit, "measurements")
+        return y[:, chosen], _choose_unit(seen.measurement_unit, unit, "measurements")
     if q > n > 2:
-        raise ProblemError(_slopes(q, n))
+        raise ProblemError(_slopes_message(q, n))
     if q < n or np.linalg.cond(response) > _CONDITION:
         raise ProblemError(
             f"the interaction matrix {response.shape} has no inverse: the {q} measurements do not "
@@ -164,13 +166,13 @@ def _modal_measurements(
         )
     notes.append("measurements: the inverse of the interaction matrix times what was recorded")
     modal = y @ np.linalg.pinv(response).T
-    own = "nm" if unit_word(seen.measurement_unit) else ""
+    own = "nm" if unit_name(seen.measurement_unit) else ""
     if not own and _FOREIGN not in seen.metadata:
         own = "nm"  # the modes of our own telemetry are
-    return modal[:, chosen], _stated(own, unit, "modes behind the interaction matrix")
+    return modal[:, chosen], _choose_unit(own, unit, "modes behind the interaction matrix")
 
 
-def _slopes(q: int, n: int) -> str:
+def _slopes_message(q: int, n: int) -> str:
     many = f"{n} modes" if n != q else "no modes"
     return (
         f"this telemetry has {q} measurements and {many}: slopes without modal coefficients. "
@@ -191,23 +193,25 @@ def _modal_commands(
                 f"this telemetry has {m} commands of {n} modes, and no influence matrix; give it "
                 "to Telemetry(influence_matrix=...), (modes, commands)."
             )
-        return u[:, chosen], _stated(seen.command_unit, unit, "commands")
+        return u[:, chosen], _choose_unit(seen.command_unit, unit, "commands")
     if np.array_equal(influence, np.eye(n, m)) and m == n:
-        return u[:, chosen], _stated(seen.command_unit, unit, "commands")
+        return u[:, chosen], _choose_unit(seen.command_unit, unit, "commands")
     notes.append("commands: the influence matrix times what was recorded")
-    own = "nm" if unit_word(seen.command_unit) or _FOREIGN not in seen.metadata else ""
-    return (u @ influence.T)[:, chosen], _stated(own, unit, "modes behind the influence matrix")
+    own = "nm" if unit_name(seen.command_unit) or _FOREIGN not in seen.metadata else ""
+    return (u @ influence.T)[:, chosen], _choose_unit(
+        own, unit, "modes behind the influence matrix"
+    )
 
 
-def _stated(own: str, given: str | None, what: str) -> str:
+def _choose_unit(own: str, given: str | None, what: str) -> str:
     """Return the unit that the telemetry has, or the one that was given."""
-    known = unit_word(own)
+    known = unit_name(own)
     if given is None:
         if known is None:
             raise ProblemError(
                 f"the unit of the {what} is {own!r}, which is none of tip and tilt; give unit."
             )
         return known
-    if known is not None and unit_word(given) not in (None, known):
+    if known is not None and unit_name(given) not in (None, known):
         raise ProblemError(f"unit must be that of the {what}, {known}; got {given!r}.")
     return given

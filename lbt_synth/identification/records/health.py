@@ -99,6 +99,6 @@ class RecordHealth:
         return f"{text}; {', '.join(spoilt)}." if spoilt else f"{text}."
 
 
-def joined(*parts: Sequence[str]) -> tuple[str, ...]:
+def merge_notes(*parts: Sequence[str]) -> tuple[str, ...]:
     """Return notes in their order, each once."""
     return tuple(dict.fromkeys(note for part in parts for note in part))

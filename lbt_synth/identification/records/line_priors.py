@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, TelemetryError
-from lbt_synth.identification.records.columns import column
+from lbt_synth.identification.records.columns import parse_column
 from lbt_synth.identification.records.contents import read_contents
 from lbt_synth.identification.records.csv_file import read_csv
 from lbt_synth.identification.records.units import hz_per
@@ -102,9 +102,9 @@ def load_lines(lines: Any) -> tuple[LinePrior, ...]:
     [16.0, 45.5]
     """
     if isinstance(lines, str | os.PathLike):
-        found = _lines_of_file(Path(lines))
+        found = _read_lines(Path(lines))
     elif isinstance(lines, list | tuple | np.ndarray):
-        found = [_line(one, "list") for one in lines]
+        found = [_line_prior(one, "list") for one in lines]
     else:
         raise ProblemError(
             f"lines must be a file or a list of frequencies; got {type(lines).__name__}."
@@ -112,7 +112,7 @@ def load_lines(lines: Any) -> tuple[LinePrior, ...]:
     return tuple(sorted(found, key=lambda line: line.frequency_hz))
 
 
-def _line(one: Any, source: str) -> LinePrior:
+def _line_prior(one: Any, source: str) -> LinePrior:
     if isinstance(one, LinePrior):
         return one
     parts = list(one) if isinstance(one, list | tuple | np.ndarray) else [one]
@@ -124,7 +124,7 @@ def _line(one: Any, source: str) -> LinePrior:
     return LinePrior(frequency_hz=parts[0], frequency_error_hz=error, source=source)
 
 
-def _lines_of_file(path: Path) -> list[LinePrior]:
+def _read_lines(path: Path) -> list[LinePrior]:
     if path.suffix.lower() not in _ENDINGS:
         raise TelemetryError(
             f"a list of lines must end in one of {', '.join(_ENDINGS)}; got {path.name!r}.",
@@ -137,12 +137,12 @@ def _lines_of_file(path: Path) -> list[LinePrior]:
                 f"it must have one or two columns, frequency and error; got "
                 f"{table.values.shape[1]}."
             )
-        at, error = _columns_of_lines(table.names)
+        at, error = _find_columns(table.names)
         gaps = np.flatnonzero(np.isnan(table.values[:, at]))
         if gaps.size:
             raise TelemetryError(f"row {gaps[0] + 1} of the numbers has no frequency.")
         rows = table.values[:, [at] if error is None else [at, error]]
-        return [_line([v for v in row if not np.isnan(v)], str(path)) for row in rows]
+        return [_line_prior([v for v in row if not np.isnan(v)], str(path)) for row in rows]
     except OSError as error:
         why = getattr(error, "strerror", None) or error
         raise TelemetryError(f"cannot read {path}: {why}.", path=path) from error
@@ -152,13 +152,13 @@ def _lines_of_file(path: Path) -> list[LinePrior]:
         raise TelemetryError(f"{path}: {error}", path=path) from error
 
 
-def _columns_of_lines(names: list[str]) -> tuple[int, int | None]:
+def _find_columns(names: list[str]) -> tuple[int, int | None]:
     """Return the columns of frequencies and of their errors; by place without a heading."""
     if not any(names):
         return 0, 1 if len(names) > 1 else None
     found: dict[str, int] = {}
     for i, name in enumerate(names):
-        known = column(name, np.zeros(1))
+        known = parse_column(name, np.zeros(1))
         plain = re.sub(r"[\s\-.]*[\[(].*$|_hz$", "", name.strip().lower())
         word = "error" if re.sub(r"[\s\-.]+", "_", plain) in _ERRORS else known.role
         if word not in ("frequency", "error") or word in found or hz_per(known.unit) != 1:
@@ -196,7 +196,7 @@ def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
     return frozen(np.stack(found, axis=1))
 
 
-def lines_of_accelerometer(
+def accelerometer_lines(
     accelerations: Any,
     measurement: Any,
     frame_rate_hz: float,
@@ -252,14 +252,14 @@ def lines_of_accelerometer(
     >>> import lbt_synth as lbt
     >>> rng, k = np.random.default_rng(1), np.arange(40_000)
     >>> shake = np.cos(2 * np.pi * 20.2 * k / 1000)
-    >>> found = lbt.identification.lines_of_accelerometer(
+    >>> found = lbt.identification.accelerometer_lines(
     ...     shake + rng.standard_normal(k.size), 2 * shake + rng.standard_normal(k.size), 1000
     ... )
     >>> [round(line.frequency_hz, 1) for line in found]
     [20.2]
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    a, z = _series(accelerations, "accelerations"), _series(measurement, "measurement")
+    a, z = _as_columns(accelerations, "accelerations"), _as_columns(measurement, "measurement")
     if len(a) != len(z):
         raise DimensionError(
             f"accelerations and measurement must have as many frames; got {len(a)} and {len(z)}."
@@ -273,7 +273,7 @@ def lines_of_accelerometer(
         length = int(min(longest, max((len(z) - 1) / _AVERAGES, _SHORTEST_SEGMENT)))
     else:
         length = integer(segment_frames, "segment_frames", at_least=_SHORTEST_SEGMENT)
-    fa, fz = _segments(a, good, length), _segments(z, good, length)
+    fa, fz = _segment_transforms(a, good, length), _segment_transforms(z, good, length)
     count = len(fz)
     if count < _FEWEST_AVERAGES:
         raise ProblemError(
@@ -294,10 +294,10 @@ def lines_of_accelerometer(
     steps = 4 * np.sin(np.pi * np.minimum(frequency, rate / 2) / rate) ** 2
     shared = np.max(coherence * power_z[:, None, :], axis=(1, 2)) / np.where(inside, steps, 1.0)
     source = f"accelerometers: coherence over {count} segments, false alarm {chance:g}"
-    return _peaks(frequency, np.where(inside, shared, 0.0), significant, source)
+    return _find_lines(frequency, np.where(inside, shared, 0.0), significant, source)
 
 
-def _series(value: Any, name: str) -> FloatArray:
+def _as_columns(value: Any, name: str) -> FloatArray:
     out = real_array(value, name)
     out = out[:, None] if out.ndim == 1 else out
     if out.ndim != 2 or out.size == 0:
@@ -305,7 +305,7 @@ def _series(value: Any, name: str) -> FloatArray:
     return out
 
 
-def _segments(series: FloatArray, good: BoolArray, length: int) -> Any:
+def _segment_transforms(series: FloatArray, good: BoolArray, length: int) -> Any:
     """Return the transforms of the segments in which all is usable, (segments, f, columns)."""
     steps, fine = np.diff(series, axis=0), good[1:] & good[:-1]
     count = len(steps) // length
@@ -315,7 +315,7 @@ def _segments(series: FloatArray, good: BoolArray, length: int) -> Any:
     return np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window[:, None], axis=1)
 
 
-def _peaks(
+def _find_lines(
     frequency: FloatArray, power: FloatArray, significant: BoolArray, source: str
 ) -> tuple[LinePrior, ...]:
     """Local maxima among the significant bins, each with a dip to the next."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.records.faults import runs
-from lbt_synth.identification.records.health import Finding, RecordHealth, joined
+from lbt_synth.identification.records.health import Finding, RecordHealth, merge_notes
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import BoolArray, FloatArray, instance, integer, matrix, number
@@ -109,7 +109,7 @@ class LoopRecord:
             instance(self.mirror, PositionLoop)
         for name in ("usable", "measured", "commanded"):
             if (flags := getattr(self, name)) is not None:
-                self._set(name, _flags(flags, name, len(y)))
+                self._set(name, _check_flags(flags, name, len(y)))
         if self.delay_frames is not None:
             _ = self.mirror_taps  # a mirror that does not fit the rate is refused
 
@@ -305,7 +305,7 @@ class LoopRecord:
             (lengths[order] <= longest) & (np.cumsum(lengths[order]) <= part * self.frames)
         ]
         for start, stop in holes[chosen]:
-            series[start:stop] = _across(series, self.usable, int(start), int(stop))
+            series[start:stop] = _interpolate_hole(series, self.usable, int(start), int(stop))
             usable[start:stop] = True
         count = int(np.sum(lengths[chosen]))
         if not count:
@@ -322,7 +322,7 @@ class LoopRecord:
             self.health,
             usable=int(np.sum(usable)),
             bridged=self.health.bridged + count,
-            notes=joined(self.health.notes, [note]),
+            notes=merge_notes(self.health.notes, [note]),
         )
         # a measurement that was replaced is none of another delay
         measured = (self.usable if self.measured is None else self.measured) & ~new
@@ -358,7 +358,7 @@ def known_frames(
     return measured & ~unknown, found
 
 
-def _across(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
+def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
     """Interpolate a hole by the polynomial through two frames on either side, or one."""
     known = np.array([start - 1, stop])
     wide = np.array([start - 2, start - 1, stop, stop + 1])
@@ -372,7 +372,7 @@ def _across(series: FloatArray, usable: BoolArray, start: int, stop: int) -> Flo
     return np.asarray(weights @ series[known])
 
 
-def _flags(value: Any, name: str, frames: int) -> BoolArray:
+def _check_flags(value: Any, name: str, frames: int) -> BoolArray:
     out = np.array(value)
     if out.dtype != np.bool_ or out.shape != (frames,):
         raise DimensionError(

@@ -46,7 +46,7 @@ _ROOT = re.compile(
 )
 
 
-def unit_word(text: str) -> str | None:
+def unit_name(text: str) -> str | None:
     """Return the name that this package has for a unit; None if it knows none such."""
     word = text.strip()
     lower = word.lower()
@@ -56,7 +56,7 @@ def unit_word(text: str) -> str | None:
 
 def nm_per(unit: str, *, diameter_m: float | None = None) -> float:
     """Return the nanometres of wavefront, rms over the pupil, of one unit."""
-    word = unit_word(unit) if isinstance(unit, str) else None
+    word = unit_name(unit) if isinstance(unit, str) else None
     if word is None:
         choice(unit, "unit", UNITS)
         raise AssertionError  # choice refuses
@@ -93,6 +93,6 @@ def density_unit(text: str) -> tuple[str, int] | None:
     """Part a unit of a spectrum: the unit and the power that the density has of it."""
     for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
         if match := pattern.match(text.strip()):
-            unit = unit_word(match["unit"])
+            unit = unit_name(match["unit"])
             return None if unit is None else (unit, power)
     return None

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbt_synth.identification.records.faults import fill, outliers, runs
+from lbt_synth.identification.records.faults import fill, find_outliers, runs
 from lbt_synth.validation import BoolArray, FloatArray
 
 _APART = 10  # frames between two: nearer ones are what a glitch left in a loop of another gain
 
 
-def glitches(open_loop: FloatArray) -> BoolArray:
+def find_glitches(open_loop: FloatArray) -> BoolArray:
     """Return the frames with an outlier in any column of a pseudo-open-loop series.
 
     What a glitch does to the commands is not in that series, but the glitch itself is: it bends the
@@ -20,14 +20,14 @@ def glitches(open_loop: FloatArray) -> BoolArray:
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.identification.tracking.glitches import glitches
+    >>> from lbt_synth.identification.tracking.glitches import find_glitches
     >>> series = np.random.default_rng(0).standard_normal((1000, 1))
     >>> series[300] = 100
-    >>> np.flatnonzero(glitches(series)).tolist()
+    >>> np.flatnonzero(find_glitches(series)).tolist()
     [300]
     """
     every = np.ones(len(open_loop), dtype=np.bool_)
-    found = [outliers(column, every) for column in open_loop.T]
+    found = [find_outliers(column, every) for column in open_loop.T]
     return np.asarray(np.any(found, axis=0))
 
 
@@ -43,6 +43,6 @@ def stand_alone(flags: BoolArray, delay_frames: float) -> bool:
     return bool(np.all(lengths <= max(1, int(delay_frames))) and np.all(gaps >= _APART))
 
 
-def bridged(series: FloatArray, flags: BoolArray) -> FloatArray:
+def bridge_frames(series: FloatArray, flags: BoolArray) -> FloatArray:
     """Return a series (frames, q) with the frames that are flagged interpolated linearly."""
     return np.column_stack([fill(column, ~flags) for column in series.T])

@@ -52,14 +52,14 @@ class LineFit:
         self._grid, self._length_s, self._rate = grid_hz, length_s, frame_rate_hz
         self._least_width = _WIDTH_BESIDE if beside else _WIDTH
 
-    def alone(self, search: Search) -> float | None:
+    def fit_alone(self, search: Search) -> float | None:
         """Frequency of a line that no other one is near [Hz]; None if it is not there."""
         at, grid = search.bins, self._grid[search.bins]
         peak = float(grid[np.argmax(search.power[at] / search.rest[at])])
         found = self._fitted(search, search.rest, (peak, 0.0))
         return None if found is None or not self._there(search, search.rest, found) else found[0]
 
-    def together(self, searches: list[Search], shared: FloatArray) -> list[float] | None:
+    def fit_together(self, searches: list[Search], shared: FloatArray) -> list[float] | None:
         """Frequencies of neighbouring lines, in the order that they had [Hz].
 
         Each is fitted beside the others in turn, from the highest peaks and from where they were

@@ -7,7 +7,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.tracking.line_fit import LineFit, Search
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.models.plant import require_no_memory, with_vibrations
+from lbt_synth.models.plant.tip_tilt import require_no_memory, with_vibrations
 from lbt_synth.validation import FloatArray, instance, number
 
 _LEAST_BINS = 8
@@ -108,10 +108,10 @@ class LineFollower:
                 searches.append(Search(line=line, bins=bins, power=powers[:, i], rest=rest))
             fit = LineFit(grid, length_s=frames / rate, frame_rate_hz=rate, beside=len(group) > 1)
             if len(group) == 1:
-                alone = fit.alone(searches[0])
+                alone = fit.fit_alone(searches[0])
                 frequencies = None if alone is None else [alone]
             else:
-                frequencies = fit.together(searches, shared[np.ix_(group, group)])
+                frequencies = fit.fit_together(searches, shared[np.ix_(group, group)])
             if frequencies is None:
                 return None
             for i, frequency in zip(group, frequencies, strict=True):

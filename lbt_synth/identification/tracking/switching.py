@@ -17,7 +17,7 @@ import numpy as np
 
 from lbt_synth.design import FilterDesign
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.loop.simulation.long_series import last_state
+from lbt_synth.loop.simulation.block_filtering import last_state
 from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.models.loop_hardware import same_mirror
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number

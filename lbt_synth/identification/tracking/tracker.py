@@ -11,12 +11,12 @@ import numpy as np
 
 from lbt_synth.design import FilterDesign, kalman
 from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.identification.tracking.glitches import bridged, glitches, stand_alone
+from lbt_synth.identification.tracking.glitches import bridge_frames, find_glitches, stand_alone
 from lbt_synth.identification.tracking.loop_identifier import LoopIdentifier
 from lbt_synth.identification.tracking.switching import SwitchedController, require_same_loop
-from lbt_synth.identification.tracking.trend import LineTrack, matched_tracks
+from lbt_synth.identification.tracking.trend import LineTrack, match_tracks
 from lbt_synth.models import LoopHardware, TipTiltPlant, Vibration
-from lbt_synth.models.plant import with_vibrations
+from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.validation import FloatArray, instance, number
 
 _MOST_SPOILT = 0.01  # of a window; fillers stand in for the measurements
@@ -78,7 +78,7 @@ class TrackingUpdate:
     switch_s: float
 
 
-class _KeptError(Exception):
+class _KeepFilterError(Exception):
     """The running filter is kept, and why."""
 
 
@@ -251,7 +251,7 @@ class TrackingController:
             designed = self._designed(self._ahead(found, time_s))
             clock.append(time.perf_counter())
             self._running.switch(designed)
-        except _KeptError as kept:
+        except _KeepFilterError as kept:
             reason = str(kept)
         except LbtSynthError as error:
             reason = f"{type(error).__name__}: {error}"
@@ -282,11 +282,11 @@ class TrackingController:
         try:
             found = self._identify(*window)
         except Exception as error:  # whatever a fit trips over, the loop goes on
-            raise _KeptError(f"the fit failed: {type(error).__name__}: {error}") from error
+            raise _KeepFilterError(f"the fit failed: {type(error).__name__}: {error}") from error
         if found is None:
-            raise _KeptError("the fit found no plant")
+            raise _KeepFilterError("the fit found no plant")
         if not isinstance(found, TipTiltPlant):
-            raise _KeptError(f"the fit gave a {type(found).__name__}, not a TipTiltPlant")
+            raise _KeepFilterError(f"the fit gave a {type(found).__name__}, not a TipTiltPlant")
         require_same_loop(found, self.hardware)
         return found
 
@@ -297,19 +297,19 @@ class TrackingController:
         plant = self.design.problem
         assert isinstance(plant, TipTiltPlant)
         seen = corrections @ plant.hardware.sensor.T  # with the sensor gain found last
-        wrong = glitches(measurements + seen)
+        wrong = find_glitches(measurements + seen)
         self._left_out = int(np.count_nonzero(missing | wrong))
         share = 100 * self._left_out / len(missing)
         what = "not finite or outliers" if wrong.any() else "not finite"
         if share > 100 * _MOST_SPOILT:
-            raise _KeptError(f"{share:.3g} % of the window's measurements are {what}")
+            raise _KeepFilterError(f"{share:.3g} % of the window's measurements are {what}")
         if wrong.any():
             if not stand_alone(wrong, self.hardware.delay_frames):
-                raise _KeptError(
+                raise _KeepFilterError(
                     f"{np.count_nonzero(wrong)} of the window's measurements are outliers that "
                     "do not stand alone"
                 )
-            measurements = bridged(measurements + seen, wrong) - seen
+            measurements = bridge_frames(measurements + seen, wrong) - seen
         return measurements, corrections
 
     def _designed(self, plant: TipTiltPlant) -> FilterDesign:
@@ -317,14 +317,14 @@ class TrackingController:
         try:
             return self._design(plant)
         except Exception as error:  # as above
-            raise _KeptError(f"the design failed: {type(error).__name__}: {error}") from error
+            raise _KeepFilterError(f"the design failed: {type(error).__name__}: {error}") from error
 
     def _ahead(self, found: TipTiltPlant, time_s: float) -> TipTiltPlant:
         """Plant with the frequencies of the middle of the time until the next update."""
         if not self._extrapolate or not found.vibrations:
             return found
         middle_s = time_s - self._window_s / 2
-        tracks = matched_tracks(self._tracks, found.vibrations)
+        tracks = match_tracks(self._tracks, found.vibrations)
         for track, line in zip(tracks, found.vibrations, strict=True):
             track.add(middle_s, line.frequency_hz, since_s=middle_s - self._trend_s)
         kept = {id(track) for track in tracks}
@@ -337,13 +337,13 @@ class TrackingController:
         return with_vibrations(
             found,
             [
-                _moved(line, track.at(ahead_s, overlap=overlap), self._rate)
+                _move_line(line, track.at(ahead_s, overlap=overlap), self._rate)
                 for line, track in zip(found.vibrations, tracks, strict=True)
             ],
         )
 
 
-def _moved(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:
+def _move_line(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:
     """Vibration at an extrapolated frequency; a wide one, or where there can be none, as it is."""
     lowest = line.damping * line.frequency_hz
     if line.damping > _NARROW:

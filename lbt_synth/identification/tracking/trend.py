@@ -15,7 +15,7 @@ _GAP_HZ = 2.0  # a line that jumps by more than this is another line
 _ALIGNED = 0.9  # cosine between directions of the same line
 
 
-def extrapolated(
+def extrapolate(
     time_s: FloatArray, frequency_hz: FloatArray, at_s: float, *, overlap: float = 1.0
 ) -> tuple[float, float, float]:
     """Extrapolate the last of several frequencies along their trend, as far as it is significant.
@@ -28,9 +28,9 @@ def extrapolated(
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.identification.tracking.trend import extrapolated
+    >>> from lbt_synth.identification.tracking.trend import extrapolate
     >>> time_s = np.arange(6.0)
-    >>> frequency, slope, error = extrapolated(time_s, 17 + 0.1 * time_s, 8.0)
+    >>> frequency, slope, error = extrapolate(time_s, 17 + 0.1 * time_s, 8.0)
     >>> round(frequency, 6), round(slope, 6)
     (17.8, 0.1)
     """
@@ -76,10 +76,10 @@ class LineTrack:
     def at(self, time_s: float, *, overlap: float) -> float:
         """Return the frequency at a time by the trend [Hz]."""
         times, frequencies = np.array(self.time_s), np.array(self.frequency_hz)
-        return extrapolated(times, frequencies, time_s, overlap=overlap)[0]
+        return extrapolate(times, frequencies, time_s, overlap=overlap)[0]
 
 
-def matched_tracks(tracks: list[LineTrack], lines: tuple[Vibration, ...]) -> list[LineTrack]:
+def match_tracks(tracks: list[LineTrack], lines: tuple[Vibration, ...]) -> list[LineTrack]:
     """Return a track for each line: the one along its direction with the nearest last frequency.
 
     A line that fits none begins a new track. The closest pairs are matched first.

@@ -11,7 +11,7 @@ from lbt_synth.identification.fit.identified_model import (
     Kind,
 )
 from lbt_synth.identification.fit.order_search import Rules
-from lbt_synth.identification.fit.parameters import Grown, has_corner
+from lbt_synth.identification.fit.parameters import FittedModel, has_corner
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whiteness import whiteness
 from lbt_synth.identification.fit.whittle import (
@@ -24,7 +24,7 @@ from lbt_synth.identification.fit.whittle import (
     damping_slope,
 )
 from lbt_synth.models import ARModel
-from lbt_synth.models.resonance import PARAMETERS, coefficients
+from lbt_synth.models.resonance_spectrum import PARAMETERS, coefficients
 from lbt_synth.validation import FloatArray, frozen
 
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
@@ -32,7 +32,7 @@ WIDE_DAMPING = 0.1
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 
 
-def covariance_of(grown: Grown, known: float | None = None) -> FloatArray:
+def parameter_covariance(grown: FittedModel, known: float | None = None) -> FloatArray:
     """Inverse of the information over the parameters that moved.
 
     With a gain that is known with a standard error of its logarithm, what that moves is added to
@@ -68,10 +68,10 @@ def _turbulence(theta: FloatArray, rate: float) -> ARModel:
     return ARModel(coefficients=-polynomial[1:], driving_rms_nm=float(size), frame_rate_hz=rate)
 
 
-def described(
+def describe_axis(
     data: LoopPeriodogram,
     rules: Rules,
-    grown: Grown,
+    grown: FittedModel,
     gain_error: float | None,
     note: str,
     *,
@@ -79,7 +79,7 @@ def described(
 ) -> IdentifiedAxis:
     """Return the fit in the units of the phase, with standard errors."""
     theta, rate = grown.theta, data.frame_rate_hz
-    covariance = covariance_of(grown, known)
+    covariance = parameter_covariance(grown, known)
     error = np.sqrt(np.maximum(np.diag(covariance), 0))
     gain = float(np.exp(theta[GAIN]))
     to_hz = rate / (2 * np.pi)
@@ -120,7 +120,7 @@ def described(
                 rms_nm=rms,
                 rms_error_nm=rms * float(np.sqrt(along @ covariance @ along)),
                 prominence=own / rest if rest > 0 else float("inf"),
-                evidence=grown.adds[i],
+                evidence=grown.evidence[i],
                 announced=part.frequency is not None,
             )
         )
@@ -142,7 +142,7 @@ def described(
         background_nm2_hz=frozen(background / gain**2),
         frame_rate_hz=rate,
         resolution_hz=data.resolution_hz,
-        grown=grown,
+        fitted_model=grown,
         data=data,
     )
 

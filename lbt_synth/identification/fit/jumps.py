@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.identification.fit.description import WIDE_DAMPING
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.order_search import Rules, kept
-from lbt_synth.identification.fit.parameters import Grown, Layout
+from lbt_synth.identification.fit.order_search import Rules, refit_model
+from lbt_synth.identification.fit.parameters import FittedModel, Layout
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
     half_angle_square,
     loop_periodogram,
 )
+from lbt_synth.identification.fit.physical_parameters import WIDE_DAMPING
+from lbt_synth.identification.fit.taper import tukey
 from lbt_synth.identification.fit.whittle import GAIN, NOISE
-from lbt_synth.identification.fit.window import tukey
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -40,7 +40,7 @@ class Jump:
     size: float  # Its size in standard deviations
 
 
-def jumps(
+def find_jumps(
     series: FloatArray, axis: IdentifiedAxis, stretches: Sequence[tuple[int, int]]
 ) -> list[Jump]:
     """Find where the innovations of a pseudo-open-loop series are far too large.
@@ -64,11 +64,13 @@ def jumps(
         edge = int(_EDGE * count)
         scale = float(np.median(size)) / 0.6745
         far = edge + np.flatnonzero(size[edge : count - edge] > _UNLIKELY * scale)
-        out += _peaks(size / scale, far, start)
+        out += _largest_of_clusters(size / scale, far, start)
     return out
 
 
-def steps(corrections: FloatArray, stretches: Sequence[tuple[int, int]]) -> list[Jump]:
+def find_correction_jumps(
+    corrections: FloatArray, stretches: Sequence[tuple[int, int]]
+) -> list[Jump]:
     """Find where the corrections of an axis go on elsewhere.
 
     The sensor gain that fits a jump of the commands is one at which it does not show: it is looked
@@ -82,10 +84,10 @@ def steps(corrections: FloatArray, stretches: Sequence[tuple[int, int]]) -> list
     if scale == 0:
         return []
     far = np.flatnonzero(inside & (change > _LARGE * scale))
-    return _peaks(change / scale, far, 0)
+    return _largest_of_clusters(change / scale, far, 0)
 
 
-def _peaks(size: FloatArray, far: IntArray, start: int) -> list[Jump]:
+def _largest_of_clusters(size: FloatArray, far: IntArray, start: int) -> list[Jump]:
     """Return the largest of each cluster of differences that are too large."""
     out = []
     for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _CLUSTER)):
@@ -95,7 +97,9 @@ def _peaks(size: FloatArray, far: IntArray, start: int) -> list[Jump]:
     return out
 
 
-def cut(stretches: Sequence[tuple[int, int]], frames: Sequence[int]) -> list[tuple[int, int]]:
+def cut_around(
+    stretches: Sequence[tuple[int, int]], frames: Sequence[int]
+) -> list[tuple[int, int]]:
     """Return stretches without the neighbourhood of some frames."""
     out = list(stretches)
     for frame in frames:
@@ -105,7 +109,7 @@ def cut(stretches: Sequence[tuple[int, int]], frames: Sequence[int]) -> list[tup
     return out
 
 
-def _with_noise(model: Grown, data: LoopPeriodogram) -> Grown:
+def _set_noise(model: FittedModel, data: LoopPeriodogram) -> FittedModel:
     """Return the model with the noise that the highest frequencies have."""
     theta = model.theta.copy()
     high = data.frequency_hz > _HIGH * data.frequency_hz[-1]
@@ -128,7 +132,7 @@ def better_delay(
         return None
     # of the model as it is, with the gain free and without new parts
     rules = Rules(gain=None, lowest_line_hz=0.0, most_lines=0)
-    simple = axis.grown.narrow(WIDE_DAMPING)
+    simple = axis.fitted_model.drop_wide(WIDE_DAMPING)
     found: dict[float, float] = {}
     for shift in (0.0, *DELAYS):
         delay = record.delay_frames + shift
@@ -141,7 +145,7 @@ def better_delay(
             frame_rate_hz=record.frame_rate_hz,
             stretches=later,
         )
-        again = kept(data, rules, _with_noise(simple, data) if shift else axis.grown)
+        again = refit_model(data, rules, _set_noise(simple, data) if shift else axis.fitted_model)
         if again is not None:
             found[delay] = again.fitted.contrast + Layout(data).price * len(again.parts)
     here = found.pop(record.delay_frames, None)

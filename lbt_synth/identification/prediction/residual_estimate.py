@@ -165,7 +165,7 @@ def _roots(variance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.where(variance >= 0, variance, np.nan)), dtype=np.float64)
 
 
-def residual_estimate(
+def estimate_residual(
     measured: FloatArray,
     stretches: Stretches,
     *,

@@ -30,7 +30,7 @@ class Series:
     notes: tuple[str, ...] = ()  # What was taken for what
 
 
-def select(
+def select_series(
     contents: Contents,
     *,
     kind: str | None,
@@ -41,50 +41,50 @@ def select(
     if not contents.columns:
         raise ProblemError("the file holds no series of numbers.")
     notes: list[str] = []
-    roles = _roles(contents.columns, columns)
+    roles = _assign_roles(contents.columns, columns)
     if not any(roles.values()):
-        roles = _nameless(contents.columns, kind, notes)
-    kind = _kind(roles, contents.columns) if kind is None else kind
+        roles = _assign_by_kind(contents.columns, kind, notes)
+    kind = _find_kind(roles, contents.columns) if kind is None else kind
     if kind == "spectrum":
-        role = _either(roles, "density", "amplitude")
-        chosen = {role: _of_axes(roles[role], role, axes)} if role else {}
+        role = _first_role(roles, "density", "amplitude")
+        chosen = {role: _choose_axes(roles[role], role, axes)} if role else {}
         if role is None or not roles["frequency"]:
             raise ProblemError(
                 "a spectrum needs columns of frequencies and densities"
-                + _choices(contents.columns, "frequency", "density")
+                + _how_to_choose(contents.columns, "frequency", "density")
             )
         series = Series(
             kind=kind,
             measurements=chosen[role],
-            frequency=_single(roles, "frequency"),
+            frequency=_only_column(roles, "frequency"),
             amplitude=role == "amplitude",
         )
     else:
-        role = _either(roles, "open_loop", "measurements")
+        role = _first_role(roles, "open_loop", "measurements")
         if kind == "closed_loop":
             role = "measurements" if roles["measurements"] else None
         if role is None or (kind == "closed_loop" and not roles["commands"]):
             raise ProblemError(
                 f"a record of kind {kind} needs measurements"
                 + (" and commands" if kind == "closed_loop" else "")
-                + _choices(contents.columns, "measurements", "commands")
+                + _how_to_choose(contents.columns, "measurements", "commands")
             )
         if kind == "open_loop" and roles["commands"]:
             notes.append("commands were left out: the record is of an open loop")
         series = Series(
             kind=kind,
-            measurements=_of_axes(roles[role], role, axes),
+            measurements=_choose_axes(roles[role], role, axes),
             commands=(
-                _of_axes(roles["commands"], "commands", axes) if kind == "closed_loop" else ()
+                _choose_axes(roles["commands"], "commands", axes) if kind == "closed_loop" else ()
             ),
-            times=_single(roles, "times"),
-            frame_numbers=_single(roles, "frame_numbers"),
+            times=_only_column(roles, "times"),
+            frame_numbers=_only_column(roles, "frame_numbers"),
         )
-        _same_axes(series)
-    return _with_notes(series, contents.columns, notes)
+        _require_same_axes(series)
+    return _add_notes(series, contents.columns, notes)
 
 
-def _same_axes(series: Series) -> None:
+def _require_same_axes(series: Series) -> None:
     """Refuse measurements of one axis with commands of another."""
     mine, theirs = (
         [each.axis for each in chosen if each.axis is not None]
@@ -96,17 +96,19 @@ def _same_axes(series: Series) -> None:
     if len(mine) == len(theirs) and mine != theirs and not from_one:
         raise ProblemError(
             f"measurements and commands must be of the same axes; got "
-            f"{_named(series.measurements)} with {_named(series.commands)}. Choose by "
+            f"{_join_names(series.measurements)} with {_join_names(series.commands)}. Choose by "
             "columns={'measurements': ..., 'commands': ...} if they do belong together."
         )
 
 
-def counted(columns: Sequence[Column]) -> list[Column]:
+def number_axes(columns: Sequence[Column]) -> list[Column]:
     """Columns as axes, in the order in which they stand."""
     return [replace(each, axis=axis) for axis, each in enumerate(columns)]
 
 
-def _roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> dict[str, list[Column]]:
+def _assign_roles(
+    columns: Sequence[Column], chosen: Mapping[str, Any] | None
+) -> dict[str, list[Column]]:
     """Columns of each role: those that were chosen, then by names."""
     out: dict[str, list[Column]] = {role: [] for role in ROLES}
     if chosen is not None and not isinstance(chosen, Mapping):
@@ -118,9 +120,9 @@ def _roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> dict[
     for role, wanted in (chosen or {}).items():
         choice(role, "a key of columns", tuple(ROLES))
         for one in (wanted,) if isinstance(wanted, str | int) else sequence(wanted, "columns"):
-            taken += (found := _found(columns, one))
+            taken += (found := _find_columns(columns, one))
             out[role] += found
-        out[role] = counted(out[role])
+        out[role] = number_axes(out[role])
     used = {id(each.values) for each in taken}
     if len(used) < len(taken):
         raise ProblemError("a column was chosen twice in columns.")
@@ -133,14 +135,14 @@ def _roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> dict[
     return out
 
 
-def _found(columns: Sequence[Column], wanted: Any) -> list[Column]:
+def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
     """Columns of a name (all of an array), or of a number."""
     if isinstance(wanted, str):
         hits = [each for each in columns if each.name.strip().lower() == wanted.strip().lower()]
         whole = wanted.strip().lower() + "["
         hits = hits or [each for each in columns if each.name.lower().startswith(whole)]
         if not hits:
-            raise ProblemError(f"there is no column {wanted!r}; got {_named(columns)}.")
+            raise ProblemError(f"there is no column {wanted!r}; got {_join_names(columns)}.")
         if len(hits) > 1 and not hits[0].name.endswith("]"):
             raise ProblemError(f"{len(hits)} columns are named {wanted!r}; choose by numbers.")
         return hits
@@ -150,7 +152,7 @@ def _found(columns: Sequence[Column], wanted: Any) -> list[Column]:
     return [columns[number]]
 
 
-def _nameless(
+def _assign_by_kind(
     columns: Sequence[Column], kind: str | None, notes: list[str]
 ) -> dict[str, list[Column]]:
     """Roles of columns whose names tell nothing, where the kind does."""
@@ -158,28 +160,28 @@ def _nameless(
     if kind is None:
         raise ProblemError(
             "names do not tell what the columns are"
-            + _choices(columns, "measurements", "commands")
+            + _how_to_choose(columns, "measurements", "commands")
             + " Or say what kind the record is."
         )
     if kind == "spectrum" and len(columns) > 1:
-        out["frequency"], out["density"] = [columns[0]], counted(columns[1:])
+        out["frequency"], out["density"] = [columns[0]], number_axes(columns[1:])
         notes.append("the first column was taken for the frequencies, the others for densities")
     elif kind == "open_loop":
         for number, each in enumerate(columns):
             if rises(each.values):
                 raise ProblemError(
-                    f"column {number} ({_named([each])}) rises from row to row, as a clock does: "
+                    f"column {number} ({_join_names([each])}) rises from row to row, as a clock does: "
                     f"choose by columns={{'times': {number}, 'open_loop': ...}}, by names or "
                     "numbers from 0."
                 )
-        out["open_loop"] = counted(columns)
+        out["open_loop"] = number_axes(columns)
         notes.append("all columns were taken for the open-loop series")
     return out
 
 
-def _kind(roles: Mapping[str, list[Column]], columns: Sequence[Column]) -> str:
+def _find_kind(roles: Mapping[str, list[Column]], columns: Sequence[Column]) -> str:
     """Return what kind the names tell."""
-    spectrum = bool(roles["frequency"]) and bool(_either(roles, "density", "amplitude"))
+    spectrum = bool(roles["frequency"]) and bool(_first_role(roles, "density", "amplitude"))
     found = [
         name
         for name, there in (
@@ -200,29 +202,32 @@ def _kind(roles: Mapping[str, list[Column]], columns: Sequence[Column]) -> str:
             "open, or the series is of the pseudo-open loop, say kind open_loop."
         )
     raise ProblemError(
-        "names do not tell what the columns are" + _choices(columns, "measurements", "commands")
+        "names do not tell what the columns are"
+        + _how_to_choose(columns, "measurements", "commands")
     )
 
 
-def _either(roles: Mapping[str, list[Column]], *names: str) -> str | None:
+def _first_role(roles: Mapping[str, list[Column]], *names: str) -> str | None:
     return next((name for name in names if roles[name]), None)
 
 
-def _single(roles: Mapping[str, list[Column]], role: str) -> Column | None:
+def _only_column(roles: Mapping[str, list[Column]], role: str) -> Column | None:
     found = roles[role]
     if len(found) > 1:
         raise ProblemError(
-            f"{_named(found)} are all named as {role}; choose by columns={{'{role}': ...}}."
+            f"{_join_names(found)} are all named as {role}; choose by columns={{'{role}': ...}}."
         )
     return found[0] if found else None
 
 
-def _of_axes(found: Sequence[Column], role: str, axes: Sequence[int] | None) -> tuple[Column, ...]:
+def _choose_axes(
+    found: Sequence[Column], role: str, axes: Sequence[int] | None
+) -> tuple[Column, ...]:
     """Columns of the axes, in the order of the axes that their names tell."""
     known = [each.axis for each in found if each.axis is not None]
     if len(found) > 1 and (len(known) < len(found) or len(set(known)) < len(known)):
         raise ProblemError(
-            f"{_named(found)} are all named as {role}, and not each of an axis of its own; choose "
+            f"{_join_names(found)} are all named as {role}, and not each of an axis of its own; choose "
             f"by columns={{'{role}': ...}}."
         )
     ordered = sorted(found, key=lambda each: each.axis or 0)
@@ -242,7 +247,7 @@ def _of_axes(found: Sequence[Column], role: str, axes: Sequence[int] | None) -> 
     return tuple(ordered[axis] for axis in given)
 
 
-def _with_notes(series: Series, columns: Sequence[Column], notes: list[str]) -> Series:
+def _add_notes(series: Series, columns: Sequence[Column], notes: list[str]) -> Series:
     """Say which columns were taken for what, and which were not taken."""
     what = {"closed_loop": "measurements", "open_loop": "the open loop", "spectrum": "densities"}
     parts = [
@@ -258,11 +263,11 @@ def _with_notes(series: Series, columns: Sequence[Column], notes: list[str]) -> 
             if each is not None
         ),
     ]
-    said = [f"{word}: {_named(chosen)}" for word, chosen in parts if chosen]
+    said = [f"{word}: {_join_names(chosen)}" for word, chosen in parts if chosen]
     used = {id(each.values) for _, chosen in parts for each in chosen}
     left = [each for each in columns if id(each.values) not in used]
     if left:
-        said.append(f"not used: {_named(left)}")
+        said.append(f"not used: {_join_names(left)}")
     return Series(
         kind=series.kind,
         measurements=series.measurements,
@@ -275,10 +280,12 @@ def _with_notes(series: Series, columns: Sequence[Column], notes: list[str]) -> 
     )
 
 
-def _named(columns: Sequence[Column]) -> str:
+def _join_names(columns: Sequence[Column]) -> str:
     return ", ".join(each.name or "a column without a name" for each in columns)
 
 
-def _choices(columns: Sequence[Column], *roles: str) -> str:
+def _how_to_choose(columns: Sequence[Column], *roles: str) -> str:
     wanted = ", ".join(f"'{role}': ..." for role in roles)
-    return f"; got {_named(columns)}. Choose by columns={{{wanted}}}, by names or numbers from 0."
+    return (
+        f"; got {_join_names(columns)}. Choose by columns={{{wanted}}}, by names or numbers from 0."
+    )

@@ -12,12 +12,12 @@ from lbt_synth.identification.records.clock import clock_of, first_per_frame
 from lbt_synth.identification.records.faults import (
     equal_runs,
     fill,
-    outliers,
+    find_outliers,
+    find_saturated,
+    find_stuck,
     runs,
-    saturated,
-    stuck,
 )
-from lbt_synth.identification.records.health import Finding, RecordHealth, joined
+from lbt_synth.identification.records.health import Finding, RecordHealth, merge_notes
 from lbt_synth.identification.records.record import LoopRecord, known_frames
 from lbt_synth.identification.records.units import nm_per
 from lbt_synth.models import PositionLoop
@@ -114,13 +114,13 @@ def loop_record(
     9.963
     """
     scale = nm_per(unit, diameter_m=diameter_m)
-    y = _columns(measurements, "measurements", scale)
+    y = _series_in_nm(measurements, "measurements", scale)
     u = None
     if commands is not None:
         command_scale = nm_per(
             unit if command_unit is None else command_unit, diameter_m=diameter_m
         )
-        u = _columns(commands, "commands", command_scale)
+        u = _series_in_nm(commands, "commands", command_scale)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
     clock = clock_of(
@@ -146,20 +146,22 @@ def loop_record(
             contradicted = np.zeros(frames, dtype=np.bool_)
             contradicted[torn] = True
             _report(findings, "repeated", "frames", None, contradicted, spoils=True)
-    y = _laid_out(y[keep], at, frames)
-    y, measured = _judged(
+    y = _lay_on_grid(y[keep], at, frames)
+    y, measured = _judge_series(
         y,
         there,
         "measurements",
         findings,
-        (("saturated", saturated), ("stuck", stuck), ("outlier", outliers)),
+        (("saturated", find_saturated), ("stuck", find_stuck), ("outlier", find_outliers)),
     )
     commanded = np.ones(frames, dtype=np.bool_)
     if u is not None:
-        u = _laid_out(u[keep], at, frames)
-        u, commanded = _judged(u, there, "commands", findings, (("saturated", _clipped),))
-        _held(u, commanded, findings)
-    said += _trends(y, measured)
+        u = _lay_on_grid(u[keep], at, frames)
+        u, commanded = _judge_series(
+            u, there, "commands", findings, (("saturated", _find_clipped),)
+        )
+        _report_held(u, commanded, findings)
+    said += _note_trends(y, measured)
     usable = measured
     if u is not None and delay_frames is not None:
         path = LoopRecord(  # checks delay and mirror
@@ -185,7 +187,7 @@ def loop_record(
             frames=frames,
             usable=int(np.sum(usable)),
             findings=tuple(findings),
-            notes=joined(notes, said),
+            notes=merge_notes(notes, said),
         ),
         diameter_m=diameter_m,
         obstruction=obstruction,
@@ -257,7 +259,7 @@ def require_length(
     return count
 
 
-def _columns(value: Any, name: str, scale: float) -> FloatArray:
+def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
     """Return a series as (frames, axes) in nm; NaN is what is masked, not finite or absurd."""
     if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "fiub":
         value = np.ma.filled(value.astype(np.float64), np.nan)
@@ -274,13 +276,13 @@ def _columns(value: Any, name: str, scale: float) -> FloatArray:
         return np.where(np.abs(scaled) < _LARGEST_NM, scaled, np.nan)
 
 
-def _laid_out(rows: FloatArray, at: IntArray, frames: int) -> FloatArray:
+def _lay_on_grid(rows: FloatArray, at: IntArray, frames: int) -> FloatArray:
     out = np.full((frames, rows.shape[1]), np.nan)
     out[at] = rows
     return out
 
 
-def _judged(
+def _judge_series(
     series: FloatArray,
     there: BoolArray,
     name: str,
@@ -327,12 +329,12 @@ def _report(
         )
 
 
-def _clipped(series: FloatArray, good: BoolArray) -> BoolArray:
+def _find_clipped(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find commands at a limit; zero is none, but that of an open loop."""
-    return saturated(series, good & (series != 0))
+    return find_saturated(series, good & (series != 0))
 
 
-def _held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> None:
+def _report_held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> None:
     """Report where the loop was open, and where its commands stood still."""
     zero = np.all(commands == 0, axis=1) & good
     is_open = np.zeros(len(zero), dtype=np.bool_)
@@ -347,7 +349,7 @@ def _held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> Non
         _report(findings, "held", "commands", axis, held & ~is_open, spoils=False)
 
 
-def _trends(series: FloatArray, good: BoolArray) -> list[str]:
+def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
     """Say where the scatter from frame to frame changes between the ends of the record."""
     pairs = np.flatnonzero(good[1:] & good[:-1])
     quarter = pairs.size // 4

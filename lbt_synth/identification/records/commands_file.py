@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.errors import TelemetryError
+from lbt_synth.identification.records.column_selection import number_axes
 from lbt_synth.identification.records.columns import Column
 from lbt_synth.identification.records.contents import Contents
-from lbt_synth.identification.records.selection import counted
 from lbt_synth.identification.records.units import seconds_per
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -30,14 +30,14 @@ def join_commands(contents: Contents, other: Contents, path: Path) -> None:
         named = [each for each in other.columns if each.role in (None, "measurements")]
     if not named:
         raise TelemetryError(f"{path} holds no commands.", path=path)
-    named = _beside(contents, other, named, path)
+    named = _match_commands(contents, other, named, path)
     own = [each for each in contents.columns if each.role != "commands"]
     if not any(each.role in ("measurements", "open_loop") for each in own):
-        plain = counted([each for each in own if each.role is None])
+        plain = number_axes([each for each in own if each.role is None])
         own = [each for each in own if each.role is not None]
         own += [replace(each, role="measurements") for each in plain]
     if len(named) > 1 and any(each.axis is None for each in named):
-        named = counted(named)
+        named = number_axes(named)
     contents.columns = own + [replace(each, role="commands") for each in named]
     for fact, places in other.facts.items():
         if fact == "unit":
@@ -49,7 +49,9 @@ def join_commands(contents: Contents, other: Contents, path: Path) -> None:
     contents.notes += [f"commands are from {path}", *other.notes]
 
 
-def _beside(contents: Contents, other: Contents, named: list[Column], path: Path) -> list[Column]:
+def _match_commands(
+    contents: Contents, other: Contents, named: list[Column], path: Path
+) -> list[Column]:
     """Return the commands in the rows of the measurements; NaN where there are none."""
     counts = {len(each.values) for each in named}
     rows = {len(each.values) for each in contents.columns}
@@ -62,7 +64,9 @@ def _beside(contents: Contents, other: Contents, named: list[Column], path: Path
                 break  # refused below
             if counts != {len(theirs[0].values)}:
                 break
-            at, there = _matched(_clock(mine[0], role), _clock(theirs[0], role), role, path)
+            at, there = _match_rows(
+                _clock_values(mine[0], role), _clock_values(theirs[0], role), role, path
+            )
             if there.all() and len(at) in counts and np.array_equal(at, np.arange(len(at))):
                 return named
             spread = []
@@ -89,11 +93,11 @@ def _beside(contents: Contents, other: Contents, named: list[Column], path: Path
     return named
 
 
-def _clock(column: Column, role: str) -> FloatArray:
+def _clock_values(column: Column, role: str) -> FloatArray:
     return column.values * (seconds_per(column.unit) if role == "times" else 1.0)
 
 
-def _matched(
+def _match_rows(
     mine: FloatArray, theirs: FloatArray, role: str, path: Path
 ) -> tuple[IntArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
     """Row of the second clock for each of the first, and whether there is one."""

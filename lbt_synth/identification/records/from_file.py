@@ -13,21 +13,21 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import load_telemetry
-from lbt_synth.identification.records.build import loop_record
+from lbt_synth.identification.records.column_selection import Series, select_series
 from lbt_synth.identification.records.columns import Column
+from lbt_synth.identification.records.commands_file import join_commands
 from lbt_synth.identification.records.contents import ENDINGS, FITS, Contents, read_contents
-from lbt_synth.identification.records.from_telemetry import record_of
-from lbt_synth.identification.records.health import joined
-from lbt_synth.identification.records.join import join_commands
+from lbt_synth.identification.records.from_arrays import loop_record
+from lbt_synth.identification.records.from_telemetry import record_from_telemetry
+from lbt_synth.identification.records.health import merge_notes
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.selection import Series, select
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.identification.records.units import (
     density_unit,
     hz_per,
     nm_per,
     seconds_per,
-    unit_word,
+    unit_name,
 )
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.fits import has_card
@@ -119,7 +119,7 @@ def load_record(
     source = Path(path)
     if kind is not None:
         choice(kind, "kind", KINDS)
-    content = _bytes(source)
+    content = _read_bytes(source)
     if _is_telemetry(source, content):
         if kind not in (None, "closed_loop") or columns is not None or commands is not None:
             raise ProblemError(
@@ -128,9 +128,9 @@ def load_record(
             )
         if averages is not None:
             raise ProblemError(f"{source} is telemetry: averages are of a spectrum.")
-        return _of(
+        return _name_file(
             source,
-            lambda: record_of(
+            lambda: record_from_telemetry(
                 load_telemetry(source),
                 modes=None if axes is None else tuple(axes),
                 frame_rate_hz=frame_rate_hz,
@@ -146,41 +146,41 @@ def load_record(
     contents = read_contents(source, content)
     if commands is not None:
         other = Path(commands)
-        join_commands(contents, read_contents(other, _bytes(other)), other)
+        join_commands(contents, read_contents(other, _read_bytes(other)), other)
 
     def build() -> LoopRecord | SpectrumRecord:
-        series = select(contents, kind=kind, axes=axes, columns=columns)
+        series = select_series(contents, kind=kind, axes=axes, columns=columns)
         facts = {
-            "frame_rate_hz": _fact(contents, "frame_rate_hz", frame_rate_hz, may_differ=False),
-            "diameter_m": _fact(contents, "diameter_m", diameter_m),
+            "frame_rate_hz": _find_fact(contents, "frame_rate_hz", frame_rate_hz, may_differ=False),
+            "diameter_m": _find_fact(contents, "diameter_m", diameter_m),
         }
         if series.kind == "spectrum":
-            return _spectrum(
+            return _build_spectrum_record(
                 series,
                 contents,
                 unit=unit,
                 source=str(source),
-                averages=_fact(contents, "averages", averages),
+                averages=_find_fact(contents, "averages", averages),
                 **facts,
             )
         if averages is not None:
             raise ProblemError(f"averages are of a spectrum; the record is of kind {series.kind}.")
-        return _loop(
+        return _build_loop_record(
             series,
             contents,
             unit=unit,
             command_unit=command_unit,
             mirror=mirror,
             source=str(source),
-            delay_frames=_fact(contents, "delay_frames", delay_frames),
-            obstruction=_fact(contents, "obstruction", obstruction),
+            delay_frames=_find_fact(contents, "delay_frames", delay_frames),
+            obstruction=_find_fact(contents, "obstruction", obstruction),
             **facts,
         )
 
-    return _of(source, build)
+    return _name_file(source, build)
 
 
-def _of(
+def _name_file(
     source: Path, build: Callable[[], LoopRecord | SpectrumRecord]
 ) -> LoopRecord | SpectrumRecord:
     """Call what may refuse the file, and name the file then."""
@@ -192,7 +192,7 @@ def _of(
         raise type(error)(f"{source}: {error}") from error
 
 
-def _bytes(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     if path.suffix.lower() not in ENDINGS:
         raise TelemetryError(
             f"a record must end in one of {', '.join(ENDINGS)}; got {path.name!r}.", path=path
@@ -216,7 +216,7 @@ def _is_telemetry(path: Path, content: bytes) -> bool:
     return names >= _ARRAYS_OF_OURS
 
 
-def _fact(contents: Contents, name: str, given: Any, *, may_differ: bool = True) -> Any:
+def _find_fact(contents: Contents, name: str, given: Any, *, may_differ: bool = True) -> Any:
     """Return what was given, or what the file tells; it may not tell two things."""
     places = contents.facts.get(name, {})
     told = {where: number(value, f"{where} ({name})") for where, value in places.items()}
@@ -240,7 +240,7 @@ def _fact(contents: Contents, name: str, given: Any, *, may_differ: bool = True)
     return given
 
 
-def _loop(
+def _build_loop_record(
     series: Series,
     contents: Contents,
     *,
@@ -248,25 +248,25 @@ def _loop(
     command_unit: str | None,
     **facts: Any,
 ) -> LoopRecord:
-    y_unit = _unit(series.measurements, unit, contents, "unit", "measurements")
+    y_unit = _find_unit(series.measurements, unit, contents, "unit", "measurements")
     u_unit = None
     if series.commands:
         given = unit if command_unit is None else command_unit
         fact = "command unit" if "command unit" in contents.facts else "unit"
-        u_unit = _unit(series.commands, given, contents, fact, "commands")
+        u_unit = _find_unit(series.commands, given, contents, fact, "commands")
     times = None
     if series.times is not None:
         times = seconds_per(series.times.unit) * series.times.values
         if not series.times.unit:
             contents.notes.append(f"{series.times.name} was taken for seconds")
     record = loop_record(
-        _stacked(series.measurements),
-        _stacked(series.commands) if series.commands else None,
+        _stack_columns(series.measurements),
+        _stack_columns(series.commands) if series.commands else None,
         unit=y_unit,
         command_unit=u_unit,
         times_s=times,
         frame_numbers=None if series.frame_numbers is None else series.frame_numbers.values,
-        notes=joined(contents.notes, series.notes),
+        notes=merge_notes(contents.notes, series.notes),
         **facts,
     )
     if series.times is not None and not series.times.unit:
@@ -280,7 +280,7 @@ def _loop(
     return record
 
 
-def _unit(
+def _find_unit(
     chosen: Sequence[Column], given: str | None, contents: Contents, fact: str, what: str
 ) -> str:
     """Return the unit of some columns: by their names or headers, the file, or as given."""
@@ -303,16 +303,16 @@ def _unit(
                 f"the file does not tell the unit of the {what}; give {option} ({choices})."
             )
         return given
-    if given is not None and _same_unit(own) != _same_unit(given):
+    if given is not None and _unit_key(own) != _unit_key(given):
         raise ProblemError(f"{option} must be that of the file, {own!r}; got {given!r}.")
     return own
 
 
-def _same_unit(text: str) -> Any:
-    return density_unit(text) or unit_word(text) or text
+def _unit_key(text: str) -> Any:
+    return density_unit(text) or unit_name(text) or text
 
 
-def _stacked(chosen: Sequence[Column]) -> FloatArray:
+def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
     sizes = {len(each.values) for each in chosen}
     if len(sizes) > 1:
         raise ProblemError(
@@ -322,7 +322,7 @@ def _stacked(chosen: Sequence[Column]) -> FloatArray:
     return np.column_stack([each.values for each in chosen])
 
 
-def _spectrum(
+def _build_spectrum_record(
     series: Series,
     contents: Contents,
     *,
@@ -331,7 +331,7 @@ def _spectrum(
     **facts: Any,
 ) -> SpectrumRecord:
     assert series.frequency is not None
-    text = _unit(series.measurements, unit, contents, "unit", "density")
+    text = _find_unit(series.measurements, unit, contents, "unit", "density")
     parted = density_unit(text)
     if parted is None:
         raise ProblemError(
@@ -346,7 +346,7 @@ def _spectrum(
     scale_hz = hz_per(series.frequency.unit)
     if not series.frequency.unit:
         contents.notes.append("frequencies were taken for Hz")
-    table = _stacked([series.frequency, *series.measurements])
+    table = _stack_columns([series.frequency, *series.measurements])
     complete = np.all(np.isfinite(table), axis=1)
     if not complete.all():
         contents.notes.append(f"{int(np.sum(~complete))} rows with gaps were left out")
@@ -361,6 +361,6 @@ def _spectrum(
         frequency_hz=scale_hz * table[:, 0],
         density_nm2_hz=scaled,
         diameter_m=diameter_m,
-        notes=joined(contents.notes, series.notes),
+        notes=merge_notes(contents.notes, series.notes),
         **facts,
     )
