@@ -16,6 +16,7 @@ from lbt_synth.design.shaping.single_mode_loop import mode_hardware, mode_loop
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.loop import (
     BandLimit,
+    ClosedLoop,
     Imaging,
     ResidualLimit,
     close_loop,
@@ -69,12 +70,12 @@ class LimitRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LimitStudy:
-    """Designs beside the limits, over where the vibrations really are.
+    """Designs beside the limits, over the true frequency of the vibrations.
 
     Attributes
     ----------
     rows : tuple of LimitRow
-        One a design.
+        One per design.
     limit : ResidualLimit or None
         The least residual of any linear controller; None where the modes do not decouple.
     band : BandLimit or None
@@ -114,14 +115,14 @@ def limits(
     designs : mapping of str to Design
         Designs by name; each is left as it is while the truth moves.
     hardware : LoopHardware
-        The loop that all are run in.
+        The loop in which all of them run.
     truth : Truth
         What the loop really meets.
     imaging : Imaging
         The camera.
     errors_hz : sequence of float, optional
         Errors of the model's frequency [Hz]: model less truth. The true vibrations move over
-        the whole range between the extreme ones.
+        the whole range between the extremes.
 
     Returns
     -------
@@ -168,13 +169,21 @@ def limits(
         )
     rows, curves = [], []
     for name, design in designs.items():
-        row, curve = _evaluate_design(name, design, hardware, truth, imaging, shifts)
-        if limit is not None:
-            row = replace(row, above_limit_percent=above_percent(row.residual_nm, limit.rms_nm))
-        if band is not None:
-            above = above_percent(row.worst_nm, band.rms_nm)
-            row = replace(row, above_band_limit_percent=above)
-        rows.append(row)
+        loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        residual_nm, ratio, curve = _evaluate_loop(loop, truth, imaging, shifts)
+        worst_nm = float(np.max(curve)) if shifts.size else residual_nm
+        rows.append(
+            LimitRow(
+                design=name,
+                method=design.method,
+                residual_nm=residual_nm,
+                strehl=ratio,
+                above_limit_percent=above_percent(residual_nm, limit.rms_nm if limit else np.nan),
+                worst_nm=worst_nm,
+                above_band_limit_percent=above_percent(worst_nm, band.rms_nm if band else np.nan),
+                stable=loop.is_stable,
+            )
+        )
         curves.append(curve)
     frequencies = {line.frequency_hz for line in vibrations}
     return LimitStudy(
@@ -199,34 +208,19 @@ def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
 
 
 def _error_band(truth: Truth, shifts: FloatArray) -> tuple[float, float] | None:
+    """Return the range of the true frequency [Hz] if there is one sinusoid and a range."""
     lines = truth.vibrations
     if len(lines) != 1 or not isinstance(lines[0], SinusoidalVibration) or shifts.size < 2:
         return None
     return lines[0].frequency_hz + float(shifts[0]), lines[0].frequency_hz + float(shifts[-1])
 
 
-def _evaluate_design(
-    name: str,
-    design: Design,
-    hardware: LoopHardware,
-    truth: Truth,
-    imaging: Imaging,
-    shifts: FloatArray,
-) -> tuple[LimitRow, FloatArray]:
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    nan = float("nan")
-    row = LimitRow(
-        design=name,
-        method=design.method,
-        residual_nm=nan,
-        strehl=nan,
-        above_limit_percent=nan,
-        worst_nm=nan,
-        above_band_limit_percent=nan,
-        stable=loop.is_stable,
-    )
+def _evaluate_loop(
+    loop: ClosedLoop, truth: Truth, imaging: Imaging, shifts: FloatArray
+) -> tuple[float, float, FloatArray]:
+    """Return residual [nm], Strehl ratio and residual at each shift [nm]; nan if unstable."""
     if not loop.is_stable:
-        return row, np.full(shifts.size, np.nan)
+        return np.nan, np.nan, np.full(shifts.size, np.nan)
     budget = residual_budget(loop, truth)
     rest = np.trace(budget.turbulence_nm2 + budget.noise_nm2)
     still = replace(truth, turbulence=None, noise_nm=0.0)
@@ -238,27 +232,18 @@ def _evaluate_design(
         )
         own = residual_budget(loop, replace(still, vibrations=moved))
         variance[i] = rest + np.trace(own.vibration_nm2)
-    curve = np.sqrt(variance)
-    return (
-        replace(
-            row,
-            residual_nm=budget.rms_nm,
-            strehl=strehl(budget, imaging),
-            worst_nm=float(np.max(curve)) if shifts.size else budget.rms_nm,
-        ),
-        curve,
-    )
+    return budget.rms_nm, strehl(budget, imaging), np.sqrt(variance)
 
 
 def above_percent(rms_nm: float, limit_nm: float) -> float:
-    """How far a residual is above a limit [%]; nan where the limit is 0 or there is none."""
-    return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else float("nan")
+    """Return how far a residual is above a limit [%]; nan where the limit is 0 or nan."""
+    return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else np.nan
 
 
 def limit_or_nan(limit: Callable[[], ResidualLimit | BandLimit]) -> float:
-    """Least residual [nm rms], nan where it cannot be computed."""
+    """Return the least residual [nm rms], nan where it cannot be computed."""
     found = _limit_or_none(limit)
-    return float("nan") if found is None else found.rms_nm
+    return np.nan if found is None else found.rms_nm
 
 
 def _limit_or_none(limit: Callable[[], T]) -> T | None:
@@ -269,27 +254,27 @@ def _limit_or_none(limit: Callable[[], T]) -> T | None:
 
 
 def model_limit(design: EstimatorDesign) -> tuple[float, float]:
-    """Limit of a filter's own model [nm rms] and how far its error is above it [%].
+    """Return the limit of a filter's own model [nm rms], and how far its error is above it [%].
 
-    nan where the limit cannot be computed; the second also for a fractional delay or a mirror
-    with dynamics, where a filter's estimation error is not its residual (it is that of an LQG).
+    Both are nan where the limit cannot be computed. The second is nan also for a fractional
+    delay or a moving mirror: there only an LQG's estimation error is its residual.
     """
     plant = design.problem
     if not isinstance(plant, TipTiltPlant | FullStatePlant):
-        return float("nan"), float("nan")
+        return np.nan, np.nan
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     delay = plant.hardware.delay_frames
     settled = delay == round(delay) and plant.hardware.mirror is None
     exact = settled or isinstance(design, LqgDesign)
-    return limit_nm, above_percent(design.rms, limit_nm) if exact else float("nan")
+    return limit_nm, above_percent(design.rms, limit_nm) if exact else np.nan
 
 
 def shaped_limit(design: ShapedDesign) -> tuple[float, float]:
-    """Limit of a shaped design's own spectra [nm rms], and how far its residual is above it [%].
+    """Return the limit of a shaped design's own spectra [nm rms], and its residual above it [%].
 
-    At unit sensor gain and over all modes. The residual is the variance plus the worst of the
-    band, as the limit. nan where a mode has no variance at unit gain, or several bands: the
-    limit of the sum is not known then.
+    Both are over all modes at unit sensor gain: the variance plus the worst of the band. They
+    are nan where a mode has no variance at unit gain, or several bands, as the limit of their
+    sum is not known.
     """
     limit_nm2, residual_nm2 = 0.0, 0.0
     for spec, parameter in zip(design.specifications, design.parameters, strict=True):
@@ -297,7 +282,7 @@ def shaped_limit(design: ShapedDesign) -> tuple[float, float]:
         variances = [leaf for leaf in at_unit if isinstance(leaf, ResidualVariance)]
         bands = [leaf for leaf in at_unit if isinstance(leaf, VibrationBand)]
         if len(variances) != 1 or len(bands) > 1:
-            return float("nan"), float("nan")
+            return np.nan, np.nan
         hardware = mode_hardware(design.loop_hardware)
         truth = Truth(turbulence=variances[0].turbulence, noise_nm=variances[0].noise_nm)
         found = limit_or_nan(partial(_mode_limit, hardware, truth, bands))

@@ -1,4 +1,4 @@
-"""Designs that ignore the mirror's dynamics, know them, or command for them, on one mirror."""
+"""What it costs to ignore the dynamics of the mirror: four designs on one moving mirror."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class MirrorRow:
     Attributes
     ----------
     design : str
-        What it believes of the mirror.
+        Its name: for ours, what it assumes about the mirror.
     stable : bool
-        Whether its loop is stable; the figures are nan where it is not.
+        Whether its loop is stable; the other numbers are nan where it is not.
     residual_nm : float
         Residual under the truth [nm rms].
     strehl : float
@@ -46,34 +46,34 @@ def mirror(
     command_weight: float = 0.0,
     more: Mapping[str, Design] | None = None,
 ) -> tuple[MirrorRow, ...]:
-    """Compare designs for a mirror that moves: what ignoring its dynamics costs.
+    """Compare designs on a moving mirror: what it costs to ignore its dynamics.
 
-    The integrator with the best gain on this mirror; the Kalman filter of a mirror that
-    settles at once; the same that takes the real positions out of its measurements; the LQG,
-    which also commands for the dynamics. Each runs on the plant's own mirror.
+    They are the integrator with the best gain on this mirror, the Kalman filter for a mirror
+    that settles at once, the same filter with the real positions taken out of its measurements,
+    and the LQG, which also commands for the dynamics. Each runs on the plant's own mirror.
 
     Parameters
     ----------
     plant : TipTiltPlant
         The plant, with the real mirror in its hardware.
     truth : Truth
-        What the loop meets.
+        What the loop really meets.
     imaging : Imaging
         The camera.
     command_weight : float, optional
         As for :func:`lqg`.
     more : mapping of str to Design, optional
-        Other designs, by name.
+        Further designs, by name.
 
     Returns
     -------
     tuple of MirrorRow
-        One a design.
+        One per design.
 
     Raises
     ------
     ProblemError
-        If the plant is none of :func:`tip_tilt_plant`.
+        If the plant does not come from :func:`tip_tilt_plant`.
     SynthesisError
         If a design fails.
 
@@ -96,21 +96,21 @@ def mirror(
     instance(truth, Truth)
     instance(imaging, Imaging)
     hardware = plant.hardware
-    believed = replace(plant, hardware=replace(hardware, mirror=None))
+    settled = replace(plant, hardware=replace(hardware, mirror=None))
     designs: dict[str, Design] = {
         "integrator, best gain": optimal_integrator(hardware, truth),
-        "kalman, settled mirror": kalman(believed),
+        "kalman, settled mirror": kalman(settled),
         "kalman, real positions": kalman(plant),
         "lqg": lqg(plant, command_weight=command_weight),
+        **(more or {}),
     }
-    designs |= dict(more or {})
-    return tuple(_row(name, made, hardware, truth, imaging) for name, made in designs.items())
+    return tuple(_row(name, design, hardware, truth, imaging) for name, design in designs.items())
 
 
 def _row(
-    name: str, made: Design, hardware: LoopHardware, truth: Truth, imaging: Imaging
+    name: str, design: Design, hardware: LoopHardware, truth: Truth, imaging: Imaging
 ) -> MirrorRow:
-    loop = close_loop(hardware, made.controller, sensor_gain=truth.sensor_gain)
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     if not loop.is_stable:
         nan = float("nan")
         return MirrorRow(design=name, stable=False, residual_nm=nan, strehl=nan, unsettled_nm=nan)

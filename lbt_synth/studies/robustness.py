@@ -1,4 +1,4 @@
-"""Robustness to an error in the vibration's frequency (paper, Table III)."""
+"""Robustness of designs to an error in the vibration's frequency, as in the paper's Table III."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.design import Design, hinf, kalman
+from lbt_synth.design import FilterDesign, hinf, kalman
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.models import TipTiltPlant, Truth, retuned_plant
@@ -73,7 +73,7 @@ def robustness(
     errors_hz : sequence of float
         Errors of the model's frequency [Hz].
     methods : sequence of {"kalman", "hinf"}, optional
-        Designs to make.
+        Methods of design.
     gamma_ratio : float, optional
         H-infinity bound as a multiple of each row's least gamma.
     gamma : float, optional
@@ -123,26 +123,17 @@ def robustness(
     for error in errors_hz:
         moved = retuned_plant(plant, number(error, "errors_hz"), hold=hold)
         for method in methods:
-            yield _row(_design(moved, method, gamma_ratio, gamma), truth, imaging, error)
+            if method == "kalman":
+                design = kalman(moved)
+            elif gamma is not None:
+                design = hinf(moved, gamma=gamma, route="riccati")
+            else:
+                design = hinf(moved, gamma_ratio=gamma_ratio, route="riccati")
+            yield _row(design, truth, imaging, float(error))
 
 
-def _design(
-    plant: TipTiltPlant, method: str, gamma_ratio: float, gamma: float | None
-) -> tuple[Design, float]:
-    if method == "kalman":
-        filtered = kalman(plant)
-    elif gamma is not None:
-        filtered = hinf(plant, gamma=gamma, route="riccati")
-    else:
-        filtered = hinf(plant, gamma_ratio=gamma_ratio, route="riccati")
-    return filtered, filtered.gamma
-
-
-def _row(
-    designed: tuple[Design, float], truth: Truth, imaging: Imaging, error: float
-) -> RobustnessRow:
-    design, gamma = designed
-    assert design.hardware is not None  # designs of this module are of plants
+def _row(design: FilterDesign, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
+    assert design.hardware is not None  # this module designs for plants
     loop = close_loop(design.hardware, design.controller, sensor_gain=truth.sensor_gain)
     try:
         budget = residual_budget(loop, truth)
@@ -151,10 +142,10 @@ def _row(
             ("strehl", "residual_nm", "vibration_nm", "turbulence_nm", "noise_nm"), np.nan
         )
         return RobustnessRow(
-            error_hz=float(error), method=design.method, stable=False, gamma=gamma, **values
+            error_hz=error, method=design.method, stable=False, gamma=design.gamma, **values
         )
     return RobustnessRow(
-        error_hz=float(error),
+        error_hz=error,
         method=design.method,
         strehl=strehl(budget, imaging),
         residual_nm=budget.rms_nm,
@@ -162,5 +153,5 @@ def _row(
         turbulence_nm=budget.turbulence_nm,
         noise_nm=budget.noise_nm,
         stable=True,
-        gamma=gamma,
+        gamma=design.gamma,
     )

@@ -1,4 +1,4 @@
-"""Strehl ratio of one design over frequency error, sensor gain and delay error, exactly."""
+"""The exact Strehl ratio of one design over frequency error, sensor gain and delay error."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _GAINS_AT_ONCE = 64
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobustnessMap:
-    """Strehl ratio of a fixed design over what it may have been told wrongly.
+    """Strehl ratio of a fixed design over errors in what it assumes about the loop.
 
     Attributes
     ----------
     errors_hz : (e,) ndarray
-        Frequency that the design believes less the true one [Hz].
+        Frequency that the design assumes less the true one [Hz].
     sensor_gains : (g,) ndarray
         Real sensor gain relative to the design's sensor matrix.
     delay_errors_frames : (d,) ndarray
@@ -36,7 +36,7 @@ class RobustnessMap:
     residual_nm : (d, g, e) ndarray
         Residual of the modes [nm rms]; nan where the loop is unstable.
     stable : (d, g) bool ndarray
-        Whether the loop is stable. A frequency error has no part in that.
+        Whether the loop is stable, which a frequency error does not change.
     """
 
     errors_hz: FloatArray
@@ -68,18 +68,18 @@ def robustness_map(
     imaging : Imaging
         The camera.
     errors_hz : (e,) array_like
-        Frequency that the design believes less the true one [Hz]: every vibration of the truth
-        is moved by minus the error, its rms kept.
+        Frequency that the design assumes less the true one [Hz]: every vibration of the truth
+        moves by minus the error and keeps its rms.
     sensor_gains : (g,) array_like
         Real sensor gains relative to the design's sensor matrix.
     delay_errors_frames : (d,) array_like, optional
         Real delay less that of the design [frames].
     advance : callable, optional
-        Called with a number of points whenever they are done.
+        Called with the number of points computed since its last call.
 
     Returns
     -------
-    StrehlMap
+    RobustnessMap
         Strehl ratio, residual and stability at all combinations.
 
     Raises
@@ -172,7 +172,7 @@ def robustness_map(
 
 
 def _checked_axis(values: Any, name: str, **bounds: Any) -> FloatArray:
-    """Values of one axis of the map, each within its bounds and there once."""
+    """Return the values of one axis of the map, each within its bounds and given once."""
     axis = real_array(values, name)
     if axis.ndim != 1 or axis.size == 0:
         raise DimensionError(f"{name} must be a list of at least one number; got {axis.shape}.")
@@ -186,7 +186,7 @@ def _checked_axis(values: Any, name: str, **bounds: Any) -> FloatArray:
 def _shift_vibrations(
     truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
 ) -> list[EnsembleVibration]:
-    """Vibrations that lie below what the design believes, one frequency an error."""
+    """Return the true vibrations, each at its frequency less every error."""
     if not truth.vibrations and np.any(errors_hz != 0):
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."

@@ -17,7 +17,7 @@ from lbt_synth.validation import choice, integer
 
 FAMILIES = ("mixed", "central")
 _MOST_POINTS = 200
-_CROWDING = 1.5  # points crowd where the norm is near its least
+_CROWDING = 1.5  # above 1, points are denser near the least norm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,14 +72,14 @@ def tradeoff(
     points : int, optional
         Levels of the norm, 2 to 200.
     families : sequence of {"mixed", "central"}, optional
-        Which filters to make at each level.
+        Which filters to design at each level.
     taps : int, optional
         Length of the mixed filters' impulse response.
 
     Returns
     -------
     iterator of TradeoffPoint
-        In the order of levels, then families; each is made when it is asked for.
+        In the order of levels, then families; each is designed when it is requested.
 
     Raises
     ------
@@ -98,8 +98,8 @@ def tradeoff(
     ...     D=[[0.0, 3.0]],
     ...     L=[[1.0, 0.0]],
     ... )
-    >>> front = list(lbt.studies.tradeoff(line, points=3, families=["mixed"]))
-    >>> front[0].rms > front[1].rms > front[2].rms
+    >>> points = list(lbt.studies.tradeoff(line, points=3, families=["mixed"]))
+    >>> points[0].rms > points[1].rms > points[2].rms
     True
     """
     require_problem(problem)

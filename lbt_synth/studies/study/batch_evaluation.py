@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import CertificateError
 from lbt_synth.loop import EnsembleResiduals
-from lbt_synth.loop.ensemble.evaluation import residuals_of_matrices, textbook_matrices
+from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.studies.study import reference_evaluation as point
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.config_paths import Keys
@@ -143,7 +143,7 @@ def _evaluate_groups(
                 continue
             with np.errstate(over="raise", divide="raise", invalid="raise"):
                 own = design_for_samples(rows) if matrices is None else matrices
-                found = residuals_of_matrices(own, sample.hardware, rows.ensemble())
+                found = residuals_from_matrices(own, sample.hardware, rows.ensemble())
             strehl = found.strehl(sample.config.imaging)
         except point.EXPECTED_ERRORS:
             continue  # one of them fails; which one is found point by point

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.config.axes import axes_of, directions_of
-from lbt_synth.config.plant_and_truth import lines_of, noise_of, rms_nm
+from lbt_synth.config.axes import count_axes, vibration_directions
+from lbt_synth.config.plant_and_truth import lines_of, measurement_noise_nm, rms_nm
 from lbt_synth.config.required_sections import nm_of_mas
 from lbt_synth.config.schema import SensorSection
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
@@ -90,7 +90,7 @@ class SampleArrays:
                     sensor = sensor.model_copy(update={"pyramid": pyramid})
                 else:
                     sensor = sensor.model_copy(update={keys[1]: value})
-            found.append(np.ravel(noise_of(settings.model_copy(update={"sensor": sensor}))))
+            found.append(np.ravel(measurement_noise_nm(settings.model_copy(update={"sensor": sensor}))))
         return np.asarray(found)[which.reshape(-1)]
 
     def believed_delay(self) -> FloatArray:
@@ -112,7 +112,7 @@ class SampleArrays:
             if given["rms_mas"] is not None:
                 rms = given["rms_mas"] * nm_of_mas(settings, 1.0, f"{key}.rms_mas")
             frequency, damping = given["frequency_hz"], given["damping"]
-            for direction in directions_of(section, axes_of(settings), key):
+            for direction in vibration_directions(section, count_axes(settings), key):
                 numbers: dict[str, Any] = {
                     "frequency_hz": section.frequency_hz if frequency is None else frequency,
                     "rms_nm": rms_nm(section, settings, key) if rms is None else rms,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.config.plant_and_truth import believed_gains
+from lbt_synth.config.plant_and_truth import assumed_gains
 from lbt_synth.config.schema import Ar1Section
 from lbt_synth.design.modal import ModalFilters, modal_filters
 from lbt_synth.models import ARModel, ModalTurbulence, Vibration
@@ -91,7 +91,7 @@ def design_for_samples(rows: SampleArrays) -> Matrices:
 def _believed_gains(rows: SampleArrays) -> FloatArray:
     """Sensor gain of each axis that designs believe in, (b, axes)."""
     given = rows.number(*BELIEVED_GAIN)
-    each = believed_gains(rows.config.settings) if given is None else given[:, None]
+    each = assumed_gains(rows.config.settings) if given is None else given[:, None]
     return np.broadcast_to(each, (rows.count, rows.config.hardware.modes))
 
 
