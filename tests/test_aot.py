@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from test_telemetry import full, same, telemetries
 
 import lbt_synth as lbt
-from lbt_synth.files.telemetry.aot import losses
+from lbt_synth.files.telemetry.aot import lost_fields
 
 pytestmark = pytest.mark.e2e
 
@@ -53,11 +53,11 @@ def strictly_read(path):
 def test_what_the_standard_carries_comes_back(tmp_path, with_slopes):
     seen = full(with_slopes=with_slopes, slope_unit="pixel" if with_slopes else "")
     back = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
-    lost = losses(seen)
+    lost = lost_fields(seen)
     assert lost == ("residual_nm", "total_nm", "controller")
     assert same(seen, back, but=lost, rtol=ROUNDING)
     assert all(getattr(back, name) is None for name in lost)
-    assert not losses(back)
+    assert not lost_fields(back)
     again = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "u.aot.fits", back))
     assert same(back, again, rtol=ROUNDING)
 
@@ -182,7 +182,7 @@ def test_the_loop_equation_holds_in_the_aot_file(tmp_path):
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
     truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=50)
-    seen = lbt.files.telemetry_of(run, path, design=design, sensor_gain=1.0)
+    seen = lbt.files.telemetry_from_simulation(run, path, design=design, sensor_gain=1.0)
     system = strictly_read(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     loop = system.loops[0]
     y = loop.input_sensor.measurements.data.reshape(50, -1)
@@ -205,7 +205,7 @@ def test_the_loop_equation_holds_in_the_aot_file(tmp_path):
 
 def test_an_obstruction_needs_a_diameter(tmp_path):
     seen = full(diameter_m=None)
-    assert losses(seen) == ("residual_nm", "total_nm", "controller", "obstruction")
+    assert lost_fields(seen) == ("residual_nm", "total_nm", "controller", "obstruction")
     back = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.aot.fits", seen))
     assert (back.diameter_m, back.obstruction) == (None, None)
 
@@ -380,7 +380,7 @@ def test_damage_is_refused(tmp_path):
         except lbt.errors.TelemetryError:
             found += 1
         else:
-            assert same(seen, back, but=losses(seen), rtol=ROUNDING)
+            assert same(seen, back, but=lost_fields(seen), rtol=ROUNDING)
     assert found > 5
 
 

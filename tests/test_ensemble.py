@@ -11,10 +11,10 @@ import lbt_synth as lbt
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.loop.budget import distinct_edges, pole_edges
-from lbt_synth.loop.ensemble.independent_parts import independent_parts
+from lbt_synth.loop.ensemble.frequency_responses import batched_response
 from lbt_synth.loop.ensemble.panels import graded_edges
-from lbt_synth.loop.ensemble.responses import stacked_response
-from lbt_synth.models.frozen_flows import _octave_splines
+from lbt_synth.loop.ensemble.subloops import split_into_subloops
+from lbt_synth.models.turbulence.frozen_flows import _octave_splines
 
 RATE = 800
 SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
@@ -370,7 +370,7 @@ def test_flows_are_those_of_single_atmospheres():
             outer_scale_m=[22.0, 30.0][i % 2],
         )
         assert psd == pytest.approx(single.psd(f), rel=1e-11)
-    assert flows.taken(np.array([3])).psd(f)[0] == pytest.approx(flows.psd(f)[3], rel=1e-12)
+    assert flows.take(np.array([3])).psd(f)[0] == pytest.approx(flows.psd(f)[3], rel=1e-12)
 
 
 def test_flows_of_many_outer_scales():
@@ -388,7 +388,7 @@ def test_kolmogorov_flows():
     air = replace(AIR, outer_scale_m=None)
     flows = lbt.models.FrozenFlows(atmosphere=air, wind_speed_m_s=[10.0, 20.0])
     assert flows.psd([3.0])[1, 0] == pytest.approx(air.psd(3.0), rel=1e-12)
-    assert flows.taken(np.array([0])).psd([3.0])[0, 0] == pytest.approx(
+    assert flows.take(np.array([0])).psd([3.0])[0, 0] == pytest.approx(
         replace(air, wind_speed_m_s=10).psd(3.0), rel=1e-12
     )
 
@@ -399,7 +399,7 @@ def test_partial_fractions_and_what_has_none():
     A[1] = np.eye(4, k=-1)  # a chain of delays: defective
     B, C, D = rng.standard_normal((3, 4, 2)), rng.standard_normal((3, 1, 4)), np.ones((3, 1, 2))
     z = np.exp(1j * np.linspace(0.01, 3, 50))
-    found = stacked_response(A, B, C, D, z)
+    found = batched_response(A, B, C, D, z)
     for k in range(3):
         system = lbt.linear.StateSpace(A=A[k], B=B[k], C=C[k], D=D[k])
         assert found[k] == pytest.approx(pointwise_response(system, z), rel=1e-9, abs=1e-9)
@@ -409,7 +409,7 @@ def test_pieces_of_a_loop(kalman, coupled):
     def pieces(design):
         system = design.controller.to_statespace()
         matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
-        return independent_parts(matrices, design.hardware)
+        return split_into_subloops(matrices, design.hardware)
 
     parts, rest = pieces(kalman)
     assert [part.modes.tolist() for part in parts] == [[0], [1]]

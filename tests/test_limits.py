@@ -14,11 +14,11 @@ from support.plants import LBT_YAML, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.linear.quadrature import settled_panels
-from lbt_synth.loop.least_residuals import band as band_module
-from lbt_synth.loop.least_residuals.prediction import Reach
-from lbt_synth.loop.least_residuals.residual import least_model_residual
-from lbt_synth.studies.limits import model_distance
+from lbt_synth.linear.quadrature import refine_panels
+from lbt_synth.loop.least_residuals import band_limit as band_module
+from lbt_synth.loop.least_residuals.prediction import InnerFactor
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.studies.limits import model_limit
 
 RATE = 800.0
 CONFIG = str(LBT_YAML)
@@ -152,7 +152,7 @@ def test_both_ways_to_the_value_at_the_zero(delay, monkeypatch):
     values = []
     for few in (1e-300, 1.0):
         monkeypatch.setattr(prediction, "_FEW_DIGITS", few)
-        assert Reach.of(path(delay)).by_series is (few == 1.0)
+        assert InnerFactor.of(path(delay)).by_series is (few == 1.0)
         values.append(variance(path(delay), **truth))
     assert values[0] == pytest.approx(values[1], rel=1e-8)
 
@@ -193,14 +193,14 @@ def test_kalman_filters_of_fractional_delays_stay_above(delay):
     truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
     limit = lbt.loop.least_residual(plant.hardware, truth).rms_nm
     assert limit < budget(design, truth).rms_nm < 1.08 * limit
-    found, above = model_distance(design)
+    found, above = model_limit(design)
     assert found == pytest.approx(limit)
     assert np.isnan(above)  # its estimation error is not its residual
 
 
 def test_kalman_of_the_example(config):
     design = lbt.kalman(config.plant)
-    limit_nm, above = model_distance(design)
+    limit_nm, above = model_limit(design)
     assert limit_nm == pytest.approx(192.619, abs=1e-3)
     assert abs(above) < 1e-8
     as_truth = lbt.Truth(
@@ -385,7 +385,7 @@ def test_designs_stay_above_the_band_limit(delay):
         plant.hardware, still, band_hz=(17, 23), rms_nm=500, direction=(1,)
     )
     assert limit.achieved_nm < limit.rms_nm * (1 + 1e-7)
-    for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.1, method="riccati")):
+    for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.1, route="riccati")):
         worst = max(
             budget(
                 design,
@@ -430,7 +430,7 @@ def test_band_without_noise():
 def test_study(config):
     designs = {
         "kalman": lbt.kalman(config.plant),
-        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, method="riccati"),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
     }
     study = lbt.studies.limits(
         designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5]
@@ -451,7 +451,7 @@ def test_study(config):
 
 
 def test_study_of_an_unstable_design(config):
-    designs = {"low": lbt.hinf(config.plant, gamma_ratio=1.05, method="riccati")}
+    designs = {"low": lbt.hinf(config.plant, gamma_ratio=1.05, route="riccati")}
     truth = replace(config.truth, sensor_gain=0.3)
     study = lbt.studies.limits(designs, config.hardware, truth, config.imaging, errors_hz=[-1, 1])
     (row,) = study.rows
@@ -494,7 +494,7 @@ def test_bad_spectra():
 
 def test_integrals_that_do_not_settle():
     with pytest.raises(lbt.errors.NumericalError, match="did not settle"):
-        settled_panels(lambda x: (1 / x)[:, None], np.array([0.0, 1.0]))
+        refine_panels(lambda x: (1 / x)[:, None], np.array([0.0, 1.0]))
 
 
 @pytest.mark.parametrize(
@@ -649,7 +649,7 @@ def test_plants_in_the_full_form(delay):
     for plant in (lbt_axis_plant(delay_frames=delay), lbt_axis_plant(delay_frames=delay, modes=2)):
         limit = least_model_residual(plant.full())
         assert limit.rms_nm == pytest.approx(least_model_residual(plant).rms_nm, rel=1e-9)
-    found, above = model_distance(lbt.kalman(plant.full()))
+    found, above = model_limit(lbt.kalman(plant.full()))
     assert found == pytest.approx(limit.rms_nm)
     assert np.isnan(above) if delay == 2.7 else abs(above) < 1e-6
 
@@ -663,14 +663,14 @@ def test_full_plants_that_do_not_decouple():
     full = lbt.tip_tilt_plant(**parts, vibrations=lines).full()
     with pytest.raises(lbt.errors.ProblemError, match="the disturbance across them"):
         least_model_residual(full)
-    assert np.isnan(model_distance(lbt.kalman(full))).all()
+    assert np.isnan(model_limit(lbt.kalman(full))).all()
     plain = lbt.tip_tilt_plant(**parts, vibrations=lines[1:]).full()
     entry = plain.D.copy()
     entry[:, 0] = 1.0
     with pytest.raises(lbt.errors.ProblemError, match="independent of the disturbance"):
         least_model_residual(replace(plain, D=entry))
     assert np.isnan(
-        model_distance(
+        model_limit(
             lbt.kalman(lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0))
         )
     ).all()

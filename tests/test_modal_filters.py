@@ -14,7 +14,7 @@ from lbt_synth.design.modal import certificate as certificates
 from lbt_synth.design.modal.plants import lines_per_mode, plant_stacks
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.loop.budget import ar_covariance
-from lbt_synth.loop.simulation.long_series import SystemStack
+from lbt_synth.loop.simulation.block_filtering import BatchedSystems
 from lbt_synth.loop.simulation.run import step_loop
 
 RATE = 800.0
@@ -255,14 +255,14 @@ def test_stacked_series_are_the_recursion(count, n, m, p, frames, seed):
     A *= (0.999 / np.abs(np.linalg.eigvals(A)).max(axis=1))[:, None, None]
     B, C = rng.standard_normal((count, n, m)), rng.standard_normal((count, p, n))
     D, u = rng.standard_normal((count, p, m)), rng.standard_normal((count, frames, m))
-    out = SystemStack(A, B, C, D).filtered(u)
+    out = BatchedSystems(A, B, C, D).filter(u)
     for i in range(count):
         system = lbt.linear.StateSpace(A=A[i], B=B[i], C=C[i], D=D[i])
         expected = lbt.loop.filter_series(system, u[i])
         assert np.allclose(out[i], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     if m == p:
         again = u.copy()
-        assert SystemStack(A, B, C, D).filtered(again, in_place=True) is again
+        assert BatchedSystems(A, B, C, D).filter(again, in_place=True) is again
         assert np.array_equal(again, out)
 
 

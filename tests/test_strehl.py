@@ -110,7 +110,7 @@ def test_series_of_an_exact_sinusoid():
     exact = lbt.loop.jitter_strehl(
         np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]]
     )
-    assert lbt.loop.strehl_of_series(series, CAMERA) == pytest.approx(exact, abs=1e-5)
+    assert lbt.loop.series_strehl(series, CAMERA) == pytest.approx(exact, abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -120,9 +120,9 @@ def test_series_of_an_exact_sinusoid():
         lambda: lbt.loop.jitter_strehl([[1, 0], [0, -1]], imaging=CAMERA),
         lambda: lbt.loop.jitter_strehl([[np.nan]], imaging=CAMERA),
         lambda: lbt.loop.jitter_strehl([[1.0]], imaging=CAMERA, line_amplitudes_nm=[[np.inf]]),
-        lambda: lbt.loop.strehl_of_series(np.zeros((10, 3)), CAMERA),
-        lambda: lbt.loop.strehl_of_series(np.zeros(10), CAMERA),
-        lambda: lbt.loop.strehl_of_series([[np.nan, 1]], CAMERA),
+        lambda: lbt.loop.series_strehl(np.zeros((10, 3)), CAMERA),
+        lambda: lbt.loop.series_strehl(np.zeros(10), CAMERA),
+        lambda: lbt.loop.series_strehl([[np.nan, 1]], CAMERA),
         lambda: lbt.Imaging(diameter_m=8, other_modes=1.2),
     ],
 )
@@ -141,7 +141,7 @@ def test_strehl_in_nm_does_not_know_the_diameter(diameter, x, y, wavelength):
     series = np.outer(np.sin(np.arange(50)), [x, y])
     for found in (
         [lbt.loop.jitter_strehl(np.diag([x**2, y**2]), imaging=c) for c in cameras],
-        [lbt.loop.strehl_of_series(series, c) for c in cameras],
+        [lbt.loop.series_strehl(series, c) for c in cameras],
     ):
         assert found[0] == found[1]
     angle = 4 * x / (wavelength * 1e3)  # in lambda / D, of the definition by angles

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.files.telemetry import layout
-from lbt_synth.files.telemetry.aot import losses
-from lbt_synth.files.telemetry.layout import LAYERS
-from lbt_synth.files.telemetry.record import CONVENTION
+from lbt_synth.files.telemetry import native_layout
+from lbt_synth.files.telemetry.aot import lost_fields
+from lbt_synth.files.telemetry.native_layout import LAYERS
+from lbt_synth.files.telemetry.telemetry import CONVENTION
 from lbt_synth.storage import array_file as archive
 
 ENDINGS = ("fits", "npz")
@@ -223,7 +223,7 @@ def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
     run = lbt.simulate(design.controller, truth, hardware=path, frames=60, cases=2, seed=5)
     lbt.files.save_telemetry(
         tmp_path / f"t.{ending}",
-        lbt.files.telemetry_of(run, path, case=1, sensor_gain=0.6, design=design),
+        lbt.files.telemetry_from_simulation(run, path, case=1, sensor_gain=0.6, design=design),
     )
     seen = lbt.files.load_telemetry(tmp_path / f"t.{ending}")
     # y(k) = g S phi_res(k-1)
@@ -263,7 +263,7 @@ def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind,
     truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
     design = lbt.integrator(path, gain=0.1)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=120, seed=5)
-    written = lbt.files.telemetry_of(run, path, design=design)
+    written = lbt.files.telemetry_from_simulation(run, path, design=design)
     name = "t.aot.fits" if kind == "aot" else f"t.{kind}"
     seen = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / name, written))
     assert "phi_cor(k) = N (c0 u(k) + c1 u(k-1)" in seen.convention
@@ -281,7 +281,7 @@ def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind,
         (seen.controller or design.controller), truth, hardware=seen.hardware, frames=120, seed=5
     )
     assert np.allclose(replayed.residual_nm, run.residual_nm, rtol=0, atol=1e-9)
-    assert "mirror" not in losses(seen)
+    assert "mirror" not in lost_fields(seen)
 
 
 def test_the_taps_stand_in_the_file(tmp_path):
@@ -298,10 +298,10 @@ def test_a_settled_mirror_leaves_the_file_as_it_was(tmp_path):
     seen = full(mirror=None)
     assert seen.convention == CONVENTION
     assert seen.mirror_taps is None
-    arrays, meta = layout.pack(seen, "float64")
+    arrays, meta = native_layout.pack(seen, "float64")
     assert "MIRROR_TAPS" not in arrays
     assert "mirror" not in meta  # what 0.1 wrote, and reads
-    assert layout.unpack(arrays, meta).mirror is None
+    assert native_layout.unpack(arrays, meta).mirror is None
 
 
 @pytest.mark.parametrize(
@@ -314,10 +314,10 @@ def test_a_settled_mirror_leaves_the_file_as_it_was(tmp_path):
     ],
 )
 def test_taps_and_mirror_must_agree(edit, text):
-    arrays, meta = layout.pack(full(), "float64")
+    arrays, meta = native_layout.pack(full(), "float64")
     edit(arrays, meta)
     with pytest.raises(ValueError, match=text):
-        layout.unpack(arrays, meta)
+        native_layout.unpack(arrays, meta)
 
 
 @pytest.mark.parametrize(
@@ -341,14 +341,16 @@ def test_the_camera_gives_telescope_and_strehl_ratio():
     truth = lbt.Truth(turbulence=None, vibrations=(shake,))
     run = lbt.simulate(design.controller, truth, hardware=path, frames=200, cases=2)
     camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
-    seen = lbt.files.telemetry_of(run, path, case=1, imaging=camera, name="a", metadata={"b": 1})
+    seen = lbt.files.telemetry_from_simulation(
+        run, path, case=1, imaging=camera, name="a", metadata={"b": 1}
+    )
     assert seen.strehl == run.strehl(camera)[1]
     assert (seen.diameter_m, seen.obstruction, seen.imaging_wavelength_um) == (8.22, 0.11, 2.2)
     assert (seen.name, dict(seen.metadata), seen.controller) == ("a", {"b": 1}, None)
     three = lbt.LoopHardware(frame_rate_hz=800, modes=3)
     slow = lbt.integrator(three, gain=0.5).controller
     wide = lbt.simulate(slow, lbt.Truth(turbulence=None), hardware=three, frames=5)
-    assert lbt.files.telemetry_of(wide, three, imaging=camera).strehl is None
+    assert lbt.files.telemetry_from_simulation(wide, three, imaging=camera).strehl is None
 
 
 def test_telemetry_of_refuses(axis_plant):
@@ -358,17 +360,17 @@ def test_telemetry_of_refuses(axis_plant):
     with pytest.raises(
         lbt.errors.ProblemError, match="case must be below the number of cases, 1; got 1"
     ):
-        lbt.files.telemetry_of(run, path, case=1)
+        lbt.files.telemetry_from_simulation(run, path, case=1)
     with pytest.raises(lbt.errors.ProblemError, match="must be that of the simulation, at 800 Hz"):
-        lbt.files.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=500, modes=1))
+        lbt.files.telemetry_from_simulation(run, lbt.LoopHardware(frame_rate_hz=500, modes=1))
     with pytest.raises(lbt.errors.ProblemError, match="expected a Simulation; got int"):
-        lbt.files.telemetry_of(3, path)
+        lbt.files.telemetry_from_simulation(3, path)
     with pytest.raises(lbt.errors.ProblemError, match="expected a LoopHardware; got int"):
-        lbt.files.telemetry_of(run, 3)
+        lbt.files.telemetry_from_simulation(run, 3)
     with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got Controller"):
-        lbt.files.telemetry_of(run, path, design=design.controller)
+        lbt.files.telemetry_from_simulation(run, path, design=design.controller)
     with pytest.raises(lbt.errors.DimensionError, match="interaction_matrix must have 1 row"):
-        lbt.files.telemetry_of(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))
+        lbt.files.telemetry_from_simulation(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))
 
 
 def test_hardware_of_slopes_is_seen_through_the_reconstructor():
@@ -534,7 +536,7 @@ def test_foreign_files_are_refused(tmp_path):
 
 def edited(tmp_path, change, *, resign=True):
     """Write a file whose arrays and metadata somebody changed."""
-    arrays, meta = layout.pack(full(), "float64")
+    arrays, meta = native_layout.pack(full(), "float64")
     arrays = {name: np.array(array) for name, array in arrays.items()}
     meta["digest"] = archive.digest(arrays, meta)
     change(arrays, meta)

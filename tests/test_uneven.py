@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.loop.least_residuals.residual import least_model_residual
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 RATE = 800.0
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)

@@ -16,7 +16,8 @@ from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.models import ARModel, Spectrum, Truth, Vibration
-from lbt_synth.models.truth import breakpoints_below, fitted_direction, stationary_vibrations
+from lbt_synth.models.spectra import breakpoints_below
+from lbt_synth.models.truth import fitted_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen
 
 

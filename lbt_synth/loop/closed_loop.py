@@ -11,7 +11,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.lifted_mirror import Response
+from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.validation import ComplexArray, FloatArray, number
 
 # A loop whose slowest pole is closer to the unit circle than this is called marginal.
@@ -185,7 +185,7 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
 
     State: controller, mirror (its past commands, if it settles), last residual phi_res(k-1).
     """
-    require_fitting(hardware, controller)
+    require_matching_controller(hardware, controller)
     k = controller.to_statespace()
     return loop_matrices(
         k.A,
@@ -198,7 +198,7 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
     )
 
 
-def require_fitting(hardware: LoopHardware, controller: Controller) -> None:
+def require_matching_controller(hardware: LoopHardware, controller: Controller) -> None:
     """Raise if a controller has other sizes or another sampling period than a loop."""
     m, q = hardware.n_commands, hardware.n_measurements
     if (controller.C.shape[0], controller.B.shape[1]) != (m, q):

@@ -192,20 +192,20 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
         )
     if count == 0:
         return np.empty(0)
-    rules = _rules(covariance, lines, spread, imaging.cycles_per_nm)
+    rules = _choose_rules(covariance, lines, spread, imaging.cycles_per_nm)
     # |f.a|^2 and f'Sf are quadratic forms of f
-    turns = _form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
-    widths = _form(covariance)
+    turns = _quadratic_form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
+    widths = _quadratic_form(covariance)
     # jitter along the axes is the same in all four quadrants
     aligned = ~np.any(turns[..., 1], axis=1) & (widths[:, 1] == 0)
     out = np.empty(count)
-    for members, rule in _alike(np.column_stack([rules, aligned])):
+    for members, rule in _group_by_rule(np.column_stack([rules, aligned])):
         squares, weight = _weighted_otf(imaging.obstruction, *rule)
         squares = squares * imaging.cycles_per_nm**2
         step = max(1, _POINT_CHUNK // weight.size)
         for start in range(0, len(members), step):
             part = members[start : start + step]
-            factor = _blurred(widths[part], squares)
+            factor = _gaussian_transfer(widths[part], squares)
             for line in range(lines.shape[1]):
                 if np.any(turns[part, line]):
                     turns_squared = np.maximum(turns[part, line] @ squares, 0)
@@ -214,7 +214,7 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
     return out
 
 
-def _blurred(forms: FloatArray, squares: FloatArray) -> FloatArray:
+def _gaussian_transfer(forms: FloatArray, squares: FloatArray) -> FloatArray:
     """Transfer of Gaussian jitters (p, nodes); those that share one are computed once."""
     if len(forms) > 1 and np.array_equal(forms[0], forms[-1]):
         unique, which = np.unique(forms, axis=0, return_inverse=True)
@@ -233,21 +233,21 @@ def widest_jitter_nm(imaging: Imaging) -> float:
     return _MOST_TURNS / imaging.cycles_per_nm
 
 
-def _form(matrices: FloatArray) -> FloatArray:
+def _quadratic_form(matrices: FloatArray) -> FloatArray:
     """Coefficients of the quadratic forms of symmetric matrices, to go with the squares of f."""
     if matrices.shape[-1] == 1:
         return np.concatenate([matrices[..., 0], np.zeros((*matrices.shape[:-2], 2))], axis=-1)
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
 
 
-def _alike(rules: IntArray) -> Iterator[tuple[IntArray, list[int]]]:
+def _group_by_rule(rules: IntArray) -> Iterator[tuple[IntArray, list[int]]]:
     """Yield the indices of the points that share a rule, with the rule."""
     unique, own = np.unique(rules, axis=0, return_inverse=True)
     for i, rule in enumerate(unique.tolist()):
         yield np.flatnonzero(own.reshape(-1) == i), rule
 
 
-def _rules(
+def _choose_rules(
     covariance: FloatArray, lines: ComplexArray, spread: FloatArray, cycles_per_nm: float
 ) -> IntArray:
     """Fineness and number of directions of the nodes that each point needs, (p, 2).
@@ -271,7 +271,7 @@ def _rules(
     return np.stack([fineness, directions], axis=1)
 
 
-def strehl_of_series(residual_nm: Any, imaging: Imaging) -> float:
+def series_strehl(residual_nm: Any, imaging: Imaging) -> float:
     """Long-exposure Strehl ratio of a residual series, whatever its distribution.
 
     Parameters
@@ -295,7 +295,7 @@ def strehl_of_series(residual_nm: Any, imaging: Imaging) -> float:
     --------
     >>> import lbt_synth as lbt
     >>> camera = lbt.Imaging(diameter_m=8.22, other_modes=0.9)
-    >>> round(lbt.loop.strehl_of_series([[5.0, 1.0]] * 10, camera), 12)
+    >>> round(lbt.loop.series_strehl([[5.0, 1.0]] * 10, camera), 12)
     0.9
     """
     series = real_array(residual_nm, "residual_nm")

@@ -22,7 +22,7 @@ from lbt_synth.design.modal.closed_loops import (
     spectral_radii,
 )
 from lbt_synth.design.modal.filters import ModalFilters
-from lbt_synth.design.modal.mixed import MixedController
+from lbt_synth.design.modal.mixed_controller import MixedController
 from lbt_synth.design.modal.plants import lines_per_mode, per_mode_number, turbulence_of
 from lbt_synth.design.modal.reconstructor import modes_named
 from lbt_synth.errors import (
@@ -33,7 +33,7 @@ from lbt_synth.errors import (
     UnstableLoopError,
 )
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.loop.simulation.long_series import SystemStack
+from lbt_synth.loop.simulation.block_filtering import BatchedSystems
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
 from lbt_synth.validation import FloatArray, float_array, frozen, integer, number, real_array
 
@@ -86,7 +86,7 @@ class ModalLoop:
     sensor_gain: FloatArray
     spectral_radii: FloatArray
     blocks: tuple[LoopBlock, ...]
-    systems: tuple[SystemStack, ...]
+    systems: tuple[BatchedSystems, ...]
 
     @property
     def n_modes(self) -> int:
@@ -258,7 +258,7 @@ class ModalLoop:
             if modes.shape[1] == 1 and isinstance(_index(modes[:, 0]), slice):
                 # all modes in their order: no other array is needed
                 joined = _joined(self.blocks[0], total, scaled)
-                only = self.systems[0].filtered(joined, in_place=True)[:, 1:, 0]
+                only = self.systems[0].filter(joined, in_place=True)[:, 1:, 0]
                 only[:, :-1] -= scaled[:, 1:]
                 return only, None
         residual = np.empty(total.shape)
@@ -266,8 +266,8 @@ class ModalLoop:
         for block, system in zip(self.blocks, self.systems, strict=True):
             w = block.modes.shape[1]
             if with_commands:
-                system = SystemStack(block.A, block.B[..., :w], block.C, block.D[..., :w])
-            out = system.filtered(_joined(block, total, scaled))[:, 1:]
+                system = BatchedSystems(block.A, block.B[..., :w], block.C, block.D[..., :w])
+            out = system.filter(_joined(block, total, scaled))[:, 1:]
             for i in range(w):
                 which = _index(block.modes[:, i])
                 residual[which] = out[..., i]
@@ -387,9 +387,9 @@ def _path(
     return path, rate
 
 
-def _residual_systems(block: LoopBlock) -> SystemStack:
+def _residual_systems(block: LoopBlock) -> BatchedSystems:
     w = block.modes.shape[1]
-    return SystemStack(block.A, block.B[..., :w], block.C[:, :w], block.D[:, :w, :w])
+    return BatchedSystems(block.A, block.B[..., :w], block.C[:, :w], block.D[:, :w, :w])
 
 
 def _joined(block: LoopBlock, total: FloatArray, scaled: FloatArray) -> FloatArray:

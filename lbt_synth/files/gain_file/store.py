@@ -12,7 +12,7 @@ import numpy as np
 from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files.gain_file import formats
-from lbt_synth.files.gain_file.layout import Meta, from_record, to_record
+from lbt_synth.files.gain_file.contents import Meta, pack_design, unpack_design
 from lbt_synth.storage.array_file import digest as _digest
 from lbt_synth.storage.array_file import reason
 from lbt_synth.storage.atomic_files import write_atomically
@@ -73,7 +73,7 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     if not isinstance(design, Design):
         raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
     write, _ = _FORMATS[target.suffix.lower()]
-    arrays, meta = to_record(design)
+    arrays, meta = pack_design(design)
     meta = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **meta}
     meta["digest"] = _digest(arrays, meta)
     content = write(arrays, json.dumps(meta, allow_nan=False), _header(design, meta))
@@ -149,7 +149,7 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
                 f"{source} is damaged: {name} holds values that are not finite.", path=source
             )
     try:
-        design = from_record({name: frozen(array) for name, array in arrays.items()}, meta)
+        design = unpack_design({name: frozen(array) for name, array in arrays.items()}, meta)
     except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise GainFileError(
             f"{source} is inconsistent: {reason(error)}. Write it again with lbt-synth design.",

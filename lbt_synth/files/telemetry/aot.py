@@ -3,7 +3,7 @@
 Standard: T. Gomes et al., A&A (2024), DOI 10.1051/0004-6361/202348486; version 2.0.0.
 It wants commands in metres, has no field for the true phase, and describes a controller by a
 control matrix and one transfer function a mode, not by a state space. What of a telemetry
-is lost, :func:`losses` tells.
+is lost, :func:`lost_fields` tells.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.errors import OutputError, TelemetryError
-from lbt_synth.files.telemetry.layout import with_same_taps
-from lbt_synth.files.telemetry.record import Telemetry
+from lbt_synth.files.telemetry.native_layout import check_taps
+from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import reason
@@ -41,7 +41,7 @@ def is_aot(content: bytes) -> bool:
     return has_card(content, "AOT-VERS")
 
 
-def losses(telemetry: Telemetry) -> tuple[str, ...]:
+def lost_fields(telemetry: Telemetry) -> tuple[str, ...]:
     """Fields that are set in a telemetry, and that the standard does not hold."""
     without = ["residual_nm", "total_nm", "controller"]
     if telemetry.diameter_m is None:
@@ -69,7 +69,7 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
 
     aotpy = require_aotpy(target)
     plain, checked = io.BytesIO(), io.BytesIO()
-    aotpy.AOTFITSWriter(_system(aotpy, telemetry, precision)).get_hdulist().writeto(plain)
+    aotpy.AOTFITSWriter(_to_system(aotpy, telemetry, precision)).get_hdulist().writeto(plain)
     # astropy's checksum of a table is right only once the table has been in a file
     with fits.open(io.BytesIO(plain.getvalue()), memmap=False) as units:
         for unit in units:
@@ -78,7 +78,7 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
     return checked.getvalue()
 
 
-def _system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
+def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     """Describe telemetry as a system of aotpy."""
     telescope = aotpy.MainTelescope(
         "Telescope",
@@ -176,10 +176,12 @@ def _system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
             pixel_intensities=image("PSF", seen.psf[None]),
             pixel_scale=pixel,
         )
-        cameras.append(aotpy.ScoringCamera("Camera", detector=detector, wavelength=_metres(seen)))
+        cameras.append(
+            aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))
+        )
     return aotpy.AOSystem(
         ao_mode="SCAO",
-        name=_ascii(seen.name) or None,
+        name=_to_ascii(seen.name) or None,
         strehl_ratio=seen.strehl,
         config=seen.convention
         + " Time filters: sum b_i z^i / sum a_i z^i, after the control matrix.",
@@ -189,11 +191,11 @@ def _system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         wavefront_sensors=[sensor],
         wavefront_correctors=[mirror],
         loops=[loop],
-        metadata=_cards(aotpy, seen),
+        metadata=_header_cards(aotpy, seen),
     )
 
 
-def _cards(aotpy: Any, seen: Telemetry) -> list[Any]:
+def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     """Cards of the primary header that the tables have no place for."""
     ours = {name: getattr(seen, name) for name in _IN_OURS} | {"metadata": dict(seen.metadata)}
     gains = seen.integrator_gains
@@ -209,7 +211,7 @@ def _cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     for sign in _UNSAFE:  # they are in texts only, where JSON may write them by their number
         text = text.replace(sign, f"\\u{ord(sign):04x}")
     cards = [aotpy.Metadatum(_CARD_OF_OURS, text)]
-    if (wavelength := _metres(seen)) is not None:
+    if (wavelength := _wavelength_m(seen)) is not None:
         # aotpy 3.2.1 writes its strehl_wavelength over the Strehl ratio
         cards.append(aotpy.Metadatum("STREHL-L", wavelength))
     return cards
@@ -233,12 +235,12 @@ def _by_subaperture(matrix: FloatArray | None, axes: int) -> FloatArray | None:
     return None if matrix is None else matrix.reshape(len(matrix), axes, -1)
 
 
-def _metres(seen: Telemetry) -> float | None:
+def _wavelength_m(seen: Telemetry) -> float | None:
     wavelength = seen.imaging_wavelength_um
     return None if wavelength is None else wavelength * 1e-6
 
 
-def _ascii(text: str) -> str:
+def _to_ascii(text: str) -> str:
     safe = (c if c.isascii() and c.isprintable() and c not in _UNSAFE else "?" for c in text)
     return "".join(safe).strip()
 
@@ -274,14 +276,14 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
         raise TelemetryError(
             f"{source} has no control loop with commands and measurements.", path=source
         )
-    fields = _series(loops[0]) | _facts(system)
+    fields = _series_fields(loops[0]) | _system_fields(system)
     if len(loops) > 1:
         fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
     taps = fields.pop("mirror_taps", None)
-    return with_same_taps(Telemetry(**fields), taps)
+    return check_taps(Telemetry(**fields), taps)
 
 
-def _facts(system: Any) -> dict[str, Any]:
+def _system_fields(system: Any) -> dict[str, Any]:
     """Fields that belong to the whole system."""
     facts: dict[str, Any] = {"name": system.name or "", "strehl": system.strehl_ratio}
     facts["metadata"] = {"timing": _FOREIGN}
@@ -310,41 +312,43 @@ def _facts(system: Any) -> dict[str, Any]:
     return facts
 
 
-def _series(loop: Any) -> dict[str, Any]:
+def _series_fields(loop: Any) -> dict[str, Any]:
     """Fields that belong to a loop and its sensor."""
     sensor = loop.input_sensor
-    measured, unit = _data(sensor.measurements), sensor.measurements.unit
-    commands, command_unit = _in_nm(_data(loop.commands), loop.commands.unit or "m")
+    measured, unit = _image_data(sensor.measurements), sensor.measurements.unit
+    commands, command_unit = _to_nm(_image_data(loop.commands), loop.commands.unit or "m")
     fields: dict[str, Any] = {
         "commands": commands,
         "command_unit": command_unit,
         "delay_frames": loop.delay,
         "subaperture_axes": measured.shape[1] if measured.ndim == 3 else 1,
-        "influence_matrix": _data(loop.commands_to_modes),
-        "mode_maps": _data(loop.modes),
+        "influence_matrix": _image_data(loop.commands_to_modes),
+        "mode_maps": _image_data(loop.modes),
     }
     flat = measured.reshape(len(measured), -1)
     if loop.modal_coefficients is not None:
         modal = loop.modal_coefficients
         fields["slopes"], fields["slope_unit"] = flat, unit or ""
-        fields["measurements"], fields["measurement_unit"] = _in_nm(_data(modal), modal.unit or "")
+        fields["measurements"], fields["measurement_unit"] = _to_nm(
+            _image_data(modal), modal.unit or ""
+        )
     else:
-        fields["measurements"], fields["measurement_unit"] = _in_nm(flat, unit or "")
-    back = _data(loop.measurements_to_modes)
+        fields["measurements"], fields["measurement_unit"] = _to_nm(flat, unit or "")
+    back = _image_data(loop.measurements_to_modes)
     fields["reconstructor"] = None if back is None else back.reshape(len(back), -1)
-    response = _data(loop.modes_to_measurements)
+    response = _image_data(loop.modes_to_measurements)
     if response is not None:
         if response.ndim == 3:  # (s_v, d, n) to (d s_v, n)
             response = response.transpose(1, 0, 2).reshape(-1, response.shape[2])
         fields["interaction_matrix"] = response
     if sensor.optical_gain is not None:
-        fields["sensor_gain"] = float(np.mean(_data(sensor.optical_gain)))
+        fields["sensor_gain"] = float(np.mean(_image_data(sensor.optical_gain)))
     clock = loop.time or loop.commands.time
     if clock is not None and clock.timestamps:
         fields["times_s"] = clock.timestamps
-    fields["frame_rate_hz"] = _rate(loop, fields.get("times_s"))
+    fields["frame_rate_hz"] = _frame_rate(loop, fields.get("times_s"))
     if loop.time_filter_num is not None and loop.time_filter_den is not None:
-        pair = (np.atleast_2d(_data(f)) for f in (loop.time_filter_num, loop.time_filter_den))
+        pair = (np.atleast_2d(_image_data(f)) for f in (loop.time_filter_num, loop.time_filter_den))
         gains = integrator_gains(*pair)
         m = commands.shape[-1]
         if gains is not None and len(gains) in (1, m):  # one row is for all
@@ -352,7 +356,7 @@ def _series(loop: Any) -> dict[str, Any]:
     return fields
 
 
-def _rate(loop: Any, times: list[float] | None) -> float:
+def _frame_rate(loop: Any, times: list[float] | None) -> float:
     if loop.framerate is not None:
         return float(loop.framerate)
     detector = loop.input_sensor.detector
@@ -363,11 +367,11 @@ def _rate(loop: Any, times: list[float] | None) -> float:
     raise KeyError("the frame rate")
 
 
-def _data(image: Any) -> Any:
+def _image_data(image: Any) -> Any:
     return None if image is None else np.asarray(image.data, dtype=np.float64)
 
 
-def _in_nm(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
+def _to_nm(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
     """Return lengths in nm; other units stay."""
     factor = _NM.get(unit)
     return (values, unit) if factor is None else (factor * values, "nm")

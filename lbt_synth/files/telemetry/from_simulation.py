@@ -8,13 +8,13 @@ import numpy as np
 
 from lbt_synth.design import Design, IntegratorDesign
 from lbt_synth.errors import ProblemError
-from lbt_synth.files.telemetry.record import Scalar, Telemetry
-from lbt_synth.loop import Imaging, Simulation, strehl_of_series
+from lbt_synth.files.telemetry.telemetry import Scalar, Telemetry
+from lbt_synth.loop import Imaging, Simulation, series_strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import instance, integer
 
 
-def telemetry_of(
+def telemetry_from_simulation(
     simulation: Simulation,
     hardware: LoopHardware,
     *,
@@ -70,7 +70,7 @@ def telemetry_of(
     ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
     ... )
     >>> run = lbt.simulate(lazy.controller, shake, hardware=path, frames=100)
-    >>> seen = lbt.files.telemetry_of(run, path, design=lazy)
+    >>> seen = lbt.files.telemetry_from_simulation(run, path, design=lazy)
     >>> bool(abs(seen.measurements[1:] - seen.residual_nm[:-1]).max() < 1e-9)  # no noise
     True
     """
@@ -92,7 +92,7 @@ def telemetry_of(
         gains = np.full(hardware.n_commands, design.gain)
     residual, strehl = simulation.residual_nm[case], None
     if imaging is not None and residual.shape[1] <= 2:  # the jitter of an image has two axes
-        strehl = float(np.clip(strehl_of_series(residual, imaging), 0, 1))  # a mean of cosines
+        strehl = float(np.clip(series_strehl(residual, imaging), 0, 1))  # a mean of cosines
     return Telemetry(
         frame_rate_hz=simulation.frame_rate_hz,
         delay_frames=hardware.delay_frames,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lbt_synth.errors import OutputError, ProblemError, TelemetryError
 from lbt_synth.files.telemetry import aot
-from lbt_synth.files.telemetry.layout import (
+from lbt_synth.files.telemetry.native_layout import (
     PRECISIONS,
     SCHEMA,
     SCHEMA_VERSION,
@@ -18,7 +18,7 @@ from lbt_synth.files.telemetry.layout import (
     primary_cards,
     unpack,
 )
-from lbt_synth.files.telemetry.record import Telemetry
+from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz, reason
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import choice
@@ -151,7 +151,7 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
         why = getattr(error, "strerror", None) or error
         raise TelemetryError(f"cannot read {source}: {why}.", path=source) from error
     if source.suffix.lower() == ".fits" and aot.is_aot(content):
-        return _checked(lambda: aot.from_bytes(content, source), source)
+        return _rebuild(lambda: aot.from_bytes(content, source), source)
     read = read_npz if source.suffix.lower() == ".npz" else read_fits
     try:
         arrays, text = read(content)
@@ -173,10 +173,10 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
         raise TelemetryError(
             f"{source} is damaged: its content does not match its digest.", path=source
         )
-    return _checked(lambda: unpack(arrays, meta), source)
+    return _rebuild(lambda: unpack(arrays, meta), source)
 
 
-def _checked(rebuild: Callable[[], Telemetry], source: Path) -> Telemetry:
+def _rebuild(rebuild: Callable[[], Telemetry], source: Path) -> Telemetry:
     """Rebuild telemetry from what was read; what does not fit is the file's fault."""
     try:
         return rebuild()

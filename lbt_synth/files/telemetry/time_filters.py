@@ -93,21 +93,23 @@ def _transfer_function(
     b, c = system.B @ row / (row @ row), system.C[output]
     d = float(system.D[output] @ row / (row @ row))
     linked = np.abs(system.A) > _NOTHING * np.max(np.abs(system.A), initial=0.0)
-    inside = _reached(linked, _counts(b)) & _reached(linked.T, _counts(c))
+    inside = _reachable_states(linked, _significant(b)) & _reachable_states(
+        linked.T, _significant(c)
+    )
     A, b, c = system.A[np.ix_(inside, inside)], b[inside], c[inside]
     if not inside.any():
         return np.array([d]), np.array([1.0])
     denominator = np.real(np.poly(A))
     numerator = np.real(np.poly(A - np.outer(b, c))) + (d - 1) * denominator
-    numerator[~_counts(numerator)] = 0.0
+    numerator[~_significant(numerator)] = 0.0
     return numerator, denominator
 
 
-def _counts(vector: FloatArray) -> BoolArray:
+def _significant(vector: FloatArray) -> BoolArray:
     return np.asarray(np.abs(vector) > _NOTHING * np.max(np.abs(vector), initial=0.0))
 
 
-def _reached(linked: BoolArray, start: BoolArray) -> BoolArray:
+def _reachable_states(linked: BoolArray, start: BoolArray) -> BoolArray:
     """States that the starting ones drive, themselves included."""
     inside = start
     for _ in range(len(linked)):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.batched import transposed
+from lbt_synth.linear.batched import transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
-from lbt_synth.loop.ensemble.loop_stacks import LoopStack, side_by_side
+from lbt_synth.loop.ensemble.batched_loops import BatchedLoops, join_subloops
 from lbt_synth.models import ARModel, ModalTurbulence
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -16,7 +16,7 @@ _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 
 
 def process_covariances(
-    loops: LoopStack, process: ARModel | ModalTurbulence, directions: FloatArray
+    loops: BatchedLoops, process: ARModel | ModalTurbulence, directions: FloatArray
 ) -> FloatArray:
     """Covariance (k, n, n) of the residual that one process a loop leaves, along a direction.
 
@@ -47,13 +47,13 @@ def process_covariances(
             f"{worst:.3g} of its Lyapunov equation. The process or the loop is nearly a random "
             "walk; damp it."
         )
-    return np.asarray(C @ X @ transposed(C))
+    return np.asarray(C @ X @ transpose(C))
 
 
 def add_process(
     total: FloatArray,
     rows: IntArray,
-    loops: list[tuple[IntArray, LoopStack]],
+    loops: list[tuple[IntArray, BatchedLoops]],
     process: ARModel | ModalTurbulence,
     direction: FloatArray,
 ) -> None:
@@ -65,6 +65,6 @@ def add_process(
     if not reached:
         return
     modes = np.concatenate([modes for modes, _ in reached])
-    stack = side_by_side([stack for _, stack in reached])
+    stack = join_subloops([stack for _, stack in reached])
     at = (rows[:, None, None], *np.ix_(modes, modes))
     total[at] += process_covariances(stack, process, direction[..., modes])

@@ -8,8 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.loop.ensemble.independent_parts import LoopPart
-from lbt_synth.loop.ensemble.loop_stacks import DelayGroup, LoopStack, delay_groups, stacked_loops
+from lbt_synth.loop.ensemble.batched_loops import (
+    BatchedLoops,
+    DelayGroup,
+    close_batched_loops,
+    group_by_delay,
+)
+from lbt_synth.loop.ensemble.subloops import Subloop
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -21,7 +26,7 @@ class LoopGroup:
     """Loops of one piece and one whole delay."""
 
     mirrors: DelayGroup  # Which loops, and their mirrors
-    loops: LoopStack  # The loops
+    loops: BatchedLoops  # The loops
     poles: ComplexArray  # (k, s): their poles
 
     def batches(self, stable: BoolArray) -> Iterator[LoopGroup]:
@@ -31,8 +36,8 @@ class LoopGroup:
         for start in range(0, order.size, _AT_ONCE):
             which = order[start : start + _AT_ONCE]
             yield LoopGroup(
-                mirrors=self.mirrors.taken(which),
-                loops=self.loops.taken(which),
+                mirrors=self.mirrors.take(which),
+                loops=self.loops.take(which),
                 poles=self.poles[which],
             )
 
@@ -45,13 +50,13 @@ class ClosedLoops:
     sensor_gains: FloatArray  # (p,): real sensor gains
     # list of (LoopPart, list of LoopGroup): each piece with its loops by their whole delays, the
     # same rows for all pieces
-    pieces: list[tuple[LoopPart, list[LoopGroup]]]
+    pieces: list[tuple[Subloop, list[LoopGroup]]]
     stable: BoolArray  # (p,): which loops are stable
 
     @classmethod
     def of(
         cls,
-        parts: list[LoopPart],
+        parts: list[Subloop],
         rest: list[FloatArray],
         hardware: LoopHardware,
         sensor_gains: FloatArray,
@@ -65,13 +70,13 @@ class ClosedLoops:
         for A in rest:
             if A.shape[-1]:
                 stable &= _radius(np.linalg.eigvals(A).astype(np.complex128)) < 1 - STABILITY_MARGIN
-        pieces: list[tuple[LoopPart, list[LoopGroup]]] = []
+        pieces: list[tuple[Subloop, list[LoopGroup]]] = []
         for part in parts:
             alike = next((groups for other, groups in pieces if other.equals(part)), None)
             if alike is None:
                 alike = []
-                for mirrors in delay_groups(hardware, delay_frames):
-                    loops = stacked_loops(part, mirrors, sensor_gains[mirrors.rows])
+                for mirrors in group_by_delay(hardware, delay_frames):
+                    loops = close_batched_loops(part, mirrors, sensor_gains[mirrors.rows])
                     poles = np.linalg.eigvals(loops.A).astype(np.complex128)
                     stable[mirrors.rows] &= _radius(poles) < 1 - STABILITY_MARGIN
                     alike.append(LoopGroup(mirrors=mirrors, loops=loops, poles=poles))
@@ -83,7 +88,7 @@ class ClosedLoops:
         """Number of modes n."""
         return self.hardware.modes
 
-    def by_delay(self) -> Iterator[tuple[IntArray, list[tuple[IntArray, LoopStack]]]]:
+    def by_delay(self) -> Iterator[tuple[IntArray, list[tuple[IntArray, BatchedLoops]]]]:
         """Yield the rows of each whole delay, with the modes and loops of each piece."""
         for whole, group in enumerate(self.pieces[0][1]):
             yield (

@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
-from lbt_synth.models.truth import spectrum_key
+from lbt_synth.models.spectra import spectrum_key
 from lbt_synth.validation import FloatArray, IntArray, frozen, instance, real_array, sequence
 
 Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
@@ -248,7 +248,7 @@ class LoopEnsemble:
 def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
     """Return the turbulence of some loops."""
     if isinstance(turbulence, FrozenFlows) and len(turbulence) > 1:
-        return turbulence.taken(rows)
+        return turbulence.take(rows)
     if isinstance(turbulence, ModalTurbulence) and turbulence.n_modes > 1:
         return ModalTurbulence(
             coefficients=turbulence.coefficients[rows],

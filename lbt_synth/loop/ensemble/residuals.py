@@ -1,142 +1,88 @@
-"""Exact residuals of many loops at once: other sensor gains, delays, noise and weather."""
+"""Residuals of many loops, by origin."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear import Controller
-from lbt_synth.loop.closed_loop import require_fitting
-from lbt_synth.loop.ensemble.ar_covariances import PROCESSES
-from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
-from lbt_synth.loop.ensemble.independent_parts import independent_parts
-from lbt_synth.loop.ensemble.loop_ensemble import LoopEnsemble, Turbulence, turbulence_rows
-from lbt_synth.loop.ensemble.residuals_by_origin import EnsembleResiduals
-from lbt_synth.loop.ensemble.turbulence_and_noise import settled_covariances
-from lbt_synth.loop.ensemble.vibrations import line_residuals
-from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, instance
+from lbt_synth.loop.strehl import Imaging, jitter_spread_nm, jitter_strehls, widest_jitter_nm
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
 
 
-def ensemble_residuals(
-    controller: Any, hardware: LoopHardware, ensemble: LoopEnsemble
-) -> EnsembleResiduals:
-    """Evaluate a controller exactly in many loops, or many controllers in a loop each.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleResiduals:
+    """Stationary residuals of p loops; nan where a loop is unstable.
 
-    The answers are those of :func:`residual_budget`, loop by loop: stability by eigenvalues,
-    spectra and noise by quadrature laid to the closed loops' poles, auto-regressive processes by
-    Lyapunov equations, sinusoids by the closed loops' response. Tip and tilt that know nothing of
-    each other are evaluated apart, and once if they are alike.
-
-    Parameters
+    Attributes
     ----------
-    controller : Controller or sequence of Controller
-        One controller for all loops, or one a loop with as many states each.
-    hardware : LoopHardware
-        Sensor and mirror of all loops; the ensemble may have other delays.
-    ensemble : LoopEnsemble
-        What the loops meet, p of them.
-
-    Returns
-    -------
-    EnsembleResiduals
-        Stability and covariances by origin.
-
-    Raises
-    ------
-    ProblemError
-        If the controller, a vibration, the turbulence or the noise does not fit the loop.
-    NumericalError
-        If an equation was not solved.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=797)
-    >>> plant = lbt.tip_tilt_plant(
-    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
-    ... )
-    >>> ensemble = lbt.loop.LoopEnsemble(
-    ...     sensor_gain=[0.8, 1.0, 4.0],
-    ...     turbulence=slow,
-    ...     noise_nm=15.5,
-    ...     vibrations=[lbt.loop.EnsembleVibration(frequency_hz=[19.0, 20.0, 20.0], rms_nm=797)],
-    ... )
-    >>> found = lbt.loop.ensemble_residuals(lbt.kalman(plant).controller, plant.hardware, ensemble)
-    >>> found.rms_nm.round(1).tolist()
-    [195.4, 181.9, nan]
+    stable : (p,) bool ndarray
+        Whether each loop is stable.
+    turbulence_nm2, noise_nm2, random_vibration_nm2 : (p, n, n) ndarray
+        Covariances over the modes [nm^2].
+    line_amplitudes_nm : (p, s, n) complex ndarray
+        Complex amplitude that each sinusoid leaves on each mode [nm].
     """
-    instance(hardware, LoopHardware)
-    instance(ensemble, LoopEnsemble)
-    matrices = _textbook(controller, hardware, ensemble.loops)
-    return residuals_of_matrices(matrices, hardware, ensemble)
+
+    stable: BoolArray
+    turbulence_nm2: FloatArray
+    noise_nm2: FloatArray
+    random_vibration_nm2: FloatArray
+    line_amplitudes_nm: ComplexArray
+
+    @property
+    def turbulence_nm(self) -> FloatArray:
+        """Residual turbulence over all modes [nm rms], (p,)."""
+        return np.sqrt(_power(self.turbulence_nm2))
+
+    @property
+    def noise_nm(self) -> FloatArray:
+        """Propagated noise over all modes [nm rms], (p,)."""
+        return np.sqrt(_power(self.noise_nm2))
+
+    @property
+    def vibration_nm(self) -> FloatArray:
+        """Residual vibration over all modes, the sinusoids by their mean power [nm rms], (p,)."""
+        return np.sqrt(self._vibration_nm2())
+
+    @property
+    def rms_nm(self) -> FloatArray:
+        """Residual over all modes [nm rms], (p,)."""
+        return np.sqrt(_power(self.turbulence_nm2) + _power(self.noise_nm2) + self._vibration_nm2())
+
+    def strehl(self, imaging: Imaging) -> FloatArray:
+        """Strehl ratio of each loop.
+
+        Parameters
+        ----------
+        imaging : Imaging
+            The camera.
+
+        Returns
+        -------
+        (p,) ndarray
+            Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by
+            more than 160 times its width.
+
+        Raises
+        ------
+        DimensionError
+            If the loops have more than two modes.
+        """
+        gaussian = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
+        lines = self.line_amplitudes_nm
+        out = np.full(self.stable.shape, np.nan)
+        found = np.flatnonzero(self.stable)
+        out[found] = 0.0
+        spread = jitter_spread_nm(gaussian[found], lines[found])
+        seen = found[spread <= widest_jitter_nm(imaging)]
+        out[seen] = jitter_strehls(gaussian[seen], imaging=imaging, line_amplitudes_nm=lines[seen])
+        return out
+
+    def _vibration_nm2(self) -> FloatArray:
+        lines = np.sum(np.abs(self.line_amplitudes_nm) ** 2, axis=(1, 2)) / 2
+        return np.asarray(_power(self.random_vibration_nm2) + lines)
 
 
-def residuals_of_matrices(
-    matrices: tuple[FloatArray, ...], hardware: LoopHardware, ensemble: LoopEnsemble
-) -> EnsembleResiduals:
-    """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each; see above."""
-    turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
-    _require_fitting_spectra(turbulence, hardware)
-    # loops that differ by their sinusoids and resonances only are closed once
-    points, which = ensemble.distinct(hardware, apart=len(matrices[0]) > 1)
-    parts, rest = independent_parts(matrices, hardware)
-    loops = ClosedLoops.of(
-        parts, rest, hardware, ensemble.gains()[points], ensemble.delays(hardware)[points]
-    )
-    turbulence_nm2, noise_nm2 = settled_covariances(
-        loops,
-        [(turbulence_rows(spectrum, points), modes) for spectrum, modes in turbulence],
-        ensemble.noise(hardware)[points],
-    )
-    random_nm2, amplitudes = line_residuals(loops, which, lines)
-    stable = loops.stable[which]
-    stable.setflags(write=False)
-    return EnsembleResiduals(
-        stable=stable,
-        turbulence_nm2=turbulence_nm2[which],
-        noise_nm2=noise_nm2[which],
-        random_vibration_nm2=random_nm2,
-        line_amplitudes_nm=amplitudes,
-    )
-
-
-def _textbook(controller: Any, hardware: LoopHardware, count: int) -> tuple[FloatArray, ...]:
-    """Return controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
-    each = [controller] if isinstance(controller, Controller) else list(controller)
-    for one in each:
-        instance(one, Controller)
-        require_fitting(hardware, one)
-    if len(each) not in (1, count) or len({one.n_states for one in each}) != 1:
-        raise DimensionError(
-            f"give one controller, or one a loop ({count}) with as many states each; got "
-            f"{len(each)} with {sorted({one.n_states for one in each})} states."
-        )
-    return textbook_matrices(each)
-
-
-def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:
-    """Return controllers of as many states each as ``A, B, C, D`` in textbook form, balanced.
-
-    In states of comparable units an entry that is tiny beside the others does nothing.
-    """
-    systems = [controller.to_statespace() for controller in controllers]
-    systems = [system.balanced() if system.n_states else system for system in systems]
-    return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
-
-
-def _require_fitting_spectra(
-    turbulence: list[tuple[Turbulence, tuple[int, ...]]], hardware: LoopHardware
-) -> None:
-    for spectrum, _ in turbulence:
-        if isinstance(spectrum, PROCESSES) and not np.isclose(
-            spectrum.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9
-        ):
-            raise ProblemError(
-                f"a disturbance must be sampled at the loop's {hardware.frame_rate_hz:.6g} Hz; got "
-                f"{spectrum.frame_rate_hz:.6g} Hz."
-            )
+def _power(covariances: FloatArray) -> FloatArray:
+    return np.asarray(np.trace(covariances, axis1=1, axis2=2), dtype=np.float64)

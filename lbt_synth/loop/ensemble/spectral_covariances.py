@@ -13,14 +13,14 @@ import numpy as np
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import gauss_panels, panel_rule
 from lbt_synth.linear.state_space import swept_response
-from lbt_synth.loop.ensemble.independent_parts import LoopPart
+from lbt_synth.loop.ensemble.batched_loops import DelayGroup
+from lbt_synth.loop.ensemble.frequency_responses import batched_response
 from lbt_synth.loop.ensemble.loop_ensemble import Turbulence
-from lbt_synth.loop.ensemble.loop_stacks import DelayGroup
 from lbt_synth.loop.ensemble.panels import graded_edges
-from lbt_synth.loop.ensemble.responses import stacked_response
+from lbt_synth.loop.ensemble.subloops import Subloop
 from lbt_synth.models import ARModel, Atmosphere, FrozenFlows, SumSpectrum, TabulatedSpectrum
-from lbt_synth.models.atmosphere import LOWEST
-from lbt_synth.models.truth import breakpoints_below
+from lbt_synth.models.spectra import breakpoints_below
+from lbt_synth.models.turbulence.atmosphere import LOWEST
 from lbt_synth.validation import ComplexArray, FloatArray
 
 ORDER = 10  # nodes a panel
@@ -32,7 +32,7 @@ _COVERED = 1e-6  # part of Nyquist above which there are geometric panels in any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sweep:
+class SampledResponses:
     """Frequencies of a batch of loops, and what one piece answers there."""
 
     # frequency_hz, weight_hz (f,): nodes and weights of the rule [Hz]
@@ -45,17 +45,17 @@ class Sweep:
     controller: ComplexArray  # (f, m, q): the controllers
 
 
-def sweep_of(
-    part: LoopPart,
+def sample_responses(
+    part: Subloop,
     group: DelayGroup,
     poles: ComplexArray,
     spectra: list[Turbulence],
     frame_rate_hz: float,
-) -> Sweep:
+) -> SampledResponses:
     """Lay frequencies to the poles of a batch of loops, and evaluate a piece there."""
     nyquist = frame_rate_hz / 2
     edges = [graded_edges(poles.ravel()) * nyquist]
-    edges += [_structure(spectrum, nyquist) for spectrum in spectra]
+    edges += [_breakpoints(spectrum, nyquist) for spectrum in spectra]
     frequency, weight = gauss_panels(np.unique(np.concatenate(edges)), ORDER)
     z = np.exp(1j * np.pi * frequency / nyquist)
     ends = (group.first,) if group.first is group.second else (group.first, group.second)
@@ -64,8 +64,8 @@ def sweep_of(
     if part.is_shared:
         controller = _response(A[0], B[0], C[0], D[0], z)
     else:
-        controller = stacked_response(A, B, C, D, z)
-    return Sweep(
+        controller = batched_response(A, B, C, D, z)
+    return SampledResponses(
         frequency_hz=frequency,
         weight_hz=weight,
         delay=1 / z,
@@ -84,14 +84,14 @@ def _response(
     return swept_response(StateSpace(A=A, B=B, C=C, D=D).balanced(), z)
 
 
-def _structure(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
+def _breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     """Frequencies between which a spectrum is smooth [Hz]."""
     if isinstance(spectrum, SumSpectrum):
-        return np.concatenate([_structure(part, nyquist_hz) for part in spectrum.parts])
+        return np.concatenate([_breakpoints(part, nyquist_hz) for part in spectrum.parts])
     if isinstance(spectrum, TabulatedSpectrum):
         return breakpoints_below(spectrum, nyquist_hz)
     if not isinstance(spectrum, Atmosphere | FrozenFlows):
-        return _halved(spectrum, nyquist_hz)
+        return _adaptive_breakpoints(spectrum, nyquist_hz)
     air = spectrum if isinstance(spectrum, Atmosphere) else spectrum.atmosphere
     wind = np.unique(spectrum.wind_speed_m_s) / air.diameter_m
     slow, fast = float(wind[0]), float(wind[-1])
@@ -111,7 +111,7 @@ def _structure(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     return points[points < nyquist_hz]
 
 
-def _halved(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
+def _adaptive_breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     """Frequencies between which a spectrum of unknown shape needs no shorter panels [Hz].
 
     Peaks that are narrower than its first panels are found where it says that it has kinks, or at
@@ -127,8 +127,8 @@ def _halved(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     done = [high[-1:]]
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        fine = _sums(spectrum, low, middle) + _sums(spectrum, middle, high)
-        open_ = np.abs(fine - _sums(spectrum, low, high)) > _SETTLED * np.abs(fine)
+        fine = _panel_integrals(spectrum, low, middle) + _panel_integrals(spectrum, middle, high)
+        open_ = np.abs(fine - _panel_integrals(spectrum, low, high)) > _SETTLED * np.abs(fine)
         done.append(low[~open_])
         low, high = (
             np.concatenate([low[open_], middle[open_]]),
@@ -139,17 +139,17 @@ def _halved(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     return np.unique(np.concatenate([*done, low]))
 
 
-def _sums(spectrum: Turbulence, low: FloatArray, high: FloatArray) -> FloatArray:
+def _panel_integrals(spectrum: Turbulence, low: FloatArray, high: FloatArray) -> FloatArray:
     """Integrals of a spectrum over panels that need not touch."""
     nodes, weights = panel_rule(low, high, ORDER)
     return np.asarray(np.sum(weights * spectrum.psd(nodes.ravel()).reshape(nodes.shape), axis=1))
 
 
 def spectral_covariances(
-    part: LoopPart,
+    part: Subloop,
     group: DelayGroup,
     sensor_gains: FloatArray,
-    sweep: Sweep,
+    sweep: SampledResponses,
     turbulence: list[tuple[Turbulence, list[int]]],
     noise_nm: FloatArray,
     frame_rate_hz: float,
@@ -159,23 +159,23 @@ def spectral_covariances(
     Shapes: sensor_gains (k,), turbulence list of (Turbulence, list of int), noise_nm (k, q) ->
     turbulence_nm2, noise_nm2 (k, n, n).
     """
-    evaluate = _scalar if part.is_scalar else _matrices
-    densities = [(_weighted(spectrum, sweep), modes) for spectrum, modes in turbulence]
+    evaluate = _scalar_covariances if part.is_scalar else _matrix_covariances
+    densities = [(_weighted_density(spectrum, sweep), modes) for spectrum, modes in turbulence]
     white = 2 / frame_rate_hz * sweep.weight_hz
     return evaluate(part, group, sensor_gains, sweep, densities, noise_nm, white)
 
 
-def _weighted(spectrum: Turbulence, sweep: Sweep) -> FloatArray:
+def _weighted_density(spectrum: Turbulence, sweep: SampledResponses) -> FloatArray:
     """Spectrum times the weights, (f,) or (k, f)."""
     density = spectrum.psd(sweep.frequency_hz)
     return np.asarray(density[0] if len(density) == 1 else density) * sweep.weight_hz
 
 
-def _scalar(
-    part: LoopPart,
+def _scalar_covariances(
+    part: Subloop,
     group: DelayGroup,
     gains: FloatArray,
-    sweep: Sweep,
+    sweep: SampledResponses,
     densities: list[tuple[FloatArray, list[int]]],
     noise_nm: FloatArray,
     white: FloatArray,
@@ -194,23 +194,23 @@ def _scalar(
     square = (real**2 + imaginary**2) / part.sensor[0, 0] ** 2
     turbulence = np.zeros(len(gains))
     for density, _ in densities:  # all of them are of the one mode
-        turbulence += _integral(rejection, density)
-    noise = noise_nm[:, 0] ** 2 * _integral(rejection * square, white)
+        turbulence += _integrate(rejection, density)
+    noise = noise_nm[:, 0] ** 2 * _integrate(rejection * square, white)
     return turbulence[:, None, None], noise[:, None, None]
 
 
-def _integral(values: FloatArray, density: FloatArray) -> FloatArray:
+def _integrate(values: FloatArray, density: FloatArray) -> FloatArray:
     """Sum over the frequencies (k, f), with one density (f,) or one a loop (k, f)."""
     if density.ndim == 1:
         return np.asarray(values @ density)
     return np.asarray(np.einsum("kf,kf->k", values, density))
 
 
-def _matrices(
-    part: LoopPart,
+def _matrix_covariances(
+    part: Subloop,
     group: DelayGroup,
     gains: FloatArray,
-    sweep: Sweep,
+    sweep: SampledResponses,
     densities: list[tuple[FloatArray, list[int]]],
     noise_nm: FloatArray,
     white: FloatArray,

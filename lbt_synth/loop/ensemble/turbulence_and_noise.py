@@ -7,11 +7,11 @@ import numpy as np
 from lbt_synth.loop.ensemble.ar_covariances import PROCESSES, add_process
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
 from lbt_synth.loop.ensemble.loop_ensemble import Turbulence, turbulence_rows
-from lbt_synth.loop.ensemble.spectral_covariances import spectral_covariances, sweep_of
+from lbt_synth.loop.ensemble.spectral_covariances import sample_responses, spectral_covariances
 from lbt_synth.validation import FloatArray
 
 
-def settled_covariances(
+def turbulence_and_noise_covariances(
     loops: ClosedLoops,
     turbulence: list[tuple[Turbulence, tuple[int, ...]]],
     noise_nm: FloatArray,
@@ -35,7 +35,9 @@ def settled_covariances(
                 rows = batch.mirrors.rows
                 at = (rows[:, None, None], *np.ix_(part.modes, part.modes))
                 spectra = [(turbulence_rows(spectrum, rows), own) for spectrum, own in smooth]
-                sweep = sweep_of(part, batch.mirrors, batch.poles, [s for s, _ in spectra], rate)
+                sweep = sample_responses(
+                    part, batch.mirrors, batch.poles, [s for s, _ in spectra], rate
+                )
                 turbulence_nm2[at], noise_nm2[at] = spectral_covariances(
                     part,
                     batch.mirrors,
@@ -51,7 +53,7 @@ def settled_covariances(
                 found = np.flatnonzero(loops.stable[rows])
                 if not found.size:
                     continue
-                chosen = [(own, stack.taken(found)) for own, stack in stacks]
+                chosen = [(own, stack.take(found)) for own, stack in stacks]
                 process = turbulence_rows(spectrum, rows[found])
                 assert isinstance(process, PROCESSES)  # rows of one are one
                 for mode in modes:

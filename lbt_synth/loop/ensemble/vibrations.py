@@ -8,13 +8,13 @@ from lbt_synth.loop.ensemble.ar_covariances import add_process
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
 from lbt_synth.loop.ensemble.loop_ensemble import EnsembleVibration
 from lbt_synth.models import ModalTurbulence
-from lbt_synth.models.vibration import sampled_lines
+from lbt_synth.models.vibration.resonance import sampled_lines
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 _AT_ONCE = 1024
 
 
-def line_residuals(
+def vibration_residuals(
     loops: ClosedLoops, which: IntArray, lines: list[EnsembleVibration]
 ) -> tuple[FloatArray, ComplexArray]:
     """Residuals of vibrations.
@@ -33,7 +33,7 @@ def line_residuals(
         for start in range(0, found.size, _AT_ONCE):
             rows = found[start : start + _AT_ONCE]
             own = place[which[rows]]
-            chosen = [(modes, stack.taken(own)) for modes, stack in stacks]
+            chosen = [(modes, stack.take(own)) for modes, stack in stacks]
             seen = 0
             for line in lines:
                 frequency, rms, direction = (

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.quadrature import SettledPanels, settled_panels
-from lbt_synth.loop.least_residuals.prediction import Reach
+from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
+from lbt_synth.loop.least_residuals.prediction import InnerFactor
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, Vibration
-from lbt_synth.models.truth import breakpoints_below, spectrum_key
+from lbt_synth.models.spectra import breakpoints_below, spectrum_key
 from lbt_synth.validation import FloatArray
 
 _COUPLING = 1e-9  # relative size of what counts as coupled
@@ -62,12 +62,12 @@ class ModeSpectrum:
 
     def log_moments(
         self,
-        reach: Reach,
+        reach: InnerFactor,
         reference: float,
         *,
         ends: Sequence[float] = (),
         skip: bool = False,
-    ) -> SettledPanels | None:
+    ) -> RefinedPanels | None:
         """Integrals of ``log(Phi / reference)`` times the weights; None where Phi vanishes.
 
         The two ``ends`` are ends of panels; with ``skip``, what lies between them is 0.
@@ -90,7 +90,7 @@ class ModeSpectrum:
             return np.asarray(values[:, None] * reach.weights(x))
 
         try:
-            return settled_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
+            return refine_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
         except _VanishingError:
             return None
 

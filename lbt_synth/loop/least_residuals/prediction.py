@@ -25,7 +25,7 @@ _ALIKE = 1e9  # condition of the zeros' Gram matrix beyond which they cannot be 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reach:
+class InnerFactor:
     """Inner factor of the path."""
 
     whole: int  # Frames of pure delay from the measured sample to the one that is corrected
@@ -33,7 +33,7 @@ class Reach:
     terms: int  # Cosine integrals that are needed, the mean included
 
     @staticmethod
-    def of(hardware: LoopHardware) -> Reach:
+    def of(hardware: LoopHardware) -> InnerFactor:
         """Inner factor of a loop's path."""
         mirror = hardware.mirror_system
         found = mirror.core.zeros
@@ -54,9 +54,9 @@ class Reach:
         # for small zeros, the quotient (F - f_0 - ...) / zero^whole is summed as a series
         small = [abs(a) for a in zeros if abs(a) ** whole <= _FEW_DIGITS]
         if not small:
-            return Reach(whole=whole, zeros=zeros, terms=whole)
+            return InnerFactor(whole=whole, zeros=zeros, terms=whole)
         more = int(np.ceil(np.log(1e-17) / np.log(max(*small, 1e-300))))
-        return Reach(whole=whole, zeros=zeros, terms=whole + 1 + more)
+        return InnerFactor(whole=whole, zeros=zeros, terms=whole + 1 + more)
 
     @property
     def by_series(self) -> bool:
@@ -87,13 +87,13 @@ def _gram(zeros: tuple[float, ...]) -> FloatArray:
 class Prediction:
     """Best prediction of a process whose spectrum has given integrals of its logarithm."""
 
-    reach: Reach  # Inner factor of the path
+    reach: InnerFactor  # Inner factor of the path
     mean_log: float  # Mean of ``log(Phi / reference)``
     coefficients: FloatArray  # (whole,): ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``
     tails: FloatArray  # (zeros,): values at the zeros of the all-pass factor of what follows them
 
     @staticmethod
-    def of(reach: Reach, moments: FloatArray) -> Prediction:
+    def of(reach: InnerFactor, moments: FloatArray) -> Prediction:
         """From the integrals of the logarithm times the weights of a reach."""
         polynomial = np.polynomial.polynomial.polyval
         f = _exponential(moments[: reach.terms])

@@ -8,7 +8,8 @@ from scipy.fft import irfft, next_fast_len
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, DriftingVibration, LoopHardware, Spectrum, Truth, Vibration
-from lbt_synth.models.truth import breakpoints_below, fitted_direction
+from lbt_synth.models.spectra import breakpoints_below
+from lbt_synth.models.truth import fitted_direction
 from lbt_synth.validation import FloatArray
 
 # A spectrum is drawn on this many times the wanted frames, so that the period is not seen.

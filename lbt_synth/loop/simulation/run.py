@@ -10,9 +10,9 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, RunningController
 from lbt_synth.loop.closed_loop import close_loop
+from lbt_synth.loop.simulation.block_filtering import filter_series
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
-from lbt_synth.loop.simulation.long_series import filter_series
-from lbt_synth.loop.strehl import Imaging, strehl_of_series
+from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.validation import FloatArray, frozen, integer
 
@@ -67,7 +67,7 @@ class Simulation:
 
     def strehl(self, imaging: Imaging) -> FloatArray:
         """Long-exposure Strehl ratio of each case, (cases,)."""
-        return np.array([strehl_of_series(case, imaging) for case in self.residual_nm])
+        return np.array([series_strehl(case, imaging) for case in self.residual_nm])
 
 
 def simulate(
@@ -185,7 +185,7 @@ def settling_frames(radius: float) -> int:
     return int(min(np.ceil(np.log(_SETTLED) / np.log(radius)), _MOST_SETTLING))
 
 
-def stepped(
+def step_controller(
     controller: SteppedController | RunningController, y: FloatArray, size: int, *, frame: int
 ) -> FloatArray:
     """Give a controller its measurements, and return its commands if they are some."""
@@ -221,7 +221,7 @@ def step_loop(
         commands = np.zeros((len(taps), m))  # u(k), u(k-1), ...
         for k in range(frames):
             y = sensor_gain * hardware.sensor @ residual + noise[case, k]
-            u = stepped(controller, y, m, frame=k)
+            u = step_controller(controller, y, m, frame=k)
             commands = np.vstack([u, commands[:-1]])
             residual = total[case, k] - hardware.influence @ (taps @ commands)
             out[case, k] = np.concatenate([residual, u, y])

@@ -22,7 +22,7 @@ from lbt_synth.design import (
     SolverReport,
 )
 from lbt_synth.design.shaping import Specification
-from lbt_synth.design.shaping.metadata import packed, unpacked
+from lbt_synth.design.shaping.metadata import from_metadata, to_metadata
 from lbt_synth.linear import Controller, EstimationProblem, Witness
 from lbt_synth.models import (
     ARModel,
@@ -52,7 +52,7 @@ _PROBLEMS: dict[str, type[EstimationProblem]] = {
 }
 
 
-def to_record(design: Design) -> tuple[Arrays, Meta]:
+def pack_design(design: Design) -> tuple[Arrays, Meta]:
     """Return the arrays and the metadata of a design."""
     arrays: Arrays = {name: getattr(design.controller, name) for name in "ABCD"}
     meta: Meta = {
@@ -85,7 +85,7 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
         for mode, parameter in enumerate(design.parameters):
             arrays |= {f"YOULA{mode + 1}_{n}": getattr(parameter, n) for n in "ABC"}
         meta["shaped"] = {
-            "specifications": [packed(spec) for spec in design.specifications],
+            "specifications": [to_metadata(spec) for spec in design.specifications],
             "objective_nm": list(design.objective_nm),
             "long_objective_nm": list(design.long_objective_nm),
             "long_functions": design.long_functions,
@@ -119,7 +119,7 @@ def to_record(design: Design) -> tuple[Arrays, Meta]:
     return arrays, meta
 
 
-def from_record(arrays: Arrays, meta: Meta) -> Design:
+def unpack_design(arrays: Arrays, meta: Meta) -> Design:
     """Rebuild a design; missing keys raise KeyError, wrong sizes a ProblemError."""
     common: dict[str, Any] = {
         "method": meta["method"],
@@ -167,7 +167,7 @@ def _unpack_shaped(arrays: Arrays, meta: Meta, common: Meta) -> ShapedDesign:
         )
         for mode in range(hardware.modes)
     )
-    specifications = tuple(unpacked(spec) for spec in shaped["specifications"])
+    specifications = tuple(from_metadata(spec) for spec in shaped["specifications"])
     if not all(isinstance(spec, Specification) for spec in specifications):
         raise ValueError("what it holds as specifications are none")
     for spec in specifications:

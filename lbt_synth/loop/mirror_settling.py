@@ -59,10 +59,10 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     """
     real = loop.hardware
     settled = replace(real, mirror=None)
-    return residual_budget(replace(loop, system=_missed(loop, settled)), truth)
+    return residual_budget(replace(loop, system=_difference_loop(loop, settled)), truth)
 
 
-def _missed(loop: ClosedLoop, settled: LoopHardware) -> StateSpace:
+def _difference_loop(loop: ClosedLoop, settled: LoopHardware) -> StateSpace:
     """Loop whose first outputs are the difference of the two positions."""
     s, n, m = loop.system, loop.hardware.modes, loop.hardware.n_commands
     each, command = np.eye(m), slice(n, n + m)

@@ -12,7 +12,7 @@ from lbt_synth.loop.least_residuals.mode_spectra import (
     decoupled_modes,
 )
 from lbt_synth.loop.least_residuals.plant_modes import plant_modes
-from lbt_synth.loop.least_residuals.prediction import Prediction, Reach
+from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.truth import fitted_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen, instance
@@ -84,18 +84,18 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     5.0
     """
     modes = truth_modes(hardware, truth)
-    return _limit(Reach.of(hardware), modes)
+    return _residual_limit(InnerFactor.of(hardware), modes)
 
 
 def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth."""
     if isinstance(plant, FullStatePlant):
-        return _limit(Reach.of(plant.hardware), plant_modes(plant))
+        return _residual_limit(InnerFactor.of(plant.hardware), plant_modes(plant))
     lines = [(fitted_direction(line, plant.hardware), line) for line in plant.vibrations]
     modes = decoupled_modes(
         plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
     )
-    return _limit(Reach.of(plant.hardware), modes)
+    return _residual_limit(InnerFactor.of(plant.hardware), modes)
 
 
 def truth_modes(
@@ -119,7 +119,7 @@ def truth_modes(
     )
 
 
-def _limit(reach: Reach, decoupled: DecoupledModes) -> ResidualLimit:
+def _residual_limit(reach: InnerFactor, decoupled: DecoupledModes) -> ResidualLimit:
     known: dict[tuple[object, ...], tuple[float, float]] = {}
     found = []
     for mode in decoupled.modes:
@@ -135,7 +135,7 @@ def _limit(reach: Reach, decoupled: DecoupledModes) -> ResidualLimit:
     )
 
 
-def mode_limit(reach: Reach, mode: ModeSpectrum) -> tuple[float, float]:
+def mode_limit(reach: InnerFactor, mode: ModeSpectrum) -> tuple[float, float]:
     """Least variance of one mode, and its relative change at the last refinement."""
     reference = mode.reference()
     panels = mode.log_moments(reach, reference) if mode.parts and reference > 0 else None

@@ -19,8 +19,8 @@ import numpy as np
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum
-from lbt_synth.loop.least_residuals.prediction import Prediction, Reach
-from lbt_synth.loop.least_residuals.residual import mode_limit, truth_modes
+from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
+from lbt_synth.loop.least_residuals.residual_limit import mode_limit, truth_modes
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.truth import fitted_direction
 from lbt_synth.validation import FloatArray, frozen, number
@@ -121,9 +121,11 @@ def least_worst_residual(
     along = fitted_direction(line, hardware)
     decoupled = truth_modes(hardware, truth, (along,))
     own = int(np.argmax(np.abs(decoupled.directions @ along)))
-    reach = Reach.of(hardware)
+    reach = InnerFactor.of(hardware)
     nyquist = hardware.frame_rate_hz / 2
-    saddle = _saddle(reach, decoupled.modes[own], (low / nyquist, high / nyquist), line.rms_nm**2)
+    saddle = _find_saddle(
+        reach, decoupled.modes[own], (low / nyquist, high / nyquist), line.rms_nm**2
+    )
     variance = np.array(
         [
             saddle.lower if i == own else mode_limit(reach, mode)[0]
@@ -175,7 +177,7 @@ class _Band:
     are nodes within it, base the spectrum with noise there.
     """
 
-    reach: Reach
+    reach: InnerFactor
     mode: ModeSpectrum
     reference: float
     outside: FloatArray
@@ -219,8 +221,10 @@ class _Band:
         return prediction.variance(self.reference, self.mode.noise_nm2), max(gap, 0.0)
 
 
-def _saddle(reach: Reach, mode: ModeSpectrum, ends: tuple[float, float], total: float) -> _Saddle:
-    band = _prepared(reach, mode, ends, total)
+def _find_saddle(
+    reach: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
+) -> _Saddle:
+    band = _prepare_band(reach, mode, ends, total)
     if band is None:  # outside the band nothing is new: the line is known from its past, too
         x, q = gauss_panels(np.linspace(*ends, _PANELS + 1), _ORDER)
         return _Saddle(lower=0.0, gap=0.0, x=x, weight=q / q.sum())
@@ -242,8 +246,8 @@ def _saddle(reach: Reach, mode: ModeSpectrum, ends: tuple[float, float], total: 
             break
         # by half a step where whole ones go back and forth
         share = 1.0 if rounds < _WHOLE_STEPS else 0.5
-        shape = _towards(shape, prediction.error_power(band.x), share)
-        fine_shape = _towards(fine_shape, fine_power, share)
+        shape = _step_towards(shape, prediction.error_power(band.x), share)
+        fine_shape = _step_towards(fine_shape, fine_power, share)
     assert best is not None  # of the first round
     if not best.gap <= _LARGEST_GAP * best.lower:
         raise NumericalError(
@@ -255,14 +259,14 @@ def _saddle(reach: Reach, mode: ModeSpectrum, ends: tuple[float, float], total: 
     return best
 
 
-def _towards(shape: FloatArray, target: FloatArray, share: float) -> FloatArray:
+def _step_towards(shape: FloatArray, target: FloatArray, share: float) -> FloatArray:
     """Geometric mean, kept off zero."""
     mixed = shape ** (1 - share) * target**share
     return np.asarray(np.maximum(mixed, 1e-14 * np.max(mixed)))
 
 
-def _prepared(
-    reach: Reach, mode: ModeSpectrum, ends: tuple[float, float], total: float
+def _prepare_band(
+    reach: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
 ) -> _Band | None:
     noise = mode.noise_nm2
     width = ends[1] - ends[0]

@@ -12,7 +12,7 @@ _PROBES = 5  # points at which partial fractions are held against linear systems
 _AGREEMENT = 1e-9
 
 
-def stacked_response(
+def batched_response(
     A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, z: ComplexArray
 ) -> ComplexArray:
     """Transfer matrices of a stack of systems, by partial fractions.
@@ -23,10 +23,10 @@ def stacked_response(
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.loop.ensemble.responses import stacked_response
+    >>> from lbt_synth.loop.ensemble.frequency_responses import batched_response
     >>> halves = np.array([[[0.5]], [[-0.5]]])
     >>> one = np.ones((2, 1, 1))
-    >>> stacked_response(halves, one, one, 0 * one, np.array([1.0 + 0j])).real.ravel().round(6)
+    >>> batched_response(halves, one, one, 0 * one, np.array([1.0 + 0j])).real.ravel().round(6)
     array([2.      , 0.666667])
     """
     out = np.empty((len(A), z.size, C.shape[1], B.shape[2]), dtype=np.complex128)

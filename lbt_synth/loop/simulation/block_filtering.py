@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.batched import transposed
+from lbt_synth.linear.batched import transpose
 from lbt_synth.validation import FloatArray, real_array
 
 _BLOCK = 8
@@ -97,7 +97,7 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.loop.simulation.long_series import last_state
+    >>> from lbt_synth.loop.simulation.block_filtering import last_state
     >>> last_state(np.array([[0.5]]), np.array([[4.0], [2.0], [1.0]])).tolist()
     [3.0]
     """
@@ -110,7 +110,7 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
     return drive[0] if len(drive) else np.zeros(len(A))
 
 
-class SystemStack:
+class BatchedSystems:
     """Small systems of the same sizes, ready to be driven by one series each.
 
     Parameters
@@ -121,10 +121,10 @@ class SystemStack:
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.loop.simulation.long_series import SystemStack
+    >>> from lbt_synth.loop.simulation.block_filtering import BatchedSystems
     >>> one = np.ones((2, 1, 1))
-    >>> sums = SystemStack(np.array([[[1.0]], [[0.5]]]), one, one, one)
-    >>> sums.filtered(np.ones((2, 3, 1)))[:, :, 0].tolist()
+    >>> sums = BatchedSystems(np.array([[[1.0]], [[0.5]]]), one, one, one)
+    >>> sums.filter(np.ones((2, 3, 1)))[:, :, 0].tolist()
     [[1.0, 2.0, 3.0], [1.0, 2.0, 2.5]]
     """
 
@@ -132,7 +132,7 @@ class SystemStack:
         self._operators = _block_operators(A, B, C, D, _STACK_BLOCK)
         self._outputs, self._inputs = D.shape[-2:]
 
-    def filtered(self, inputs: FloatArray, *, in_place: bool = False) -> FloatArray:
+    def filter(self, inputs: FloatArray, *, in_place: bool = False) -> FloatArray:
         """Compute the outputs from zero states. Shapes: inputs (N, frames, m) -> (N, frames, p)."""
         u, op, block = inputs, self._operators, _STACK_BLOCK
         count, frames, m = u.shape
@@ -211,8 +211,8 @@ def _block_operators(
     axes = [*range(len(lead)), *(len(lead) + i for i in (0, 2, 3, 1))]
     return _BlockOperators(
         step=np.linalg.matrix_power(A, block),
-        reach=np.concatenate([transposed(column) for column in reversed(columns)], axis=-2),
-        observe=np.concatenate([transposed(row) for row in rows], axis=-1),
+        reach=np.concatenate([transpose(column) for column in reversed(columns)], axis=-2),
+        observe=np.concatenate([transpose(row) for row in rows], axis=-1),
         toeplitz=np.ascontiguousarray(late.transpose(axes)).reshape(*lead, block * m, block * p),
     )
 

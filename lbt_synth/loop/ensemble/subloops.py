@@ -16,7 +16,7 @@ _SAME = 1e-11  # relative difference of pieces that are the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopPart:
+class Subloop:
     """A piece of a loop: some modes, and all that depends on them."""
 
     # modes, measurements (n,): which modes and measurements of the loop these are
@@ -46,7 +46,7 @@ class LoopPart:
         matrices = self.A, self.B, self.C, self.D
         return matrices if self.is_shared else tuple(part[rows] for part in matrices)
 
-    def equals(self, other: LoopPart) -> bool:
+    def equals(self, other: Subloop) -> bool:
         """Whether another piece behaves the same, to rounding."""
         names = ("A", "B", "C", "D", "sensor", "influence")
         pairs = [(getattr(self, name), getattr(other, name)) for name in names]
@@ -57,9 +57,9 @@ class LoopPart:
         )
 
 
-def independent_parts(
+def split_into_subloops(
     matrices: tuple[FloatArray, ...], hardware: LoopHardware
-) -> tuple[list[LoopPart], list[FloatArray]]:
+) -> tuple[list[Subloop], list[FloatArray]]:
     """Take a loop apart along what does not depend on each other.
 
     Shapes: returns rest list of (N, s, s).
@@ -67,11 +67,11 @@ def independent_parts(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.loop.ensemble.independent_parts import independent_parts
+    >>> from lbt_synth.loop.ensemble.subloops import split_into_subloops
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
     >>> textbook = lbt.integrator(path, gain=0.5).controller.to_statespace()
     >>> matrices = tuple(m[None] for m in (textbook.A, textbook.B, textbook.C, textbook.D))
-    >>> [part.modes.tolist() for part in independent_parts(matrices, path)[0]]
+    >>> [part.modes.tolist() for part in split_into_subloops(matrices, path)[0]]
     [[0], [1]]
     """
     A, B, C, D = matrices
@@ -87,7 +87,7 @@ def independent_parts(
         (y, r, sensor[None]),
         (r, u, influence[None]),
     ):
-        links[np.ix_(rows, columns)] = _present(entries)
+        links[np.ix_(rows, columns)] = _nonzero_entries(entries)
     _, label = connected_components(csr_matrix(links), directed=False)
     parts, rest = [], []
     for piece in np.unique(label):
@@ -98,7 +98,7 @@ def independent_parts(
             rest.append(A[:, states[:, None], states])
             continue
         parts.append(
-            LoopPart(
+            Subloop(
                 modes=modes,
                 measurements=inputs,
                 A=A[:, states[:, None], states],
@@ -112,7 +112,7 @@ def independent_parts(
     return parts, rest
 
 
-def _present(entries: FloatArray) -> BoolArray:
+def _nonzero_entries(entries: FloatArray) -> BoolArray:
     """Which entries of a stack are more than rounding, in any of its matrices."""
     sizes = np.abs(entries)
     largest = np.max(sizes, axis=(1, 2), keepdims=True, initial=0.0)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.loop.closed_loop import loop_matrices
-from lbt_synth.loop.ensemble.independent_parts import LoopPart
+from lbt_synth.loop.ensemble.subloops import Subloop
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.lifted_mirror import Response, tapped_mirror
+from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 
@@ -28,12 +28,12 @@ class DelayGroup:
     first: Response
     second: Response
 
-    def taken(self, which: IntArray) -> DelayGroup:
+    def take(self, which: IntArray) -> DelayGroup:
         """Return some of its loops."""
         return replace(self, rows=self.rows[which], fraction=self.fraction[which])
 
 
-def delay_groups(hardware: LoopHardware, delay_frames: FloatArray) -> Iterator[DelayGroup]:
+def group_by_delay(hardware: LoopHardware, delay_frames: FloatArray) -> Iterator[DelayGroup]:
     """Yield the loops by the whole part of their delay; by the delay if the mirror moves."""
     if hardware.mirror is None:
         lead = np.floor(delay_frames - 1).astype(np.int64)
@@ -57,7 +57,7 @@ def delay_groups(hardware: LoopHardware, delay_frames: FloatArray) -> Iterator[D
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopStack:
+class BatchedLoops:
     """Closed loops from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``, (k, ., .) each."""
 
     A: FloatArray
@@ -65,9 +65,9 @@ class LoopStack:
     C: FloatArray
     D: FloatArray
 
-    def taken(self, which: IntArray) -> LoopStack:
+    def take(self, which: IntArray) -> BatchedLoops:
         """Return some of the loops."""
-        return LoopStack(A=self.A[which], B=self.B[which], C=self.C[which], D=self.D[which])
+        return BatchedLoops(A=self.A[which], B=self.B[which], C=self.C[which], D=self.D[which])
 
     def rejections(self, turn: FloatArray) -> ComplexArray:
         """Rejection (k, n, n) of each loop at its own frequency [radians a frame]."""
@@ -77,7 +77,7 @@ class LoopStack:
         return np.asarray(self.C @ states + self.D[..., :n])
 
 
-def stacked_loops(part: LoopPart, group: DelayGroup, sensor_gains: FloatArray) -> LoopStack:
+def close_batched_loops(part: Subloop, group: DelayGroup, sensor_gains: FloatArray) -> BatchedLoops:
     """Close the loops of a group around a piece. Shapes: sensor_gains (k,)."""
     controllers = part.controllers(group.rows)
     ends = [
@@ -91,10 +91,10 @@ def stacked_loops(part: LoopPart, group: DelayGroup, sensor_gains: FloatArray) -
     )
     gain, n, count = sensor_gains[:, None, None], part.modes.size, group.rows.size
     B, D = (np.broadcast_to(m, (count, *m.shape[1:])) for m in (B, D[:, :n]))
-    return LoopStack(A=A0 + gain * A1, B=B, C=(C0 + gain * C1)[:, :n], D=D)
+    return BatchedLoops(A=A0 + gain * A1, B=B, C=(C0 + gain * C1)[:, :n], D=D)
 
 
-def side_by_side(stacks: list[LoopStack]) -> LoopStack:
+def join_subloops(stacks: list[BatchedLoops]) -> BatchedLoops:
     """Put loops that know nothing of each other into one system, only from the total phase."""
     if len(stacks) == 1:
         return stacks[0]
@@ -108,4 +108,4 @@ def side_by_side(stacks: list[LoopStack]) -> LoopStack:
         modes = slice(stack.C.shape[1])
         A[:, x, x], B[:, x, r] = stack.A, stack.B[..., modes]
         C[:, r, x], D[:, r, r] = stack.C, stack.D[..., modes]
-    return LoopStack(A=A, B=B, C=C, D=D)
+    return BatchedLoops(A=A, B=B, C=C, D=D)

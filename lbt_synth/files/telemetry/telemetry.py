@@ -299,7 +299,9 @@ class Telemetry:
                 raise ProblemError(f"{name} must be a text; got {text!r}.")
         if not isinstance(self.metadata, Mapping):
             raise ProblemError(f"metadata must be a mapping; got {type(self.metadata).__name__}.")
-        checked = {_key(key): _scalar(value, key) for key, value in self.metadata.items()}
+        checked = {
+            _check_key(key): _check_scalar(value, key) for key, value in self.metadata.items()
+        }
         self._set("metadata", MappingProxyType(checked))
 
     def _check_controller(self) -> None:
@@ -389,13 +391,13 @@ class Telemetry:
         )
 
 
-def _key(key: Any) -> str:
+def _check_key(key: Any) -> str:
     if not isinstance(key, str) or not key:
         raise ProblemError(f"the keys of metadata must be words; got {key!r}.")
     return key
 
 
-def _scalar(value: Any, key: Any) -> Scalar:
+def _check_scalar(value: Any, key: Any) -> Scalar:
     out = value.item() if isinstance(value, np.generic) else value
     if not isinstance(out, str | float | int | bool):
         raise ProblemError(

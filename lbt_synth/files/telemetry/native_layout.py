@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 import lbt_synth
 from lbt_synth.errors import ProblemError
-from lbt_synth.files.telemetry.record import Telemetry
+from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.linear import Controller
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import Cards
@@ -40,7 +40,7 @@ class Layer:
         """Whether it has one row a frame."""
         return self.axes.startswith("frame")
 
-    def unit_of(self, telemetry: Telemetry) -> str:
+    def unit_in(self, telemetry: Telemetry) -> str:
         """Return the unit, in this telemetry."""
         return str(getattr(telemetry, self.unit[1:])) if self.unit[:1] == "_" else self.unit
 
@@ -115,7 +115,7 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
         if (value := getattr(telemetry, layer.field)) is None:
             continue
         exact = not layer.series or layer.field == "times_s"  # times need their digits
-        arrays[name] = value if exact else _rounded(value, precision, layer.field)
+        arrays[name] = value if exact else _round_series(value, precision, layer.field)
     meta: Meta = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -132,7 +132,7 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
     return arrays, meta
 
 
-def _rounded(series: FloatArray, precision: str, name: str) -> npt.NDArray[Any]:
+def _round_series(series: FloatArray, precision: str, name: str) -> npt.NDArray[Any]:
     if precision == "float64":
         return series
     with np.errstate(over="ignore"):
@@ -160,7 +160,7 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
     taps = fields.pop("mirror_taps", None)
     if "mirror" in meta:  # files of a mirror that settles at once have none
         fields["mirror"] = PositionLoop(**meta["mirror"])
-    return with_same_taps(
+    return check_taps(
         Telemetry(
             **fields, **{name: meta[name] for name in _FACTS}, metadata=dict(meta["metadata"])
         ),
@@ -168,7 +168,7 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
     )
 
 
-def with_same_taps(telemetry: Telemetry, taps: npt.ArrayLike | None) -> Telemetry:
+def check_taps(telemetry: Telemetry, taps: npt.ArrayLike | None) -> Telemetry:
     """Return telemetry whose mirror has the taps that stand in its file."""
     own = telemetry.mirror_taps
     if (own is None) != (taps is None):
@@ -202,7 +202,7 @@ def layer_cards(telemetry: Telemetry) -> dict[str, Cards]:
     out: dict[str, Cards] = {}
     for name, layer in LAYERS.items():
         cards: dict[str, tuple[Any, str]] = {}
-        if unit := layer.unit_of(telemetry):
+        if unit := layer.unit_in(telemetry):
             cards["BUNIT"] = (unit, "rms of wavefront" if unit == "nm" else "")
         cards["CONTENT"] = (layer.meaning, "")
         for number, axis in enumerate(reversed(layer.axes.split(", ")), start=1):

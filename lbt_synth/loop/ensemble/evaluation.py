@@ -1,0 +1,144 @@
+"""Exact residuals of many loops at once: other sensor gains, delays, noise and weather."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear import Controller
+from lbt_synth.loop.closed_loop import require_matching_controller
+from lbt_synth.loop.ensemble.ar_covariances import PROCESSES
+from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
+from lbt_synth.loop.ensemble.loop_ensemble import LoopEnsemble, Turbulence, turbulence_rows
+from lbt_synth.loop.ensemble.residuals import EnsembleResiduals
+from lbt_synth.loop.ensemble.subloops import split_into_subloops
+from lbt_synth.loop.ensemble.turbulence_and_noise import turbulence_and_noise_covariances
+from lbt_synth.loop.ensemble.vibrations import vibration_residuals
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, instance
+
+
+def ensemble_residuals(
+    controller: Any, hardware: LoopHardware, ensemble: LoopEnsemble
+) -> EnsembleResiduals:
+    """Evaluate a controller exactly in many loops, or many controllers in a loop each.
+
+    The answers are those of :func:`residual_budget`, loop by loop: stability by eigenvalues,
+    spectra and noise by quadrature laid to the closed loops' poles, auto-regressive processes by
+    Lyapunov equations, sinusoids by the closed loops' response. Tip and tilt that know nothing of
+    each other are evaluated apart, and once if they are alike.
+
+    Parameters
+    ----------
+    controller : Controller or sequence of Controller
+        One controller for all loops, or one a loop with as many states each.
+    hardware : LoopHardware
+        Sensor and mirror of all loops; the ensemble may have other delays.
+    ensemble : LoopEnsemble
+        What the loops meet, p of them.
+
+    Returns
+    -------
+    EnsembleResiduals
+        Stability and covariances by origin.
+
+    Raises
+    ------
+    ProblemError
+        If the controller, a vibration, the turbulence or the noise does not fit the loop.
+    NumericalError
+        If an equation was not solved.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=797)
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
+    ... )
+    >>> ensemble = lbt.loop.LoopEnsemble(
+    ...     sensor_gain=[0.8, 1.0, 4.0],
+    ...     turbulence=slow,
+    ...     noise_nm=15.5,
+    ...     vibrations=[lbt.loop.EnsembleVibration(frequency_hz=[19.0, 20.0, 20.0], rms_nm=797)],
+    ... )
+    >>> found = lbt.loop.ensemble_residuals(lbt.kalman(plant).controller, plant.hardware, ensemble)
+    >>> found.rms_nm.round(1).tolist()
+    [195.4, 181.9, nan]
+    """
+    instance(hardware, LoopHardware)
+    instance(ensemble, LoopEnsemble)
+    matrices = _controller_matrices(controller, hardware, ensemble.loops)
+    return residuals_from_matrices(matrices, hardware, ensemble)
+
+
+def residuals_from_matrices(
+    matrices: tuple[FloatArray, ...], hardware: LoopHardware, ensemble: LoopEnsemble
+) -> EnsembleResiduals:
+    """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each; see above."""
+    turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
+    _require_frame_rate(turbulence, hardware)
+    # loops that differ by their sinusoids and resonances only are closed once
+    points, which = ensemble.distinct(hardware, apart=len(matrices[0]) > 1)
+    parts, rest = split_into_subloops(matrices, hardware)
+    loops = ClosedLoops.of(
+        parts, rest, hardware, ensemble.gains()[points], ensemble.delays(hardware)[points]
+    )
+    turbulence_nm2, noise_nm2 = turbulence_and_noise_covariances(
+        loops,
+        [(turbulence_rows(spectrum, points), modes) for spectrum, modes in turbulence],
+        ensemble.noise(hardware)[points],
+    )
+    random_nm2, amplitudes = vibration_residuals(loops, which, lines)
+    stable = loops.stable[which]
+    stable.setflags(write=False)
+    return EnsembleResiduals(
+        stable=stable,
+        turbulence_nm2=turbulence_nm2[which],
+        noise_nm2=noise_nm2[which],
+        random_vibration_nm2=random_nm2,
+        line_amplitudes_nm=amplitudes,
+    )
+
+
+def _controller_matrices(
+    controller: Any, hardware: LoopHardware, count: int
+) -> tuple[FloatArray, ...]:
+    """Return controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
+    each = [controller] if isinstance(controller, Controller) else list(controller)
+    for one in each:
+        instance(one, Controller)
+        require_matching_controller(hardware, one)
+    if len(each) not in (1, count) or len({one.n_states for one in each}) != 1:
+        raise DimensionError(
+            f"give one controller, or one a loop ({count}) with as many states each; got "
+            f"{len(each)} with {sorted({one.n_states for one in each})} states."
+        )
+    return textbook_matrices(each)
+
+
+def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:
+    """Return controllers of as many states each as ``A, B, C, D`` in textbook form, balanced.
+
+    In states of comparable units an entry that is tiny beside the others does nothing.
+    """
+    systems = [controller.to_statespace() for controller in controllers]
+    systems = [system.balanced() if system.n_states else system for system in systems]
+    return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
+
+
+def _require_frame_rate(
+    turbulence: list[tuple[Turbulence, tuple[int, ...]]], hardware: LoopHardware
+) -> None:
+    for spectrum, _ in turbulence:
+        if isinstance(spectrum, PROCESSES) and not np.isclose(
+            spectrum.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9
+        ):
+            raise ProblemError(
+                f"a disturbance must be sampled at the loop's {hardware.frame_rate_hz:.6g} Hz; got "
+                f"{spectrum.frame_rate_hz:.6g} Hz."
+            )
