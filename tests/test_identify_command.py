@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
+from support.recorded_loops import RATE, slow
 from test_cli import run
-from test_identification import RATE, slow
 
 import lbt_synth as lbt
 
@@ -27,7 +27,7 @@ def loop():
 @pytest.fixture(scope="module")
 def night(loop, tmp_path_factory):
     run_, path, ran = loop
-    seen = lbt.files.telemetry_of(run_, path, sensor_gain=GAIN, design=ran)
+    seen = lbt.files.telemetry_from_simulation(run_, path, sensor_gain=GAIN, design=ran)
     return lbt.files.save_telemetry(tmp_path_factory.mktemp("night") / "night.fits", seen)
 
 

@@ -1,4 +1,4 @@
-"""Lines that are known beforehand: lists, and accelerometers beside the wavefront."""
+"""Lines known beforehand: lists, and accelerometers beside the wavefront."""
 
 from __future__ import annotations
 
@@ -7,6 +7,18 @@ import pytest
 from scipy.signal import coherence, lfilter
 
 import lbt_synth as lbt
+
+
+def test_headings_of_lists_of_lines(tmp_path):
+    path = tmp_path / "lines.csv"
+    for heading in ("frequency_error_hz,frequency_hz", "Error [Hz],Frequency [Hz]", "sigma,f"):
+        path.write_text(f"{heading}\n0.1,20\n,45\n")
+        found = [
+            (line.frequency_hz, line.frequency_error_hz)
+            for line in lbt.identification.load_lines(path)
+        ]
+        assert found == [(20.0, 0.1), (45.0, 0.0)]
+
 
 RATE = 1000.0
 

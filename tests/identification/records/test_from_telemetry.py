@@ -1,97 +1,19 @@
-"""Records: units, arrays that are refused, and telemetry of all kinds."""
+"""Records from telemetry of all kinds."""
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
+from support.records import SHELL
 
 import lbt_synth as lbt
 
 RATE = 1000.0
-SHELL = lbt.models.PositionLoop.of_bandwidth(
-    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
-)
+
+
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
 
 
-# -------------------------------------------------------------------- units
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [
-        ("nm", 1.0),
-        ("um", 1e3),
-        ("µm", 1e3),
-        ("m", 1e9),
-        ("mas", 9.96292),
-        ("arcsec", 9962.92),
-        ("urad", 2055.0),  # D/4 = 2.055 m a radian
-        ("rad", 2.055e9),
-    ],
-)
-def test_units(unit, factor):
-    y = np.array([1.0, 2.0, -1.0])
-    seen = lbt.identification.loop_record(
-        y / factor, frame_rate_hz=RATE, unit=unit, diameter_m=8.22
-    )
-    assert seen.measurements[:, 0] == pytest.approx(y, rel=1e-5)
-    if unit in ("mas", "arcsec", "urad", "rad"):
-        with pytest.raises(lbt.errors.ProblemError, match="give diameter_m"):
-            lbt.identification.loop_record(y, frame_rate_hz=RATE, unit=unit)
-
-
-def test_commands_may_have_a_unit_of_their_own():
-    y = np.random.default_rng(0).standard_normal((30, 1))
-    seen = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm", command_unit="um")
-    assert np.allclose(seen.commands, 1e3 * y)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"unit": "volt"}, "unit must be one of nm, um, m, mas"),
-        ({"unit": 3}, "unit must be one of"),
-        ({"command_unit": "pixel"}, "unit must be one of"),
-        ({"measurements": np.ones((3, 5))}, "one or two axes.*Choose tip and tilt"),
-        ({"measurements": np.ones((2, 50))}, "one or two axes.*Transpose it"),
-        ({"measurements": []}, "not empty"),
-        ({"measurements": [["a"]]}, "array of numbers"),
-        ({"commands": np.ones((30, 1))}, "commands must match measurements"),
-        ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
-        ({"diameter_m": -1}, "diameter_m must be above 0"),
-        ({"obstruction": 1}, "obstruction must be below 1"),
-        ({"mirror": "shell"}, "expected a PositionLoop"),
-    ],
-)
-def test_arrays_that_are_refused(change, words):
-    y = np.random.default_rng(0).standard_normal((30, 2))
-    fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE, "unit": "nm"}
-    with pytest.raises(lbt.errors.ProblemError, match=words):
-        lbt.identification.loop_record(**{**fields, **change})
-
-
-def test_a_mirror_that_does_not_fit_the_rate_is_refused():
-    y = np.random.default_rng(0).standard_normal((30, 1))
-    with pytest.raises(lbt.errors.ProblemError, match="whole number of samples a frame"):
-        lbt.identification.loop_record(
-            y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm"
-        )
-
-
-def test_records_are_frozen():
-    seen = lbt.identification.loop_record([1.0, 2.0], [1.0, 3.0], frame_rate_hz=RATE, unit="nm")
-    for name in ("measurements", "commands", "usable", "measured", "commanded"):
-        assert not getattr(seen, name).flags.writeable
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        seen.source = "x"
-    with pytest.raises(lbt.errors.DimensionError, match="usable must be 2 truth values"):
-        dataclasses.replace(seen, usable=np.ones(3, dtype=bool))
-    with pytest.raises(lbt.errors.DimensionError, match="commands must have 2 rows"):
-        dataclasses.replace(seen, commands=np.ones((3, 1)))
-
-
-# ---------------------------------------------------------------- telemetry
 def telemetry(frames=60, **changes):
     rng = np.random.default_rng(2)
     fields = {

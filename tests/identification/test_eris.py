@@ -1,4 +1,6 @@
-"""The example on the vibration spectrum of VLT/ERIS, and what it needed: sums of spectra, labels."""
+"""The example on the vibration spectrum of VLT/ERIS."""
+
+from __future__ import annotations
 
 import hashlib
 import importlib.util
@@ -6,12 +8,9 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.report.figures.identification import _apart
 
 FILE = ROOT / "examples" / "data" / "eris_vibrations_psd.fits"
 
@@ -167,42 +166,3 @@ def test_figure_of_a_short_spectrum(model):
             x, y = blended.transform(text.get_position())
             assert edges.x0 < x < edges.x1
             assert y > top
-
-
-@given(st.lists(st.floats(0, 1), max_size=40))
-def test_labels_do_not_overlap(wanted):
-    wanted = sorted(wanted)
-    places = _apart(wanted)
-    gap = min(0.045, 1 / max(len(wanted), 1))
-    assert places.size == len(wanted)
-    assert np.all(np.diff(places) > gap - 1e-9)
-    assert np.all((places > 0) & (places < 1))
-    if wanted and np.all(np.diff([-0.03, *wanted, 1.03]) > 0.06):
-        assert places == pytest.approx(wanted)
-
-
-def test_sum_of_spectra():
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=2.0, frame_rate_hz=500)
-    table = lbt.models.TabulatedSpectrum(frequency_hz=[10, 20, 40], density_nm2_hz=[1, 5, 2])
-    other = lbt.models.TabulatedSpectrum(frequency_hz=[20, 30], density_nm2_hz=[7, 7])
-    whole = lbt.models.SumSpectrum(parts=[slow, lbt.models.SumSpectrum(parts=[table, other])])
-    f = np.array([5.0, 15.0, 25.0, 100.0])
-    assert whole.psd(f) == pytest.approx(slow.psd(f) + np.array([0, 3, 4.25 + 7, 0]))
-    assert whole.parts == (slow, table, other)
-    assert whole.breakpoints_hz.tolist() == [10, 20, 30, 40]
-    assert isinstance(whole, lbt.models.Spectrum)
-    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
-    left = [
-        lbt.residual_budget(loop, lbt.Truth(turbulence=part)).turbulence_nm2[0, 0]
-        for part in (whole, slow, table, other)
-    ]
-    assert left[0] == pytest.approx(sum(left[1:]), rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("parts", "text"), [([], "at least one"), ([3.0], "psd"), (3.0, "must be a list")]
-)
-def test_sums_of_no_spectra_are_refused(parts, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
-        lbt.models.SumSpectrum(parts=parts)

@@ -1,47 +1,17 @@
-"""Records from files of others: what names, headers and options tell, and what is refused."""
+"""Records from files: every format, facts, units, spectra, and what is refused."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from support.record_files import csv, hdus, image, write_csv
 
 import lbt_synth as lbt
 
 RATE = 500.0
 
 
-@pytest.fixture
-def series():
-    rng = np.random.default_rng(0)
-    return 20 * rng.standard_normal((60, 2)), 20 * rng.standard_normal((60, 2))
-
-
-def write_csv(path, names, columns, *, sign=",", comments=()):
-    rows = [*(f"# {line}" for line in comments), sign.join(names)] if names else []
-    rows += [sign.join(repr(float(v)) for v in row) for row in np.column_stack(columns)]
-    path.write_text("\n".join(rows) + "\n")
-    return path
-
-
-def hdus(path, *units, **cards):
-    primary = fits.PrimaryHDU()
-    for key, value in cards.items():
-        primary.header[key] = value
-    fits.HDUList([primary, *units]).writeto(path)
-    return path
-
-
-def image(name, data, unit=None, **cards):
-    unit_hdu = fits.ImageHDU(np.asarray(data), name=name)
-    if unit:
-        unit_hdu.header["BUNIT"] = unit
-    for key, value in cards.items():
-        unit_hdu.header[key] = value
-    return unit_hdu
-
-
-# ---------------------------------------------------------- every format alike
 @pytest.mark.parametrize(
     "kind",
     ["csv", "tsv", "semicolon", "blanks", "fits images", "turned", "fits table", "npz", "npy"],
@@ -100,7 +70,9 @@ def test_telemetry_of_ours(tmp_path):
     )
     run = lbt.simulate(lbt.integrator(path, gain=0.2).controller, truth, hardware=path, frames=99)
     for name in ("a.fits", "a.npz"):
-        file = lbt.files.save_telemetry(tmp_path / name, lbt.files.telemetry_from_simulation(run, path))
+        file = lbt.files.save_telemetry(
+            tmp_path / name, lbt.files.telemetry_from_simulation(run, path)
+        )
         seen = lbt.load_record(file)
         assert np.array_equal(seen.measurements, run.measurements[0])
         assert np.array_equal(seen.mirror_taps, path.mirror_taps)
@@ -135,125 +107,6 @@ def test_telemetry_of_the_standard(tmp_path):
     assert np.flatnonzero(~back.usable).tolist() == [0, 1]
 
 
-# --------------------------------------------------------------------- names
-@pytest.mark.parametrize(
-    ("names", "axes"),
-    [
-        (["y_nm"], 1),
-        (["Y [nm]"], 1),
-        (["Residual (nm)"], 1),
-        (["tip_nm", "tilt_nm"], 2),
-        (["tilt_nm", "tip_nm"], 2),
-        (["slopes_tip_nm", "slopes_tilt_nm"], 2),
-        (["residual_x_nm", "residual_y_nm"], 2),
-        (["measurement 1 [nm]", "measurement 2 [nm]"], 2),
-        (["y1_nm", "y0_nm"], 2),
-    ],
-)
-def test_names_of_measurements(tmp_path, series, names, axes):
-    y, u = series
-    commands = ["u_nm"] if axes == 1 else ["cmd_tip_nm", "cmd_tilt_nm"]
-    path = write_csv(tmp_path / "a.csv", [*names, *commands], [*y.T[:axes], *u.T[:axes]])
-    seen = lbt.load_record(path, frame_rate_hz=RATE)
-    order = [1, 0] if names[0] in ("tilt_nm", "y1_nm") else [0, 1][:axes]
-    assert np.array_equal(seen.measurements, y[:, order])
-    assert np.array_equal(seen.commands, u[:, :axes])
-
-
-@pytest.mark.parametrize(
-    ("names", "kind"),
-    [
-        (["pol_tip_nm", "pol_tilt_nm"], None),
-        (["open_loop_0_nm", "open_loop_1_nm"], None),
-        (["disturbance_x [nm]", "disturbance_y [nm]"], None),
-        (["y0_nm", "y1_nm"], "open_loop"),
-    ],
-)
-def test_open_loops(tmp_path, series, names, kind):
-    y, _ = series
-    path = write_csv(tmp_path / "a.csv", names, y.T)
-    seen = lbt.load_record(path, kind=kind, frame_rate_hz=RATE)
-    assert seen.commands is None
-    assert np.array_equal(seen.pseudo_open_loop(), y)
-    assert seen.usable.all()
-
-
-def test_measurements_alone_are_not_taken_for_an_open_loop(tmp_path, series):
-    path = write_csv(tmp_path / "a.csv", ["y0_nm", "y1_nm"], series[0].T)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="Residuals of a closed loop need its commands"
-    ):
-        lbt.load_record(path, frame_rate_hz=RATE)
-
-
-def test_open_loop_and_commands(tmp_path, series):
-    y, u = series
-    path = write_csv(tmp_path / "a.csv", ["y_nm", "u_nm"], [y[:, 0], u[:, 0]])
-    seen = lbt.load_record(path, kind="open_loop", frame_rate_hz=RATE)
-    assert seen.commands is None
-    assert "commands were left out: the record is of an open loop" in seen.health.notes
-    both = write_csv(tmp_path / "b.csv", ["y_nm", "u_nm", "pol_nm"], [*y.T, u[:, 0]])
-    with pytest.raises(
-        lbt.errors.ProblemError, match="more than one record; say kind: open_loop or clos"
-    ):
-        lbt.load_record(both, frame_rate_hz=RATE)
-    assert lbt.load_record(both, kind="open_loop", frame_rate_hz=RATE).measurements[
-        :, 0
-    ] == pytest.approx(u[:, 0])
-
-
-def test_columns_are_chosen(tmp_path, series):
-    y, u = series
-    path = write_csv(
-        tmp_path / "a.csv", ["a", "b", "c", "d", "stamp"], [*y.T, *u.T, np.arange(60) / RATE]
-    )
-    choice = {"measurements": ["a", 1], "commands": ("C", "d"), "times": "stamp"}
-    seen = lbt.load_record(path, columns=choice, unit="mas", diameter_m=8, command_unit="nm")
-    assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8) * y)
-    assert np.array_equal(seen.commands, u)
-    assert seen.frame_rate_hz == RATE
-    one = lbt.load_record(path, columns={"open_loop": "b"}, unit="nm", frame_rate_hz=RATE)
-    assert np.array_equal(one.measurements[:, 0], y[:, 1])
-    assert "not used: a, c, d, stamp" in one.health.notes
-
-
-def test_axes_of_many_columns(tmp_path):
-    y, u = np.random.default_rng(0).standard_normal((2, 60, 5))
-    path = tmp_path / "a.npz"
-    np.savez(path, y=y, u=u, fs=RATE)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="5 columns of measurements; say which.*axes="
-    ):
-        lbt.load_record(path, unit="nm")
-    seen = lbt.load_record(path, unit="nm", axes=(3, 1))
-    assert np.array_equal(seen.measurements, y[:, [3, 1]])
-    assert np.array_equal(seen.commands, u[:, [3, 1]])
-    with pytest.raises(
-        lbt.errors.ProblemError, match="axes must be one or two different numbers below 5"
-    ):
-        lbt.load_record(path, unit="nm", axes=(0, 5))
-
-
-def test_commands_from_another_file(tmp_path, series):
-    y, u = series
-    np.save(tmp_path / "y.npy", y)
-    np.save(tmp_path / "u.npy", u)
-    seen = lbt.load_record(
-        tmp_path / "y.npy", commands=tmp_path / "u.npy", frame_rate_hz=RATE, unit="nm"
-    )
-    assert np.array_equal(seen.measurements, y)
-    assert np.array_equal(seen.commands, u)
-    assert f"commands are from {tmp_path / 'u.npy'}" in seen.health.notes
-    np.save(tmp_path / "v.npy", u[:-1])
-    with pytest.raises(
-        lbt.errors.TelemetryError, match="as many frames as the measurements; got 59, 60"
-    ):
-        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "v.npy", unit="nm")
-    with pytest.raises(lbt.errors.TelemetryError, match="cannot read .*w.npy: No such file"):
-        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "w.npy", unit="nm")
-
-
-# --------------------------------------------------------------------- clocks
 def test_gaps_times_and_counters(tmp_path):
     path = tmp_path / "a.csv"
     rng = np.random.default_rng(0)
@@ -325,7 +178,6 @@ def test_facts_in_comments(tmp_path, series):
     assert np.allclose(seen.measurements, 1e3 * series[0][:, :1])
 
 
-# ---------------------------------------------------------------------- units
 def test_units_have_to_be_told(tmp_path, series):
     y, _ = series
     path = write_csv(tmp_path / "a.csv", ["pol"], [y[:, 0]])
@@ -353,7 +205,6 @@ def test_units_have_to_be_told(tmp_path, series):
         lbt.load_record(angle)
 
 
-# -------------------------------------------------------------------- spectra
 @pytest.mark.parametrize("form", ["csv", "fits", "array"])
 def test_spectra(tmp_path, form):
     f = np.linspace(5, 100, 300)
@@ -411,7 +262,6 @@ def gapped(folder):
     return lbt.load_record(path)
 
 
-# -------------------------------------------------------------------- refusals
 @pytest.mark.parametrize(
     ("names", "options", "words"),
     [
@@ -451,55 +301,6 @@ def test_what_is_refused(tmp_path, series, names, options, words):
         assert "night.csv" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("a.xls", b"", "must end in one of .fits"),
-        ("a.csv", b"", "has no rows"),
-        ("a.csv", b"y_nm,u_nm\n", "a heading and no rows"),
-        ("a.csv", b"y_nm,u_nm\n1,2\n3\n", "line 3 must have 2 cells; got 1"),
-        ("a.csv", b"# x\ny_nm,u_nm\n1,2\n3,up\n", "cell 2 of line 4 must be a number; got 'up'"),
-        ("a.csv", b"\xff\xfe\x00", "no text in UTF-8"),
-        ("a.npy", b"\x93NUMPY garbage", "cannot read .*a.npy as .npy"),
-        ("a.npz", b"PK garbage", "cannot read .*a.npz as .npz"),
-        ("a.fits", b"SIMPLE", "cannot read .*a.fits as .fits"),
-        ("a.fits", b"", "cannot read .*a.fits as .fits"),
-    ],
-)
-def test_damage(tmp_path, name, content, words):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
-        lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
-    assert "Traceback" not in str(caught.value)
-
-
-@pytest.mark.parametrize("size", [2000, 4000, 6000])
-def test_truncated_files(tmp_path, series, size):
-    path = hdus(tmp_path / "a.fits", image("POL", np.tile(series[0], (10, 1)), "nm"))
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(lbt.LbtSynthError, match=r"a\.fits"):
-        lbt.load_record(path, frame_rate_hz=RATE)
-
-
-def test_nulls_of_integer_columns(tmp_path):
-    values = np.random.default_rng(0).integers(-500, 500, 40).astype(np.int32)
-    values[7] = -99999
-    table = fits.BinTableHDU.from_columns(
-        [fits.Column("POL", "J", array=values, null=-99999, unit="nm")]
-    )
-    seen = lbt.load_record(hdus(tmp_path / "a.fits", table), frame_rate_hz=RATE)
-    assert np.flatnonzero(~seen.usable).tolist() == [7]
-    assert np.array_equal(seen.measurements[8:, 0], values[8:])
-
-
-def test_no_pickle_is_opened(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([{"y": 1}], dtype=object), allow_pickle=True)
-    np.savez(tmp_path / "b.npz", y=np.array([{"y": 1}], dtype=object))
-    for name in ("a.npy", "b.npz"):
-        with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
-            lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
-
-
 def test_a_missing_file():
     with pytest.raises(lbt.errors.TelemetryError, match=r"cannot read nowhere\.csv: No such file"):
         lbt.load_record("nowhere.csv")
@@ -512,3 +313,63 @@ def test_files_without_series(tmp_path):
     np.savez(tmp_path / "b.npz", cube=np.ones((3, 4, 5)), text=np.array(["a", "b"]))
     with pytest.raises(lbt.errors.ProblemError, match="holds no series of numbers"):
         lbt.load_record(tmp_path / "b.npz")
+
+
+FRAMES = 60
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("frequency_hz,error_hz\n20,0.1\n,0.2\n", "row 2 of the numbers has no frequency"),
+        ("frequency_hz,rms_nm\n20,300\n", "must be frequency_hz, and frequency_error_hz.*rms_nm"),
+        ("frequency_khz\n0.02\n", "must be frequency_hz"),
+        ("f_hz,frequency_hz\n20,20\n", "must be frequency_hz"),
+        ("error_hz\n20\n", "must have a column frequency_hz"),
+    ],
+)
+def test_lists_of_lines_that_are_refused(tmp_path, text, words):
+    path = tmp_path / "lines.csv"
+    path.write_text(text)
+    with pytest.raises(lbt.errors.TelemetryError, match=words):
+        lbt.identification.load_lines(path)
+
+
+def test_telemetry_takes_an_obstruction_and_refuses_averages(tmp_path, series):
+    path = lbt.LoopHardware(frame_rate_hz=800)
+    run = lbt.simulate(
+        lbt.integrator(path, gain=0.3).controller,
+        lbt.Truth(turbulence=None, noise_nm=5.0),
+        hardware=path,
+        frames=99,
+    )
+    file = lbt.files.save_telemetry(
+        tmp_path / "a.fits", lbt.files.telemetry_from_simulation(run, path)
+    )
+    assert lbt.load_record(file, obstruction=0.3).obstruction == 0.3
+    with pytest.raises(lbt.errors.ProblemError, match="averages are of a spectrum"):
+        lbt.load_record(file, averages=3)
+    plain = csv(tmp_path / "b.csv", pol_nm=series[0][:, 0])
+    with pytest.raises(lbt.errors.ProblemError, match="averages are of a spectrum"):
+        lbt.load_record(plain, frame_rate_hz=RATE, averages=3)
+
+
+def test_capitals_of_frequencies(tmp_path):
+    f = np.linspace(1, 50, 40)
+    for unit, factor in (("mHz", 1e-3), ("MHz", 1e6), ("kHz", 1e3), ("HZ", 1.0)):
+        path = csv(tmp_path / "a.csv", **{f"f [{unit}]": f, "psd_nm2_hz": f})
+        assert np.allclose(lbt.load_record(path).frequency_hz, factor * f)
+    path = csv(tmp_path / "a.csv", f_mhz=f, psd_nm2_hz=f)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="must be in one of Hz, kHz, mHz, MHz; got 'mhz'"
+    ):
+        lbt.load_record(path)
+
+
+@pytest.mark.parametrize("step", [1.0, 2.0, 1 / 86.4e6])
+def test_times_that_are_no_seconds(tmp_path, series, step):
+    path = csv(tmp_path / "a.csv", time=10 + step * np.arange(FRAMES), pol_nm=series[0][:, 0])
+    with pytest.raises(
+        lbt.errors.ProblemError, match="Hz with time in seconds, and their unit is not to"
+    ):
+        lbt.load_record(path)

@@ -1,20 +1,13 @@
-"""What a taper makes of a narrow line, and lines that a record does not resolve."""
+"""Smearing of narrow lines by the taper, against its integral."""
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
-from scipy.signal import lfilter
-from support.plants import ROOT
-from test_identification import RATE, loop_of
 
-import lbt_synth as lbt
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.taper import TAPER, WIDE, log_smearing
 
@@ -78,63 +71,3 @@ def test_periodogram_of_a_sinusoid_is_the_taper(frequency: float) -> None:
         line = width / np.pi / (width**2 + d[inside] ** 2)
         model = line * np.exp(log_smearing(width, d[inside])[0]) * rms**2 * data.duration_s
         assert np.mean(data.power(1.0)[inside]) == pytest.approx(np.mean(model), rel=0.06)
-
-
-def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:
-    rng = np.random.default_rng(0)
-    k = np.arange(40_000)
-    wave = 300 * np.sqrt(2) * np.cos(2 * np.pi * 20.0037 * k / RATE)
-    slow = np.cumsum(rng.standard_normal(k.size))
-    found = lbt.identification.identify_axis(
-        wave + slow + 5 * rng.standard_normal(k.size), frame_rate_hz=RATE
-    )
-    (line,) = found.lines
-    assert not line.resolved
-    assert line.damping * line.frequency_hz * 40 == pytest.approx(0.01, rel=1e-2)
-    assert line.frequency_hz == pytest.approx(20.0037, abs=0.002)
-    assert line.rms_nm == pytest.approx(300, abs=3 * line.rms_error_nm)
-    assert line.rms_error_nm < 40
-    assert found.noise_nm == pytest.approx(5, rel=0.02)
-
-
-def test_a_line_that_is_resolved_says_so() -> None:
-    y, c = loop_of(lines=((40, 0.01, 30),), frames=20_000)
-    (line,) = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE).lines
-    assert line.resolved
-    assert line.damping == pytest.approx(0.01, abs=5 * line.damping_error)
-
-
-@pytest.mark.study
-def test_random_closed_loops_reach_what_the_page_says() -> None:
-    sys.path.insert(0, str(Path(ROOT) / "docs" / "measure"))
-    try:
-        from identification import studied
-    finally:
-        sys.path.pop(0)
-    results = [studied(seed, 60_000) for seed in range(40)]
-    found, missed, false = (
-        sum(len(r[key]) for r in results) for key in ("found", "missed", "false")
-    )
-    assert found / (found + missed) > 0.95
-    assert false / len(results) < 0.2
-    ratio = np.array([r["ratio"] for r in results])
-    assert np.median(ratio) < 1.03
-    assert np.percentile(ratio, 95) < 1.10
-    half = np.array([r["half_ratio"] for r in results])
-    assert np.median(half) < 1.01
-    assert np.mean(half < 1) > 0.5
-
-
-@pytest.mark.parametrize(("frequency", "stretch"), [(60.0, 667), (30.0, 667), (51.603, 1000)])
-def test_short_stretches_do_not_lead_to_a_sidelobe(frequency: float, stretch: int) -> None:
-    rng = np.random.default_rng(3)
-    k = np.arange(20_000)
-    slow = lfilter([1], [1, -0.99], 4 * rng.standard_normal(k.size))
-    z = slow + 5 * rng.standard_normal(k.size)
-    z += 50 * np.sqrt(2) * np.cos(2 * np.pi * frequency * k / RATE + 1)
-    pieces = [(j, j + stretch) for j in range(0, k.size - stretch, stretch + 5)]
-    found = lbt.identification.identify_axis(z, frame_rate_hz=RATE, stretches=pieces)
-    (line,) = found.lines
-    assert line.frequency_hz == pytest.approx(frequency, abs=0.1)
-    assert line.rms_nm == pytest.approx(50, rel=0.15)
-    assert found.turbulence_fit.damping > 0.05

@@ -1,0 +1,47 @@
+"""Periodograms of a loop: density, leakage, gaps, quadratic in the gain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lbt_synth.identification.fit.periodogram import loop_periodogram
+
+RATE = 1000.0
+
+
+def test_periodogram_of_white_noise_is_its_density_and_leaks_nothing_of_turbulence() -> None:
+    rng = np.random.default_rng(1)
+    white = 3 * rng.standard_normal(20_000)
+    data = loop_periodogram(white, None, frame_rate_hz=RATE, stretches=[(0, white.size)])
+    density = 2 * 9 / RATE
+    assert np.mean(data.power(1.0)) == pytest.approx(density, rel=0.02)
+    # a random walk a thousand times larger at low frequencies leaves the noise as it is
+    walk = np.cumsum(rng.standard_normal(white.size)) * 2
+    leaking = loop_periodogram(white + walk, None, frame_rate_hz=RATE, stretches=[(0, white.size)])
+    walk_density = 2 * 4 / RATE / (4 * np.sin(np.pi * data.frequency_hz / RATE) ** 2)
+    high = data.frequency_hz > 300
+    excess = np.mean(leaking.power(1.0)[high] / (density + walk_density[high]))
+    assert excess == pytest.approx(1, rel=0.04)
+
+
+@given(gain=st.floats(0.1, 3), cut=st.integers(2000, 6000))
+@settings(max_examples=10, deadline=None)
+def test_periodogram_is_quadratic_in_the_gain(gain: float, cut: int) -> None:
+    rng = np.random.default_rng(cut)
+    y, c = rng.standard_normal((2, 8000))
+    pieces = [(0, cut), (cut + 100, 8000)]
+    parts = loop_periodogram(y, c, frame_rate_hz=RATE, stretches=pieces)
+    whole = loop_periodogram(y + gain * c, None, frame_rate_hz=RATE, stretches=pieces)
+    assert parts.power(gain) == pytest.approx(whole.power(1.0), rel=1e-9, abs=1e-12)
+
+
+def test_a_gap_shortens_the_segments_and_keeps_most_frames() -> None:
+    rng = np.random.default_rng(0)
+    y = rng.standard_normal(30_000)
+    y[9990:10_010] = 1e6  # what a gap holds is never used
+    data = loop_periodogram(y, None, frame_rate_hz=RATE, stretches=[(0, 9990), (10_010, 30_000)])
+    assert np.mean(data.power(1.0)) == pytest.approx(2 / RATE, rel=0.03)
+    assert 0.8 * 15_000 < np.sum(data.count) < 15_000

@@ -1,0 +1,13 @@
+"""Series that the tests of files share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def series():
+    """Measurements and commands, (60, 2) each."""
+    rng = np.random.default_rng(0)
+    return 20 * rng.standard_normal((60, 2)), 20 * rng.standard_normal((60, 2))

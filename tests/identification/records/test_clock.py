@@ -1,0 +1,127 @@
+"""Times and counters: missing and repeated frames, stated rates."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from support.records import noise
+
+import lbt_synth as lbt
+
+RATE = 1000.0
+
+
+@pytest.mark.parametrize("by", ["times", "numbers", "both"])
+def test_missing_frames_become_holes(by):
+    y = np.random.default_rng(0).standard_normal((500, 2))
+    kept = np.delete(np.arange(500), [100, 101, 300])
+    clock = {}
+    if by != "numbers":
+        jitter = np.random.default_rng(1).uniform(-1e-4, 1e-4, len(kept))
+        clock["times_s"] = 1.7e9 + kept / RATE + jitter
+    if by != "times":
+        clock["frame_numbers"] = 7000 + kept
+    rate = RATE if by == "numbers" else None
+    seen = lbt.identification.loop_record(y[kept], frame_rate_hz=rate, unit="nm", **clock)
+    assert np.flatnonzero(~seen.usable).tolist() == [100, 101, 300]
+    assert seen.frames == 500
+    assert seen.frame_rate_hz == pytest.approx(RATE, rel=1e-5)
+    assert np.array_equal(seen.measurements[seen.usable], y[kept])
+    assert seen.health.rows() == (("missing", "frames", None, 3, 0.6, 100, "spoilt"),)
+
+
+def test_rows_that_come_twice():
+    y = np.random.default_rng(0).standard_normal((100, 2))
+    order = np.sort(np.concatenate([np.arange(100), [20, 20, 50]]))
+    rows = y[order].copy()
+    same = lbt.identification.loop_record(rows, frame_rate_hz=RATE, frame_numbers=order, unit="nm")
+    assert same.usable.all()
+    assert np.array_equal(same.measurements, y)
+    assert same.health.notes == ("3 rows of a time that had been recorded already were left out",)
+    rows[np.flatnonzero(order == 50)[1]] += 1  # two stories of one frame
+    torn = lbt.identification.loop_record(rows, times_s=order / RATE, unit="nm")
+    assert np.flatnonzero(~torn.usable).tolist() == [50]
+    assert torn.health.rows() == (("repeated", "frames", None, 1, 1.0, 50, "spoilt"),)
+
+
+@pytest.mark.parametrize(
+    ("clock", "words"),
+    [
+        ({}, "frame rate is not known; give frame_rate_hz"),
+        ({"times_s": [0, 1, 2]}, r"times_s must have shape \(6,\)"),
+        ({"times_s": [0, 1, 2, 1.5, 3, 4]}, "must not run backwards; got 2 and then 1.5 at row 3"),
+        ({"times_s": [0, 1, 2, np.nan, 3, 4]}, "times_s must be finite"),
+        ({"times_s": [1, 1, 1, 1, 1, 1]}, "times_s must rise"),
+        ({"times_s": [0, 1, 2.4, 4.3, 5.3, 6.3]}, "lie on no regular grid of 1 Hz"),
+        ({"times_s": np.arange(6), "frame_rate_hz": 2}, "must be that of the times, 1 Hz; got 2"),
+        ({"times_s": [0, 1, 2, 3, 4, 500]}, "495 of 501 frames would be missing"),
+        (
+            {"times_s": [0, 1, 2, 3, 4, 500], "frame_rate_hz": 1},
+            "495 of 501 frames would be missing",
+        ),
+        ({"frame_numbers": [0, 2, 4, 6, 8, 10], "frame_rate_hz": 2}, "median step of 2"),
+        ({"frame_numbers": [0, 1, 2, 0, 1, 2], "frame_rate_hz": 2}, "frame_numbers must not run b"),
+        ({"frame_numbers": [0, 1, 2, 2.5, 3, 4], "frame_rate_hz": 2}, "must be whole numbers"),
+        ({"frame_rate_hz": 0}, "frame_rate_hz must be above 0"),
+    ],
+)
+def test_clocks_that_are_refused(clock, words):
+    y = np.random.default_rng(0).standard_normal((6, 1))
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        lbt.identification.loop_record(y, unit="nm", **clock)
+
+
+def test_a_stated_rate_is_held_against_the_times():
+    times = np.arange(20_000) / 1000
+    for rate in (1004, 999, 1000.2):
+        with pytest.raises(
+            lbt.errors.ProblemError, match="must be that of the times, 1000 Hz; got"
+        ):
+            lbt.identification.loop_record(
+                noise(20_000), frame_rate_hz=rate, times_s=times, unit="nm"
+            )
+    near = lbt.identification.loop_record(
+        noise(20_000), frame_rate_hz=1000.05, times_s=times, unit="nm"
+    )
+    assert near.frame_rate_hz == 1000.05
+    assert near.health.notes == (
+        "frame rate 1000.05 Hz, as stated; by the times 1000 Hz, 1 frames apart over the record",
+    )
+    # with a counter beside the times, too
+    with pytest.raises(lbt.errors.ProblemError, match="must be that of the times"):
+        lbt.identification.loop_record(
+            noise(20_000),
+            frame_rate_hz=1004,
+            times_s=times,
+            frame_numbers=np.arange(20_000),
+            unit="nm",
+        )
+    same = lbt.identification.loop_record(
+        noise(20_000), frame_rate_hz=1000, times_s=times, unit="nm"
+    )
+    assert same.health.notes == ()
+
+
+def test_jumps_beyond_all_integers():
+    late = np.arange(50.0)
+    late[30:] += 1e19
+    for clock in ({"frame_numbers": late}, {"times_s": late}):
+        with pytest.raises(
+            lbt.errors.ProblemError, match=r"frames would be missing .* cut the record"
+        ):
+            lbt.identification.loop_record(noise(50), frame_rate_hz=500, unit="nm", **clock)
+    with pytest.raises(lbt.errors.ProblemError, match="frames would be missing"):
+        lbt.identification.loop_record(noise(50), times_s=late, unit="nm")
+
+
+def test_repeated_rows_take_a_time_in_proportion():
+    rows = np.repeat(np.arange(60_000), 2)
+    start = time.perf_counter()
+    seen = lbt.identification.loop_record(
+        np.repeat(noise(60_000), 2), frame_rate_hz=500, frame_numbers=rows, unit="nm"
+    )
+    assert time.perf_counter() - start < 2  # not with its square
+    assert seen.frames == 60_000
+    assert seen.usable.all()

@@ -1,0 +1,163 @@
+"""What files hold: nulls, facts in arrays and comments, damage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from support.record_files import csv, hdus, image
+
+import lbt_synth as lbt
+
+RATE = 500.0
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.xls", b"", "must end in one of .fits"),
+        ("a.csv", b"", "has no rows"),
+        ("a.csv", b"y_nm,u_nm\n", "a heading and no rows"),
+        ("a.csv", b"y_nm,u_nm\n1,2\n3\n", "line 3 must have 2 cells; got 1"),
+        ("a.csv", b"# x\ny_nm,u_nm\n1,2\n3,up\n", "cell 2 of line 4 must be a number; got 'up'"),
+        ("a.csv", b"\xff\xfe\x00", "no text in UTF-8"),
+        ("a.npy", b"\x93NUMPY garbage", "cannot read .*a.npy as .npy"),
+        ("a.npz", b"PK garbage", "cannot read .*a.npz as .npz"),
+        ("a.fits", b"SIMPLE", "cannot read .*a.fits as .fits"),
+        ("a.fits", b"", "cannot read .*a.fits as .fits"),
+    ],
+)
+def test_damage(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
+        lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
+    assert "Traceback" not in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [2000, 4000, 6000])
+def test_truncated_files(tmp_path, series, size):
+    path = hdus(tmp_path / "a.fits", image("POL", np.tile(series[0], (10, 1)), "nm"))
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(lbt.LbtSynthError, match=r"a\.fits"):
+        lbt.load_record(path, frame_rate_hz=RATE)
+
+
+def test_nulls_of_integer_columns(tmp_path):
+    values = np.random.default_rng(0).integers(-500, 500, 40).astype(np.int32)
+    values[7] = -99999
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column("POL", "J", array=values, null=-99999, unit="nm")]
+    )
+    seen = lbt.load_record(hdus(tmp_path / "a.fits", table), frame_rate_hz=RATE)
+    assert np.flatnonzero(~seen.usable).tolist() == [7]
+    assert np.array_equal(seen.measurements[8:, 0], values[8:])
+
+
+def test_no_pickle_is_opened(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([{"y": 1}], dtype=object), allow_pickle=True)
+    np.savez(tmp_path / "b.npz", y=np.array([{"y": 1}], dtype=object))
+    for name in ("a.npy", "b.npz"):
+        with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
+            lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
+
+
+FRAMES = 60
+
+
+def table(path, *columns, **cards):
+    unit = fits.BinTableHDU.from_columns(columns)
+    for key, value in cards.items():
+        unit.header[key] = value
+    unit.writeto(path)
+    return path
+
+
+def test_nulls_of_scaled_columns_and_images(tmp_path):
+    rng = np.random.default_rng(0)
+    raw = rng.integers(-1000, 1000, FRAMES).astype(np.int16)
+    raw[10] = -999
+    raw[11] = -998
+    scaled = table(
+        tmp_path / "a.fits",
+        fits.Column("POL", "I", array=raw, null=-999, unit="nm"),
+        TSCAL1=0.01,
+        TZERO1=3.0,
+        FPS=RATE,
+    )
+    unsigned = (raw.astype(int) + 32768).astype(np.uint16)
+    column = fits.Column("POL", "I", array=unsigned, bzero=32768, null=-999, unit="nm")
+    shifted = table(tmp_path / "b.fits", column, FPS=RATE)
+    image = fits.PrimaryHDU(np.column_stack([raw, raw]))
+    image.header.update({"BLANK": -999, "BUNIT": "nm", "FPS": RATE})
+    image.writeto(tmp_path / "c.fits")
+    image = fits.PrimaryHDU(np.column_stack([unsigned, unsigned]))
+    image.header.update({"BUNIT": "nm", "FPS": RATE})
+    image.writeto(tmp_path / "d.fits")
+    fits.setval(tmp_path / "d.fits", "BLANK", value=-999)
+    for path in (scaled, shifted, tmp_path / "c.fits", tmp_path / "d.fits"):
+        chosen = {"open_loop": (0, 1)} if path.name in ("c.fits", "d.fits") else None
+        seen = lbt.load_record(path, columns=chosen)
+        assert np.flatnonzero(~seen.usable).tolist() == [10]
+    assert lbt.load_record(scaled).measurements[11, 0] == pytest.approx(3 - 9.98)
+
+
+def test_a_name_and_a_header_of_two_units(tmp_path, series):
+    path = table(
+        tmp_path / "a.fits", fits.Column("POL_mas", "D", array=series[0][:, 0], unit="nm"), FPS=RATE
+    )
+    with pytest.raises(
+        lbt.errors.TelemetryError, match="POL_mas has the unit 'nm' in the header: which"
+    ):
+        lbt.load_record(path, diameter_m=8)
+    same = table(
+        tmp_path / "b.fits", fits.Column("POL_nm", "D", array=series[0][:, 0], unit="NM"), FPS=RATE
+    )
+    assert lbt.load_record(same).axes == 1
+
+
+@pytest.mark.parametrize(
+    ("comment", "delay"),
+    [
+        ("[ms] readout after end of frame", None),
+        ("[s] in frames of 2 ms", None),
+        ("after the end of the frame", None),
+        ("[frames] of the loop", 2.5),
+        ("total, in frames", 2.5),
+        ("(frames)", 2.5),
+    ],
+)
+def test_delays_that_are_in_frames(tmp_path, series, comment, delay):
+    y = series[0][:, 0]
+    path = table(
+        tmp_path / "a.fits",
+        fits.Column("Y", "D", array=y, unit="nm"),
+        fits.Column("U", "D", array=y, unit="nm"),
+        FPS=RATE,
+        DELAY=(2.5, comment),
+    )
+    assert lbt.load_record(path).delay_frames == delay
+
+
+def test_facts_in_arrays_and_texts(tmp_path, series):
+    path = tmp_path / "a.npz"
+    y, u = series
+    np.savez(path, y=y, u=u, unit="nm", frame_rate_hz=np.array([RATE]), delay_frames="2")
+    seen = lbt.load_record(path)
+    assert (seen.frame_rate_hz, seen.delay_frames) == (RATE, 2.0)
+    np.savez(path, y=y, u=u, unit="nm", frame_rate_hz="500 Hz", delay_frames="a few")
+    seen = lbt.load_record(path)
+    assert (seen.frame_rate_hz, seen.delay_frames) == (RATE, None)
+    assert "delay_frames was not taken for delay_frames: 'a few' is no number" in seen.health.notes
+    comments = ("frame rate = 500 Hz", "unit: nm", "delay frames: two")
+    seen = lbt.load_record(csv(tmp_path / "b.csv", comments, y=y[:, 0], u=u[:, 0]))
+    assert (seen.frame_rate_hz, seen.delay_frames) == (RATE, None)
+    assert any("'two' is no number" in note for note in seen.health.notes)
+
+
+def test_broken_archives_do_not_speak_of_pickles(tmp_path):
+    for name, words in (("a.npz", "no ZIP archive"), ("a.npy", "does not begin as an NPY")):
+        for content in (b"", b"PK", b"garbage"):
+            (tmp_path / name).write_bytes(content)
+            with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
+                lbt.load_record(tmp_path / name)
+            assert "pickle" not in str(caught.value)

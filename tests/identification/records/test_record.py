@@ -1,0 +1,206 @@
+"""Records: the exact pseudo-open loop, later delays, bridged holes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.records import ran, record
+
+import lbt_synth as lbt
+
+RATE = 1000.0
+
+
+SHELL = lbt.models.PositionLoop.of_bandwidth(
+    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
+)
+
+
+@pytest.mark.parametrize("mirror", [None, SHELL], ids=["settled", "moving"])
+@pytest.mark.parametrize("sensor_gain", [0.4, 1.0, 1.3])
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.4, 3.0])
+def test_without_noise_it_is_the_phase_before_the_correction(delay, sensor_gain, mirror):
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, mirror=mirror)
+    run = ran(path, sensor_gain=sensor_gain)
+    seen = record(run, path)
+    first = len(path.mirror_taps)
+    assert not seen.usable[:first].any()
+    assert seen.usable[first:].all()
+    z = seen.pseudo_open_loop(sensor_gain)[first:]
+    phase = run.total_nm[0, first - 1 : -1]
+    assert np.max(np.abs(z - phase)) < 1e-9 * np.max(np.abs(phase))
+    # what was taken out of it is the correction itself
+    assert np.allclose(
+        seen.corrections()[first:], (run.total_nm - run.residual_nm)[0, first - 1 : -1], atol=1e-8
+    )
+
+
+@settings(max_examples=25)
+@given(
+    delay=st.floats(1.0, 3.5),
+    gains=st.tuples(st.floats(0.3, 1.4), st.floats(0.3, 1.4)),
+    noise=st.floats(0.1, 50),
+    moving=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_with_noise_it_is_phase_and_noise_over_the_gain(delay, gains, noise, moving, seed):
+    """Against the loop stepped by hand, one gain an axis, from its first frame."""
+    path = lbt.LoopHardware(
+        frame_rate_hz=RATE, delay_frames=delay, mirror=SHELL if moving else None
+    )
+    rng, frames = np.random.default_rng(seed), 80
+    phase = np.cumsum(rng.standard_normal((frames, 2)), axis=0) * 20
+    w = noise * rng.standard_normal((frames, 2))
+    taps, g = path.mirror_taps, np.array(gains)
+    u, y = np.zeros((frames, 2)), np.zeros((frames, 2))
+    residual = np.zeros(2)
+    for k in range(frames):
+        y[k] = g * residual + w[k]
+        u[k] = 0.99 * u[k - 1] + 0.1 * y[k]
+        seen = [u[k - i] if k >= i else np.zeros(2) for i in range(len(taps))]
+        residual = phase[k] - sum(c * past for c, past in zip(taps, seen, strict=True))
+    seen = lbt.identification.loop_record(
+        y, u, frame_rate_hz=RATE, delay_frames=delay, mirror=path.mirror, unit="nm"
+    )
+    z = seen.pseudo_open_loop(g)
+    expected = phase[:-1] + w[1:] / g
+    # before the record there were no commands: here even its first frames are right
+    assert np.max(np.abs(z[1:] - expected)) < 1e-9 * np.max(np.abs(expected))
+
+
+def test_an_open_loop_is_its_own_series():
+    y = np.random.default_rng(0).standard_normal((50, 1))
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    assert np.array_equal(seen.pseudo_open_loop(), y)
+    assert np.array_equal(seen.pseudo_open_loop(0.5), 2 * y)
+    assert not seen.corrections().any()
+    assert seen.stretches() == ((0, 50),)
+
+
+def test_a_delay_can_come_later():
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2.4)
+    run = ran(path)
+    u = run.commands[0].copy()
+    u[100, 1] = np.nan
+    unknown = lbt.identification.loop_record(run.measurements[0], u, frame_rate_hz=RATE, unit="nm")
+    assert unknown.usable.all()
+    with pytest.raises(
+        lbt.errors.ProblemError, match="delay of this loop is not known; give delay_fram"
+    ):
+        unknown.corrections()
+    seen = unknown.with_delay(2.4)
+    # taps of u(k-2), u(k-3): frame 100 enters 102 and 103
+    assert np.flatnonzero(~seen.usable).tolist() == [0, 1, 2, 102, 103]
+    assert seen.health.usable == 295
+    other = seen.with_delay(1.0)
+    assert np.flatnonzero(~other.usable).tolist() == [0, 101]
+    assert [row[0] for row in other.health.rows()].count("correction not known") == 1
+
+
+def test_a_spoilt_command_spoils_what_its_correction_enters():
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=3.0)
+    run = ran(path)
+    u = run.commands[0].copy()
+    u[50] = np.inf
+    seen = lbt.identification.loop_record(
+        run.measurements[0], u, frame_rate_hz=RATE, delay_frames=3, unit="nm"
+    )
+    assert np.flatnonzero(~seen.usable).tolist() == [0, 1, 2, 53]
+    assert seen.stretches() == ((3, 53), (54, 300))
+    good = seen.usable
+    z = seen.pseudo_open_loop()
+    assert np.allclose(z[1:][good[1:]], run.total_nm[0, :-1][good[1:]], atol=1e-9)
+    assert np.all(np.isfinite(seen.commands))
+
+
+def test_short_holes_are_bridged_on_the_pseudo_open_loop():
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2.4)
+    run = ran(path, frames=2000, sensor_gain=0.6)
+    y = run.measurements[0].copy()
+    y[300, 0] = np.nan
+    y[700:703] = np.nan
+    y[900:904] = np.nan
+    seen = lbt.identification.loop_record(
+        y, run.commands[0], frame_rate_hz=RATE, delay_frames=2.4, unit="nm"
+    )
+    whole = seen.bridged(sensor_gain=0.6)
+    assert whole.health.bridged == 4
+    assert "4 frames in 2 holes of at most 3 were interpolated" in whole.health.notes
+    assert np.flatnonzero(~whole.usable).tolist() == [0, 1, 2, 900, 901, 902, 903]
+    assert whole.health.usable == 1993
+    z, phase = whole.pseudo_open_loop(0.6), run.total_nm[0]
+    assert np.array_equal(z[seen.usable], seen.pseudo_open_loop(0.6)[seen.usable])
+    # a cubic through two frames on either side, to the last bit of a cubic
+    inside = np.array([300, 700, 701, 702])
+    for k, wide in ((300, [298, 299, 301, 302]), (701, [698, 699, 703, 704])):
+        cubic = np.polynomial.polynomial.polyfit(np.array(wide) - k, phase[np.array(wide) - 1], 3)
+        assert np.allclose(z[k], cubic[0], atol=1e-6)
+    # what is left out by a plain interpolation of y would be far off
+    assert np.max(np.abs(z - np.vstack([phase[:1], phase[:-1]]))[inside]) < 60
+    # the original stays as it was, and its delay may still change
+    assert seen.health.bridged == 0
+    assert not seen.usable[300]
+    assert whole.with_delay(2.4).health.bridged == 0
+    assert not whole.with_delay(2.4).usable[300]
+
+
+def test_bridges_have_a_budget():
+    y = np.random.default_rng(0).standard_normal(1000)
+    y[[100, 200, 300]] = np.nan
+    y[400:402] = y[500:503] = np.nan
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    part = seen.bridged(most_fraction=0.005)
+    assert part.health.bridged == 5
+    assert part.health.notes[-1].endswith("1 more such holes were left, beyond 0.5 %")
+    assert np.flatnonzero(~part.usable).tolist() == [500, 501, 502]
+    assert seen.bridged(1).health.bridged == 3
+    assert seen.bridged(most_fraction=0.0) is seen
+    for bad in ({"most": 0}, {"most_fraction": 2}, {"sensor_gain": 0}, {"sensor_gain": [1, 1]}):
+        with pytest.raises(lbt.errors.ProblemError, match="must be"):
+            seen.bridged(**bad)
+
+
+def test_a_hole_with_one_frame_beside_it_is_bridged_straight():
+    y = np.array([1.0, 2.0, np.nan, 4.0, np.nan, 7.0, 9.0, 3.0, 2.0, 5.0])
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm").bridged(most_fraction=1)
+    assert seen.measurements[[2, 4], 0] == pytest.approx([3.0, 5.5])
+
+
+def test_another_delay_keeps_the_mirror_and_drops_the_bridges():
+    shell = lbt.models.PositionLoop.of_bandwidth(
+        natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
+    )
+    rng = np.random.default_rng(0)
+    y, u = np.cumsum(rng.standard_normal((2, 2000)), axis=1)
+    u[1000] = np.nan
+    seen = lbt.identification.loop_record(
+        y, u, frame_rate_hz=800, delay_frames=2, mirror=shell, unit="nm"
+    )
+    other = seen.with_delay(3)
+    assert other.mirror is shell
+    assert np.array_equal(
+        other.mirror_taps,
+        lbt.LoopHardware(frame_rate_hz=800, delay_frames=3, mirror=shell).mirror_taps,
+    )
+    plain = lbt.identification.loop_record(y, u, frame_rate_hz=800, delay_frames=2, unit="nm")
+    whole = plain.bridged()
+    assert whole.usable[1002]
+    assert whole.measurements[1002, 0] != y[1002]
+    assert not whole.with_delay(3).usable[1002]
+    assert plain.with_delay(3).usable[1002]
+
+
+def test_records_are_frozen():
+    seen = lbt.identification.loop_record([1.0, 2.0], [1.0, 3.0], frame_rate_hz=RATE, unit="nm")
+    for name in ("measurements", "commands", "usable", "measured", "commanded"):
+        assert not getattr(seen, name).flags.writeable
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        seen.source = "x"
+    with pytest.raises(lbt.errors.DimensionError, match="usable must be 2 truth values"):
+        dataclasses.replace(seen, usable=np.ones(3, dtype=bool))
+    with pytest.raises(lbt.errors.DimensionError, match="commands must have 2 rows"):
+        dataclasses.replace(seen, commands=np.ones((3, 1)))

@@ -1,0 +1,26 @@
+"""A design from a record, and what is noted against it."""
+
+from __future__ import annotations
+
+import numpy as np
+from support.recorded_loops import LINE, RATE, spliced_record
+
+import lbt_synth as lbt
+
+
+def test_a_design_is_doubted_where_the_gains_disagree() -> None:
+    first = spliced_record((0,), lines=LINE, frames=20_000, sensor_gain=0.9)
+    second = spliced_record((1,), lines=LINE, frames=20_000, sensor_gain=0.4)
+    both = lbt.identification.loop_record(
+        np.vstack([first.measurements, second.measurements]),
+        np.vstack([first.commands, second.commands]),
+        frame_rate_hz=RATE,
+        delay_frames=2,
+        unit="nm",
+    )
+    try:
+        notes = lbt.design_from_record(both).notes
+    except lbt.errors.CertificateError as error:
+        notes = (str(error),)
+    assert any("sensor gain" in note for note in notes)
+    assert lbt.design_from_record(first).notes == ()

@@ -1,0 +1,147 @@
+"""Lines followed in the pseudo-open loop, alone and beside neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.tracking import AIR, axis, line
+
+import lbt_synth as lbt
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+
+
+# The follower.
+def test_lines_are_found_in_the_pseudo_open_loop():
+    """Two axes with a line each, along other directions than the axes, seen by three sensors."""
+    lines = [
+        lbt.Vibration(frequency_hz=18, damping=0.01, rms_nm=200, direction=(1, 1)),
+        lbt.Vibration(frequency_hz=31, damping=0.01, rms_nm=150, direction=(1, -1)),
+    ]
+    sensor = np.array([[1, 0.1], [0.2, 0.9], [0.3, -0.4]])
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800, turbulence=AIR, noise_nm=15.5, vibrations=lines, sensor_matrix=sensor
+    )
+    true = [replace(v, frequency_hz=v.frequency_hz + 1.3) for v in lines]
+    truth = lbt.Truth(turbulence=AIR, noise_nm=15.5, vibrations=true)
+    rng = np.random.default_rng(0)
+    size = {"frames": 3200, "cases": 12, "rng": rng}
+    total, noise = (
+        draw_disturbance(truth, plant.hardware, **size),
+        draw_noise(truth, plant.hardware, **size),
+    )
+    corrections = 500 * rng.standard_normal(total.shape)  # whatever the loop did
+    follow, errors = lbt.identification.LineFollower(plant), []
+    for k in range(12):
+        follow.reset()
+        found = follow((total - corrections)[k] @ sensor.T + noise[k], corrections[k])
+        errors.append(
+            [a.frequency_hz - b.frequency_hz for a, b in zip(found.vibrations, true, strict=True)]
+        )
+        assert [v.rms_nm for v in found.vibrations] == [v.rms_nm for v in lines]
+        assert np.array_equal(found.hardware.sensor, sensor)
+    # in four seconds a resonance wanders by a part of its width, sqrt(k f / (2 pi 4 s)) and more
+    assert np.all(np.std(errors, axis=0) < 0.3)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * np.std(errors, axis=0) / np.sqrt(12))
+
+
+def neighbours(frequencies_hz, second=(1, 0)):
+    lines = [
+        lbt.Vibration(frequency_hz=hz, damping=0.01, rms_nm=100, direction=along)
+        for hz, along in zip(frequencies_hz, [(1, 0), second], strict=True)
+    ]
+    return lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=AIR, noise_nm=15.5, vibrations=lines)
+
+
+def sinusoids(*parts, seed, axis=0, frames=3200):
+    rng, time_s = np.random.default_rng(seed), np.arange(frames) / 800
+    series = 15.5 * rng.standard_normal((frames, 2))
+    for hz, amplitude_nm in parts:
+        phase = rng.uniform(0, 2 * np.pi)
+        series[:, axis] += amplitude_nm * np.sin(2 * np.pi * hz * time_s + phase)
+    return series
+
+
+@pytest.mark.parametrize(
+    ("frames", "parts"),
+    [
+        (3200, [(21.6, 140), (23.6, 300)]),
+        (3200, [(21.6, 300), (23.6, 140)]),
+        (3200, [(20.3, 140), (22.3, 140)]),
+        (3200, [(18.6, 140), (20.6, 300)]),
+        (3200, [(20.5, 140), (21.7, 140)]),
+        (3200, [(19, 800), (23, 100)]),
+        (1600, [(20.3, 140), (22.3, 140)]),
+    ],
+)
+def test_neighbours_are_found_each_at_its_own_peak(frames, parts):
+    for order in (1, -1):
+        follow = lbt.identification.LineFollower(neighbours([20, 22][::order]))
+        for seed in range(2):
+            follow.reset()
+            series = sinusoids(*parts, seed=seed, frames=frames)
+            found = follow(series, np.zeros_like(series))
+            wanted = [hz for hz, _ in parts][::order]
+            assert [v.frequency_hz for v in found.vibrations] == pytest.approx(wanted, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [(21, 400)],
+        [(21, 4000)],
+        [(21, 40)],
+        [(20, 140)],
+        [(19.3, 1000)],
+        [(20.9, 300), (21.2, 300)],  # closer than the window resolves
+    ],
+)
+def test_two_lines_are_not_found_on_one_peak(parts):
+    follow = lbt.identification.LineFollower(neighbours([20, 22]))
+    for seed in range(3):
+        series = sinusoids(*parts, seed=seed)
+        assert follow(series, np.zeros_like(series)) is None
+
+
+def test_lines_along_other_directions_are_no_neighbours():
+    plant = neighbours([20, 22], second=(0, 1))
+    series = sinusoids((21.3, 400), seed=0) + sinusoids((21.2, 300), seed=1, axis=1)
+    found = lbt.identification.LineFollower(plant)(series, np.zeros_like(series))
+    assert [v.frequency_hz for v in found.vibrations] == pytest.approx([21.3, 21.2], abs=0.02)
+
+
+def test_no_line_is_no_plant():
+    plant = axis(20)
+    follow = lbt.identification.LineFollower(plant)
+    still = lbt.Truth(turbulence=AIR, noise_nm=15.5)
+    rng = np.random.default_rng(5)
+    size = {"frames": 3200, "cases": 1, "rng": rng}
+    calm = (
+        draw_disturbance(still, plant.hardware, **size) + draw_noise(still, plant.hardware, **size)
+    )[0]
+    assert follow(calm, np.zeros_like(calm)) is None
+    assert follow(calm[:100], np.zeros((100, 1))) is None  # nor is a window without resolution
+    shaken = calm + 30 * np.cos(2 * np.pi * 22 * np.arange(3200)[:, None] / 800)
+    found = follow(shaken, np.zeros_like(calm))
+    assert found.vibrations[0].frequency_hz == pytest.approx(22, abs=0.05)
+
+
+def test_wrong_followers_are_refused():
+    with pytest.raises(lbt.errors.ProblemError, match="a vibration to follow"):
+        lbt.identification.LineFollower(axis())
+    blind = lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        turbulence=AIR,
+        noise_nm=1,
+        sensor_matrix=[[1.0, 1.0]],
+        vibrations=[replace(line(20), direction=(1, 0))],
+    )
+    with pytest.raises(lbt.errors.ProblemError, match="every mode must be measured"):
+        lbt.identification.LineFollower(blind)
+    with pytest.raises(lbt.errors.ProblemError, match="span_hz must be above 0"):
+        lbt.identification.LineFollower(axis(20), span_hz=0)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.identification.LineFollower("plant")
+    with pytest.raises(lbt.errors.DimensionError, match=r"must be \(frames, 1\) and \(frames, 1\)"):
+        lbt.identification.LineFollower(axis(20))(np.zeros((100, 2)), np.zeros((100, 1)))

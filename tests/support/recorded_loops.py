@@ -1,0 +1,63 @@
+"""Recorded loops of an integrator, for the tests of identification."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import lbt_synth as lbt
+from lbt_synth.models.resonance_spectrum import coefficients
+
+RATE = 1000.0
+FRAMES = 16_384
+LINE = ((31.0, 0.004, 60.0),)  # frequency [Hz], damping ratio, rms [nm]
+
+
+def integrator_loop(
+    *,
+    lines: tuple[tuple[float, float, float], ...] = (),
+    noise: float = 6.0,
+    sensor_gain: float = 0.6,
+    gain: float = 0.4,
+    frames: int = FRAMES,
+    seed: int = 0,
+    turbulence: lbt.models.ARModel | None = None,
+    axes: int = 1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measurements and corrections of an integrator's loop, (frames, axes) each."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=axes)
+    direction = (1.0,) if axes == 1 else (1.0, 0.0)
+    truth = lbt.Truth(
+        turbulence=slow() if turbulence is None else turbulence,
+        vibrations=tuple(
+            lbt.Vibration(frequency_hz=f, damping=z, rms_nm=r, direction=direction)
+            for f, z, r in lines
+        ),
+        noise_nm=noise,
+        sensor_gain=sensor_gain,
+    )
+    controller = lbt.integrator(path, gain=gain).controller
+    run = lbt.simulate(controller, truth, hardware=path, frames=frames, seed=seed)
+    return run.measurements[0][2:], run.commands[0][:-2]
+
+
+def slow() -> lbt.models.ARModel:
+    """Turbulence of 300 nm around 1 Hz."""
+    a1, a2, drive = coefficients(2 * np.pi * 1.0 / RATE, 0.6)
+    return lbt.models.ARModel(
+        coefficients=[a1, a2], driving_rms_nm=300 * np.sqrt(drive), frame_rate_hz=RATE
+    )
+
+
+def spliced_record(
+    seeds: tuple[int, ...] = (0,), *, delay: float = 2.0, **options
+) -> lbt.identification.LoopRecord:
+    """Records of one axis, end to end."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    series = []
+    for seed in seeds:
+        y, c = integrator_loop(seed=seed, **options)
+        u = np.vstack([c[2:], c[-2:]])  # c(k) = u(k-2)
+        series.append((y[:-2], u[:-2]))
+    y, u = (np.vstack([one[i] for one in series]) for i in range(2))
+    assert path.delay_frames == 2
+    return lbt.identification.loop_record(y, u, frame_rate_hz=RATE, delay_frames=delay, unit="nm")
