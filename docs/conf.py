@@ -1,6 +1,12 @@
 """Sphinx configuration. Build with ``make docs``; warnings are errors, no network is used."""
 
+import sys
+from pathlib import Path
+
 import lbt_synth
+
+sys.path.insert(0, str(Path(__file__).parent))
+import house
 
 project = "lbt_synth"
 author = "The lbt_synth developers"
@@ -16,7 +22,7 @@ extensions = [
 ]
 root_doc = "index"
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["_build", "benchmarks_table.md"]
+exclude_patterns = ["_build", "benchmarks_table.md", "api/generated/modules.md"]
 templates_path = ["_templates"]
 
 myst_enable_extensions = ["amsmath", "dollarmath"]
@@ -41,5 +47,13 @@ def _closed_literals(app, what, name, obj, options, lines):
     lines[:] = [line.replace(" + ... + ", " + … + ") for line in lines]
 
 
+def _write_modules(app):
+    """Write the part of the architecture page that is made from the code."""
+    target = Path(app.srcdir) / "api" / "generated" / "modules.md"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(house.page(), encoding="utf-8")
+
+
 def setup(app):
+    app.connect("builder-inited", _write_modules, priority=100)
     app.connect("autodoc-process-docstring", _closed_literals, priority=900)

@@ -103,6 +103,7 @@ def test_public_fields_say_which_gain_they_are(name):
     "page",
     [
         "README.md",
+        "docs/linear.md",
         "docs/tutorial.md",
         "docs/robustness.md",
         "docs/ensemble.md",
@@ -110,7 +111,7 @@ def test_public_fields_say_which_gain_they_are(name):
         "docs/report.md",
         "docs/mirror.md",
         "docs/modal.md",
-        "docs/replay.md",
+        "docs/prediction.md",
         "docs/records.md",
         "docs/identification.md",
         "docs/tracking.md",

@@ -1,0 +1,90 @@
+"""The contracts of imports hold for modules that are not yet written."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+
+import pytest
+from support.plants import ROOT
+
+# a module that somebody may write tomorrow, what it imports, and the contract that it breaks
+FORBIDDEN = {
+    "design/new_method.py": ("cvxpy", "Only linear.lmi imports cvxpy"),
+    "interop/new_program.py": ("specula", "Only interop.specula.optics imports specula"),
+    "files/telemetry/new_format.py": ("aotpy", "Only files.telemetry.aot imports aotpy"),
+    "studies/study/new_pool.py": (
+        "distributed",
+        "Only studies.study.cluster imports distributed",
+    ),
+    "studies/new_table.py": ("pyarrow", "Only studies.study.parquet imports pyarrow"),
+    "report/page/new_chart.py": ("bokeh", "Only report.page.bokeh_charts imports bokeh"),
+    "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),
+    "loop/new_figure.py": ("matplotlib", "Only report imports matplotlib"),
+    "linear/new_system.py": ("control", "Only linear.state_space imports control"),
+    "linear/new_oracle.py": ("slycot", "Nothing imports a GPL package"),
+    "linear/new_plant.py": ("lbt_synth.models", "Rooms import only downwards"),
+}
+
+CONTRACTS = {
+    contract["name"]
+    for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
+        "contracts"
+    ]
+}
+
+
+def broken_contracts(folder):
+    """Exit status, names of the contracts that a copy of the package breaks, and the text."""
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from importlinter.cli import lint_imports_command; lint_imports_command()",
+            "--config",
+            str(ROOT / "pyproject.toml"),
+            "--no-cache",
+        ],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    broken = set(re.findall(r"^(.*) BROKEN\b", done.stdout, re.MULTILINE))
+    return done.returncode, broken, done.stdout
+
+
+@pytest.fixture
+def package(tmp_path):
+    shutil.copytree(
+        ROOT / "lbt_synth", tmp_path / "lbt_synth", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    return tmp_path / "lbt_synth"
+
+
+def test_the_package_keeps_its_contracts(package):
+    status, broken, text = broken_contracts(package.parent)
+    assert status == 0, text
+    assert broken == set()
+    assert f"{len(CONTRACTS)} kept" in text
+
+
+def test_each_contract_holds_for_a_module_that_is_not_yet_written(package):
+    for path, (module, _) in FORBIDDEN.items():
+        (package / path).write_text(f'"""New."""\n\nimport {module}\n')
+    status, broken, text = broken_contracts(package.parent)
+    assert status == 1
+    assert broken == CONTRACTS, text
+
+
+def test_a_room_that_is_not_in_the_order_is_refused(package):
+    (package / "new_room").mkdir()
+    (package / "new_room" / "__init__.py").write_text('"""New."""\n')
+    status, _, text = broken_contracts(package.parent)
+    assert status == 1
+    assert "- lbt_synth.new_room" in text
