@@ -8,7 +8,7 @@ from support.studies import BASE, LBT_TEXT, study_file
 
 import lbt_synth as lbt
 from lbt_synth.studies.study import batch_evaluation
-from lbt_synth.studies.study import reference_evaluation as point
+from lbt_synth.studies.study import reference_evaluation as reference
 from lbt_synth.studies.study.sample_arrays import changes_beliefs_only, changes_numbers_only
 
 COUNT = 8
@@ -25,7 +25,7 @@ def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
     )
     values = study.values(0, count)
     found = lbt.studies.evaluate_samples(study, values, 0)
-    single = point.evaluate_rows(study, values, 0)
+    single = reference.evaluate_rows(study, values, 0)
     assert found.columns.keys() == single.columns.keys()
     for name, expected in single.columns.items():
         assert found.columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
@@ -36,13 +36,13 @@ def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
 def counted(monkeypatch):
     """Count the samples that are evaluated point by point."""
     rows = []
-    real = point.evaluate_row
+    real = reference.evaluate_row
 
     def spy(study, values, row):
         rows.append(row)
         return real(study, values, row)
 
-    monkeypatch.setattr(batch.point, "evaluate_row", spy)
+    monkeypatch.setattr(batch_evaluation.reference, "evaluate_row", spy)
     return rows
 
 
@@ -69,7 +69,7 @@ def test_filters_told_their_samples(tmp_path, monkeypatch):
     study = lbt.studies.load_study(
         study_file(tmp_path, base=LBT_TEXT, controllers=TOLD, parameters=WEATHER)
     )
-    single = point.evaluate_rows(study, study.values(0, 6), 0)
+    single = reference.evaluate_rows(study, study.values(0, 6), 0)
     rows = counted(monkeypatch)
     found = lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
     assert rows == [3]  # all of them at once, and one by itself
@@ -215,7 +215,7 @@ def test_samples_that_the_configuration_refuses(tmp_path):
     values[2, 0] = -5.0
     values[4, 1] = 0.0
     found = lbt.studies.evaluate_samples(study, values, 100)
-    single = point.evaluate_rows(study, values, 100)
+    single = reference.evaluate_rows(study, values, 100)
     assert [(f.row, f.controller) for f in found.failures] == [
         (102, "slow"),
         (102, "kalman"),
@@ -288,12 +288,12 @@ def test_two_answers_stop_a_study(tmp_path, monkeypatch):
             parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}",
         )
     )
-    real = batch.residuals_of_matrices
+    real = batch_evaluation.residuals_from_matrices
 
     def wrong(matrices, hardware, ensemble):
         found = real(matrices, hardware, ensemble)
         return replace(found, noise_nm2=1.001 * found.noise_nm2)
 
-    monkeypatch.setattr(batch, "residuals_of_matrices", wrong)
+    monkeypatch.setattr(batch_evaluation, "residuals_from_matrices", wrong)
     with pytest.raises(lbt.errors.CertificateError, match="row 14 has slow.*by itself"):
         lbt.studies.evaluate_samples(study, study.values(10, 16)[:8], 11)

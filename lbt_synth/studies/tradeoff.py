@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.design import FilterDesign, central, hinf, kalman, mixed
+from lbt_synth.design import FilterDesign, central_filter, hinf, kalman, mixed
 from lbt_synth.design.mixed import require_taps
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import EstimationProblem
@@ -128,7 +128,7 @@ def _points(
             elif family == "mixed":
                 design = mixed(problem, gamma=level, taps=taps)
             else:
-                design = central(problem, gamma=level)
+                design = central_filter(problem, gamma=level)
             yield _point(design, family, least.gamma_least)
 
 

@@ -1,4 +1,4 @@
-"""Tables II and III end to end: cases of a campaign, and what comes out beside the paper."""
+"""Tables II and III of the paper, simulated end to end with SPECULA."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
 from lbt_synth.storage import run_cases
 from lbt_synth.studies.paper import parameters as given
-from lbt_synth.studies.paper.published import TABLE_II, TABLE_III
+from lbt_synth.studies.paper.published import TABLE_II, TABLE_III, TableII, TableIII
 from lbt_synth.validation import choice
 
 CLASSICAL_GAIN = 0.5
@@ -35,15 +35,13 @@ class PlannedRow:
     """One row of a table for one controller: cases that differ in their seed only."""
 
     table: str  # "II" or "III"
-    # label, method: Row and controller
     label: str
     method: str
-    # Frequency of the model less that of the vibration; None without vibration
-    error_hz: float | None
-    paper: float  # The paper's Strehl ratio [%]; nan where it has none
-    controller: Controller  # Controller of tip and tilt
-    truth: Truth  # Vibrations that are there
-    cases: dict[str, dict[str, Any]]  # Cases by name
+    error_hz: float | None  # of the model's frequency; None without vibration
+    paper: float  # the paper's Strehl ratio [%], or nan
+    controller: Controller  # of tip and tilt
+    truth: Truth
+    cases: dict[str, dict[str, Any]]  # by name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +51,7 @@ class EndToEndEntry:
     Attributes
     ----------
     table, label, method : str
-        As planned.
+        Table, row and controller.
     error_hz : float or None
         Frequency of the model less that of the vibration [Hz].
     strehls : tuple of float
@@ -102,10 +100,10 @@ def plan_tables(
     row_seeds: Sequence[int] = (0,),
     tables: Sequence[str] = ("II", "III"),
 ) -> list[PlannedRow]:
-    """Lay out both tables for a system.
+    """Plan the rows and cases of both tables for a system.
 
-    The filters are those of :func:`~lbt_synth.studies.paper.tables.paper_filters`, designed anew
-    at each frequency of Table III. Further designs are fixed: for them the vibration moves
+    The filters are those of :func:`~lbt_synth.studies.paper.tables.paper_filters`, designed
+    for each frequency of Table III. Further designs are fixed: for them the vibration moves
     instead of the model, by the same error.
     """
     for table in tables:
@@ -131,7 +129,7 @@ def plan_tables(
 
 
 class _TableRow(NamedTuple):
-    """What the controllers of one row have in common."""
+    """One row of a table, for all its controllers."""
 
     table: str
     label: str
@@ -141,12 +139,12 @@ class _TableRow(NamedTuple):
 
     @property
     def truth_hz(self) -> float | None:
-        """Frequency of the vibration where the model moves; None without vibration."""
+        """Frequency of the vibration if the model moves; None without vibration."""
         return None if self.error_hz is None else given.VIBRATION_HZ
 
     @property
     def moved_hz(self) -> float | None:
-        """Frequency of the vibration where the design stays; None without vibration."""
+        """Frequency of the vibration if the design stays; None without vibration."""
         return None if self.error_hz is None else given.VIBRATION_HZ - self.error_hz
 
 
@@ -165,8 +163,7 @@ def _plan_table_ii(
         gain = CLASSICAL_GAIN_VIBRATION if shaken else CLASSICAL_GAIN
         classical = integrator(setup.system.hardware, gain=gain).controller
         yield _plan_row(setup, row, "classical", classical, published.classical)
-        yield from _plan_filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
-        yield from _plan_designs(setup, row, fixed)
+        yield from _plan_controllers(setup, row, published, fixed)
 
 
 def _plan_table_iii(
@@ -184,31 +181,25 @@ def _plan_table_iii(
             model_hz=published.model_hz,
             seeds=seeds if error == 0 else row_seeds,
         )
-        yield from _plan_filters(setup, row, {name: getattr(published, name) for name in _FILTERS})
-        yield from _plan_designs(setup, row, fixed)
+        yield from _plan_controllers(setup, row, published, fixed)
 
 
-def _plan_filters(
-    setup: EndToEndSetup, row: _TableRow, published: Mapping[str, float]
+def _plan_controllers(
+    setup: EndToEndSetup,
+    row: _TableRow,
+    published: TableII | TableIII,
+    designs: Mapping[str, Design],
 ) -> Iterator[PlannedRow]:
-    for method, paper in published.items():
+    """Yield the paper's filters, then the fixed designs."""
+    for method in _FILTERS:
         controller = _paper_filter(method, row.model_hz)
-        yield _plan_row(setup, row, method, controller, paper)
-
-
-def _plan_designs(
-    setup: EndToEndSetup, row: _TableRow, designs: Mapping[str, Design]
-) -> Iterator[PlannedRow]:
+        yield _plan_row(setup, row, method, controller, getattr(published, method))
     for name, design in designs.items():
         yield _plan_row(setup, row, name, design.controller, float("nan"))
 
 
 def _plan_row(
-    setup: EndToEndSetup,
-    row: _TableRow,
-    method: str,
-    controller: Controller,
-    paper: float,
+    setup: EndToEndSetup, row: _TableRow, method: str, controller: Controller, paper: float
 ) -> PlannedRow:
     tuned = method in _FILTERS
     true_hz = row.truth_hz if tuned else row.moved_hz
@@ -217,7 +208,7 @@ def _plan_row(
         shake = given.PAPER_TRUTH.vibrations[0]
         assert isinstance(shake, SinusoidalVibration)
         lines = (replace(shake, frequency_hz=true_hz),)
-    met = "none" if true_hz is None else f"{true_hz:g}hz"
+    vibration = "none" if true_hz is None else f"{true_hz:g}hz"
     name = f"{method}-{row.model_hz:g}hz" if tuned else method
     return PlannedRow(
         table=row.table,
@@ -228,11 +219,8 @@ def _plan_row(
         controller=controller,
         truth=replace(given.PAPER_TRUTH, vibrations=lines),
         cases={
-            f"{name}-vibration-{met}-seed-{seed}": make_case(
-                setup,
-                controller,
-                vibrations=lines,
-                seed=seed,
+            f"{name}-vibration-{vibration}-seed-{seed}": make_case(
+                setup, controller, vibrations=lines, seed=seed
             )
             for seed in row.seeds
         },
@@ -262,9 +250,8 @@ def end_to_end_tables(
 ) -> list[EndToEndEntry]:
     """Run Tables II and III of Agapito et al. 2008 end to end, or what is missing of them.
 
-    Each run is a case of :func:`run_cases`: started again in the same directory, only
-    what is missing is run. All controllers of a row meet the same air, vibrations and
-    noise.
+    Each run is a case of :func:`run_cases`: started again in the same directory, only the
+    missing ones run. All controllers of a row meet the same air, vibrations and noise.
 
     Parameters
     ----------
@@ -290,7 +277,7 @@ def end_to_end_tables(
     Returns
     -------
     list of EndToEndEntry
-        One a row and controller, ours beside the paper's and the modal analysis.
+        One per row and controller, ours beside the paper's and the modal analysis.
 
     Raises
     ------
@@ -327,7 +314,7 @@ def run_tables(
     progress: Callable[[int], None] | None = None,
 ) -> list[EndToEndEntry]:
     """Run what is missing of tables of :func:`plan_tables`; see :func:`end_to_end_tables`."""
-    calibrate(setup.system, cache=cache)  # once, and not in each process
+    calibrate(setup.system, cache=cache)  # once for all processes
     results = run_cases(
         functools.partial(run_case, cache=cache),
         all_cases(rows),
@@ -347,11 +334,11 @@ def all_cases(rows: Iterable[PlannedRow]) -> dict[str, dict[str, Any]]:
 def make_entries(
     rows: Iterable[PlannedRow], results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
 ) -> list[EndToEndEntry]:
-    """Return the tables from the results of their cases."""
-    out = []
+    """Make the entries of the tables from the results of their cases."""
+    entries = []
     for row in rows:
         found = [results[name] for name in row.cases]
-        out.append(
+        entries.append(
             EndToEndEntry(
                 table=row.table,
                 label=row.label,
@@ -366,7 +353,7 @@ def make_entries(
                 other_modes=100 * _mean([one["other_modes_strehl"] for one in found]),
             )
         )
-    return out
+    return entries
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -374,6 +361,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndSetup) -> float:
+    """Return the Strehl ratio of the modal analysis [%], with the gain measured in a run."""
     system = setup.system
     gain = result["tip_tilt_gain"]
     if gain <= 0:
@@ -393,6 +381,6 @@ def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndS
 
 
 def rms_modal_difference(table: Iterable[EndToEndEntry], method: str) -> float:
-    """Root mean square of end-to-end less modal over Table III, for one controller [points]."""
-    apart = [e.strehl - e.modal for e in table if e.table == "III" and e.method == method]
-    return float(np.sqrt(np.mean(np.square(apart))))
+    """Return the rms of end-to-end less modal over Table III, for one controller [points]."""
+    differences = [e.strehl - e.modal for e in table if e.table == "III" and e.method == method]
+    return float(np.sqrt(np.mean(np.square(differences))))

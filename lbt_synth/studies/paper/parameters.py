@@ -1,9 +1,8 @@
-"""Parameters of the comparison: what the paper gives, and what is fitted here.
+"""Parameters of the comparison with the paper: those that it gives, and those fitted here.
 
-The paper gives its Table I, the vibration (80 mas at 20 Hz) and the delay. It
-does not give the noise, the damping, the weights, gamma, the integrator's gain
-or the optical gain of the pyramid. Those marked *fitted* were chosen so that
-the tables come out; other sets fit as well.
+The paper gives its Table I, the vibration (80 mas at 20 Hz) and the delay. It does not give
+the noise, the damping, the weights, gamma, the integrator's gain or the optical gain of the
+pyramid. Those marked *fitted* were chosen to reproduce the tables; other sets fit as well.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from lbt_synth.models import (
     tip_tilt_plant,
 )
 
-# -- given in the paper --------------------------------------------------------
+# given in the paper
 DIAMETER_M = 8.22
 OBSTRUCTION = 0.11
 FRAME_RATE_HZ = 800.0
@@ -35,11 +34,11 @@ ATMOSPHERE = Atmosphere(
     seeing_arcsec=0.8, outer_scale_m=22.0, wind_speed_m_s=20.0, diameter_m=DIAMETER_M
 )
 
-# -- derived from the paper's Table I ------------------------------------------
+# derived from the paper's Table I
 NOISE_NM = 15.5  # photons, read noise and modulation, at unit optical gain
 VIBRATION_NM = VIBRATION_MAS * nm_per_mas(DIAMETER_M)  # "80 mas" read as the rms
 
-# -- fitted to Tables II and III -----------------------------------------------
+# fitted to Tables II and III
 TRUTH_SENSOR_GAIN = 0.358  # optical gain of the pyramid, unknown to the filters
 OTHER_MODES_STREHL = 0.845
 KALMAN_DAMPING = 0.0051

@@ -1,7 +1,7 @@
-"""What the paper prints: Tables I, II and III.
+"""Tables I, II and III of Agapito et al. (2008) as printed there.
 
-G. Agapito, F. Quiros-Pacheco, P. Tesi, A. Riccardi, S. Esposito, "Optimal
-filtering techniques for the adaptive optics system of the LBT" (2008).
+G. Agapito, F. Quiros-Pacheco, P. Tesi, A. Riccardi, S. Esposito, "Optimal filtering techniques
+for the adaptive optics system of the LBT" (2008).
 """
 
 from __future__ import annotations

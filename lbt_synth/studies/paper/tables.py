@@ -1,4 +1,4 @@
-"""Tables II and III computed anew."""
+"""Tables II and III of the paper, computed by modal analysis."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ class TableEntry:
     """One entry of a table, ours beside the paper's [% Strehl]."""
 
     table: str  # "II" or "III"
-    label: str  # Row of the table
+    label: str  # of the row
     method: str  # "classical", "kalman" or "hinf"
-    # ours, paper: Strehl ratios [%]
-    ours: float
-    paper: float
+    ours: float  # Strehl ratio [%]
+    paper: float  # Strehl ratio [%]
 
     @property
     def difference(self) -> float:
@@ -77,7 +76,7 @@ def table_ii() -> list[TableEntry]:
 
 
 def table_iii() -> Iterator[RobustnessRow]:
-    """Rows of Table III, two a frequency: Kalman, then H-infinity."""
+    """Yield the rows of Table III, two per frequency: Kalman, then H-infinity."""
     for row in TABLE_III:
         for plant, method, gamma in (
             (given.kalman_plant(), "kalman", None),
@@ -95,27 +94,20 @@ def table_iii() -> Iterator[RobustnessRow]:
 
 def compare_with_paper(rows: list[RobustnessRow]) -> list[TableEntry]:
     """Put rows of :func:`table_iii` beside the paper's."""
-    published = {
-        (method, row.model_hz): getattr(row, method)
-        for row in TABLE_III
-        for method in ("kalman", "hinf")
-    }
-    out = []
-    for row in rows:
-        frequency = given.VIBRATION_HZ + row.error_hz
-        out.append(
-            TableEntry(
-                table="III",
-                label=f"{frequency:.1f} Hz",
-                method=row.method,
-                ours=100 * row.strehl,
-                paper=published[row.method, frequency],
-            )
+    published = {row.model_hz - given.VIBRATION_HZ: row for row in TABLE_III}
+    return [
+        TableEntry(
+            table="III",
+            label=f"{given.VIBRATION_HZ + row.error_hz:.1f} Hz",
+            method=row.method,
+            ours=100 * row.strehl,
+            paper=getattr(published[row.error_hz], row.method),
         )
-    return out
+        for row in rows
+    ]
 
 
 def _strehl_percent(design: Design, truth: Truth) -> float:
-    assert design.hardware is not None  # designs of this module are of plants
+    assert design.hardware is not None  # this module designs for plants
     loop = close_loop(design.hardware, design.controller, sensor_gain=truth.sensor_gain)
     return 100 * strehl(residual_budget(loop, truth), given.imaging())

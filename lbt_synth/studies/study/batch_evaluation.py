@@ -1,4 +1,4 @@
-"""Many samples at once, exactly; what cannot be done at once is done point by point."""
+"""Evaluate many samples of a study at once, and one by one where that is not possible."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.errors import CertificateError
 from lbt_synth.loop import EnsembleResiduals
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
-from lbt_synth.studies.study import reference_evaluation as point
+from lbt_synth.studies.study import reference_evaluation as reference
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.config_paths import Keys
 from lbt_synth.studies.study.sample import make_sample
@@ -29,18 +29,18 @@ from lbt_synth.studies.study.sample_designs import (
 from lbt_synth.studies.study.study import Study, StudyController
 from lbt_synth.validation import FloatArray, IntArray
 
-_AGREEMENT = 1e-5  # of a sample evaluated both ways; a residual of less than 1 nm counts as 1 nm
-_FEWEST = 4  # samples of a group that are worth an ensemble
+_AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
+_FEWEST = 4  # samples in a group that is worth an ensemble
 
 
 def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResult:
-    """Evaluate samples that follow each other.
+    """Evaluate consecutive samples.
 
     Samples whose configurations differ by numbers only are evaluated together by
     :func:`ensemble_residuals`; Kalman filters for samples are designed together by
-    :func:`modal_filters`. Other designs, simulations, and samples that a configuration refuses
-    are evaluated one after the other. So is one sample of each group that is evaluated together,
-    and the two answers have to agree.
+    :func:`modal_filters`. Other designs, simulations, and samples that the configuration refuses
+    are evaluated one by one. So is one sample of each group that is evaluated together, and the
+    two answers must agree.
 
     Parameters
     ----------
@@ -49,19 +49,18 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     values : (b, parameters) ndarray
         Rows of ``Study.values``.
     start : int
-        Number of the first.
+        Number of the first sample.
 
     Returns
     -------
     BatchResult
-        A value of each of ``study.result_columns`` for each sample. A controller that has no
-        result is among the failures, and has nan; an unstable loop has ``stable`` 0 and nan
-        otherwise.
+        Each of ``study.result_columns`` for each sample. A controller without a result is among
+        the failures and has nan; an unstable loop has ``stable`` 0 and nan otherwise.
 
     Raises
     ------
     CertificateError
-        If the sample that is evaluated both ways has two answers.
+        If a sample that is evaluated both ways has two answers.
 
     Examples
     --------
@@ -73,12 +72,12 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     """
     columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
     failures: list[Failure] = []
-    left: dict[int, list[StudyController]] = {}  # what is done point by point, by sample
+    left: dict[int, list[StudyController]] = {}  # what to evaluate one by one, by sample
     for controller in study.controllers:
         done = np.zeros(len(values), dtype=np.bool_)
         for rows, found, strehl in _evaluate_groups(study, controller, values):
             done[rows] = True
-            results = {
+            together = {
                 "strehl": strehl,
                 "residual_nm": found.rms_nm,
                 "turbulence_nm": found.turbulence_nm,
@@ -86,23 +85,18 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
                 "noise_nm": found.noise_nm,
                 "stable": found.stable.astype(np.float64),
             }
-            for name, result in results.items():
-                columns[f"{controller.name}.{name}"][rows] = result
-            _require_agreement(
-                replace(study, controllers=(controller,)),
-                values,
-                start,
-                int(rows[rows.size // 2]),
-                columns,
-            )
+            for name, numbers in together.items():
+                columns[f"{controller.name}.{name}"][rows] = numbers
+            alone = replace(study, controllers=(controller,))
+            _require_agreement(alone, values, start, int(rows[rows.size // 2]), columns)
         for i in np.flatnonzero(~done).tolist():
             left.setdefault(i, []).append(controller)
     for i, controllers in sorted(left.items()):
         some = replace(study, controllers=tuple(controllers))
         with np.errstate(all="ignore"):  # what overflows fails its checks
-            results_of_row, failed = point.evaluate_row(some, values[i], start + i)
+            row, failed = reference.evaluate_row(some, values[i], start + i)
         failures += failed
-        for name, value in results_of_row.items():
+        for name, value in row.items():
             columns[name][i] = value
     return BatchResult(start=start, columns=columns, failures=tuple(failures))
 
@@ -111,55 +105,44 @@ def _evaluate_groups(
     study: Study, controller: StudyController, values: FloatArray
 ) -> Iterator[tuple[IntArray, EnsembleResiduals, FloatArray]]:
     """Yield what could be evaluated together: rows, residuals, Strehl ratios."""
-    if study.settings.evaluation != "exact":
+    for_sample = is_kalman_for_sample(controller)
+    if study.settings.evaluation != "exact" or (controller.design is None and not for_sample):
         return
-    if controller.design is not None:
-        matrices = textbook_matrices([controller.design.controller])
+    design = controller.design
+    matrices = None if design is None else textbook_matrices([design.controller])
 
-        def together(keys: Keys) -> bool:
-            return _changes_numbers(study, keys)
+    def together(keys: Keys) -> bool:
+        """Whether samples that differ at a place fit in one ensemble."""
+        if not (changes_numbers_only(study, keys) or changes_beliefs_only(study, keys)):
+            return False
+        return not for_sample or (
+            keys != BELIEVED_DELAY and changes_design_numbers_only(study, keys)
+        )
 
-    elif is_kalman_for_sample(controller):
-        matrices = None
-
-        def together(keys: Keys) -> bool:
-            return (
-                keys != BELIEVED_DELAY
-                and _changes_numbers(study, keys)
-                and changes_design_numbers_only(study, keys)
-            )
-
-    else:
-        return
     for group in _find_groups(study, values, together):
         try:
             sample = make_sample(study, values[group[0]])
             if matrices is None and not has_independent_axes(sample.config):
                 continue
-            rows = make_sample_arrays(study, sample, values[group])
-            good = rows.valid()
-            rows, group = rows.take(np.flatnonzero(good)), group[good]
+            arrays = make_sample_arrays(study, sample, values[group])
+            valid = arrays.valid()
+            arrays, group = arrays.take(np.flatnonzero(valid)), group[valid]
             if not group.size:
                 continue
             with np.errstate(over="raise", divide="raise", invalid="raise"):
-                own = design_for_samples(rows) if matrices is None else matrices
-                found = residuals_from_matrices(own, sample.hardware, rows.ensemble())
+                own = design_for_samples(arrays) if matrices is None else matrices
+                found = residuals_from_matrices(own, sample.hardware, arrays.ensemble())
             strehl = found.strehl(sample.config.imaging)
-        except point.EXPECTED_ERRORS:
-            continue  # one of them fails; which one is found point by point
+        except reference.EXPECTED_ERRORS:
+            continue  # one of them fails; evaluating them one by one finds which
         yield group, found, strehl
-
-
-def _changes_numbers(study: Study, keys: Keys) -> bool:
-    """Whether a fixed controller meets samples that differ there in one ensemble."""
-    return changes_numbers_only(study, keys) or changes_beliefs_only(study, keys)
 
 
 def _require_agreement(
     study: Study, values: FloatArray, start: int, i: int, columns: Mapping[str, FloatArray]
 ) -> None:
-    """Hold one sample against its evaluation by itself."""
-    alone, failed = point.evaluate_row(study, values[i], start + i)
+    """Refuse a batch in which a sample differs from its evaluation by itself."""
+    alone, failed = reference.evaluate_row(study, values[i], start + i)
     if failed:
         raise CertificateError(
             f"row {start + i} has a result among others, and fails by itself: {failed[0].error} "
@@ -179,7 +162,7 @@ def _require_agreement(
 def _find_groups(
     study: Study, values: FloatArray, together: Callable[[Keys], bool]
 ) -> Iterator[IntArray]:
-    """Yield the samples that can be evaluated together."""
+    """Yield the indices of samples that can be evaluated together."""
     apart = [
         i
         for i, parameter in enumerate(study.parameters)

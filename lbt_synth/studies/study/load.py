@@ -13,8 +13,8 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.config import Config, load_config
-from lbt_synth.config.design_methods import DesignRequest, designed
-from lbt_synth.config.load import read_mapping, validated
+from lbt_synth.config.design_methods import DesignRequest, design_by_method
+from lbt_synth.config.load import read_mapping, validate_sections
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError
 from lbt_synth.files.gain_file.store import load_with_digest
@@ -79,7 +79,7 @@ def load_study(
     True
     """
     source = Path(path)
-    settings = validated(StudySection, read_mapping(source), source)
+    settings = validate_sections(StudySection, read_mapping(source), source)
     config_file = source.parent / settings.config
     config = load_config(config_file)
     if config.hardware.modes > _MOST_MODES:
@@ -150,7 +150,7 @@ def _read_designs(study: Study, directory: str | os.PathLike[str] | None) -> dic
 
 def _make_design(name: str, request: DesignRequest, config: Config, source: Path) -> Design:
     try:
-        return designed(config, request)
+        return design_by_method(config, request)
     except LbtSynthError as error:
         error.args = (f"{source}: controllers.{name}: {error}",)
         raise

@@ -1,4 +1,4 @@
-"""Samples evaluated one after the other by the library's own calls: slow, and what is true."""
+"""Evaluate samples one by one with the library's own calls, as the slow reference."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lbt_synth.config.design_methods import designed
+from lbt_synth.config.design_methods import design_by_method
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, simulate, strehl
@@ -17,28 +17,12 @@ from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.study import Study, StudyController
 from lbt_synth.validation import FloatArray
 
-# what a sample may raise without being a fault of the study; LinAlgError is a ValueError
+# errors that fail a sample and not the study; LinAlgError is a ValueError
 EXPECTED_ERRORS = (LbtSynthError, ArithmeticError, ValueError)
 
 
 def evaluate_rows(study: Study, values: FloatArray, start: int) -> BatchResult:
-    """Evaluate samples that follow each other.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    values : (b, parameters) ndarray
-        Rows of ``Study.values``.
-    start : int
-        Number of the first.
-
-    Returns
-    -------
-    BatchResult
-        A value of each of ``study.result_columns`` for each sample. A controller that has no
-        result is among the failures, and has nan; an unstable loop has ``stable`` 0 and nan
-        otherwise.
+    """Evaluate consecutive rows of ``Study.values`` one by one, (b, parameters).
 
     Examples
     --------
@@ -52,10 +36,9 @@ def evaluate_rows(study: Study, values: FloatArray, start: int) -> BatchResult:
     columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
     failures: list[Failure] = []
     for i, row_values in enumerate(values):
-        row = start + i
-        results, failed = evaluate_row(study, row_values, row)
+        row, failed = evaluate_row(study, row_values, start + i)
         failures += failed
-        for name, value in results.items():
+        for name, value in row.items():
             columns[name][i] = value
     return BatchResult(start=start, columns=columns, failures=tuple(failures))
 
@@ -63,7 +46,7 @@ def evaluate_rows(study: Study, values: FloatArray, start: int) -> BatchResult:
 def evaluate_row(
     study: Study, values: FloatArray, row: int
 ) -> tuple[dict[str, float], tuple[Failure, ...]]:
-    """Evaluate one sample; results are by the names of their columns."""
+    """Evaluate one sample, and return its results by column and its failures."""
     try:
         sample = make_sample(study, values)
     except EXPECTED_ERRORS as error:
@@ -101,15 +84,15 @@ def evaluate_row(
 
 
 def design_for_sample(controller: StudyController, sample: Sample) -> Design:
-    """Return a controller's design; for the sample, made from what it is told of it."""
+    """Return a controller's design, made for the sample if it has none for all."""
     if controller.design is not None:
         return controller.design
-    assert controller.request is not None  # what is no file is designed
-    return designed(sample.config, controller.request)
+    assert controller.request is not None  # only a gain file has none
+    return design_by_method(sample.config, controller.request)
 
 
 def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
-    """Close the real loop of a sample around a design."""
+    """Close the real loop of a sample with a design."""
     return close_loop(sample.hardware, design.controller, sensor_gain=sample.truth.sensor_gain)
 
 
@@ -118,7 +101,7 @@ def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
     budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
     spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
     return {
-        # the image is gone, as EnsembleResiduals.strehl has it
+        # 0 beyond the widest jitter that is integrated, as in EnsembleResiduals.strehl
         "strehl": strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0,
         "residual_nm": budget.rms_nm,
         "turbulence_nm": budget.turbulence_nm,
@@ -128,7 +111,7 @@ def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
 
 
 def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
-    """Return the mean Strehl ratio and the residual of a stable loop, run as configured."""
+    """Return the mean Strehl ratio and the residual of a stable loop, simulated as configured."""
     section = sample.config.settings.simulation
     run = simulate(
         loop.controller,
@@ -146,7 +129,7 @@ def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> di
 
 
 def _settle_frames(study: Study, loops: Mapping[str, ClosedLoop]) -> int:
-    """Return the frames to drop: the same for all controllers, so that they meet one weather."""
+    """Return the frames to drop, the same for all controllers: they meet the same disturbances."""
     needed = [settling_frames(loop.spectral_radius) for loop in loops.values() if loop.is_stable]
     return max([study.config.settings.simulation.settle_frames, *needed])
 

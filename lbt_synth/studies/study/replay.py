@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.config import save_config
-from lbt_synth.config.load import validated
+from lbt_synth.config.load import validate_sections
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
@@ -161,7 +161,7 @@ def row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, d
     if sample.noise_factor != 1:
         _set_noise(content, sample, comments)
     content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)
-    settings = validated(FileSection, content, study.config.source)
+    settings = validate_sections(FileSection, content, study.config.source)
     return settings, comments
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from lbt_synth.config import Config
-from lbt_synth.config.load import config_of, validated
+from lbt_synth.config.load import build_config, validate_sections
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.models import LoopHardware, Truth
@@ -34,7 +34,7 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
     for parameter, value in zip(study.parameters, values, strict=True):
         for keys in parameter.places:
             set_number(content, keys, float(value), full=full)
-    config = config_of(validated(FileSection, content, base.source), base.source)
+    config = build_config(validate_sections(FileSection, content, base.source), base.source)
     delay_error = study.parameter_value(DELAY_ERROR, values, 0.0)
     factor = study.parameter_value(NOISE_FACTOR, values, 1.0)
     hardware, truth = config.hardware, config.truth

@@ -15,8 +15,12 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.config.axes import count_axes, vibration_directions
-from lbt_synth.config.plant_and_truth import lines_of, measurement_noise_nm, rms_nm
-from lbt_synth.config.required_sections import nm_of_mas
+from lbt_synth.config.plant_and_truth import (
+    measurement_noise_nm,
+    spread_vibration,
+    vibration_rms_nm,
+)
+from lbt_synth.config.required_sections import convert_mas_to_nm
 from lbt_synth.config.schema import SensorSection
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
 from lbt_synth.models import FrozenFlows, Vibration
@@ -90,7 +94,9 @@ class SampleArrays:
                     sensor = sensor.model_copy(update={"pyramid": pyramid})
                 else:
                     sensor = sensor.model_copy(update={keys[1]: value})
-            found.append(np.ravel(measurement_noise_nm(settings.model_copy(update={"sensor": sensor}))))
+            found.append(
+                np.ravel(measurement_noise_nm(settings.model_copy(update={"sensor": sensor})))
+            )
         return np.asarray(found)[which.reshape(-1)]
 
     def believed_delay(self) -> FloatArray:
@@ -110,12 +116,12 @@ class SampleArrays:
             given = {name: self.number(owner, "vibrations", i, name) for name in _VIBRATION_NUMBERS}
             rms = given["rms_nm"]
             if given["rms_mas"] is not None:
-                rms = given["rms_mas"] * nm_of_mas(settings, 1.0, f"{key}.rms_mas")
+                rms = given["rms_mas"] * convert_mas_to_nm(settings, 1.0, f"{key}.rms_mas")
             frequency, damping = given["frequency_hz"], given["damping"]
             for direction in vibration_directions(section, count_axes(settings), key):
                 numbers: dict[str, Any] = {
                     "frequency_hz": section.frequency_hz if frequency is None else frequency,
-                    "rms_nm": rms_nm(section, settings, key) if rms is None else rms,
+                    "rms_nm": vibration_rms_nm(section, settings, key) if rms is None else rms,
                     "damping": section.damping if damping is None else damping,
                     "direction": direction,
                 }
@@ -124,7 +130,7 @@ class SampleArrays:
                     continue
                 # nothing varies of vibrations where one of them is several
                 whole = Vibration(**numbers)
-                for line in lines_of(whole, section, self.config.hardware.frame_rate_hz, i):
+                for line in spread_vibration(whole, section, self.config.hardware.frame_rate_hz, i):
                     yield {name: getattr(line, name) for name in numbers}, key
 
     def ensemble(self) -> LoopEnsemble:

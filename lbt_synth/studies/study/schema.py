@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from lbt_synth.config.design_methods import OWNERS, ROUTES, WITHOUT_HORIZON
+from lbt_synth.config.design_methods import METHOD_ROUTES, METHODS_WITHOUT_HORIZON, OPTION_METHODS
 from lbt_synth.config.schema import Positive, Section
 
 KINDS = ("fixed", "uniform", "normal", "list")
@@ -80,7 +80,7 @@ class ControllerSection(Section):
     @property
     def options(self) -> dict[str, Any]:
         """Options of the design that are given."""
-        named = {name: getattr(self, name) for name in ("route", "horizon", *OWNERS)}
+        named = {name: getattr(self, name) for name in ("route", "horizon", *OPTION_METHODS)}
         return {name: value for name, value in named.items() if value is not None}
 
     @model_validator(mode="after")
@@ -93,15 +93,15 @@ class ControllerSection(Section):
                 raise ValueError(f"{foreign[0]} goes with design, not with file")
             return self
         for name in self.options:
-            owners = OWNERS.get(name)
+            owners = OPTION_METHODS.get(name)
             if owners is not None and self.design not in owners:
                 raise ValueError(f"{name} goes with design: {' or '.join(owners)}")
-        if self.route is not None and self.route not in ROUTES[self.design]:
-            known = " or ".join(ROUTES[self.design]) or "no route"
+        if self.route is not None and self.route not in METHOD_ROUTES[self.design]:
+            known = " or ".join(METHOD_ROUTES[self.design]) or "no route"
             raise ValueError(f"design: {self.design} takes {known}; got route {self.route!r}")
         if self.design == "polytopic" and self.half_width_hz is None:
             raise ValueError("design: polytopic needs half_width_hz")
-        if self.horizon is not None and self.design in WITHOUT_HORIZON:
+        if self.horizon is not None and self.design in METHODS_WITHOUT_HORIZON:
             raise ValueError(f"design: {self.design} takes no horizon")
         if sum(v is not None for v in (self.gamma, self.gamma_ratio, self.rms)) > 1:
             raise ValueError("expected at most one of gamma, gamma_ratio, rms")
