@@ -47,13 +47,6 @@ def _closed_literals(app, what, name, obj, options, lines):
     lines[:] = [line.replace(" + ... + ", " + … + ") for line in lines]
 
 
-def _write_modules(app):
-    """Write the part of the architecture page that is made from the code."""
-    target = Path(app.srcdir) / "api" / "generated" / "modules.md"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(house.page(), encoding="utf-8")
-
-
 def setup(app):
-    app.connect("builder-inited", _write_modules, priority=100)
+    app.connect("config-inited", lambda app, _: house.write(Path(app.srcdir) / "api"))
     app.connect("autodoc-process-docstring", _closed_literals, priority=900)

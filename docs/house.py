@@ -1,7 +1,8 @@
-"""What the architecture page says of the code, read from the code.
+"""What the documentation says of the code, read from the code.
 
-The order of the rooms is that of the contract in ``pyproject.toml``; the table of
-modules holds the first sentence of each module's docstring.
+The architecture page takes the order of the rooms from the contract in ``pyproject.toml``
+and the first sentence of each module's docstring; the reference has one page per room,
+with the names of its stub.
 """
 
 import ast
@@ -50,7 +51,7 @@ def module_table(package: Path, prefix: str) -> list[str]:
     return rows
 
 
-def page(root: Path = ROOT) -> str:
+def architecture(root: Path = ROOT) -> str:
     """Return the part of the architecture page that is made from the code."""
     package = root / "lbt_synth"
     order = rooms(root / "pyproject.toml")
@@ -63,3 +64,60 @@ def page(root: Path = ROOT) -> str:
         else:
             out += [f"### {room}", "", first_sentence(package / f"{room}.py"), ""]
     return "\n".join(out)
+
+
+def public_names(room: Path) -> list[str]:
+    """Return the public names of a room: functions first, then classes."""
+    if room.with_suffix(".py").exists():  # errors: a module
+        found = [
+            node.name
+            for node in ast.parse(room.with_suffix(".py").read_text()).body
+            if isinstance(node, ast.ClassDef)
+        ]
+    else:
+        found = [
+            alias.name
+            for node in ast.parse((room / "__init__.pyi").read_text()).body
+            if isinstance(node, ast.ImportFrom) and node.module
+            for alias in node.names
+        ]
+    return sorted(found, key=lambda name: (name[0].isupper(), name.lower()))
+
+
+def reference(root: Path = ROOT) -> dict[str, str]:
+    """Return the pages of the reference by the dotted names of the rooms."""
+    package = root / "lbt_synth"
+    stubs = [stub.parent.relative_to(package) for stub in sorted(package.rglob("__init__.pyi"))]
+    found = [".".join(path.parts) for path in stubs if path.parts] + ["errors"]
+    order = rooms(root / "pyproject.toml")
+    found.sort(key=lambda room: (-order.index(room.split(".")[0]), room))
+    return {
+        room: "\n".join(
+            [
+                f"# lbt.{room}",
+                "",
+                "```{eval-rst}",
+                f".. automodule:: lbt_synth.{room}",
+                "   :no-members:",
+                "",
+                f".. currentmodule:: lbt_synth.{room}",
+                "",
+                ".. autosummary::",
+                "   :toctree: ../generated",
+                "",
+                *(f"   {name}" for name in public_names(package / room.replace(".", "/"))),
+                "```",
+                "",
+            ]
+        )
+        for room in found
+    }
+
+
+def write(folder: Path) -> None:
+    """Write the generated pages below the folder of the reference."""
+    (folder / "generated").mkdir(exist_ok=True)
+    (folder / "generated" / "modules.md").write_text(architecture(), encoding="utf-8")
+    (folder / "rooms").mkdir(exist_ok=True)
+    for room, text in reference().items():
+        (folder / "rooms" / f"{room.replace('.', '_')}.md").write_text(text, encoding="utf-8")
