@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 import lbt_synth as lbt
 from lbt_synth.design.shaping.basis import Basis, laguerre_basis, orthonormal_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.reduction import Solved, reduced, solved
+from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
 from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.linear import Controller
 
@@ -41,11 +41,11 @@ def specification(gains: tuple[float, ...]) -> lbt.design.shaping.Specification:
     )
 
 
-def timed(spec: lbt.design.shaping.Specification, size: int, pole: float) -> tuple[Solved, float]:
+def timed(spec: lbt.design.shaping.Specification, size: int, pole: float) -> tuple[ModeSolution, float]:
     """Solve with Laguerre functions, and take the time."""
     basis = laguerre_basis(size, pole, dt_s=PATH.dt_s)
     start = time.perf_counter()
-    found = solved(spec, Channel(hardware=PATH, basis=basis))
+    found = solve_mode(spec, Channel(hardware=PATH, basis=basis))
     return found, time.perf_counter() - start
 
 
@@ -75,7 +75,7 @@ def refitted(spec: lbt.design.shaping.Specification, parameter: Controller) -> f
     """The programme solved anew with a parameter's poles."""
     basis: Basis = orthonormal_basis(np.linalg.eigvals(parameter.A), dt_s=PATH.dt_s)
     try:
-        return solved(spec, Channel(hardware=PATH, basis=basis)).objective_nm
+        return solve_mode(spec, Channel(hardware=PATH, basis=basis)).objective_nm
     except (lbt.errors.SynthesisError, lbt.errors.ProblemError):
         return float("nan")
 
@@ -108,7 +108,7 @@ def main() -> None:
     for order in (30, 19, 15, 11):
         cut = truncated(long.parameter, order)
         start = time.perf_counter()
-        few = reduced(several, long, order, 10.0, fewest=False).objective_nm
+        few = reduce_poles(several, long, order, 10.0, fewest=False).objective_nm
         seconds = time.perf_counter() - start
         print(
             f"{order:4d}: {objective_nm(several, cut):8.2f} {refitted(several, cut):8.2f} "

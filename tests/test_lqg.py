@@ -13,14 +13,14 @@ from scipy.optimize import minimize
 from support.plants import ROOT, lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.design.lqg_design import estimation_plant, loop_powers
-from lbt_synth.loop.least_residuals.residual import least_model_residual
+from lbt_synth.design.lqg_design import estimation_plant, loop_variances
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
 
 
 def shell(bandwidth_hz=100.0, **changes):
-    return lbt.models.PositionLoop.of_bandwidth(
+    return lbt.models.PositionLoop.from_bandwidth(
         **{"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": bandwidth_hz, **changes}
     )
 
@@ -43,7 +43,7 @@ def slow_plant(delay=2.0, mirror=None, modes=1, **changes):
 
 def model_rms(plant, controller):
     """Residual of a controller where the plant's model is the truth [nm]."""
-    return np.sqrt(loop_powers(plant, estimation_plant(plant), controller)[0])
+    return np.sqrt(loop_variances(plant, estimation_plant(plant), controller)[0])
 
 
 @pytest.mark.parametrize("delay", [1.0, 2.0, 3.0, 4.0])
@@ -124,7 +124,7 @@ def test_no_other_gain_costs_less():
         loop = lbt.close_loop(plant.hardware, changed)
         if not loop.is_stable:
             return 1e12
-        residual, commands = loop_powers(plant, design.estimation, changed)
+        residual, commands = loop_variances(plant, design.estimation, changed)
         return residual + 0.01 * commands
 
     best = minimize(cost, np.zeros(3), method="Nelder-Mead", options={"maxfev": 60})
@@ -219,7 +219,7 @@ def test_gain_files(tmp_path, ending, mirror):
     design = lbt.lqg(plant, command_weight=0.01)
     loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"x.{ending}", design))
     assert isinstance(loaded, lbt.design.LqgDesign)
-    assert loaded.recertified().passed
+    assert loaded.recertify().passed
     np.testing.assert_array_equal(loaded.controller.A, design.controller.A)
     np.testing.assert_array_equal(loaded.gain_mirror, design.gain_mirror)
     assert loaded.command_weight == 0.01
@@ -229,7 +229,7 @@ def test_gain_files(tmp_path, ending, mirror):
     else:
         assert loaded.hardware.mirror is None
     other = lbt.load_gain(lbt.save_gain(tmp_path / f"k.{ending}", lbt.kalman(plant)))
-    assert other.recertified().passed
+    assert other.recertify().passed
     np.testing.assert_array_equal(other.hardware.mirror_taps, plant.hardware.mirror_taps)
 
 
@@ -244,10 +244,10 @@ def test_a_gain_file_that_does_not_fit_its_mirror_is_refused(tmp_path):
 @pytest.mark.parametrize("field", ["gain_predictor", "gain_state", "gain_mirror", "objective_nm"])
 def test_changed_gains_fail_the_certificate(field):
     design = lbt.lqg(slow_plant(2.0, shell()))
-    assert design.recertified().passed
+    assert design.recertify().passed
     value = getattr(design, field)
     changed = replace(design, **{field: value * (1 + 1e-4)})
-    certificate = changed.recertified()
+    certificate = changed.recertify()
     assert not certificate.passed
     with pytest.raises(lbt.errors.CertificateError):
         certificate.require()
@@ -258,7 +258,7 @@ def test_a_changed_controller_fails_the_certificate():
     K = design.controller
     changed = lbt.Controller(A=K.A, B=K.B * 1.0001, C=K.C, D=K.D, dt_s=K.dt_s)
     failed = [
-        c.name for c in replace(design, controller=changed).recertified().checks if not c.passed
+        c.name for c in replace(design, controller=changed).recertify().checks if not c.passed
     ]
     assert "controller against its gains" in failed
 

@@ -29,7 +29,7 @@ def ends(plant):
 @pytest.mark.parametrize("ratio", [1.01, 1.05, 1.1, 1.2])
 def test_less_variance_than_the_central_filter_of_the_same_norm(plant, ends, ratio):
     bound = ratio * ends[0].gamma_least
-    best, central = lbt.mixed(plant, gamma=bound), lbt.design.central(plant, gamma=bound)
+    best, central = lbt.mixed(plant, gamma=bound), lbt.design.central_filter(plant, gamma=bound)
     assert best.gamma == pytest.approx(bound, rel=1e-6)
     assert central.gamma == pytest.approx(bound, rel=1e-6)
     assert ends[1].rms < best.rms < central.rms
@@ -41,7 +41,7 @@ def test_the_ends_of_the_front(plant, ends):
     least, kalman = ends
     assert lbt.mixed(plant, gamma=2 * kalman.gamma).rms == pytest.approx(kalman.rms, rel=1e-9)
     assert lbt.mixed(plant, gamma_ratio=1).gamma == pytest.approx(least.gamma, rel=1e-9)
-    assert lbt.design.central(plant, gamma=2 * kalman.gamma).rms == pytest.approx(
+    assert lbt.design.central_filter(plant, gamma=2 * kalman.gamma).rms == pytest.approx(
         kalman.rms, rel=1e-9
     )
     assert lbt.mixed(plant, rms=2 * least.rms).gamma == pytest.approx(least.gamma, rel=1e-5)
@@ -66,7 +66,7 @@ def test_no_gain_of_the_plants_own_order_does_better(plant, ends):
     """An independent search over all predictor gains, not convex: it ends above."""
     bound = 1.05 * ends[0].gamma_least
     best = lbt.mixed(plant, gamma=bound)
-    start = lbt.design.central(plant, gamma=bound).gain_predictor
+    start = lbt.design.central_filter(plant, gamma=bound).gain_predictor
 
     def variance(gain):
         error = plant.error_system(gain.reshape(start.shape))
@@ -104,16 +104,16 @@ def test_bounds_hold_on_any_problem(seed, n, q, l):
     assert (
         kalman.rms * (1 - 1e-9)
         <= design.rms
-        <= lbt.design.central(problem, gamma=bound).rms * (1 + 1e-6)
+        <= lbt.design.central_filter(problem, gamma=bound).rms * (1 + 1e-6)
     )
-    assert design.recertified().passed
+    assert design.recertify().passed
 
 
 def test_a_mixed_filter_is_a_design_like_any_other(tmp_path, plant):
     design = lbt.mixed(plant, gamma_ratio=1.1, taps=8)
     assert design.problem.n_states == plant.n_states + 8
     loaded = lbt.load_gain(lbt.save_gain(tmp_path / "mixed.fits", design))
-    assert loaded.recertified().passed
+    assert loaded.recertify().passed
     assert loaded.gamma_requested == pytest.approx(1.1 * loaded.gamma_least)
     loop = lbt.close_loop(loaded.hardware, loaded.controller)
     assert loop.is_stable
@@ -318,9 +318,9 @@ def test_the_demand_is_kept_and_checked(tmp_path, plant):
     assert design.gamma_requested is None
     loaded = lbt.load_gain(lbt.save_gain(tmp_path / "m.json", design))
     assert loaded.rms_requested == 140.0
-    assert loaded.recertified().passed
+    assert loaded.recertify().passed
     forged = dataclasses.replace(loaded, rms_requested=139.0)
-    failed = [check.name for check in forged.recertified().checks if not check.passed]
+    failed = [check.name for check in forged.recertify().checks if not check.passed]
     assert failed == ["standard deviation of the estimation error"]
 
 

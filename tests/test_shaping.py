@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 import lbt_synth as lbt
 from lbt_synth.design.shaping.basis import laguerre_basis, orthonormal_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.exact_evaluation import mode_loop
-from lbt_synth.design.shaping.pole_fit import fitted_poles
-from lbt_synth.design.shaping.sequence import solve_sequence
+from lbt_synth.design.shaping.pole_fitting import fit_poles
+from lbt_synth.design.shaping.programme_sequence import solve_sequence
+from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.files.gain_file.store import _digest
 from lbt_synth.linear.norms import band_norm, largest_real_part
 
@@ -434,7 +434,7 @@ def small():
 def test_a_shaped_design_returns_from_its_gain_file(small, tmp_path, ending):
     loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"gain{ending}", small))
     assert isinstance(loaded, lbt.design.ShapedDesign)
-    assert loaded.recertified().passed
+    assert loaded.recertify().passed
     assert loaded.objective_nm == small.objective_nm
     assert [d.label for d in loaded.specifications[0].demands] == [
         d.label for d in small.specifications[0].demands
@@ -449,14 +449,14 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
         A=parameter.A, B=parameter.B, C=parameter.C * 1.01, D=parameter.D, dt_s=parameter.dt_s
     )
     failed = [
-        c.name for c in replace(small, parameters=(other,)).recertified().checks if not c.passed
+        c.name for c in replace(small, parameters=(other,)).recertify().checks if not c.passed
     ]
     assert "controller against its parameters" in failed
     stricter = replace(
         small.specifications[0], demands=(lbt.design.shaping.ModulusMargin(at_least=0.9),)
     )
-    assert not replace(small, specifications=(stricter,)).recertified().passed
-    assert not replace(small, objective_nm=(small.objective_nm[0] * 0.999,)).recertified().passed
+    assert not replace(small, specifications=(stricter,)).recertify().passed
+    assert not replace(small, objective_nm=(small.objective_nm[0] * 0.999,)).recertify().passed
 
 
 @pytest.mark.parametrize(
@@ -629,6 +629,6 @@ def test_poles_of_a_response_are_found():
     z = np.exp(1j * angles)
     target = z**2 * (z + 0.3) * z / np.prod(z[:, None] - poles, axis=1)
     start = np.array([0.9 * np.exp(0.3j), 0.9 * np.exp(-0.3j), 0.1, 0.7])
-    found, misfit = fitted_poles(angles, target, np.ones(400), start)
+    found, misfit = fit_poles(angles, target, np.ones(400), start)
     assert misfit < 1e-6
     np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(poles), atol=1e-4)

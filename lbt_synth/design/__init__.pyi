@@ -1,6 +1,6 @@
 from . import modal as modal
 from . import shaping as shaping
-from .central import central as central
+from .central_filters import central_filter as central_filter
 from .certificate import Certificate as Certificate
 from .certificate import Check as Check
 from .certificate import certify_filter as certify_filter
@@ -12,6 +12,7 @@ from .integrator import integrator_gain_limit as integrator_gain_limit
 from .integrator import model_integrator as model_integrator
 from .integrator import optimal_integrator as optimal_integrator
 from .kalman import kalman as kalman
+from .loop_shaping import shape as shape
 from .lqg import lqg as lqg
 from .lqg_design import LqgDesign as LqgDesign
 from .mixed import mixed as mixed
@@ -23,5 +24,4 @@ from .result import FilterDesign as FilterDesign
 from .result import IntegratorDesign as IntegratorDesign
 from .result import SolverReport as SolverReport
 from .robust import robust as robust
-from .shape import shape as shape
 from .shaped_design import ShapedDesign as ShapedDesign

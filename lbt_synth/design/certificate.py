@@ -22,7 +22,7 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, frozen, number
+from lbt_synth.validation import FloatArray, frozen_copy, number
 
 GAIN_TOLERANCE = 1e-6
 NORM_TOLERANCE = 1e-6
@@ -153,7 +153,7 @@ def certify_filter(
     >>> lbt.design.certify_filter(p, [[0.7]], least_variance=True).passed
     False
     """
-    certificate, norm, P = _examined(problem.error_system(gain_predictor))
+    certificate, norm, P = _examine(problem.error_system(gain_predictor))
     if norm is None or P is None:
         return certificate
     gain = np.asarray(gain_predictor)
@@ -186,17 +186,17 @@ def certify_error(
     error: StateSpace, *, stability: str = "spectral radius of the filter"
 ) -> Certificate:
     """Certificate of an estimation error: stability, its variance both ways, its norm both ways."""
-    return _examined(error, stability)[0]
+    return _examine(error, stability)[0]
 
 
-def _examined(
+def _examine(
     error: StateSpace, stability: str = "spectral radius of the filter"
 ) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
     """Certificate of an error, with its norm and covariance if it is stable."""
     radius = error.spectral_radius
-    checks = [_stability(stability, radius)]
+    checks = [_stability_check(stability, radius)]
     if not checks[0].passed:
-        infinite = frozen(np.full(len(error.C), np.inf))
+        infinite = frozen_copy(np.full(len(error.C), np.inf))
         return Certificate(checks=tuple(checks), gamma=np.inf, rms_per_output=infinite), None, None
     drive = error.B @ error.B.T
     P = stationary_covariance(error.A, drive)
@@ -209,7 +209,7 @@ def _examined(
         )
     )
     variances = np.diag(error.C @ P @ error.C.T)
-    checks.append(_variance_both_ways(error, float(variances.sum())))
+    checks.append(_adjoint_variance_check(error, float(variances.sum())))
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     excess = float(np.max(largest_singular_values(error, grid))) / max(norm.upper, 1e-300) - 1
@@ -224,12 +224,12 @@ def _examined(
     certificate = Certificate(
         checks=tuple(checks),
         gamma=norm.value,
-        rms_per_output=frozen(np.sqrt(np.maximum(variances, 0))),
+        rms_per_output=frozen_copy(np.sqrt(np.maximum(variances, 0))),
     )
     return certificate, norm, P
 
 
-def _variance_both_ways(error: StateSpace, variance: float) -> Check:
+def _adjoint_variance_check(error: StateSpace, variance: float) -> Check:
     """Compare the variance with that of the adjoint equation, which sums it in another order."""
     weight = stationary_covariance(error.A.T, error.C.T @ error.C)
     adjoint = float(np.trace(error.B.T @ weight @ error.B))
@@ -327,14 +327,14 @@ def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
     False
     """
     radius = close_loop(hardware, controller).spectral_radius
-    return _stability("spectral radius of the closed loop", radius)
+    return _stability_check("spectral radius of the closed loop", radius)
 
 
-def _stability(name: str, radius: float) -> Check:
+def _stability_check(name: str, radius: float) -> Check:
     return Check(name=name, value=radius, limit=1 - STABILITY_MARGIN, computed_by="eigenvalues")
 
 
-def controller_distance(one: Controller, other: Controller) -> float:
+def controller_difference(one: Controller, other: Controller) -> float:
     """Largest difference of two controllers' matrices, over the largest entry of each.
 
     Infinite where their sizes differ.

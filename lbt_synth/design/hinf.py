@@ -14,8 +14,8 @@ from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_l
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.linear.riccati.gamma import gamma_riccati, least_gamma
-from lbt_synth.linear.riccati.invisible_disturbance import worst_invisible
-from lbt_synth.validation import FloatArray, choice, frozen, number
+from lbt_synth.linear.riccati.invisible_disturbance import worst_invisible_disturbance
+from lbt_synth.validation import FloatArray, choice, frozen_copy, number
 
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9
@@ -37,7 +37,7 @@ class Gains(Protocol):
         """Gain of the measurement update alone."""
 
 
-class _Solved(Gains, Protocol):
+class _RouteSolution(Gains, Protocol):
     """What both routes return."""
 
     @property
@@ -150,7 +150,7 @@ def hinf(
         witness=witness,
     )
     if design.gamma < infeasible * (1 - _CONTRADICTION):
-        raise _contradiction(infeasible, design.gamma)
+        raise _contradiction_error(infeasible, design.gamma)
     return design
 
 
@@ -173,26 +173,26 @@ class _RiccatiRoute:
         usable = (spread > 1e-150) & (spread < 1e150)
         # powers of two: the change of units rounds nothing
         self.units = np.exp2(np.round(np.log2(np.where(usable, spread, 1.0))))[:, None]
-        self.problem = in_units(problem, self.units)
+        self.problem = scale_states(problem, self.units)
         self.start = self._scaled(start, 1 / self.units)
 
-    def least(self) -> tuple[_Solved, Witness]:
+    def least(self) -> tuple[_RouteSolution, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)
         _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
-        witness = worst_invisible(self.problem, best.P, level, self.start.P)
-        states = frozen(self.units * witness.states)
+        witness = worst_invisible_disturbance(self.problem, best.P, level, self.start.P)
+        states = frozen_copy(self.units * witness.states)
         return self._scaled(best, self.units), replace(witness, states=states)
 
-    def at(self, gamma: float) -> _Solved:
+    def at(self, gamma: float) -> _RouteSolution:
         return self._scaled(self._at(gamma), self.units)
 
     @staticmethod
     def _scaled(solution: FilterRiccati, units: FloatArray) -> FilterRiccati:
         return replace(
             solution,
-            P=frozen(units * solution.P * units.T),
-            gain_predictor=frozen(units * solution.gain_predictor),
-            gain_filter=frozen(units * solution.gain_filter),
+            P=frozen_copy(units * solution.P * units.T),
+            gain_predictor=frozen_copy(units * solution.gain_predictor),
+            gain_filter=frozen_copy(units * solution.gain_filter),
         )
 
     def _at(self, gamma: float) -> FilterRiccati:
@@ -213,20 +213,20 @@ class _LmiRoute:
         self.problem, self.start = problem, start
         self.scale = _kalman_bracket(problem, start)[1]
 
-    def least(self) -> tuple[_Solved, Witness]:
+    def least(self) -> tuple[_RouteSolution, Witness]:
         from lbt_synth.linear.lmi.hinf import least_gamma_lmi
 
         solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
         assert solution.witness is not None  # the least gamma has a dual solution
         return solution, solution.witness
 
-    def at(self, gamma: float) -> _Solved:
+    def at(self, gamma: float) -> _RouteSolution:
         from lbt_synth.linear.lmi.hinf import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 
 
-def in_units(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:
+def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:
     """Problem with the states divided by units (n, 1)."""
     return EstimationProblem(
         A=problem.A * units.T / units,
@@ -239,7 +239,7 @@ def in_units(problem: EstimationProblem, units: FloatArray) -> EstimationProblem
 
 
 def _verified_bracket(
-    problem: EstimationProblem, start: FilterRiccati, gains: _Solved, witness: Witness
+    problem: EstimationProblem, start: FilterRiccati, gains: _RouteSolution, witness: Witness
 ) -> tuple[float, float]:
     """Least gamma from both sides: the norm of a filter, and a level that a witness refutes."""
     error = problem.error_system(gains.gain_predictor)
@@ -252,11 +252,11 @@ def _verified_bracket(
     least = hinf_norm(error).upper
     infeasible = infeasible_level(problem, witness, start.P)
     if infeasible > least * (1 + _CONTRADICTION):
-        raise _contradiction(infeasible, least)
+        raise _contradiction_error(infeasible, least)
     return least, min(infeasible, least)
 
 
-def _contradiction(infeasible: float, achieved: float) -> NumericalError:
+def _contradiction_error(infeasible: float, achieved: float) -> NumericalError:
     return NumericalError(
         f"no filter should have a norm below {infeasible:.9g}, yet one achieves {achieved:.9g}. "
         "Try the other route, or scale the states to similar sizes.",

@@ -20,7 +20,7 @@ from lbt_synth.loop import (
     stable_sensor_gains,
 )
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
-from lbt_synth.validation import frozen, instance, number
+from lbt_synth.validation import frozen_copy, number, require_instance
 
 _TRIALS = 32
 TRIED_GAINS = 1e-4, 0.999  # parts of the limit between which the best gain is looked for
@@ -55,11 +55,11 @@ def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
     >>> bool(max(abs(lbt.integrator(path, gain=0.25).poles)) < 1)
     True
     """
-    return _certified(hardware, number(gain, "gain", above=0), route="closed form", status="given")
+    return _certify(hardware, number(gain, "gain", above=0), route="closed form", status="given")
 
 
-def _certified(hardware: LoopHardware, gain: float, *, route: str, status: str) -> IntegratorDesign:
-    controller = _controller(hardware, gain)
+def _certify(hardware: LoopHardware, gain: float, *, route: str, status: str) -> IntegratorDesign:
+    controller = _integrator_controller(hardware, gain)
     return IntegratorDesign(
         method="integrator",
         controller=controller,
@@ -104,7 +104,7 @@ def integrator_gain_limit(delay_frames: float) -> float:
     if d == round(d):
         return float(2 * np.sin(np.pi / (2 * (2 * d - 1))))
     start = 0.5 / d  # stable: well below the limit of the next whole delay
-    return start * stable_sensor_gains(hardware, _controller(hardware, start))[1]
+    return start * stable_sensor_gains(hardware, _integrator_controller(hardware, start))[1]
 
 
 def hardware_gain_limit(hardware: LoopHardware) -> float:
@@ -119,9 +119,9 @@ def hardware_gain_limit(hardware: LoopHardware) -> float:
     )
     taps = single.mirror_taps
     start = 0.5 / (1 + float(np.abs(np.arange(taps.size) @ taps)))  # over the mean delay
-    while not close_loop(single, _controller(single, start)).is_stable:
+    while not close_loop(single, _integrator_controller(single, start)).is_stable:
         start /= 2
-    return start * stable_sensor_gains(single, _controller(single, start))[1]
+    return start * stable_sensor_gains(single, _integrator_controller(single, start))[1]
 
 
 def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign:
@@ -160,7 +160,7 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
         raise ProblemError(
             "the truth must disturb the loop; got no turbulence, vibration or noise."
         )
-    return _least(hardware, lambda loop: residual_budget(loop, truth), truth.sensor_gain)
+    return _least_residual(hardware, lambda loop: residual_budget(loop, truth), truth.sensor_gain)
 
 
 def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
@@ -191,17 +191,17 @@ def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
     >>> bool(abs(lbt.design.model_integrator(plant).gain / same.gain - 1) < 1e-6)
     True
     """
-    instance(plant, TipTiltPlant)
-    return _least(plant.hardware, lambda loop: model_budget(loop, plant), 1.0)
+    require_instance(plant, TipTiltPlant)
+    return _least_residual(plant.hardware, lambda loop: model_budget(loop, plant), 1.0)
 
 
-def _least(
+def _least_residual(
     hardware: LoopHardware, budget: Callable[[ClosedLoop], ResidualBudget], sensor_gain: float
 ) -> IntegratorDesign:
     limit = hardware_gain_limit(hardware) / max(1.0, sensor_gain)
 
     def variance(log_gain: float) -> float:
-        controller = _controller(hardware, float(np.exp(log_gain)))
+        controller = _integrator_controller(hardware, float(np.exp(log_gain)))
         try:
             loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
             return budget(loop).rms_nm ** 2
@@ -215,11 +215,11 @@ def _least(
     found = minimize_scalar(variance, bounds=bracket, method="bounded", options={"xatol": 1e-7})
     limited = best == _TRIALS - 1
     status = "limited by stability at unit sensor gain" if limited else "least residual"
-    return _certified(hardware, float(np.exp(found.x)), route="search", status=status)
+    return _certify(hardware, float(np.exp(found.x)), route="search", status=status)
 
 
-def _controller(hardware: LoopHardware, gain: float) -> Controller:
-    reconstructor = frozen(np.linalg.pinv(hardware.sensor @ hardware.influence))
+def _integrator_controller(hardware: LoopHardware, gain: float) -> Controller:
+    reconstructor = frozen_copy(np.linalg.pinv(hardware.sensor @ hardware.influence))
     m, q = reconstructor.shape
     return Controller(
         A=np.eye(m), B=gain * reconstructor, C=np.eye(m), D=np.zeros((m, q)), dt_s=hardware.dt_s

@@ -27,8 +27,8 @@ from lbt_synth.linear import solve_dare
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.models.lifted_mirror import Response
-from lbt_synth.validation import FloatArray, frozen, number
+from lbt_synth.models.mirror.frame_rate_system import Response
+from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _ON_CIRCLE = 1e-6  # a zero this close to the unit circle leaves no stable regulator
 _SQUARINGS = 60
@@ -86,7 +86,7 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     --------
     >>> import lbt_synth as lbt
     >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
     ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=100
     ... )
     >>> plant = lbt.tip_tilt_plant(
@@ -132,12 +132,12 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         ),
         problem=plant,
         gain_predictor=solution.gain_predictor,
-        gain_state=frozen(gains),
-        gain_mirror=frozen(regulator.gain_mirror),
+        gain_state=frozen_copy(gains),
+        gain_mirror=frozen_copy(regulator.gain_mirror),
         command_weight=rho,
         objective_nm=float(np.sqrt(max(float(cost), 0.0))),
     )
-    certificate = design.recertified().require(
+    certificate = design.recertify().require(
         "Try a small command_weight, such as 1e-4, or states of similar sizes."
     )
     return replace(design, certificate=certificate)
@@ -169,7 +169,7 @@ def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regu
     total = float(weight + G @ X @ G)
     gain_mirror = (G @ X @ F + d * h) / total
     closed = F - np.outer(G, gain_mirror)
-    crossed = _stein(closed.T, A, (gain_mirror * d - h)[None, :, None] * L[:, None, :])
+    crossed = _solve_stein(closed.T, A, (gain_mirror * d - h)[None, :, None] * L[:, None, :])
     gain_state = (d * L - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
     return Regulator(
         gain_state=gain_state,
@@ -180,7 +180,7 @@ def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regu
     )
 
 
-def _stein(left: FloatArray, right: FloatArray, drive: FloatArray) -> FloatArray:
+def _solve_stein(left: FloatArray, right: FloatArray, drive: FloatArray) -> FloatArray:
     """Solve ``Y = left Y right + drive`` for a stack of drives, by squaring."""
     Y = drive
     for _ in range(_SQUARINGS):

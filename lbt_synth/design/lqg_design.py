@@ -14,7 +14,7 @@ from lbt_synth.design.certificate import (
     certify_error,
     certify_filter,
     certify_loop,
-    controller_distance,
+    controller_difference,
 )
 from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import ProblemError
@@ -22,7 +22,7 @@ from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant, tip_tilt_plant
-from lbt_synth.models.plant import require_no_memory
+from lbt_synth.models.plant.tip_tilt import require_no_memory
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _SAME = 1e-9
@@ -122,7 +122,7 @@ class LqgDesign(EstimatorDesign):
         D = np.zeros((modes, B.shape[1]))
         return StateSpace(A=A, B=B, C=C, D=D, dt_s=own.dt_s)
 
-    def recertified(self) -> Certificate:
+    def recertify(self) -> Certificate:
         """Compute the certificate anew from the matrices.
 
         Returns
@@ -141,7 +141,7 @@ class LqgDesign(EstimatorDesign):
         checks.append(
             Check(
                 name="controller against its gains",
-                value=controller_distance(
+                value=controller_difference(
                     self.controller,
                     lqg_controller(
                         self.problem, self.gain_predictor, self.gain_state, self.gain_mirror
@@ -187,7 +187,7 @@ class LqgDesign(EstimatorDesign):
 
     def _costs(self, rms: float) -> list[Check]:
         """Compare the real loop's cost, by a Lyapunov equation, with what is claimed."""
-        residual, commands = loop_powers(self.problem, self.estimation, self.controller)
+        residual, commands = loop_variances(self.problem, self.estimation, self.controller)
         cost = residual + self.command_weight * commands
         pairs = (
             ("residual of the closed loop, against the error system", residual, rms**2),
@@ -236,7 +236,7 @@ def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:
     )
 
 
-def loop_powers(
+def loop_variances(
     plant: TipTiltPlant, model: TipTiltPlant, controller: Controller
 ) -> tuple[float, float]:
     """Variances of residual and command (as a wavefront) of the loop, the model as the truth."""

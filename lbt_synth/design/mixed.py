@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from lbt_synth.design.central import CentralFamily
+from lbt_synth.design.central_filters import CentralFilters
 from lbt_synth.design.hinf import Gains, hinf, require_reachable
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
@@ -23,7 +23,7 @@ from lbt_synth.linear import (
 )
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.validation import FloatArray, frozen, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 if TYPE_CHECKING:
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
@@ -146,9 +146,9 @@ def mixed(
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
             return programme.least_variance(bound * (1 - _ROOM), grid)
 
-    base = CentralFamily(problem, least).member(measure)
-    made = _completed(problem, base, length, solve)
-    return _certified(problem, base, made, least, gamma=gamma, rms=rms)
+    base = CentralFilters(problem, least).member(measure)
+    made = _complete_base(problem, base, length, solve)
+    return _mixed_design(problem, base, made, least, gamma=gamma, rms=rms)
 
 
 def require_taps(taps: int) -> int:
@@ -160,7 +160,7 @@ def require_taps(taps: int) -> int:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Completed:
+class _ImpulseResponse:
     """An impulse response on the innovations of a base."""
 
     taps: FloatArray
@@ -168,12 +168,12 @@ class _Completed:
     rounds: int
 
 
-def _completed(
+def _complete_base(
     problem: EstimationProblem,
     base: Gains,
     length: int,
     solve: Callable[[InnovationProgramme, FloatArray], _Answer],
-) -> _Completed:
+) -> _ImpulseResponse:
     """Solve on a set of frequencies, and add to it until the norm holds between them."""
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
@@ -182,13 +182,13 @@ def _completed(
     excess = np.inf
     for rounds in range(1, _ROUNDS + 1):
         taps, level, status = solve(programme, grid)
-        error = problem.with_memory(taps).error_system(_with_memory(base.gain_predictor, length))
+        error = problem.with_memory(taps).error_system(_extend_gain(base.gain_predictor, length))
         peak = hinf_norm(error)
         excess = peak.value / level - 1
         if excess <= _EXCESS:
-            return _Completed(taps=taps, status=status, rounds=rounds)
+            return _ImpulseResponse(taps=taps, status=status, rounds=rounds)
         fine = np.linspace(0, 0.5 / error.dt_s, _FINE_GRID)
-        fine = np.unique(np.concatenate([fine, _near_poles(error)]))
+        fine = np.unique(np.concatenate([fine, _frequencies_near_poles(error)]))
         sigma = largest_singular_values(error, fine)
         inner = np.r_[True, sigma[1:] >= sigma[:-1]] & np.r_[sigma[:-1] >= sigma[1:], True]
         high = fine[inner & (sigma > level * (1 + _EXCESS / 4))]
@@ -201,10 +201,10 @@ def _completed(
     )
 
 
-def _certified(
+def _mixed_design(
     problem: EstimationProblem,
     base: Gains,
-    made: _Completed,
+    made: _ImpulseResponse,
     least: FilterDesign,
     *,
     gamma: float | None,
@@ -212,12 +212,12 @@ def _certified(
 ) -> FilterDesign:
     extended = problem.with_memory(made.taps)
     size, q = made.taps.shape[1], base.gain_predictor.shape[1]
-    gain = _with_memory(base.gain_predictor, size // q)
+    gain = _extend_gain(base.gain_predictor, size // q)
     assert least.witness is not None
     assert least.gamma_infeasible is not None
     padding = np.zeros((size, least.witness.states.shape[1]))
     witness = Witness(
-        states=frozen(np.vstack([least.witness.states, padding])),
+        states=frozen_copy(np.vstack([least.witness.states, padding])),
         disturbances=least.witness.disturbances,
     )
     proved = infeasible_level(extended, witness, kalman_riccati(extended).P)
@@ -236,18 +236,18 @@ def _certified(
     )
 
 
-def _with_memory(gain_predictor: FloatArray, length: int) -> FloatArray:
+def _extend_gain(gain_predictor: FloatArray, length: int) -> FloatArray:
     """Gain that feeds the innovations into the memory as well."""
     q = gain_predictor.shape[1]
-    return frozen(np.vstack([gain_predictor, np.eye(q), np.zeros(((length - 1) * q, q))]))
+    return frozen_copy(np.vstack([gain_predictor, np.eye(q), np.zeros(((length - 1) * q, q))]))
 
 
 def _first_grid(error: StateSpace) -> FloatArray:
     even = np.linspace(0, 0.5 / error.dt_s, _FIRST_GRID)
-    return np.unique(np.concatenate([even, _near_poles(error)]))
+    return np.unique(np.concatenate([even, _frequencies_near_poles(error)]))
 
 
-def _near_poles(error: StateSpace) -> FloatArray:
+def _frequencies_near_poles(error: StateSpace) -> FloatArray:
     """Frequencies at and around the poles of a system [Hz]."""
     centres, widths = np.abs(np.angle(error.poles)), 1 - np.abs(error.poles)
     offsets = np.array([0.0, 0.3, 1.0, 3.0])

@@ -13,15 +13,15 @@ from lbt_synth.design.certificate import (
     Check,
     certify_error,
     certify_loop,
-    controller_distance,
+    controller_difference,
 )
 from lbt_synth.design.result import EstimatorDesign, SolverReport
-from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
+from lbt_synth.design.worst_case import bound_worst_error, error_size, search_worst_error
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import youla_controller
 from lbt_synth.models import TipTiltPlant, tip_tilt_plant
-from lbt_synth.models.frequency_interval import FrequencyInterval, error_system
+from lbt_synth.models.plant.frequency_interval import FrequencyInterval, error_system
 from lbt_synth.validation import ComplexArray, FloatArray, choice
 
 _NORMS = ("hinf", "h2")
@@ -88,7 +88,7 @@ class PolytopicDesign(EstimatorDesign):
         """
         return error_system(problem or self.problem, self.predictor)
 
-    def recertified(self) -> Certificate:
+    def recertify(self) -> Certificate:
         """Compute the certificate anew from the matrices.
 
         Returns
@@ -96,7 +96,7 @@ class PolytopicDesign(EstimatorDesign):
         Certificate
             Passed or not.
         """
-        return _certified(self)
+        return _certify(self)
 
 
 def polytopic(
@@ -150,7 +150,7 @@ def polytopic(
     choice(norm, "norm", _NORMS)
     interval = FrequencyInterval(plant=plant, half_width_hz=half_width_hz)
     interval = replace(interval, plant=plant.ahead(horizon))
-    predictor, bound, solver = _synthesised(interval, norm)
+    predictor, bound, solver = _synthesise(interval, norm)
     return polytopic_design(interval, predictor, norm=norm, bound_programme=bound, solver=solver)
 
 
@@ -164,7 +164,7 @@ def polytopic_design(
 ) -> PolytopicDesign:
     """Make a design of a filter and certify it; raise CertificateError if it fails."""
     stable = bool(np.max(np.abs(np.linalg.eigvals(predictor.A))) < 1)
-    found, where = worst_found(interval, predictor, norm) if stable else (np.inf, np.nan)
+    found, where = search_worst_error(interval, predictor, norm) if stable else (np.inf, np.nan)
     plant = interval.plant
     design = PolytopicDesign(
         method=f"polytopic-{norm}",
@@ -175,12 +175,12 @@ def polytopic_design(
         predictor=predictor,
         half_width_hz=interval.half_width_hz,
         norm=norm,
-        bound_guaranteed=worst_guaranteed(interval, predictor, norm) if stable else np.inf,
+        bound_guaranteed=bound_worst_error(interval, predictor, norm) if stable else np.inf,
         worst_achieved=found,
         worst_frequency_hz=where,
         bound_programme=bound_programme,
     )
-    certificate = design.recertified().require("Try a narrower interval.")
+    certificate = design.recertify().require("Try a narrower interval.")
     return replace(design, certificate=certificate)
 
 
@@ -190,14 +190,14 @@ def _controller(plant: TipTiltPlant, predictor: Controller) -> Controller:
     return youla_controller(plant.hardware, replace(predictor, C=to_command, D=D))
 
 
-def _certified(design: PolytopicDesign) -> Certificate:
+def _certify(design: PolytopicDesign) -> Certificate:
     interval, norm, predictor = design.interval, design.norm, design.predictor
     certificate = certify_error(
         design.error_system(), stability="spectral radius of plant and filter"
     )
     if not certificate.passed:
         return certificate
-    found, _ = worst_found(interval, predictor, norm)
+    found, _ = search_worst_error(interval, predictor, norm)
     a1 = interval.coefficient(design.worst_frequency_hz)
     there = error_size(interval.error_system(a1, predictor), norm)
     outside = abs(design.worst_frequency_hz - interval.plant.vibrations[0].frequency_hz)
@@ -206,7 +206,7 @@ def _certified(design: PolytopicDesign) -> Certificate:
     checks = [
         Check(
             name="bound over the interval, recomputed",
-            value=worst_guaranteed(interval, predictor, norm),
+            value=bound_worst_error(interval, predictor, norm),
             limit=design.bound_guaranteed * (1 + NORM_TOLERANCE),
             computed_by="envelope of all plants, level sets"
             if norm == "hinf"
@@ -238,7 +238,7 @@ def _certified(design: PolytopicDesign) -> Certificate:
         ),
         Check(
             name="controller, against the one made of the filter",
-            value=controller_distance(design.controller, made),
+            value=controller_difference(design.controller, made),
             limit=NORM_TOLERANCE,
             computed_by="relative, largest entry",
         ),
@@ -247,22 +247,22 @@ def _certified(design: PolytopicDesign) -> Certificate:
     return replace(certificate, checks=(*certificate.checks, *checks))
 
 
-def _synthesised(interval: FrequencyInterval, norm: str) -> tuple[Controller, float, SolverReport]:
+def _synthesise(interval: FrequencyInterval, norm: str) -> tuple[Controller, float, SolverReport]:
     """Filter of all axes; those that nothing couples are designed one by one."""
     from lbt_synth.linear.lmi.polytopic import SegmentFilter, segment_filter
 
     plant = interval.plant
     made: list[SegmentFilter] = []
     solved: list[tuple[TipTiltPlant, SegmentFilter]] = []
-    for axis in _axes(plant):
-        known = [filtered for other, filtered in solved if _same(axis, other)]
+    for axis in _decoupled_axes(plant):
+        known = [filtered for other, filtered in solved if _equal_plants(axis, other)]
         if not known:
             ends = (axis.A, axis.A)
             if axis.vibrations:
                 own = replace(interval, plant=axis)
                 low, high = own.coefficients
                 ends = (own.state_matrix(low), own.state_matrix(high))
-            coordinates, scale = _expected(axis, interval.half_width_hz, norm)
+            coordinates, scale = _expected_error(axis, interval.half_width_hz, norm)
             known = [segment_filter(axis, ends, norm=norm, coordinates=coordinates, scale=scale)]
             solved.append((axis, known[0]))
         made.append(known[0])
@@ -285,7 +285,7 @@ def _synthesised(interval: FrequencyInterval, norm: str) -> tuple[Controller, fl
     return predictor, float(np.max(bounds) if norm == "hinf" else np.linalg.norm(bounds)), report
 
 
-def _axes(plant: TipTiltPlant) -> list[TipTiltPlant]:
+def _decoupled_axes(plant: TipTiltPlant) -> list[TipTiltPlant]:
     """Plants of the single axes, or the plant itself where something couples them."""
     hw, n = plant.hardware, plant.hardware.modes
     directions = np.array([line.direction for line in plant.vibrations])
@@ -322,11 +322,13 @@ def _is_diagonal(matrix: FloatArray) -> bool:
     return not np.any(matrix - np.diag(np.diag(matrix)))
 
 
-def _same(one: TipTiltPlant, other: TipTiltPlant) -> bool:
+def _equal_plants(one: TipTiltPlant, other: TipTiltPlant) -> bool:
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in "ABCDL")
 
 
-def _expected(plant: TipTiltPlant, half_width_hz: float, norm: str) -> tuple[FloatArray, float]:
+def _expected_error(
+    plant: TipTiltPlant, half_width_hz: float, norm: str
+) -> tuple[FloatArray, float]:
     """Covariance and size of the error to expect: of a line as wide as the interval."""
     if plant.vibrations:
         hw = plant.hardware

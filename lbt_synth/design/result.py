@@ -84,7 +84,7 @@ class Design:
         """
         return self.controller.to_statespace().to_control()
 
-    def recertified(self) -> Certificate:
+    def recertify(self) -> Certificate:
         """Compute the certificate anew from the matrices."""
         return self.certificate
 
@@ -186,7 +186,7 @@ class FilterDesign(EstimatorDesign):
         """Poles of the estimation error, (n,)."""
         return self.error_system().poles
 
-    def recertified(self) -> Certificate:
+    def recertify(self) -> Certificate:
         """Compute the certificate anew from the matrices.
 
         Returns
@@ -222,7 +222,7 @@ class IntegratorDesign(Design):
         """Poles of the closed loop."""
         return close_loop(self.loop_hardware, self.controller).system.poles
 
-    def recertified(self) -> Certificate:
+    def recertify(self) -> Certificate:
         """Compute the certificate anew from the matrices.
 
         Returns
@@ -238,7 +238,7 @@ def loop_certificate(check: Check) -> Certificate:
     return Certificate(checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0))
 
 
-class Demands(TypedDict, total=False):
+class FilterClaims(TypedDict, total=False):
     """What a filter design was asked for, and what is claimed of its problem."""
 
     gamma_requested: float | None
@@ -294,7 +294,7 @@ def filter_design(
     *,
     method: str,
     solver: SolverReport,
-    **demands: Unpack[Demands],
+    **demands: Unpack[FilterClaims],
 ) -> FilterDesign:
     """Make a design and certify it; raise CertificateError if it fails."""
     design = FilterDesign(
@@ -307,7 +307,7 @@ def filter_design(
         gain_filter=gain_filter,
         **demands,
     )
-    certificate = design.recertified().require(
+    certificate = design.recertify().require(
         "Try the other route, or scale the states to similar sizes."
     )
     return replace(design, certificate=certificate)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lbt_synth.design.shape import shape
-from lbt_synth.design.shaped_design import ShapedDesign, noise_of_modes
+from lbt_synth.design.loop_shaping import shape
+from lbt_synth.design.shaped_design import ShapedDesign, noise_per_mode
 from lbt_synth.design.shaping.bounds import ModulusMargin
 from lbt_synth.design.shaping.demand_types import Demand
 from lbt_synth.design.shaping.objectives import ResidualVariance, Term, Total, VibrationBand
@@ -100,7 +100,7 @@ def robust(
     fixed: list[Demand] = [ModulusMargin(at_least=modulus_margin)]
     if (low, high) != (1, 1):
         fixed.append(SensorGainRange(low=low, high=high))
-    deviations = noise_of_modes(plant.hardware, plant.R)
+    deviations = noise_per_mode(plant.hardware, plant.R)
     made: dict[tuple[str, int], Specification] = {}
     specifications = []
     for noise_nm, model in zip(deviations, plant.turbulence, strict=True):

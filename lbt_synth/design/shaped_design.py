@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.design.certificate import Certificate, Check, certify_loop, controller_distance
+from lbt_synth.design.certificate import Certificate, Check, certify_loop, controller_difference
 from lbt_synth.design.result import Design
-from lbt_synth.design.shaping.exact_evaluation import mode_loop
 from lbt_synth.design.shaping.objectives import leaves
+from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import DimensionError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import ComplexArray, FloatArray, frozen
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 _SAME = 1e-9
 _RMS_TOLERANCE = 1e-6
@@ -105,7 +105,7 @@ class ShapedDesign(Design):
             ]
         return tuple(out)
 
-    def recertified(self) -> Certificate:
+    def recertify(self) -> Certificate:
         """Compute the certificate anew from the matrices.
 
         Returns
@@ -129,11 +129,11 @@ class ShapedDesign(Design):
                 replace(check, name=prefix + check.name)
                 for check in _mode_checks(hardware, spec, parameter, claimed)
             ]
-        whole = assembled(hardware, self.parameters)
+        whole = controller_from_parameters(hardware, self.parameters)
         checks += [
             Check(
                 name="controller against its parameters",
-                value=controller_distance(self.controller, whole),
+                value=controller_difference(self.controller, whole),
                 limit=_SAME,
                 computed_by="matrices assembled anew",
             ),
@@ -141,7 +141,9 @@ class ShapedDesign(Design):
         ]
         if checks[-1].passed:
             checks.append(self._decoupled())
-        return Certificate(checks=tuple(checks), gamma=np.nan, rms_per_output=frozen(np.zeros(0)))
+        return Certificate(
+            checks=tuple(checks), gamma=np.nan, rms_per_output=frozen_copy(np.zeros(0))
+        )
 
     def _decoupled(self) -> Check:
         """Check that the whole loop rejects what the loops of the single modes reject."""
@@ -204,7 +206,9 @@ def require_separable(hardware: LoopHardware) -> None:
             )
 
 
-def assembled(hardware: LoopHardware, parameters: tuple[Controller, ...]) -> Controller:
+def controller_from_parameters(
+    hardware: LoopHardware, parameters: tuple[Controller, ...]
+) -> Controller:
     """Return the controller of the whole loop: the modes' parameters side by side."""
     back = np.linalg.pinv(hardware.sensor)
     sizes = [p.n_states for p in parameters]
@@ -227,7 +231,7 @@ def assembled(hardware: LoopHardware, parameters: tuple[Controller, ...]) -> Con
     return youla_controller(hardware, whole)
 
 
-def noise_of_modes(hardware: LoopHardware, covariance: FloatArray) -> FloatArray:
+def noise_per_mode(hardware: LoopHardware, covariance: FloatArray) -> FloatArray:
     """Return the deviation of each mode's noise, (n,), from the covariance of the measurements."""
     back = np.linalg.pinv(hardware.sensor)
     return np.asarray(np.sqrt(np.diag(back @ covariance @ back.T)))

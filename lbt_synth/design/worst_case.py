@@ -17,7 +17,7 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.norms import band_norm
-from lbt_synth.models.frequency_interval import FrequencyInterval
+from lbt_synth.models.plant.frequency_interval import FrequencyInterval
 
 _GRID = 33
 _GAP = 1e-4  # of the variance, between what is guaranteed and what was found
@@ -32,7 +32,7 @@ def error_size(error: StateSpace, norm: str) -> float:
     return float(np.sqrt(np.trace(error.C @ covariance @ error.C.T)))
 
 
-def worst_found(
+def search_worst_error(
     interval: FrequencyInterval, estimator: Controller, norm: str
 ) -> tuple[float, float]:
     """Worst error on a grid of frequencies, refined, and where it is [Hz]."""
@@ -55,7 +55,7 @@ def worst_found(
     return max(found)
 
 
-def worst_guaranteed(interval: FrequencyInterval, estimator: Controller, norm: str) -> float:
+def bound_worst_error(interval: FrequencyInterval, estimator: Controller, norm: str) -> float:
     """Bound of the error on all of the interval."""
     if norm == "hinf":
         ends = [hinf_norm(interval.error_system(a, estimator)) for a in interval.coefficients]
@@ -79,7 +79,7 @@ def _greatest_variance(interval: FrequencyInterval, estimator: Controller) -> fl
     curvature = _curvature(interval)
     count = 1 + int(np.ceil((high - low) * np.sqrt(curvature / 4)))
     if count > _MOST_PARTS:
-        raise _unbounded()
+        raise _unbounded_error()
     points = np.linspace(low, high, count + 1)
     values = [variance(float(a)) for a in points]
     best = max(values)
@@ -101,10 +101,10 @@ def _greatest_variance(interval: FrequencyInterval, estimator: Controller) -> fl
         best = max(best, at_middle)
         heapq.heapreplace(parts, part(a, middle, at_a, at_middle))
         heapq.heappush(parts, part(middle, b, at_middle, at_b))
-    raise _unbounded()
+    raise _unbounded_error()
 
 
-def _unbounded() -> NumericalError:
+def _unbounded_error() -> NumericalError:
     return NumericalError(
         f"the variance over the interval is not bounded to {_GAP:g} with {_MOST_PARTS} parts: the "
         "vibration is too narrow a line for it. Try a narrower interval, or more damping.",

@@ -28,7 +28,7 @@ from lbt_synth.loop import (
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import FullStatePlant, LoopHardware, SinusoidalVibration, TipTiltPlant, Truth
 from lbt_synth.models.truth import stationary_vibrations
-from lbt_synth.validation import FloatArray, frozen, number
+from lbt_synth.validation import FloatArray, frozen_copy, number
 
 T = TypeVar("T")
 _GRID = 65  # shifts over the range of errors, at least
@@ -191,8 +191,8 @@ def limits(
         limit=limit,
         band=band,
         band_hz=band_hz,
-        shift_hz=frozen(shifts),
-        residual_nm=frozen(curves),
+        shift_hz=frozen_copy(shifts),
+        residual_nm=frozen_copy(curves),
         frequency_hz=frequencies.pop() if len(frequencies) == 1 else None,
     )
 

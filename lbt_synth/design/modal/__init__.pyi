@@ -5,7 +5,7 @@ from .gains import modal_gains as modal_gains
 from .loop import ModalLoop as ModalLoop
 from .loop import ModalRun as ModalRun
 from .loop import modal_loop as modal_loop
-from .mixed import MixedController as MixedController
+from .mixed_controller import MixedController as MixedController
 from .reconstructor import Reconstructor as Reconstructor
 from .reconstructor import project_out as project_out
 from .reconstructor import reconstructor as reconstructor

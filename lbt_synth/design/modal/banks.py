@@ -28,7 +28,7 @@ class Bank:
         """Number of modes w of each controller."""
         return int(self.modes.shape[1])
 
-    def of_modes(self, modes: np.ndarray) -> Bank:
+    def for_modes(self, modes: np.ndarray) -> Bank:
         """Return the same controllers for other modes: i becomes ``modes[i]``."""
         return Bank(modes=modes[self.modes], A=self.A, B=self.B, C=self.C, D=self.D)
 

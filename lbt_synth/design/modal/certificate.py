@@ -12,16 +12,16 @@ from lbt_synth.design.certificate import (
     Check,
 )
 from lbt_synth.design.modal.closed_loops import spectral_radii
-from lbt_synth.design.modal.plants import PlantStack
-from lbt_synth.design.modal.reconstructor import modes_named
+from lbt_synth.design.modal.plants import PlantBatch
+from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.linear import DareSolution
-from lbt_synth.linear.batched import norms, transposed
+from lbt_synth.linear.batched import frobenius_norms, transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
 
-class Examined:
+class ModalChecks:
     """What was measured of every mode, by other means than the Riccati equation."""
 
     def __init__(self, modes: int) -> None:
@@ -30,21 +30,21 @@ class Examined:
         self.estimation, self.residual = np.full((2, modes), np.nan)  # variances
         self.variance, self.gain = np.full((2, modes), np.nan)  # relative distances
 
-    def filters(self, stack: PlantStack, gains: FloatArray, solution: DareSolution) -> None:
+    def filters(self, stack: PlantBatch, gains: FloatArray, solution: DareSolution) -> None:
         """Take the estimation errors: stability, variance against Riccati's, gain from it."""
         modes = stack.modes
         A, drive = stack.errors(gains)
         self.radius[modes] = spectral_radii(A)
         self.riccati[modes] = solution.residuals
         P, self.lyapunov[modes] = stationary_covariances(A, drive)
-        lyapunov = (stack.L @ P @ transposed(stack.L))[:, 0, 0]
-        riccati = (stack.L @ solution.X @ transposed(stack.L))[:, 0, 0]
+        lyapunov = (stack.L @ P @ transpose(stack.L))[:, 0, 0]
+        riccati = (stack.L @ solution.X @ transpose(stack.L))[:, 0, 0]
         self.estimation[modes] = lyapunov
         self.variance[modes] = np.abs(lyapunov - riccati) / riccati
-        seen = P @ transposed(stack.C)
+        seen = P @ transpose(stack.C)
         optimal = stack.A @ seen / (stack.R + stack.C @ seen)
-        size = norms(optimal)
-        self.gain[modes] = norms(gains - optimal) / np.where(size > 0, size, 1.0)
+        size = frobenius_norms(optimal)
+        self.gain[modes] = frobenius_norms(gains - optimal) / np.where(size > 0, size, 1.0)
 
     def loops(
         self,
@@ -66,30 +66,32 @@ class Examined:
         stable = 1 - STABILITY_MARGIN
         equation = "relative, by squaring"
         checks = [
-            _worst("spectral radius of the filter", self.radius, stable, "eigenvalues"),
-            _worst("spectral radius of the closed loop", self.loop_radius, stable, "eigenvalues"),
-            _worst(
+            _worst_mode_check("spectral radius of the filter", self.radius, stable, "eigenvalues"),
+            _worst_mode_check(
+                "spectral radius of the closed loop", self.loop_radius, stable, "eigenvalues"
+            ),
+            _worst_mode_check(
                 "residual of the Riccati equation",
                 self.riccati,
                 RESIDUAL_TOLERANCE,
                 "relative, in extended precision",
             ),
-            _worst(
+            _worst_mode_check(
                 "residual of the Lyapunov equation", self.lyapunov, RESIDUAL_TOLERANCE, equation
             ),
-            _worst(
+            _worst_mode_check(
                 "variance, against the Riccati equation",
                 self.variance,
                 VARIANCE_TOLERANCE,
                 "relative, Lyapunov equation",
             ),
-            _worst(
+            _worst_mode_check(
                 "distance from the least-variance gain",
                 self.gain,
                 GAIN_TOLERANCE,
                 "gain recomputed from the Lyapunov covariance",
             ),
-            _worst(
+            _worst_mode_check(
                 "residual of the loop's Lyapunov equation",
                 self.loop_lyapunov,
                 RESIDUAL_TOLERANCE,
@@ -99,7 +101,7 @@ class Examined:
         if applied:  # the residual is the estimation error
             apart = np.abs(self.residual - self.estimation) / self.estimation
             checks.append(
-                _worst(
+                _worst_mode_check(
                     "residual of the closed loop, against the estimation error",
                     apart,
                     VARIANCE_TOLERANCE,
@@ -108,7 +110,7 @@ class Examined:
             )
         else:
             checks.append(
-                _worst(
+                _worst_mode_check(
                     "rounding in the residual of the closed loop",
                     self.rounding,
                     VARIANCE_TOLERANCE,
@@ -118,14 +120,14 @@ class Examined:
         return Certificate(
             checks=tuple(checks),
             gamma=np.nan,
-            rms_per_output=frozen(np.sqrt(np.maximum(self.estimation, 0))),
+            rms_per_output=frozen_copy(np.sqrt(np.maximum(self.estimation, 0))),
         )
 
 
-def _worst(name: str, values: FloatArray, limit: float, computed_by: str) -> Check:
+def _worst_mode_check(name: str, values: FloatArray, limit: float, computed_by: str) -> Check:
     """Check of the worst of all modes."""
     failing = np.flatnonzero(~(values < limit))
     value = float(np.max(values)) if not np.isnan(values).any() else float("nan")
     if failing.size:
-        name = f"{name} ({modes_named(failing)})"
+        name = f"{name} ({name_modes(failing)})"
     return Check(name=name, value=value, limit=limit, computed_by=computed_by)

@@ -8,11 +8,11 @@ import numpy as np
 
 from lbt_synth.design.modal.banks import Bank
 from lbt_synth.design.modal.plants import Lines, disturbances
-from lbt_synth.linear.batched import transposed
+from lbt_synth.linear.batched import transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.loop.closed_loop import loop_matrices
 from lbt_synth.models import ModalTurbulence
-from lbt_synth.models.lifted_mirror import Response
+from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.validation import FloatArray
 
 
@@ -77,10 +77,10 @@ def block_variances(
         A[:, :n, x] = block.B[..., i : i + 1] @ rows[:, i]
         C[..., x] = block.D[:, :w, i : i + 1] @ rows[:, i]
         A[:, x, x], B[:, x, v] = models[:, i], drives[:, i]
-    P, residuals = stationary_covariances(A, B @ transposed(B))
-    output = C @ P @ transposed(C) + D @ transposed(D)
+    P, residuals = stationary_covariances(A, B @ transpose(B))
+    output = C @ P @ transpose(C) + D @ transpose(D)
     variances = np.diagonal(output, axis1=-2, axis2=-1).copy()
-    sizes = np.abs(C) @ np.abs(P) @ np.abs(transposed(C))
+    sizes = np.abs(C) @ np.abs(P) @ np.abs(transpose(C))
     sizes = np.diagonal(sizes, axis1=-2, axis2=-1) + np.sum(D**2, axis=-1)
     small = np.finfo(float).tiny  # no disturbance: 0, and nothing is lost
     rounding = np.finfo(float).eps * np.max(sizes / np.maximum(variances, small), axis=-1)

@@ -10,22 +10,22 @@ import numpy as np
 
 from lbt_synth.design.certificate import Certificate
 from lbt_synth.design.modal.banks import Bank, RunningBanks
-from lbt_synth.design.modal.certificate import Examined
+from lbt_synth.design.modal.certificate import ModalChecks
 from lbt_synth.design.modal.closed_loops import block_variances, close_bank, spectral_radii
 from lbt_synth.design.modal.plants import (
     Lines,
-    PlantStack,
+    PlantBatch,
+    as_modal_turbulence,
     lines_per_mode,
-    per_mode_number,
-    plant_stacks,
-    turbulence_of,
+    number_per_mode,
+    plant_batches,
 )
-from lbt_synth.design.modal.reconstructor import modes_named
+from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import DetectabilityError, NumericalError, ProblemError
 from lbt_synth.linear import Controller, DareSolution, solve_dare
-from lbt_synth.linear.batched import transposed
+from lbt_synth.linear.batched import transpose
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray, frozen, integer
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray, frozen_copy, integer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -200,16 +200,16 @@ def modal_filters(
     >>> filters.rms_nm.round(1).tolist(), filters.certificate.passed
     ([135.9, 30.6], True)
     """
-    air = turbulence_of(turbulence)
+    air = as_modal_turbulence(turbulence)
     n = air.n_modes
-    noise = per_mode_number(noise_nm, "noise_nm", n)
-    gain = per_mode_number(sensor_gain, "sensor_gain", n)
+    noise = number_per_mode(noise_nm, "noise_nm", n)
+    gain = number_per_mode(sensor_gain, "sensor_gain", n)
     hardware = LoopHardware(
         frame_rate_hz=air.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
     )
     lines = lines_per_mode(vibrations, n)
     response = hardware.mirror_system.whole
-    stacks = plant_stacks(
+    stacks = plant_batches(
         air, lines, noise_nm=noise, delay_frames=hardware.delay_frames, sensor_gain=gain
     )
     s = max(stack.A.shape[-1] for stack in stacks)
@@ -223,11 +223,11 @@ def modal_filters(
     }
     poles = np.zeros((n, s), dtype=np.complex128)
     states = np.zeros(n, dtype=np.int64)
-    examined = Examined(n)
+    examined = ModalChecks(n)
     for stack in stacks:
         modes, size = stack.modes, stack.A.shape[-1]
-        solution = _solved(stack)
-        gains = np.array(transposed(solution.gain_feedback))
+        solution = _solve_filters(stack)
+        gains = np.array(transpose(solution.gain_feedback))
         A, B, C, D = stack.controllers(gains, response)
         used = A.shape[-1]
         states[modes], poles[modes, :size] = size, solution.poles
@@ -253,19 +253,19 @@ def modal_filters(
         states=_read_only(states),
         controller_states=_read_only(states + response.n_states),
         poles=poles,
-        rms_nm=frozen(np.sqrt(examined.residual)),
+        rms_nm=frozen_copy(np.sqrt(examined.residual)),
         certificate=certificate,
-        **{name: frozen(part) for name, part in parts.items()},
+        **{name: frozen_copy(part) for name, part in parts.items()},
     )
 
 
-def _solved(stack: PlantStack) -> DareSolution:
+def _solve_filters(stack: PlantBatch) -> DareSolution:
     """Solve the filter equations of a stack."""
     try:
-        return solve_dare(transposed(stack.A), transposed(stack.C), stack.Q, stack.R)
+        return solve_dare(transpose(stack.A), transpose(stack.C), stack.Q, stack.R)
     except (DetectabilityError, NumericalError) as error:
         raise NumericalError(
-            f"the filters of {modes_named(stack.modes)} were not all found (their equations are "
+            f"the filters of {name_modes(stack.modes)} were not all found (their equations are "
             f"counted from 0 in this order): {error}",
             status="riccati",
         ) from error

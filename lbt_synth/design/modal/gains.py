@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
-from lbt_synth.design.modal.plants import Lines, lines_per_mode, per_mode_number
+from lbt_synth.design.modal.plants import Lines, lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import distinct_edges, pole_edges
@@ -27,8 +27,8 @@ from lbt_synth.models import (
     Spectrum,
     Vibration,
 )
-from lbt_synth.models.truth import breakpoints_below
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen, number
+from lbt_synth.models.spectra import breakpoints_below
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, number
 
 Density = Callable[[FloatArray], FloatArray]
 
@@ -148,12 +148,12 @@ def modal_gains(
                 out[mode] += line.ar_model(rate).psd(frequency)
         return out
 
-    return least_residuals(
+    return find_gains(
         density,
         edges,
         path,
-        noise=per_mode_number(noise_nm, "noise_nm", count, zero=True),
-        gain=per_mode_number(sensor_gain, "sensor_gain", count),
+        noise=number_per_mode(noise_nm, "noise_nm", count, zero=True),
+        gain=number_per_mode(sensor_gain, "sensor_gain", count),
         margin=margin,
     )
 
@@ -195,7 +195,7 @@ def _own_edges(
     """Edges of panels where spectra have peaks or kinks, in units of the Nyquist frequency."""
     models = [line.ar_model(rate) for own in lines for line in own]
     if isinstance(spectra, ModalTurbulence):
-        edges = [pole_edges(_distinct(np.linalg.eigvals(spectra.companions).ravel()))]
+        edges = [pole_edges(_distinct_poles(np.linalg.eigvals(spectra.companions).ravel()))]
     else:
         distinct = {id(spectrum): spectrum for spectrum in spectra}.values()
         models += [spectrum for spectrum in distinct if isinstance(spectrum, ARModel)]
@@ -205,7 +205,7 @@ def _own_edges(
     return np.concatenate(edges)
 
 
-def _distinct(poles: Any) -> ComplexArray:
+def _distinct_poles(poles: Any) -> ComplexArray:
     """Leave out poles that have the place and the distance from the circle of another one.
 
     Both to a quarter of that distance, which is the width of the peak: panels fit all of them.
@@ -217,7 +217,7 @@ def _distinct(poles: Any) -> ComplexArray:
     return np.asarray(inside[kept], dtype=np.complex128)
 
 
-def least_residuals(
+def find_gains(
     density: Density,
     own_edges: FloatArray,
     path: LoopHardware,
@@ -242,7 +242,7 @@ def least_residuals(
             "margin and sensor_gain must leave room for a gain; got gains of at most "
             f"{np.min(highest / gain):.3g} at a sensor gain of {np.min(gain):.3g}."
         )
-    poles = [np.roots(_characteristic(taps, part * limit)) for part in _RESONANT]
+    poles = [np.roots(_characteristic_polynomial(taps, part * limit)) for part in _RESONANT]
     edges = distinct_edges(
         np.concatenate([[0.0], np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), own_edges])
     )
@@ -265,19 +265,19 @@ def least_residuals(
                 "every mode must have turbulence, vibration or noise; got none in mode "
                 f"{int(np.argmin(variances[:, 0]))}."
             )
-        found = _minimised(loop_gains, variances, limit, highest)
+        found = _minimise(loop_gains, variances, limit, highest)
         if differenced:
             floor = (noise / gain) ** 2 * np.interp(found[0], loop_gains, propagated)
             found = found[0], np.maximum(found[1], floor)
-        if last is not None and _alike(found, last):
+        if last is not None and _is_settled(found, last):
             allowed = highest / gain
             gains = np.minimum(found[0] / gain, allowed)
             limited = gains > allowed * (1 - 1e-6)
             limited.setflags(write=False)
             return ModalGains(
-                gains=frozen(gains),
-                rms_nm=frozen(np.sqrt(found[1])),
-                limit=frozen(allowed),
+                gains=frozen_copy(gains),
+                rms_nm=frozen_copy(np.sqrt(found[1])),
+                limit=frozen_copy(allowed),
                 limited=limited,
                 noise_nm=noise,
                 delay_frames=path.delay_frames,
@@ -293,13 +293,13 @@ def least_residuals(
     )
 
 
-def _alike(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> bool:
+def _is_settled(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> bool:
     """Whether gains and variances are the same to what is asked."""
     variance = np.max(np.abs(one[1] / other[1] - 1))
     return bool(variance < _SETTLED and np.max(np.abs(one[0] / other[0] - 1)) < 1e-4)
 
 
-def _characteristic(taps: FloatArray, loop_gain: float) -> FloatArray:
+def _characteristic_polynomial(taps: FloatArray, loop_gain: float) -> FloatArray:
     """Coefficients of ``1 - z^-1 + h z^-1 M(z)`` in powers of z^-1."""
     out = np.zeros(len(taps) + 1)
     out[:2] = 1, -1
@@ -322,7 +322,7 @@ def _transfers(
     return rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power
 
 
-def _minimised(
+def _minimise(
     loop_gains: FloatArray, variances: FloatArray, limit: float, highest: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Loop gain of least variance of each mode, up to the highest one, and that variance."""

@@ -23,8 +23,8 @@ from lbt_synth.design.modal.closed_loops import (
 )
 from lbt_synth.design.modal.filters import ModalFilters
 from lbt_synth.design.modal.mixed_controller import MixedController
-from lbt_synth.design.modal.plants import lines_per_mode, per_mode_number, turbulence_of
-from lbt_synth.design.modal.reconstructor import modes_named
+from lbt_synth.design.modal.plants import as_modal_turbulence, lines_per_mode, number_per_mode
+from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import (
     DimensionError,
     NonFiniteError,
@@ -35,7 +35,7 @@ from lbt_synth.errors import (
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.simulation.block_filtering import BatchedSystems
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
-from lbt_synth.validation import FloatArray, float_array, frozen, integer, number, real_array
+from lbt_synth.validation import FloatArray, float_array, frozen_copy, integer, number, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,7 +111,7 @@ class ModalLoop:
             worst = float(self.spectral_radii.max())
             raise UnstableLoopError(
                 f"the loop of every mode must be stable; got unstable or marginal ones, "
-                f"{modes_named(bad)} (spectral radius up to {worst:.12g}). Lower their gains, or "
+                f"{name_modes(bad)} (spectral radius up to {worst:.12g}). Lower their gains, or "
                 "design for this delay and sensor gain.",
                 spectral_radius=worst,
             )
@@ -150,14 +150,14 @@ class ModalLoop:
             If rounding leaves too few digits: a process that is all but a random walk.
         """
         self.require_stable()
-        air = turbulence_of(turbulence, self.n_modes)
+        air = as_modal_turbulence(turbulence, self.n_modes)
         rate = self.frame_rate_hz
         if rate is not None and not np.isclose(air.frame_rate_hz, rate, rtol=1e-9):
             raise ProblemError(
                 f"turbulence must be sampled at the loop's frame rate, {rate:.6g} Hz; got "
                 f"{air.frame_rate_hz:.6g} Hz."
             )
-        noise = per_mode_number(noise_nm, "noise_nm", self.n_modes, zero=True)
+        noise = number_per_mode(noise_nm, "noise_nm", self.n_modes, zero=True)
         lines = lines_per_mode(vibrations, self.n_modes)
         out = np.zeros(self.n_modes)
         for block in self.blocks:
@@ -170,13 +170,13 @@ class ModalLoop:
                 if bad.size:
                     raise NumericalError(
                         f"{what} must be below {limit:g}; got {np.max(error):.3g} in "
-                        f"{modes_named(np.unique(block.modes[bad]))}. A process with a pole this "
+                        f"{name_modes(np.unique(block.modes[bad]))}. A process with a pole this "
                         "close to 1 is a random walk: move the pole inwards.",
                         status="lyapunov",
                         residual=float(np.max(error)),
                     )
             out[block.modes] = np.sqrt(np.maximum(variances, 0))
-        return frozen(out)
+        return frozen_copy(out)
 
     def run(
         self, total_nm: Any, noise_nm: Any, *, settle_frames: int = 0, all_series: bool = False
@@ -246,7 +246,7 @@ class ModalLoop:
             residual_nm=_read_only(kept),
             commands=None if commands is None else _read_only(commands[:, settle:]),
             measurements=None if measurements is None else _read_only(measurements[:, settle:]),
-            rms_nm=frozen(rms),
+            rms_nm=frozen_copy(rms),
         )
 
     def _filtered(
@@ -339,7 +339,7 @@ def modal_loop(
         )
     hardware, rate = _path(controller, delay_frames, mirror, frame_rate_hz)
     n = controller.n_modes
-    gain = per_mode_number(sensor_gain, "sensor_gain", n)
+    gain = number_per_mode(sensor_gain, "sensor_gain", n)
     radii = np.zeros(n)
     blocks = []
     for bank in controller.banks():
@@ -351,7 +351,7 @@ def modal_loop(
         frame_rate_hz=rate,
         mirror=hardware.mirror,
         sensor_gain=gain,
-        spectral_radii=frozen(radii),
+        spectral_radii=frozen_copy(radii),
         blocks=tuple(blocks),
         systems=tuple(_residual_systems(block) for block in blocks),
     )

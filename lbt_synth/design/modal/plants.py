@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear.batched import transposed
+from lbt_synth.linear.batched import transpose
 from lbt_synth.models import ARModel, ModalTurbulence, Vibration
-from lbt_synth.models.lifted_mirror import Response
-from lbt_synth.models.vibration import sampled_lines
-from lbt_synth.validation import FloatArray, frozen, integer, real_array
+from lbt_synth.models.mirror.frame_rate_system import Response
+from lbt_synth.models.vibration.resonance import sampled_lines
+from lbt_synth.validation import FloatArray, frozen_copy, integer, real_array
 
 Lines = tuple[tuple[Vibration, ...], ...]
 
 
-def per_mode_number(
+def number_per_mode(
     value: Any, name: str, modes: int, *, zero: bool = False, at_most: float = np.inf
 ) -> FloatArray:
     """Return one positive number a mode, (n,), from one for all or one each."""
@@ -32,10 +32,10 @@ def per_mode_number(
         raise ProblemError(f"{name} must be {'at least' if zero else 'above'} 0; got {low:.6g}.")
     if np.any(given > at_most):
         raise ProblemError(f"{name} must be at most {at_most:g}; got {given.max():.6g}.")
-    return frozen(np.broadcast_to(given, (modes,)))
+    return frozen_copy(np.broadcast_to(given, (modes,)))
 
 
-def turbulence_of(
+def as_modal_turbulence(
     turbulence: ModalTurbulence | Sequence[ARModel], modes: int | None = None
 ) -> ModalTurbulence:
     """Return the turbulence as arrays, of a given number of modes."""
@@ -106,7 +106,7 @@ def disturbances(turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray) -
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlantStack:
+class PlantBatch:
     """Estimation problems of modes that have the same number of states."""
 
     modes: np.ndarray  # (N,): numbers of the modes
@@ -142,17 +142,17 @@ class PlantStack:
     def errors(self, gains: FloatArray) -> tuple[FloatArray, FloatArray]:
         """State matrices and driving covariances of the estimation errors."""
         A = self.A - gains @ self.C
-        return A, self.Q + gains @ self.R @ transposed(gains)
+        return A, self.Q + gains @ self.R @ transpose(gains)
 
 
-def plant_stacks(
+def plant_batches(
     turbulence: ModalTurbulence,
     lines: Lines,
     *,
     noise_nm: FloatArray,
     delay_frames: float,
     sensor_gain: FloatArray,
-) -> list[PlantStack]:
+) -> list[PlantBatch]:
     """Plants of all modes, one stack for each number of vibrations."""
     counts = np.array([len(each) for each in lines])
     steps = max(int(np.ceil(delay_frames)), 2)
@@ -166,10 +166,10 @@ def plant_stacks(
         A, Q = np.zeros((2, count, s, s))
         A[:, :k, :k], A[:, k, :k] = d.A, d.row
         A[:, k + 1 :, k : s - 1] = np.eye(chain - 1)
-        Q[:, :k, :k] = d.B @ transposed(d.B)
+        Q[:, :k, :k] = d.B @ transpose(d.B)
         C, L = np.zeros((2, count, 1, s))
         C[:, 0, -1] = sensor_gain[modes]
         L[:, 0, :k], L[:, 0, k] = (1 - late) * d.row, late
         R = noise_nm[modes, None, None] ** 2
-        stacks.append(PlantStack(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
+        stacks.append(PlantBatch(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
     return stacks

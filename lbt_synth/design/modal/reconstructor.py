@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.validation import FloatArray, frozen, integer, matrix, number, real_array
+from lbt_synth.validation import FloatArray, frozen_copy, integer, matrix, number, real_array
 
 _NAMED = 5  # modes that a message lists
 _EMPTY = 1e-8  # part of a mode that has to be left by a projection
@@ -61,7 +61,7 @@ class Reconstructor:
     @property
     def noise_amplification(self) -> FloatArray:
         """Standard deviation of each mode for slopes with independent noise of 1, (n,)."""
-        return frozen(np.linalg.norm(self.matrix, axis=1))
+        return frozen_copy(np.linalg.norm(self.matrix, axis=1))
 
 
 def reconstructor(
@@ -114,7 +114,7 @@ def reconstructor(
     invisible = np.flatnonzero(size <= q * np.finfo(float).eps * size.max())
     if invisible.size:
         raise ProblemError(
-            f"every mode must give slopes; got none from {modes_named(invisible)} of {n} (zero "
+            f"every mode must give slopes; got none from {name_modes(invisible)} of {n} (zero "
             "columns of interaction_matrix). Measure them, or leave them out."
         )
     if condition is not None and kept is not None:
@@ -140,7 +140,10 @@ def reconstructor(
         )
     inverse = (right[:count].T / values[:count]) @ left[:, :count].T
     return Reconstructor(
-        interaction_matrix=D, matrix=frozen(inverse), singular_values=frozen(values), kept=count
+        interaction_matrix=D,
+        matrix=frozen_copy(inverse),
+        singular_values=frozen_copy(values),
+        kept=count,
     )
 
 
@@ -223,7 +226,7 @@ def project_out(
     gone = others[size <= _EMPTY * before]
     if gone.size:
         raise ProblemError(
-            f"nothing is left of {modes_named(gone)} without the removed ones. Leave them out."
+            f"nothing is left of {name_modes(gone)} without the removed ones. Leave them out."
         )
     overlap = np.abs(base.T @ left) / np.outer(np.linalg.norm(base, axis=0), size)
     if overlap.size and overlap.max() > 1e-6:
@@ -233,7 +236,7 @@ def project_out(
             status="projection",
             residual=float(overlap.max()),
         )
-    return frozen(out)
+    return frozen_copy(out)
 
 
 def mode_indices(indices: Any, name: str, modes: int) -> np.ndarray:
@@ -248,7 +251,7 @@ def mode_indices(indices: Any, name: str, modes: int) -> np.ndarray:
     return np.array(out, dtype=np.intp)
 
 
-def modes_named(indices: Any) -> str:
+def name_modes(indices: Any) -> str:
     """Text that names some modes: "mode 3", "modes 3, 7, 8 and 12 more"."""
     numbers = [str(int(i)) for i in indices]
     if len(numbers) == 1:

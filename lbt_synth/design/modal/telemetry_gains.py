@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.design.modal.gains import ModalGains, least_residuals
-from lbt_synth.design.modal.plants import per_mode_number
+from lbt_synth.design.modal.gains import ModalGains, find_gains
+from lbt_synth.design.modal.plants import number_per_mode
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
@@ -117,7 +117,7 @@ def modal_gains_from_telemetry(
     y, u = y.T, u.T
     count, frames = y.shape
     segment = integer(segment_frames, "segment_frames", at_least=16)
-    gain = per_mode_number(sensor_gain, "sensor_gain", count)
+    gain = number_per_mode(sensor_gain, "sensor_gain", count)
     first = len(taps)  # frame whose correction is known
     if frames - first <= segment:
         raise ProblemError(
@@ -139,7 +139,7 @@ def modal_gains_from_telemetry(
         quiet = frequency > _QUIET * rate
         noise = np.sqrt(np.mean(power[:, quiet] / unit[quiet], axis=1)) * gain
     else:
-        noise = per_mode_number(noise_nm, "noise_nm", count, zero=True)
+        noise = number_per_mode(noise_nm, "noise_nm", count, zero=True)
     table = power - np.outer((noise / gain) ** 2, unit)
 
     def density(wanted: FloatArray) -> FloatArray:
@@ -150,6 +150,4 @@ def modal_gains_from_telemetry(
         return np.asarray(table[:, left] * (1 - part) + table[:, left + 1] * part)
 
     edges = 2 * frequency / rate
-    return least_residuals(
-        density, edges, path, noise=noise, gain=gain, margin=margin, differenced=True
-    )
+    return find_gains(density, edges, path, noise=noise, gain=gain, margin=margin, differenced=True)

@@ -16,7 +16,7 @@ from scipy.linalg import null_space, solve_discrete_lyapunov
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace
-from lbt_synth.validation import ComplexArray, FloatArray, frozen
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +80,7 @@ def orthonormal_basis(poles: ComplexArray, *, dt_s: float) -> Basis:
         C, D = np.hstack([d @ C, c]), d @ D
     if len(A) != given.size:
         raise ProblemError("complex poles must come in conjugate pairs; one of them does not.")
-    return Basis(A=frozen(A), B=frozen(B), dt_s=dt_s)
+    return Basis(A=frozen_copy(A), B=frozen_copy(B), dt_s=dt_s)
 
 
 def laguerre_basis(size: int, pole: float, *, dt_s: float) -> Basis:

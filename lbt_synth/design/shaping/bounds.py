@@ -13,13 +13,13 @@ import numpy as np
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.band import Band
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.exact_evaluation import MeasuredLoop
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, discs
 from lbt_synth.design.shaping.frequency_grid import Grid, spectrum_edges
-from lbt_synth.design.shaping.grid_tightening import LEVEL_SETS, ROOM, discs
 from lbt_synth.design.shaping.objectives import ResidualVariance
+from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import hinf_norm
-from lbt_synth.linear.convex_functions import Bounded, Constraint, Fractions
+from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBound
 from lbt_synth.linear.norms import band_norm
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import resonance_edges
@@ -65,7 +65,7 @@ class ModulusMargin:
         rows = channel.complementary_rows(f)
         return (discs(f, -rows, np.ones(len(rows)), (1 - ROOM) / self.at_least),)
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         return (
             Check(
@@ -114,7 +114,7 @@ class NoisePeak:
         rows = channel.noise_rows(f)
         return (discs(f, rows, np.zeros(len(rows)), (1 - ROOM) * self.at_most),)
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         return (
             Check(
@@ -188,7 +188,7 @@ class Attenuation(Band):
         centre = (1 - a**2 * rest) / curvature
         return (discs(f, -rows, np.full(f.size, centre), a * self.sensor_gain / curvature),)
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         rejection = loop.at(self.sensor_gain).rejection()
         return (
@@ -262,9 +262,9 @@ class CommandRms:
             steering=None,
             worst=False,
         )
-        return (Bounded(function=function, limit=((1 - ROOM) * self.at_most_nm) ** 2),)
+        return (FunctionBound(function=function, limit=((1 - ROOM) * self.at_most_nm) ** 2),)
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         nyquist, dt_s = loop.hardware.frame_rate_hz / 2, loop.hardware.dt_s
         parameter = loop.parameter

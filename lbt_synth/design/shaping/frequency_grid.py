@@ -8,7 +8,7 @@ import numpy as np
 
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, Spectrum
-from lbt_synth.models.truth import breakpoints_below
+from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _ORDER = 5
@@ -95,7 +95,7 @@ def spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
     return breakpoints_below(spectrum, nyquist_hz)
 
 
-def thinned(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
+def thin_spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
     """Return these edges, but not more than a programme can carry: the highest of many [Hz]."""
     edges = spectrum_edges(spectrum, nyquist_hz)
     if spectrum is None or edges.size <= _MOST_EDGES:

@@ -28,24 +28,27 @@ _KINDS: dict[str, type[Any]] = {
 }
 
 
-def packed(value: Any) -> Any:
+def to_metadata(value: Any) -> Any:
     """Return a specification, or a part of it, as what JSON knows."""
     name = type(value).__name__
     if name in _KINDS:
-        return {"kind": name, **{f.name: packed(getattr(value, f.name)) for f in fields(value)}}
+        return {
+            "kind": name,
+            **{f.name: to_metadata(getattr(value, f.name)) for f in fields(value)},
+        }
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, list | tuple):
-        return [packed(v) for v in value]
+        return [to_metadata(v) for v in value]
     return value
 
 
-def unpacked(data: Any) -> Any:
-    """Rebuild what :func:`packed` wrote; an unknown kind raises KeyError, a bad value its own."""
+def from_metadata(data: Any) -> Any:
+    """Rebuild what :func:`to_metadata` wrote; an unknown kind raises KeyError, a bad value its own."""
     if isinstance(data, dict):
         values = dict(data)
         kind = _KINDS[values.pop("kind")]
-        return kind(**{key: unpacked(v) for key, v in values.items()})
+        return kind(**{key: from_metadata(v) for key, v in values.items()})
     if isinstance(data, list):
-        return tuple(unpacked(v) for v in data)
+        return tuple(from_metadata(v) for v in data)
     return data

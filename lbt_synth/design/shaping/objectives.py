@@ -9,17 +9,17 @@ import numpy as np
 
 from lbt_synth.design.shaping.band import Band
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.exact_evaluation import MeasuredLoop
 from lbt_synth.design.shaping.frequency_grid import Grid
+from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.convex_functions import Combined, Fractions, Function
+from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function
 from lbt_synth.linear.norms import band_norm
 from lbt_synth.loop import residual_budget
 from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth
 from lbt_synth.validation import ComplexArray, FloatArray, number, sequence
 
 
-def checked_spectrum(value: object, name: str) -> None:
+def require_spectrum(value: object, name: str) -> None:
     """Refuse a spectrum that cannot be written into a gain file."""
     if value is not None and not isinstance(value, ARModel | Atmosphere | TabulatedSpectrum):
         raise ProblemError(
@@ -58,7 +58,7 @@ class ResidualVariance:
     sensor_gain: float = 1.0
 
     def __post_init__(self) -> None:
-        checked_spectrum(self.turbulence, "turbulence")
+        require_spectrum(self.turbulence, "turbulence")
         set_ = object.__setattr__
         set_(self, "noise_nm", number(self.noise_nm, "noise_nm", at_least=0))
         set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
@@ -94,7 +94,7 @@ class ResidualVariance:
             worst=False,
         )
 
-    def measured_nm2(self, loop: MeasuredLoop) -> float:
+    def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the variance in the real loop, exactly."""
         truth = Truth(
             turbulence=self.turbulence, noise_nm=self.noise_nm, sensor_gain=self.sensor_gain
@@ -158,14 +158,14 @@ class VibrationBand(Band):
             worst=True,
         )
 
-    def measured_nm2(self, loop: MeasuredLoop) -> float:
+    def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets."""
         rejection = loop.at(self.sensor_gain).rejection()
         return (self.rms_nm * band_norm(rejection, self.low_hz, self.high_hz).upper) ** 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Several:
+class _CombinedTerms:
     largest: ClassVar[bool] = False  # of the terms, instead of their sum
 
     terms: tuple[Term, ...]
@@ -196,13 +196,13 @@ class _Several:
 
     def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the objective over a grid as a function of the coefficients [nm^2]."""
-        return Combined(
+        return CombinedFunction(
             parts=tuple(term.function(channel, grid) for term in self.terms),
             weights=self.factors,
             worst=self.largest,
         )
 
-    def measured_nm2(self, loop: MeasuredLoop) -> float:
+    def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the objective of the real loop [nm^2]."""
         values = [
             weight * term.measured_nm2(loop)
@@ -211,7 +211,7 @@ class _Several:
         return max(values) if self.largest else sum(values)
 
 
-class Total(_Several):
+class Total(_CombinedTerms):
     """Weighted sum of terms.
 
     Parameters
@@ -238,7 +238,7 @@ class Total(_Several):
     __slots__ = ()
 
 
-class Worst(_Several):
+class Worst(_CombinedTerms):
     """Largest of weighted terms.
 
     Parameters
@@ -267,12 +267,12 @@ class Worst(_Several):
 
 
 Leaf: TypeAlias = ResidualVariance | VibrationBand
-Term: TypeAlias = ResidualVariance | VibrationBand | _Several
+Term: TypeAlias = ResidualVariance | VibrationBand | _CombinedTerms
 
 
 def require_term(term: object) -> None:
     """Refuse anything that is not a term of an objective."""
-    if not isinstance(term, ResidualVariance | VibrationBand | _Several):
+    if not isinstance(term, ResidualVariance | VibrationBand | _CombinedTerms):
         raise ProblemError(
             "an objective is made of ResidualVariance, VibrationBand, Total and Worst; got "
             f"{type(term).__name__}."
@@ -281,7 +281,7 @@ def require_term(term: object) -> None:
 
 def leaves(term: Term) -> tuple[Leaf, ...]:
     """Variances and vibrations of an objective, in order."""
-    if isinstance(term, _Several):
+    if isinstance(term, _CombinedTerms):
         return tuple(leaf for part in term.terms for leaf in leaves(part))
     return (term,)
 
@@ -290,7 +290,7 @@ def _steering(complementary: ComplexArray, sensor_gain: float) -> ComplexArray |
     return None if sensor_gain == 1 else (1 - sensor_gain) * complementary
 
 
-def spread_weights(term: Term, frequency_hz: FloatArray) -> FloatArray:
+def frequency_costs(term: Term, frequency_hz: FloatArray) -> FloatArray:
     """How much an error of T costs at each frequency, up to a factor: spectra and bands."""
     cost = np.zeros(frequency_hz.size)
     for leaf in leaves(term):

@@ -8,15 +8,15 @@ import numpy as np
 
 from lbt_synth.design.shaping.basis import orthonormal_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.exact_evaluation import mode_loop
-from lbt_synth.design.shaping.objectives import noise_level, spread_weights
-from lbt_synth.design.shaping.pole_fit import (
-    first_poles,
-    fitted_poles,
-    leaving_out,
-    without_least_pair,
+from lbt_synth.design.shaping.objectives import frequency_costs, noise_level
+from lbt_synth.design.shaping.pole_fitting import (
+    drop_cheapest_pair,
+    fit_poles,
+    misfit_without_each_pair,
+    starting_poles,
 )
-from lbt_synth.design.shaping.sequence import SequenceResult, solve_sequence
+from lbt_synth.design.shaping.programme_sequence import SequenceSolution, solve_sequence
+from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear import Controller
@@ -28,10 +28,10 @@ _SLOW_HZ = (0.002, 0.004, 0.008)  # where turbulence meets the noise, of the fra
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Solved:
+class ModeSolution:
     """A solved specification in one basis."""
 
-    sequence: SequenceResult  # How it was solved
+    sequence: SequenceSolution  # How it was solved
     objective_nm: float  # Root of the objective in the real loop [nm]
 
     @property
@@ -40,7 +40,9 @@ class Solved:
         return self.sequence.channel.basis.parameter(self.sequence.coefficients)
 
 
-def solved(spec: Specification, channel: Channel, *, start: FloatArray | None = None) -> Solved:
+def solve_mode(
+    spec: Specification, channel: Channel, *, start: FloatArray | None = None
+) -> ModeSolution:
     """Solve in a basis, on a grid that is fine enough for the objective."""
     miss = np.inf
     for fineness in (1, 2, 4):
@@ -50,7 +52,7 @@ def solved(spec: Specification, channel: Channel, *, start: FloatArray | None = 
         exact = spec.objective.measured_nm2(loop)
         miss = abs(sequence.objective_nm2 / exact - 1)
         if miss < _INTEGRAL and all(check.passed for check in spec.checks(loop)):
-            return Solved(sequence=sequence, objective_nm=float(np.sqrt(exact)))
+            return ModeSolution(sequence=sequence, objective_nm=float(np.sqrt(exact)))
     raise NumericalError(
         f"the objective over the frequencies of the programme misses that of the real loop by "
         f"{miss:.2g}, expected {_INTEGRAL:g}, or a bound is exceeded between them. Try "
@@ -59,9 +61,9 @@ def solved(spec: Specification, channel: Channel, *, start: FloatArray | None = 
     )
 
 
-def reduced(
-    spec: Specification, long: Solved, order: int, tolerance: float, *, fewest: bool = True
-) -> Solved:
+def reduce_poles(
+    spec: Specification, long: ModeSolution, order: int, tolerance: float, *, fewest: bool = True
+) -> ModeSolution:
     """Fewest poles whose programme keeps the objective within a tolerance."""
     sequence = long.sequence
     hardware, f = sequence.channel.hardware, sequence.grid.nodes_hz
@@ -73,23 +75,23 @@ def reduced(
         for low, high in spec.objective.bands_hz
     )
     starts = [
-        fitted_poles(
+        fit_poles(
             angles,
             target,
             weight,
-            first_poles(order, bands=tuple(dict.fromkeys(bands)), noise_rad=2 * np.pi * slow),
+            starting_poles(order, bands=tuple(dict.fromkeys(bands)), noise_rad=2 * np.pi * slow),
         )
         for slow in _SLOW_HZ
     ]
     candidates = [min(starts, key=lambda start: start[1])[0]]
     while fewest and candidates[-1].size > 2 and np.any(candidates[-1].imag):
-        fewer = without_least_pair(
-            candidates[-1], leaving_out(angles, target, weight, candidates[-1])
+        fewer = drop_cheapest_pair(
+            candidates[-1], misfit_without_each_pair(angles, target, weight, candidates[-1])
         )
-        candidates.append(fitted_poles(angles, target, weight, fewer)[0])
+        candidates.append(fit_poles(angles, target, weight, fewer)[0])
 
-    def attempt(index: int) -> tuple[Solved | None, float]:
-        found = _with_poles(spec, sequence, candidates[index], target, weight)
+    def attempt(index: int) -> tuple[ModeSolution | None, float]:
+        found = _solve_with_poles(spec, sequence, candidates[index], target, weight)
         return found, np.inf if found is None else found.objective_nm / long.objective_nm - 1
 
     accepted, loss = attempt(0)
@@ -111,13 +113,13 @@ def reduced(
     return accepted
 
 
-def _with_poles(
+def _solve_with_poles(
     spec: Specification,
-    long: SequenceResult,
+    long: SequenceSolution,
     poles: ComplexArray,
     target: ComplexArray,
     weight: FloatArray,
-) -> Solved | None:
+) -> ModeSolution | None:
     """Solve the specification with given poles; None if that cannot be done."""
     hardware = long.channel.hardware
     channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
@@ -128,14 +130,14 @@ def _with_poles(
         np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
     )[0]
     try:
-        return solved(spec, channel, start=start)
+        return solve_mode(spec, channel, start=start)
     except (InfeasibleError, NumericalError):
         return None
 
 
-def _fit_weight(spec: Specification, sequence: SequenceResult) -> FloatArray:
+def _fit_weight(spec: Specification, sequence: SequenceSolution) -> FloatArray:
     """Weight of an error of the parameter at the nodes: spectra, and some everywhere."""
     f, w = sequence.grid.nodes_hz, sequence.grid.weights_hz
     nyquist = sequence.channel.nyquist_hz
-    cost = w * (spread_weights(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
+    cost = w * (frequency_costs(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
     return np.asarray(np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist))

@@ -11,9 +11,9 @@ from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import Channel
 from lbt_synth.design.shaping.demand_types import DEMANDS, Demand
-from lbt_synth.design.shaping.exact_evaluation import MeasuredLoop
-from lbt_synth.design.shaping.frequency_grid import Grid, first_grid, thinned
+from lbt_synth.design.shaping.frequency_grid import Grid, first_grid, thin_spectrum_edges
 from lbt_synth.design.shaping.objectives import ResidualVariance, Term, leaves, require_term
+from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.design.shaping.uncertainty import MirrorUncertainty, SensorGainRange
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, Function
@@ -111,7 +111,7 @@ class Specification:
     def grid(self, channel: Channel, *, fineness: int = 1) -> Grid:
         """Return the first grid of frequencies for a channel."""
         nyquist = channel.nyquist_hz
-        edges = [thinned(spectrum, nyquist) for spectrum in self.spectra]
+        edges = [thin_spectrum_edges(spectrum, nyquist) for spectrum in self.spectra]
         return first_grid(
             channel.hardware.frame_rate_hz,
             bands_hz=self.bands_hz,
@@ -130,6 +130,6 @@ class Specification:
         """Return the constraints of each demand over a grid."""
         return tuple(demand.constraints(channel, grid) for demand in self.demands)
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check each demand on the real loop."""
         return tuple(check for demand in self.demands for check in demand.checks(loop))

@@ -9,9 +9,9 @@ import numpy as np
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.band import Band
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.exact_evaluation import MeasuredLoop, through_taps
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, discs
 from lbt_synth.design.shaping.frequency_grid import Grid
-from lbt_synth.design.shaping.grid_tightening import LEVEL_SETS, ROOM, discs
+from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, through_taps
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
@@ -72,7 +72,7 @@ class SensorGainRange:
             for sign, bound in self._bounds()
         )
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         T = loop.complementary
         return tuple(
@@ -157,7 +157,7 @@ class DelayError:
             for _, taps in self._differences(channel.hardware)
         )
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         return tuple(
             Check(
@@ -213,7 +213,7 @@ class MirrorUncertainty(Band):
         rows = channel.complementary_rows(f)
         return (discs(f, rows, np.zeros(f.size), (1 - ROOM) / self.relative),)
 
-    def checks(self, loop: MeasuredLoop) -> tuple[Check, ...]:
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         return (
             Check(

@@ -27,7 +27,7 @@ from lbt_synth.loop.closed_loop import STABILITY_MARGIN, spectral_radii
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.studies import RobustnessMap, robustness_map
-from lbt_synth.validation import ComplexArray, FloatArray, frozen
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 _GAINS = np.geomspace(0.01, 100.0, 400)  # where stable intervals are looked for
 
@@ -180,7 +180,9 @@ def assessed(
         rejection=_norms(loop, frequency_hz, noise=False),
         noise_transfer=_norms(loop, frequency_hz, noise=True),
         curve=curve,
-        map=replace(found, sensor_gains=frozen(np.asarray(sensor_gains))),  # the real ones again
+        map=replace(
+            found, sensor_gains=frozen_copy(np.asarray(sensor_gains))
+        ),  # the real ones again
     )
 
 
@@ -237,7 +239,7 @@ def stable_intervals(
 def _recertified(design: Design) -> tuple[tuple[Check, ...], str]:
     """Return the checks of the certificate computed anew, or why that failed."""
     try:
-        return design.recertified().checks, ""
+        return design.recertify().checks, ""
     except (LbtSynthError, ArithmeticError) as error:
         return (), str(error)
 
@@ -246,4 +248,4 @@ def _norms(loop: ClosedLoop, frequency_hz: FloatArray, *, noise: bool) -> FloatA
     if not loop.is_stable:
         return None
     response = loop.noise_transfer(frequency_hz) if noise else loop.sensitivity(frequency_hz)
-    return frozen(spectral_norms(response))
+    return frozen_copy(spectral_norms(response))

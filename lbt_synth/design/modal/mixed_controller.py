@@ -21,7 +21,7 @@ from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller, RunningController
 from lbt_synth.loop.simulation.run import SteppedController
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, float_array, frozen, instance, real_array
+from lbt_synth.validation import FloatArray, float_array, frozen_copy, real_array, require_instance
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -95,20 +95,20 @@ class MixedController:
                 f"leak must be from 0 to 1; got {leak.min():.6g} to {leak.max():.6g}."
             )
         if self.reconstructor is not None:
-            instance(self.reconstructor, Reconstructor)
+            require_instance(self.reconstructor, Reconstructor)
             if self.reconstructor.n_modes != n:
                 raise DimensionError(
                     f"gains must be one a mode of the reconstructor, {self.reconstructor.n_modes}; "
                     f"got {n}."
                 )
-        self.gains, self.leak = gains, frozen(np.broadcast_to(leak, (n,)))
+        self.gains, self.leak = gains, frozen_copy(np.broadcast_to(leak, (n,)))
         self._gain, self._leak = np.array(self.gains), np.array(self.leak)
         self._modes, self._running = np.zeros(0, dtype=np.intp), None
         if self.filter is not None:
             self._modes = mode_indices(self.filtered, "filtered", n)
             if self._modes.size == 0:
                 raise ProblemError("filtered must name at least one mode; got none.")
-            self._running = _started(self.filter, self._modes.size)
+            self._running = _start_filter(self.filter, self._modes.size)
             self._gain[self._modes] = self._leak[self._modes] = 0.0
         self.filtered = tuple(int(i) for i in self._modes)
         self.reset()
@@ -242,7 +242,7 @@ class MixedController:
         own = Bank(modes=kept[:, None], A=leak, B=gain, C=one, D=np.zeros_like(one))
         out = [own] if kept.size else []
         if isinstance(self._running, RunningBanks):
-            out += [bank.of_modes(self._modes) for bank in self._running.banks]
+            out += [bank.for_modes(self._modes) for bank in self._running.banks]
         elif isinstance(self._running, RunningController):
             k = self._running.controller
             out.append(
@@ -312,7 +312,7 @@ class MixedController:
         )
 
 
-def _started(given: Any, modes: int) -> SteppedController:
+def _start_filter(given: Any, modes: int) -> SteppedController:
     """Return the filter as an object to step, of as many inputs and outputs as modes."""
     if isinstance(given, Design):
         given = given.controller

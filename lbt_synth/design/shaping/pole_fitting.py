@@ -17,7 +17,7 @@ _EVALUATIONS = 60
 _STEEPEST = 9.0  # of the logarithm that stands for a modulus: 1 - 1e-4
 
 
-def fitted_poles(
+def fit_poles(
     angles: FloatArray, target: ComplexArray, weight: FloatArray, start: ComplexArray
 ) -> tuple[ComplexArray, float]:
     """Poles of the functions ``z (z I - A)^-1 B`` that fit a response best.
@@ -31,8 +31,8 @@ def fitted_poles(
     size = float(np.linalg.norm(goal))
 
     def misfit(x: FloatArray) -> FloatArray:
-        upper, single = _unpacked(x, pairs.size)
-        return _unfitted(goal, weight, _functions(z, upper, single)) / size
+        upper, single = _poles_from_vector(x, pairs.size)
+        return _fit_residual(goal, weight, _basis_responses(z, upper, single)) / size
 
     x0 = np.concatenate(
         [np.log(np.abs(pairs) / (1 - np.abs(pairs))), np.angle(pairs), np.arctanh(real)]
@@ -52,12 +52,12 @@ def fitted_poles(
             [np.ones(pairs.size), np.full(pairs.size, 0.02), np.ones(real.size)]
         ),
     )
-    upper, single = _unpacked(found.x, pairs.size)
+    upper, single = _poles_from_vector(found.x, pairs.size)
     poles = np.concatenate([upper, upper.conj(), single.astype(np.complex128)])
     return poles, float(np.linalg.norm(found.fun))
 
 
-def first_poles(
+def starting_poles(
     count: int, *, bands: tuple[tuple[float, float], ...], noise_rad: float
 ) -> ComplexArray:
     """Poles to start the fit from: some in each band, some below and above.
@@ -82,14 +82,14 @@ def first_poles(
     return np.concatenate([upper, upper.conj(), single])
 
 
-def without_least_pair(poles: ComplexArray, costs: FloatArray) -> ComplexArray:
+def drop_cheapest_pair(poles: ComplexArray, costs: FloatArray) -> ComplexArray:
     """Return the poles without the pair of the least cost of leaving out."""
     upper = poles[poles.imag > 0]
     kept = np.delete(upper, int(np.argmin(costs)))
     return np.concatenate([kept, kept.conj(), poles[poles.imag == 0]])
 
 
-def leaving_out(
+def misfit_without_each_pair(
     angles: FloatArray, target: ComplexArray, weight: FloatArray, poles: ComplexArray
 ) -> FloatArray:
     """Misfit of the response when each pair of poles is left out, (pairs,)."""
@@ -97,13 +97,17 @@ def leaving_out(
     upper, single = poles[poles.imag > 0], poles[poles.imag == 0].real
     goal = weight * target
     out = [
-        float(np.linalg.norm(_unfitted(goal, weight, _functions(z, np.delete(upper, i), single))))
+        float(
+            np.linalg.norm(
+                _fit_residual(goal, weight, _basis_responses(z, np.delete(upper, i), single))
+            )
+        )
         for i in range(upper.size)
     ]
     return np.array(out)
 
 
-def _unfitted(goal: ComplexArray, weight: FloatArray, functions: ComplexArray) -> FloatArray:
+def _fit_residual(goal: ComplexArray, weight: FloatArray, functions: ComplexArray) -> FloatArray:
     """Return what real multiples of weighted functions leave of a goal, real parts first."""
     columns = weight[:, None] * functions
     q, _ = np.linalg.qr(np.vstack([columns.real, columns.imag]))
@@ -111,13 +115,13 @@ def _unfitted(goal: ComplexArray, weight: FloatArray, functions: ComplexArray) -
     return np.asarray(stacked - q @ (q.T @ stacked))
 
 
-def _unpacked(x: FloatArray, pairs: int) -> tuple[ComplexArray, FloatArray]:
+def _poles_from_vector(x: FloatArray, pairs: int) -> tuple[ComplexArray, FloatArray]:
     modulus = 1 / (1 + np.exp(-x[:pairs]))
     upper = modulus * np.exp(1j * x[pairs : 2 * pairs])
     return upper.astype(np.complex128), np.tanh(x[2 * pairs :])
 
 
-def _functions(z: ComplexArray, upper: ComplexArray, single: FloatArray) -> ComplexArray:
+def _basis_responses(z: ComplexArray, upper: ComplexArray, single: FloatArray) -> ComplexArray:
     """Responses that span the orthonormal functions of the poles, well conditioned."""
     columns = []
     passed = np.ones(z.size, dtype=np.complex128)

@@ -13,7 +13,7 @@ from lbt_synth.validation import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MeasuredLoop:
+class SingleModeLoop:
     """A controller of one mode in its loop."""
 
     hardware: LoopHardware  # Loop of one mode
@@ -53,10 +53,10 @@ class MeasuredLoop:
         return StateSpace(A=s.A, B=s.B, C=-s.C, D=1 - s.D, dt_s=s.dt_s)
 
 
-def mode_loop(hardware: LoopHardware, parameter: Controller) -> MeasuredLoop:
+def mode_loop(hardware: LoopHardware, parameter: Controller) -> SingleModeLoop:
     """Return the loop of one mode, of the delay of a whole loop, around its parameter."""
     single = mode_hardware(hardware)
-    return MeasuredLoop(hardware=single, controller=youla_controller(single, parameter))
+    return SingleModeLoop(hardware=single, controller=youla_controller(single, parameter))
 
 
 def mode_hardware(hardware: LoopHardware) -> LoopHardware:

@@ -10,11 +10,15 @@ import numpy as np
 
 from lbt_synth.design.certificate import Certificate
 from lbt_synth.design.result import SolverReport
-from lbt_synth.design.shaped_design import ShapedDesign, assembled, require_separable
+from lbt_synth.design.shaped_design import (
+    ShapedDesign,
+    controller_from_parameters,
+    require_separable,
+)
 from lbt_synth.design.shaping.basis import laguerre_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.exact_evaluation import mode_hardware
-from lbt_synth.design.shaping.reduction import Solved, reduced, solved
+from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
+from lbt_synth.design.shaping.single_mode_loop import mode_hardware
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller
@@ -96,7 +100,7 @@ def shape(
             "hardware must be a LoopHardware, such as plant.hardware; got "
             f"{type(hardware).__name__}."
         )
-    specifications = _one_a_mode(specification, hardware.modes)
+    specifications = _specification_per_mode(specification, hardware.modes)
     size = integer(functions, "functions", at_least=1)
     if size > _MOST_FUNCTIONS:
         raise ProblemError(f"functions must be at most {_MOST_FUNCTIONS}; got {size}.")
@@ -109,16 +113,16 @@ def shape(
     for spec in specifications:
         spec.require_fitting(hardware.frame_rate_hz)
 
-    made: dict[int, _Mode] = {}
+    made: dict[int, _ModeDesign] = {}
     for spec in specifications:
         if id(spec) not in made:
             channel = Channel(hardware=single, basis=laguerre_basis(size, common, dt_s=single.dt_s))
-            made[id(spec)] = _designed(spec, channel, order, tolerance)
+            made[id(spec)] = _design_mode(spec, channel, order, tolerance)
     modes = [made[id(spec)] for spec in specifications]
     parameters = tuple(mode.parameter for mode in modes)
     design = ShapedDesign(
         method="shaped",
-        controller=assembled(hardware, parameters),
+        controller=controller_from_parameters(hardware, parameters),
         certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
         solver=SolverReport(
             route="youla",
@@ -132,12 +136,12 @@ def shape(
         long_objective_nm=tuple(mode.long_objective_nm for mode in modes),
         long_functions=size,
     )
-    certificate = design.recertified().require("Try more functions, or looser demands.")
+    certificate = design.recertify().require("Try more functions, or looser demands.")
     return replace(design, certificate=certificate)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Mode:
+class _ModeDesign:
     parameter: Controller
     objective_nm: float
     long_objective_nm: float
@@ -145,7 +149,7 @@ class _Mode:
     programmes: int
 
 
-def _one_a_mode(
+def _specification_per_mode(
     specification: Specification | Sequence[Specification], modes: int
 ) -> tuple[Specification, ...]:
     given: tuple[Any, ...] = (
@@ -163,15 +167,17 @@ def _one_a_mode(
     return given
 
 
-def _designed(spec: Specification, channel: Channel, order: int | None, tolerance: float) -> _Mode:
-    long = solved(spec, channel)
+def _design_mode(
+    spec: Specification, channel: Channel, order: int | None, tolerance: float
+) -> _ModeDesign:
+    long = solve_mode(spec, channel)
     if order is None or order >= channel.basis.size:
         return _mode(long, long)
-    return _mode(reduced(spec, long, order, tolerance), long)
+    return _mode(reduce_poles(spec, long, order, tolerance), long)
 
 
-def _mode(result: Solved, long: Solved) -> _Mode:
-    return _Mode(
+def _mode(result: ModeSolution, long: ModeSolution) -> _ModeDesign:
+    return _ModeDesign(
         parameter=result.parameter,
         objective_nm=result.objective_nm * (1 + _ROUNDED),
         long_objective_nm=long.objective_nm,

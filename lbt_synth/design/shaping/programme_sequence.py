@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.frequency_bounds import ROOM
 from lbt_synth.design.shaping.frequency_grid import Grid, fine_frequencies
-from lbt_synth.design.shaping.grid_tightening import ROOM
 from lbt_synth.design.shaping.objectives import noise_level
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import InfeasibleError, NumericalError
@@ -17,9 +17,9 @@ from lbt_synth.linear.convex_functions import (
     Discs,
     Function,
     HalfPlanes,
-    fractions,
     is_convex,
-    merged,
+    leaf_fractions,
+    merge_constraints,
     without_denominators,
 )
 from lbt_synth.validation import FloatArray
@@ -34,7 +34,7 @@ _RELAXED = 1e-6  # relaxations below this are none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SequenceResult:
+class SequenceSolution:
     """Coefficients of one basis, and how they were found."""
 
     channel: Channel  # Mode and basis
@@ -57,7 +57,7 @@ def solve_sequence(
     *,
     start: FloatArray | None = None,
     fineness: int = 1,
-) -> SequenceResult:
+) -> SequenceSolution:
     """Minimise the objective of a specification in a basis.
 
     A convex specification takes one programme, and another for each time that a bound is exceeded
@@ -65,23 +65,23 @@ def solve_sequence(
     until the demands hold at all frequencies, and goes on with upper bounds that touch the
     objective; none of these steps makes it larger or leaves the demands. Shapes: start (n,).
     """
-    from lbt_synth.linear.lmi.conic_program import least
+    from lbt_synth.linear.lmi.conic_program import minimize
 
     grid = specification.grid(channel, fineness=fineness)
-    watch = _Watch.of(specification, channel, grid, _FINE * fineness)
+    watch = _FineGrid.of(specification, channel, grid, _FINE * fineness)
     function, groups = specification.compiled(channel, grid)
     convex = is_convex(function)
-    scale = _scale(specification, function, channel.basis.size)
+    scale = _objective_scale(specification, function, channel.basis.size)
     # the upper bounds need coefficients whose loops are stable at all sensor gains
     c = start if start is not None and watch.is_stable(start) else None
     aware = convex or c is not None
     values: list[float] = []
     for programmes in range(1, _STEPS + 1):
-        constraints = merged(tuple(x for group in groups for x in group))
+        constraints = merge_constraints(tuple(x for group in groups for x in group))
         goal = function if aware else without_denominators(function)
-        solution = least(goal, constraints, size=channel.basis.size, scale=scale, start=c)
+        solution = minimize(goal, constraints, size=channel.basis.size, scale=scale, start=c)
         if solution.coefficients is None:
-            raise _refusal(specification, groups, channel.basis.size, solution.status)
+            raise _infeasibility_error(specification, groups, channel.basis.size, solution.status)
         c = solution.coefficients
         values.append(function.value(c))
         excess = watch.excess(function, c)
@@ -89,7 +89,7 @@ def solve_sequence(
         if not aware:
             aware, settled, values = excess.size == 0, False, values[-1:]
         if excess.size == 0 and settled:
-            return SequenceResult(
+            return SequenceSolution(
                 channel=channel,
                 grid=grid,
                 coefficients=c,
@@ -109,13 +109,13 @@ def solve_sequence(
     )
 
 
-def _scale(specification: Specification, function: Function, size: int) -> float:
+def _objective_scale(specification: Specification, function: Function, size: int) -> float:
     """Size of the objective in the end, within a few powers of ten [nm^2]."""
     return max(4 * noise_level(specification.objective) ** 2, 1e-4 * function.value(np.zeros(size)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Watch:
+class _FineGrid:
     """Bounds and worst cases between the frequencies of the programme."""
 
     specification: Specification
@@ -125,14 +125,16 @@ class _Watch:
     constraints: tuple[Constraint, ...]
 
     @classmethod
-    def of(cls, specification: Specification, channel: Channel, grid: Grid, count: int) -> _Watch:
+    def of(
+        cls, specification: Specification, channel: Channel, grid: Grid, count: int
+    ) -> _FineGrid:
         rate, poles = channel.hardware.frame_rate_hz, channel.basis.poles
         return cls._on(specification, channel, grid, fine_frequencies(rate, poles, count))
 
     @classmethod
     def _on(
         cls, specification: Specification, channel: Channel, grid: Grid, points_hz: FloatArray
-    ) -> _Watch:
+    ) -> _FineGrid:
         fine = replace(grid, points_hz=points_hz)
         function, groups = specification.compiled(channel, fine)
         return cls(
@@ -140,7 +142,7 @@ class _Watch:
             channel=channel,
             grid=fine,
             function=function,
-            constraints=merged(tuple(c for group in groups for c in group)),
+            constraints=merge_constraints(tuple(c for group in groups for c in group)),
         )
 
     def is_stable(self, c: FloatArray) -> bool:
@@ -151,7 +153,8 @@ class _Watch:
     def excess(self, function: Function, c: FloatArray) -> FloatArray:
         """Frequencies at which bounds, or the programme's own worst cases, are exceeded [Hz]."""
         limits = tuple(
-            leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf for leaf in fractions(function)
+            leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf
+            for leaf in leaf_fractions(function)
         )
         found = self._above(limits, c, 1 + ROOM / 2)
         if found.size:
@@ -173,7 +176,7 @@ class _Watch:
         ]
         worst = [
             _local_peaks(leaf.frequency_hz, leaf.values(c), limit * level)
-            for leaf, limit in zip(fractions(self.function), limits, strict=True)
+            for leaf, limit in zip(leaf_fractions(self.function), limits, strict=True)
             if leaf.worst
         ]
         return np.unique(np.concatenate([np.zeros((0, 3)), *bounds, *worst]), axis=0)
@@ -189,18 +192,18 @@ def _local_peaks(frequency_hz: FloatArray, values: FloatArray, limit: float) -> 
     return np.stack([f[before], f[at], f[after]], axis=1)
 
 
-def _refusal(
+def _infeasibility_error(
     specification: Specification,
     groups: tuple[tuple[Constraint, ...], ...],
     size: int,
     status: str,
 ) -> InfeasibleError | NumericalError:
     """Error that names a smallest set of demands that cannot hold, and how far each is off."""
-    from lbt_synth.linear.lmi.conic_program import least_relaxation
+    from lbt_synth.linear.lmi.conic_program import minimize_relaxation
 
     labels = [demand.label for demand in specification.demands]
     free = (False,) * len(groups)
-    if not groups or np.max(least_relaxation(groups, size=size, rigid=free)) <= _RELAXED:
+    if not groups or np.max(minimize_relaxation(groups, size=size, rigid=free)) <= _RELAXED:
         return NumericalError(
             f"the programme of the shaped loop ended as {status!r}; expected an optimum. Try "
             "another number of functions.",
@@ -211,14 +214,14 @@ def _refusal(
         rest = [i for i in core if i != candidate]
         if not rest:
             continue
-        relaxed = least_relaxation(
+        relaxed = minimize_relaxation(
             tuple(groups[i] for i in rest), size=size, rigid=(False,) * len(rest)
         )
         if np.max(relaxed) > _RELAXED:
             core = rest
     listing = []
     for i in core:
-        relaxed = least_relaxation(
+        relaxed = minimize_relaxation(
             tuple(groups[j] for j in core), size=size, rigid=tuple(j != i for j in core)
         )
         factor = 1 + float(relaxed[core.index(i)])

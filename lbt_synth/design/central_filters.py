@@ -20,7 +20,7 @@ _DECADES = 4.0  # of gamma, over which a member is searched
 _SLACK = 4e-7  # by which a member may miss its norm
 
 
-def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
+def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     """Design the central H-infinity filter that has a given norm.
 
     The filter that :func:`hinf` makes for a bound stays below it; this one reaches it, and
@@ -47,7 +47,7 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     --------
     >>> import lbt_synth as lbt
     >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> round(lbt.design.central(walk, gamma=1.5).gamma, 6)
+    >>> round(lbt.design.central_filter(walk, gamma=1.5).gamma, 6)
     1.5
     """
     require_problem(problem)
@@ -55,7 +55,7 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     least = hinf(problem, route="riccati")
     assert least.gamma_least is not None  # of an H-infinity design
     require_reachable(bound, least.gamma_least)
-    gains = CentralFamily(problem, least).member(lambda norm, _: norm - bound)
+    gains = CentralFilters(problem, least).member(lambda norm, _: norm - bound)
     return filter_design(
         problem,
         gains.gain_predictor,
@@ -69,7 +69,7 @@ def central(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     )
 
 
-class CentralFamily:
+class CentralFilters:
     """The central filters of a problem, from that of the least gamma to the Kalman filter.
 
     Parameters
