@@ -15,9 +15,14 @@ import lbt_synth as lbt
 from lbt_synth.cli import end_to_end as end_to_end_commands
 from lbt_synth.cli.main import main
 from lbt_synth.errors import ConfigError, MissingExtraError, OutputError, ProblemError
-from lbt_synth.interop.specula.cases import case_of
-from lbt_synth.report.figures.paper import table_figure
-from lbt_synth.studies.paper.end_to_end import all_cases, entries, modal_distance, plan_tables
+from lbt_synth.interop.specula.json_cases import make_case
+from lbt_synth.report.figures.end_to_end_table import end_to_end_table_figure
+from lbt_synth.studies.paper.end_to_end import (
+    all_cases,
+    make_entries,
+    plan_tables,
+    rms_modal_difference,
+)
 from lbt_synth.studies.paper.published import TABLE_III
 
 CONFIG = "examples/lbt.yaml"
@@ -152,7 +157,7 @@ def test_configurations_that_cannot_be_simulated(tmp_path, capsys, old, new, mat
     config = lbt.load_config(file)
     with pytest.raises(ConfigError, match=match):
         _ = config.end_to_end
-    assert main(["e2e", str(file), "x.fits", "-o", str(tmp_path / "run")]) == 2
+    assert main(["end-to-end", str(file), "x.fits", "-o", str(tmp_path / "run")]) == 2
     assert "lbt-synth: error:" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
@@ -186,8 +191,8 @@ def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path,
     gain = tmp_path / "i.fits"
     lbt.save_gain(gain, lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5))
     for arguments in (
-        ["e2e", CONFIG, str(gain), "-o", str(tmp_path / "run")],
-        ["e2e-table", CONFIG, "-o", str(tmp_path / "table"), "--tables", "II"],
+        ["end-to-end", CONFIG, str(gain), "-o", str(tmp_path / "run")],
+        ["end-to-end-table", CONFIG, "-o", str(tmp_path / "table"), "--tables", "II"],
     ):
         assert main(arguments) == 2
         assert 'pip install "lbt-synth[e2e]"' in capsys.readouterr().err
@@ -197,7 +202,7 @@ def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path,
 
 
 def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
-    shell = lbt.models.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.from_bandwidth(
         natural_frequency_hz=20, damping=0.5, bandwidth_hz=150
     )
     slow = replace(setup.system.hardware, mirror=shell)
@@ -216,14 +221,14 @@ def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
 def test_a_case_holds_all_that_decides_and_fits_into_json(setup):
     design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
     shake = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100)
-    case = case_of(setup, design.controller, vibrations=[shake], seed=3)
+    case = make_case(setup, design.controller, vibrations=[shake], seed=3)
     assert json.loads(json.dumps(case)) is not None
     for other in (
-        case_of(setup, None, vibrations=[shake], seed=3),
-        case_of(setup, design.controller, seed=3),
-        case_of(setup, design.controller, vibrations=[shake], seed=4),
-        case_of(replace(setup, gain=0.4), design.controller, vibrations=[shake], seed=3),
-        case_of(
+        make_case(setup, None, vibrations=[shake], seed=3),
+        make_case(setup, design.controller, seed=3),
+        make_case(setup, design.controller, vibrations=[shake], seed=4),
+        make_case(replace(setup, gain=0.4), design.controller, vibrations=[shake], seed=3),
+        make_case(
             replace(setup, system=replace(setup.system, photons=51.0)),
             design.controller,
             vibrations=[shake],
@@ -289,7 +294,7 @@ def fake_results(rows, gain=0.6, strehl=0.7):
 @pytest.fixture(scope="module")
 def table(setup, rows):
     some = [row for row in rows if row.error_hz in (None, -3.5, 0.0, 3.5)]
-    return entries(some, fake_results(some), setup)
+    return make_entries(some, fake_results(some), setup)
 
 
 def test_entries_are_means_over_seeds_beside_the_modal_analysis(table):
@@ -304,7 +309,7 @@ def test_entries_are_means_over_seeds_beside_the_modal_analysis(table):
     camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11, wavelength_um=2.2, other_modes=0.85)
     expected = 100 * lbt.strehl(lbt.residual_budget(loop, truth), camera)
     assert first.modal == pytest.approx(expected, abs=1e-9)
-    assert modal_distance(table, "kalman") > 0
+    assert rms_modal_difference(table, "kalman") > 0
     # a filter for 20 Hz meets a line that moved: as bad as the model that moved
     slow = {e.error_hz: e.modal for e in table if e.method == "slow" and e.table == "III"}
     assert slow[-3.5] < slow[3.5]  # an integrator rejects 23.5 Hz less than 16.5 Hz
@@ -312,12 +317,12 @@ def test_entries_are_means_over_seeds_beside_the_modal_analysis(table):
 
 @pytest.mark.parametrize("gain", [-0.1, 0.0, 5.0])
 def test_a_loop_that_is_unstable_at_the_measured_gain_predicts_nothing(setup, rows, gain):
-    table = entries(rows, fake_results(rows, gain=gain), setup)
+    table = make_entries(rows, fake_results(rows, gain=gain), setup)
     assert {e.modal for e in table} == {0.0}
 
 
 def test_the_figure_has_a_panel_a_controller(table):
-    figure = table_figure(table)
+    figure = end_to_end_table_figure(table)
     assert [axis.get_title() for axis in figure.axes] == ["Kalman", r"H$_\infty$", "slow"]
     assert figure.axes[0].lines[0].get_label() == "Agapito et al. 2008"
 
@@ -350,7 +355,7 @@ def test_a_design_cannot_take_the_name_of_the_papers(setup):
 )
 def test_bad_input_at_the_command_line(tmp_path, capsys, arguments):
     out = tmp_path / "table"
-    assert main(["e2e-table", CONFIG, *arguments, "-o", str(out)]) == 2
+    assert main(["end-to-end-table", CONFIG, *arguments, "-o", str(out)]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("lbt-synth: error:")
     assert captured.out == ""

@@ -15,7 +15,7 @@ import pytest
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
 from lbt_synth.errors import ProblemError
-from lbt_synth.interop.specula.cases import case_of, run_case
+from lbt_synth.interop.specula.json_cases import make_case, run_case
 from lbt_synth.interop.specula.optics import Optics, make_modes
 
 pytestmark = [
@@ -209,12 +209,12 @@ def test_a_case_is_its_run(cache):
     setup = replace(SETUP, frames=60, settle_frames=200, vibrations=(SHAKE,), seed=5)
     design = lbt.kalman(PLANT)
     direct = setup.run(design, cache=cache)
-    case = json.loads(json.dumps(case_of(setup, design.controller, vibrations=(SHAKE,), seed=5)))
+    case = json.loads(json.dumps(make_case(setup, design.controller, vibrations=(SHAKE,), seed=5)))
     result = run_case(case, cache=cache)
     assert result["strehl"] == direct.strehl
     assert result["tip_rms_nm"] == float(direct.rms_nm[0])
     shake = lbt.Vibration(frequency_hz=30, damping=0.05, rms_nm=10.0)
-    case = json.loads(json.dumps(case_of(setup, None, vibrations=[shake], seed=5)))
+    case = json.loads(json.dumps(make_case(setup, None, vibrations=[shake], seed=5)))
     run = replace(setup, vibrations=(shake,)).run(None, cache=cache)
     assert run_case(case, cache=cache)["tip_rms_nm"] == float(run.rms_nm[0])
 
@@ -242,7 +242,16 @@ def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
     config, gain = small_config(tmp_path), tmp_path / "k.fits"
     lbt.save_gain(gain, lbt.kalman(lbt.load_config(config).plant))
     out = tmp_path / "run"
-    arguments = ["e2e", str(config), str(gain), "-o", str(out), "--cache", str(cache), "--json"]
+    arguments = [
+        "end-to-end",
+        str(config),
+        str(gain),
+        "-o",
+        str(out),
+        "--cache",
+        str(cache),
+        "--json",
+    ]
     assert main(arguments) == 0
     data = json.loads(capsys.readouterr().out)
     assert sorted(p.name for p in out.iterdir()) == ["run.png", "summary.json", "telemetry.fits"]
@@ -264,7 +273,7 @@ def test_a_table_that_was_killed_goes_on(tmp_path, cache):
         sys.executable,
         "-m",
         "lbt_synth.cli.main",
-        "e2e-table",
+        "end-to-end-table",
         str(config),
         "-o",
         str(out),

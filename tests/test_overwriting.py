@@ -7,11 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from support.commands import run
 from support.plants import LBT_YAML
-from test_cli import run
 
 import lbt_synth as lbt
-from lbt_synth.cli.command_table import COMMANDS
+from lbt_synth.cli.parser import COMMANDS
 from lbt_synth.errors import OutputError
 from lbt_synth.storage.atomic_files import refuse_replacing, require_writable
 
@@ -50,14 +50,14 @@ CASES = {
     "limits gain": ("gain.fits", ("config.yaml", "gain.fits", "-o", "OUT.pdf")),
     "mirror": ("config.yaml", ("config.yaml", "-o", "OUT.png")),
     "modal": ("config.yaml", ("config.yaml", "-o", "OUT.csv")),
-    "e2e": ("gain.fits", ("config.yaml", "gain.fits", "-o", "."), "telemetry.fits"),
-    "e2e config": ("config.yaml", ("config.yaml", "gain.fits", "-o", "."), "summary.json"),
+    "end-to-end": ("gain.fits", ("config.yaml", "gain.fits", "-o", "."), "telemetry.fits"),
+    "end-to-end config": ("config.yaml", ("config.yaml", "gain.fits", "-o", "."), "summary.json"),
     "study": ("config.yaml", ("study.yaml", "-o", "."), "a.fits"),
     "study configuration": ("config.yaml", ("study.yaml", "-o", "."), "results.csv"),
     "study file": ("study.yaml", ("study.yaml", "-o", "."), "summary.html"),
     "study row": ("config.yaml", ("study.yaml", "-o", ".", "--row", "3"), "row_3.yaml"),
-    "e2e-table": ("gain.fits", ("config.yaml", "gain.fits", "-o", "."), "table_ii.csv"),
-    "e2e-table config": ("config.yaml", ("config.yaml", "-o", "."), "table_iii.pdf"),
+    "end-to-end-table": ("gain.fits", ("config.yaml", "gain.fits", "-o", "."), "table_ii.csv"),
+    "end-to-end-table config": ("config.yaml", ("config.yaml", "-o", "."), "table_iii.pdf"),
 }
 
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import run
 from support.pages import Reader
 from support.plants import LBT_YAML, lbt_axis_plant
-from test_cli import run
 
 import lbt_synth as lbt
 from lbt_synth.design import Certificate, Check
@@ -26,7 +26,7 @@ from lbt_synth.report.designs.report import possible_errors, steps_of
 from lbt_synth.report.designs.simulation import exact_spectrum, step_response
 from lbt_synth.report.designs.verdict import good_range, verdict
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
-from lbt_synth.report.provenance import time_of_making
+from lbt_synth.report.provenance import creation_time
 from lbt_synth.storage.tables import Table
 
 SMALL = re.sub(
@@ -103,7 +103,7 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         assert one.rejection == pytest.approx(peak, rel=1e-9)
     kalman = report.assessments[0]
     assert (kalman.gamma, kalman.estimation_rms) == (kalman.design.gamma, kalman.design.rms)
-    assert kalman.checks == designs["kalman"].recertified().checks
+    assert kalman.checks == designs["kalman"].recertify().checks
 
 
 def test_an_unstable_loop_is_told_loudly(report, text):
@@ -354,13 +354,13 @@ def test_numbers_as_texts():
 
 def test_the_time_of_making(monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
-    assert time_of_making() == datetime(1970, 1, 2, tzinfo=UTC)
+    assert creation_time() == datetime(1970, 1, 2, tzinfo=UTC)
     for wrong in ("tomorrow", "1e400", str(10**30)):
         monkeypatch.setenv("SOURCE_DATE_EPOCH", wrong)
         with pytest.raises(lbt.errors.ProblemError, match="SOURCE_DATE_EPOCH must be a number"):
-            time_of_making()
+            creation_time()
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
-    assert abs((datetime.now(UTC) - time_of_making()).total_seconds()) < 60
+    assert abs((datetime.now(UTC) - creation_time()).total_seconds()) < 60
 
 
 def test_what_is_counted(config, designs):

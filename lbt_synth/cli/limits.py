@@ -7,22 +7,23 @@ from dataclasses import asdict
 from typing import Any
 
 from lbt_synth import studies
-from lbt_synth.cli.output import Report, TableText, fixed, working
+from lbt_synth.cli.loop_inputs import load_designs, loop_difference_notes
+from lbt_synth.cli.output import Report, TableText, format_fixed
 from lbt_synth.cli.output_files import require_outputs, write_outputs
-from lbt_synth.cli.simulate import foreign_notes, named_designs
+from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design, hinf, kalman, optimal_integrator
 from lbt_synth.report.figures import limits_figure
 
 
-def limits(arguments: Namespace) -> Report:
-    """Compare designs with the limits of performance."""
+def run(arguments: Namespace) -> Report:
+    """Compare designs with the least residual of any linear controller."""
     require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     config = load_config(arguments.config)
-    given = named_designs(arguments.gains)
-    with working("comparing", quiet=arguments.json):
-        designs = _made(config)
-        designs |= {f"{name} (file)" if name in designs else name: d for name, d in given.items()}
+    files = load_designs(arguments.gains)
+    with show_spinner("comparing", quiet=arguments.json):
+        designs = _config_designs(config)
+        designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
         study = studies.limits(
             designs,
             config.hardware,
@@ -46,19 +47,17 @@ def limits(arguments: Namespace) -> Report:
                 rows=[_cells(record)[: len(headings)] for record in records],
             )
         ],
-        notes=[*_notes(study), *_design_notes(config, designs, study)],
+        notes=[*_limit_notes(study), *_design_notes(config, designs, study)],
     )
     write_outputs(report, arguments.output, records=records, figure=lambda: limits_figure(study))
     return report
 
 
-def _made(config: Config) -> dict[str, Design]:
+def _config_designs(config: Config) -> dict[str, Design]:
     return {
         "integrator": optimal_integrator(config.hardware, config.truth),
         "kalman": kalman(config.plant),
-        "hinf": hinf(
-            config.plant, gamma_ratio=config.settings.design.gamma_ratio, method="riccati"
-        ),
+        "hinf": hinf(config.plant, gamma_ratio=config.settings.design.gamma_ratio, route="riccati"),
     }
 
 
@@ -69,11 +68,11 @@ def _record(row: dict[str, Any], *, banded: bool) -> dict[str, Any]:
 def _cells(record: dict[str, Any]) -> list[str]:
     return [
         record["design"],
-        fixed(record["residual_nm"], 2) if record["stable"] else "unstable",
-        fixed(100 * record["strehl"], 2),
-        fixed(record["above_limit_percent"], 2),
-        fixed(record["worst_nm"], 2),
-        fixed(record.get("above_band_limit_percent", float("nan")), 2),
+        format_fixed(record["residual_nm"], 2) if record["stable"] else "unstable",
+        format_fixed(100 * record["strehl"], 2),
+        format_fixed(record["above_limit_percent"], 2),
+        format_fixed(record["worst_nm"], 2),
+        format_fixed(record.get("above_band_limit_percent", float("nan")), 2),
     ]
 
 
@@ -91,7 +90,7 @@ def _data(study: studies.LimitStudy, records: list[dict[str, Any]]) -> dict[str,
     return data
 
 
-def _notes(study: studies.LimitStudy) -> list[str]:
+def _limit_notes(study: studies.LimitStudy) -> list[str]:
     if study.limit is None:
         return [
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
@@ -114,7 +113,7 @@ def _notes(study: studies.LimitStudy) -> list[str]:
 def _design_notes(
     config: Config, designs: dict[str, Design], study: studies.LimitStudy
 ) -> list[str]:
-    """Say what makes a row another comparison than it seems."""
+    """Warn of rows that compare something else than they seem to."""
     notes = []
     if config.truth.vibrations and not config.plant.vibrations:
         notes.append(
@@ -124,5 +123,5 @@ def _design_notes(
     if study.band is None and len(config.truth.vibrations) > 1:
         notes.append("note: the limit over a range of frequencies is that of a single sinusoid.")
     for name, design in designs.items():
-        notes += [f"{note[:-1]} ({name})." for note in foreign_notes(config, design)]
+        notes += [f"{note[:-1]} ({name})." for note in loop_difference_notes(config, design)]
     return notes

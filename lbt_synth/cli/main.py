@@ -1,4 +1,4 @@
-"""Entry point of ``lbt-synth``: dispatch, exit codes.
+"""The entry point of ``lbt-synth``: it runs a command and turns errors into exit codes.
 
 Exit status: 0 done, 1 a design or a verification failed, 2 wrong usage or bad input.
 Nothing heavy is imported before a command runs.
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     arguments = build_parser().parse_args(argv)
     given = os.environ.get("SOURCE_DATE_EPOCH")
-    if given is not None:  # libraries read it, too, when they are loaded
+    if given is not None:  # checked here, as libraries read it when they are loaded
         try:
             time.gmtime(int(given))
         except (ValueError, OverflowError, OSError):
@@ -34,9 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 WRONG,
                 as_json=arguments.json,
             )
-    commands = importlib.import_module("lbt_synth.cli.command_table")
+    command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
     try:
-        report = commands.COMMANDS[arguments.command](arguments)
+        report = command.run(arguments)
     except SynthesisError as error:
         return _refuse(error, FAILED, as_json=arguments.json)
     except LbtSynthError as error:
@@ -59,7 +59,7 @@ def _refuse(error: LbtSynthError, status: int, *, as_json: bool) -> int:
 
 
 def entry_point() -> None:
-    """Console script."""
+    """Run the console script, and survive a closed pipe or a full disk."""
     try:
         status = main()
         sys.stdout.flush()

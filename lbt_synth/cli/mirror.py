@@ -6,19 +6,20 @@ from argparse import Namespace
 from dataclasses import asdict
 
 from lbt_synth import studies
-from lbt_synth.cli.output import Report, TableText, fixed, working
+from lbt_synth.cli.output import Report, TableText, format_fixed
 from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import load_config
 from lbt_synth.errors import ConfigError
 from lbt_synth.loop import least_residual
 from lbt_synth.report.figures import mirror_figure
 from lbt_synth.studies.limits import limit_or_nan
 
-_FEW = 8
+_SHOWN_TAPS = 8
 
 
-def mirror(arguments: Namespace) -> Report:
-    """Look at the mirror of a configuration."""
+def run(arguments: Namespace) -> Report:
+    """Show how the mirror of a configuration settles, and compare designs on it."""
     require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
     hardware, shell = config.hardware, config.hardware.mirror
@@ -30,7 +31,7 @@ def mirror(arguments: Namespace) -> Report:
             path=key,
         )
     step = shell.step_response(arguments.tolerance)
-    with working("designing", quiet=arguments.json):
+    with show_spinner("designing", quiet=arguments.json):
         rows = studies.mirror(
             config.plant,
             config.truth,
@@ -40,7 +41,9 @@ def mirror(arguments: Namespace) -> Report:
     limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
     records = [asdict(row) for row in rows]
     taps = hardware.mirror_taps
-    shown = ", ".join(f"{tap:.4f}" for tap in taps[:_FEW]) + (", ..." if taps.size > _FEW else "")
+    shown = ", ".join(f"{tap:.4f}" for tap in taps[:_SHOWN_TAPS]) + (
+        ", ..." if taps.size > _SHOWN_TAPS else ""
+    )
     report = Report(
         data={
             "rise_s": step.rise_s,
@@ -77,9 +80,9 @@ def mirror(arguments: Namespace) -> Report:
                 rows=[
                     (
                         row.design,
-                        fixed(row.residual_nm, 2) if row.stable else "unstable",
-                        fixed(100 * row.strehl, 2),
-                        fixed(row.unsettled_nm, 2),
+                        format_fixed(row.residual_nm, 2) if row.stable else "unstable",
+                        format_fixed(100 * row.strehl, 2),
+                        format_fixed(row.unsettled_nm, 2),
                     )
                     for row in rows
                 ],
@@ -87,7 +90,7 @@ def mirror(arguments: Namespace) -> Report:
         ],
         notes=[
             f"weights of u(k), u(k-1), ... in exposure k: {shown}",
-            f"least residual of any linear controller: {fixed(limit_nm, 2)} nm rms",
+            f"least residual of any linear controller: {format_fixed(limit_nm, 2)} nm rms",
         ],
     )
     write_outputs(

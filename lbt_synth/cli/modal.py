@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.cli.output import Report, TableText, fixed, working
+from lbt_synth.cli.output import Report, TableText, format_fixed
 from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
 from lbt_synth.errors import ConfigError, ProblemError
@@ -20,16 +21,18 @@ from lbt_synth.validation import FloatArray, integer
 _MOST_MODES = 20_000
 
 
-def modal(arguments: Namespace) -> Report:
+def run(arguments: Namespace) -> Report:
     """Compare integrators, optimised gains and Kalman filters, mode by mode."""
     require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
-    count = _count(arguments.modes, config)
-    atmosphere = config.air("the turbulence of hundreds of modes is computed from it")
-    noise, assumed = _noise(config, count)
-    with working("designing", quiet=arguments.json):
+    count = _mode_count(arguments.modes, config)
+    atmosphere = config.require_atmosphere(
+        "the turbulence of hundreds of modes is computed from it"
+    )
+    noise, assumed = _noise_nm(config, count)
+    with show_spinner("designing", quiet=arguments.json):
         air = modal_turbulence(atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz)
-        lines = _vibrations(config, count)
+        lines = _axis_vibrations(config, count)
         path: dict[str, Any] = {
             "delay_frames": config.hardware.delay_frames,
             "sensor_gain": config.sensor_gain,
@@ -45,7 +48,7 @@ def modal(arguments: Namespace) -> Report:
             return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
 
         best = minimize_scalar(
-            lambda one: _total(integrators(one)),
+            lambda one: _norm(integrators(one)),
             bounds=(1e-3 * gains.limit.min(), gains.limit.min()),
             method="bounded",
         )
@@ -54,17 +57,17 @@ def modal(arguments: Namespace) -> Report:
         "integrators, optimised gains": gains.rms_nm,
         "Kalman filters": filters.rms_nm,
     }
-    records = _records(count, air.rms_nm, noise, gains.gains, list(residuals.values()))
-    whole = {name: _total(rms) for name, rms in residuals.items()}
+    records = _order_records(count, air.rms_nm, noise, gains.gains, list(residuals.values()))
+    whole = {name: _norm(rms) for name, rms in residuals.items()}
     report = Report(
         data={
             "modes": count,
             "uniform_gain": float(best.x),
             "rows": records,
             "residual_nm": whole,
-            "turbulence_nm": _total(air.rms_nm),
+            "turbulence_nm": _norm(air.rms_nm),
         },
-        tables=[_totals(whole, _total(air.rms_nm)), _orders(records)],
+        tables=[_whole_table(whole, _norm(air.rms_nm)), _order_table(records)],
         notes=[
             "turbulence: AR1 models, von Karman variances, poles by radial order.",
             "vibrations: those of the model, on tip and tilt.",
@@ -82,22 +85,22 @@ def modal(arguments: Namespace) -> Report:
     return report
 
 
-def _count(asked: int | None, config: Config) -> int:
-    if asked is None:
-        asked = config.settings.mirror.modes
-        if asked is None:
+def _mode_count(given: int | None, config: Config) -> int:
+    if given is None:
+        given = config.settings.mirror.modes
+        if given is None:
             raise ConfigError(
                 f"{config.source}: the key mirror.modes is missing; give it, or --modes.",
                 path="mirror.modes",
             )
-    count = integer(asked, "modes", at_least=2)
+    count = integer(given, "modes", at_least=2)
     if count > _MOST_MODES:
         raise ProblemError(f"modes must be at most {_MOST_MODES}; got {count}.")
     return count
 
 
-def _noise(config: Config, count: int) -> tuple[FloatArray, str]:
-    """Noise of each mode, and what it was taken for."""
+def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
+    """Return the noise of each mode [nm], and what it assumes in words."""
     settings = config.settings
     for section, key in ((settings.sensor, "noise_nm"), (settings.model, "sensor_gain")):
         if isinstance(getattr(section, key), list):
@@ -118,8 +121,8 @@ def _noise(config: Config, count: int) -> tuple[FloatArray, str]:
     )
 
 
-def _vibrations(config: Config, count: int) -> dict[int, list[Vibration]]:
-    """Vibrations of the model on tip and on tilt, each axis by itself."""
+def _axis_vibrations(config: Config, count: int) -> dict[int, list[Vibration]]:
+    """Return the vibrations of the model on tip and on tilt, each axis by itself."""
     found: dict[int, list[Vibration]] = {}
     for line in config.plant.vibrations:
         for axis, part in enumerate(line.direction):
@@ -136,7 +139,7 @@ def _vibrations(config: Config, count: int) -> dict[int, list[Vibration]]:
 
 
 def _mirror_notes(config: Config) -> list[str]:
-    """Say what the controllers know of a mirror with dynamics."""
+    """Say what the controllers know of the mirror, unless it settles at once."""
     if config.hardware.mirror is None:
         return []
     return [
@@ -146,28 +149,28 @@ def _mirror_notes(config: Config) -> list[str]:
     ]
 
 
-def _total(rms: FloatArray) -> float:
+def _norm(rms: FloatArray) -> float:
     return float(np.sqrt(np.sum(rms**2)))
 
 
-def _records(
+def _order_records(
     count: int,
     turbulence: FloatArray,
     noise: FloatArray,
     gains: FloatArray,
     residuals: list[FloatArray],
 ) -> list[dict[str, Any]]:
-    """One row a radial order: its first mode's gain, and sums over its modes."""
+    """Return one record per radial order: its mean gain, and sums over its modes."""
     radial, _ = noll_orders(count)
     rows = []
     for order in range(1, int(radial[-1]) + 1):
         which = radial == order
-        uniform, optimised, filtered = (_total(rms[which]) for rms in residuals)
+        uniform, optimised, filtered = (_norm(rms[which]) for rms in residuals)
         rows.append(
             {
                 "radial_order": order,
                 "modes": int(which.sum()),
-                "turbulence_nm": _total(turbulence[which]),
+                "turbulence_nm": _norm(turbulence[which]),
                 "noise_nm": float(noise[which][0]),
                 "gain": float(gains[which].mean()),
                 "uniform_nm": uniform,
@@ -178,17 +181,17 @@ def _records(
     return rows
 
 
-def _totals(whole: dict[str, float], turbulence: float) -> TableText:
-    rows = [["none, turbulence alone", fixed(turbulence, 1)]]
-    rows += [[name, fixed(value, 1)] for name, value in whole.items()]
+def _whole_table(whole: dict[str, float], turbulence: float) -> TableText:
+    rows = [["none, turbulence alone", format_fixed(turbulence, 1)]]
+    rows += [[name, format_fixed(value, 1)] for name, value in whole.items()]
     return TableText(title="All modes", headings=["controller", "residual [nm]"], rows=rows)
 
 
-def _orders(records: list[dict[str, Any]]) -> TableText:
+def _order_table(records: list[dict[str, Any]]) -> TableText:
     digits = {"noise_nm": 2, "gain": 3}
     rows = [
         [
-            str(value) if isinstance(value, int) else fixed(value, digits.get(key, 1))
+            str(value) if isinstance(value, int) else format_fixed(value, digits.get(key, 1))
             for key, value in record.items()
         ]
         for record in records

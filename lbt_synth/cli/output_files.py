@@ -1,4 +1,4 @@
-"""Outputs that a study writes: tables (.csv) and figures, as many as were asked for."""
+"""Files that commands write: directories, tables (.csv), figures, telemetry."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from typing import Any
 
 from lbt_synth.cli.output import Report
 from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.report.figures.style import FIGURE_ENDINGS, save_figure
+from lbt_synth.files import Telemetry, save_telemetry
+from lbt_synth.files.telemetry.aot import lost_fields
+from lbt_synth.files.telemetry.store import require_telemetry_name
+from lbt_synth.report.figures.style import FIGURE_ENDINGS, require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_writable, write_atomically
 from lbt_synth.storage.tables import csv_bytes
 
 
-def made_directory(path: str | Path) -> Path:
-    """Return a directory, made if it was not there."""
+def make_directory(path: str | Path) -> Path:
+    """Make a directory if there is none, and return its path."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -26,8 +29,13 @@ def made_directory(path: str | Path) -> Path:
     return folder
 
 
+def require_figure(output: str, *, inputs: Sequence[str]) -> None:
+    """Refuse an output that cannot become a figure."""
+    require_writable(require_figure_name(output), inputs=inputs)
+
+
 def require_outputs(outputs: Sequence[str], *, inputs: Sequence[str]) -> None:
-    """Refuse names of neither a table nor a figure, inputs, and places that cannot be written."""
+    """Refuse outputs that cannot become a table or a figure, or would replace an input."""
     for output in outputs:
         if Path(output).suffix.lower() not in (".csv", *FIGURE_ENDINGS):
             raise ProblemError(
@@ -43,7 +51,7 @@ def write_outputs(
     records: Sequence[Mapping[str, Any]],
     figure: Callable[[], Any],
 ) -> None:
-    """Write each output, and note it in the report."""
+    """Write each output as its ending says, and note it in the report."""
     report.data["files"] = []
     for output in outputs:
         if Path(output).suffix.lower() == ".csv":
@@ -55,9 +63,29 @@ def write_outputs(
 
 
 def records_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return records with the same keys as a CSV table; what is not a number is left empty."""
+    """Return records with the same keys as a CSV table, with empty cells for nan."""
     cells = [
         ["" if isinstance(v, float) and math.isnan(v) else v for v in record.values()]
         for record in records
     ]
     return csv_bytes(list(records[0]), cells)
+
+
+def write_telemetry(
+    report: Report,
+    output: str,
+    telemetry: Telemetry,
+    *,
+    key: str,
+    what: str = "telemetry",
+    kind: str | None = None,
+    precision: str = "float64",
+) -> None:
+    """Write telemetry, and note in the report the file and what its format leaves out."""
+    kind = require_telemetry_name(output, kind)
+    path = save_telemetry(output, telemetry, format=kind, precision=precision)
+    lost = lost_fields(telemetry) if kind == "aot" else ()
+    report.data |= {key: str(path), "lost": list(lost)}
+    report.notes.append(f"written: {path} ({what})")
+    if lost:
+        report.notes.append(f"note: the AOT standard has no place for {', '.join(lost)}.")

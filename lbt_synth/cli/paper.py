@@ -1,25 +1,28 @@
-"""The command that sets the paper's tables beside ours."""
+"""The command paper: the tables and figures of Agapito et al. (2008), ours beside theirs."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from typing import Any
 
-from lbt_synth.cli.output import Report, TableText, progress
-from lbt_synth.cli.output_files import made_directory
+from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output_files import make_directory
+from lbt_synth.cli.progress import track_progress
 from lbt_synth.report.paper import PaperResult, write_paper
 from lbt_synth.studies.paper.parameters import PARAMETERS
 from lbt_synth.studies.paper.published import TABLE_III
-from lbt_synth.studies.paper.tables import Comparison, rms_difference, table_iii
+from lbt_synth.studies.paper.tables import TableEntry, rms_difference, table_iii
 
 _NAMES = {"classical": "classical", "kalman": "mixed Kalman", "hinf": "mixed H-inf"}
 
 
-def paper(arguments: Namespace) -> Report:
+def run(arguments: Namespace) -> Report:
     """Compute and write the tables and figures of the paper."""
-    folder = made_directory(arguments.output)
+    folder = make_directory(arguments.output)
     rows = list(
-        progress(table_iii(), total=2 * len(TABLE_III), what="Table III", quiet=arguments.json)
+        track_progress(
+            table_iii(), total=2 * len(TABLE_III), what="Table III", quiet=arguments.json
+        )
     )
     result = write_paper(folder, rows)
     columns = {
@@ -28,8 +31,8 @@ def paper(arguments: Namespace) -> Report:
     }
     return Report(
         data={
-            "table_ii": [_entry(e) for e in result.table_ii],
-            "table_iii": [_entry(e) for e in result.table_iii],
+            "table_ii": [_entry_record(e) for e in result.table_ii],
+            "table_iii": [_entry_record(e) for e in result.table_iii],
             "table_iii_rms_points": columns,
             "hinf_gamma_ratio": _gamma_ratio(result),
             "parameters": [parameter._asdict() for parameter in PARAMETERS],
@@ -39,8 +42,8 @@ def paper(arguments: Namespace) -> Report:
             TableText(
                 title="Parameters", headings=("parameter", "value", "origin"), rows=PARAMETERS
             ),
-            _comparison("Table II: Strehl ratio [%] at 2.2 um", result.table_ii),
-            _comparison("Table III: Strehl ratio [%] at 2.2 um", result.table_iii),
+            _comparison_table("Table II: Strehl ratio [%] at 2.2 um", result.table_ii),
+            _comparison_table("Table III: Strehl ratio [%] at 2.2 um", result.table_iii),
         ],
         notes=[
             f"Table III, rms difference: Kalman {columns['kalman']:.2f} points, "
@@ -58,7 +61,7 @@ def _gamma_ratio(result: PaperResult) -> float:
     return design.gamma_requested / design.gamma_least
 
 
-def _entry(entry: Comparison) -> dict[str, Any]:
+def _entry_record(entry: TableEntry) -> dict[str, Any]:
     return {
         "row": entry.label,
         "method": entry.method,
@@ -68,7 +71,7 @@ def _entry(entry: Comparison) -> dict[str, Any]:
     }
 
 
-def _comparison(title: str, entries: list[Comparison]) -> TableText:
+def _comparison_table(title: str, entries: list[TableEntry]) -> TableText:
     methods = list(dict.fromkeys(e.method for e in entries))
     cells = {(e.label, e.method): e for e in entries}
     headings = ["row"]

@@ -6,8 +6,10 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
-from lbt_synth.cli.output import Report, TableText, counting, fixed
-from lbt_synth.cli.simulate import named_designs
+from lbt_synth.cli.certificate_table import check_records
+from lbt_synth.cli.loop_inputs import load_designs
+from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import DesignAssessment, DesignReport, design_report, write_report
@@ -18,24 +20,24 @@ from lbt_synth.report.provenance import require_letters, time_text
 from lbt_synth.studies import LimitRow
 
 
-def report_command(arguments: Namespace) -> Report:
-    """Examine designs in the loop of a configuration, and write what was found."""
+def run(arguments: Namespace) -> Report:
+    """Assess designs in the loop of a configuration, and write the page."""
     inputs = (arguments.config, *arguments.gains)
     require_page_names(arguments.output, arguments.pdf, inputs=inputs)
     if arguments.title is not None and not arguments.title.strip():
         raise ProblemError("--title must hold at least one letter; got an empty text.")
     require_letters(arguments.title or "", "--title")
     config = load_config(arguments.config)
-    designs = named_designs(arguments.gains)
+    designs = load_designs(arguments.gains)
     files = dict(zip(designs, arguments.gains, strict=True))
     total = steps_of(len(designs)) + 1
-    with counting(total=total, what="report", quiet=arguments.json) as count:
+    with count_progress(total=total, what="report", quiet=arguments.json) as count:
         found = design_report(config, designs, gain_files=files, advance=count)
         written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
         count(1)
     return Report(
         data={
-            "designs": {one.name: _numbers(found, one, row) for one, row in found.rows},
+            "designs": {one.name: _design_record(found, one, row) for one, row in found.rows},
             "verdict": verdict(found),
             "limit_nm": None if found.limits.limit is None else found.limits.limit.rms_nm,
             "sensor_gain": found.real_gain,
@@ -62,10 +64,10 @@ def report_command(arguments: Namespace) -> Report:
                         one.design.method,
                         one.stable,
                         one.certified,
-                        fixed(one.residual_nm, 2),
-                        fixed(100 * one.strehl, 2),
-                        fixed(100 * _worst(one), 2),
-                        None if one.margins is None else fixed(one.margins.modulus, 3),
+                        format_fixed(one.residual_nm, 2),
+                        format_fixed(100 * one.strehl, 2),
+                        format_fixed(100 * _worst_strehl(one), 2),
+                        None if one.margins is None else format_fixed(one.margins.modulus, 3),
                     )
                     for one in found.assessments
                 ],
@@ -79,11 +81,10 @@ def report_command(arguments: Namespace) -> Report:
     )
 
 
-def _numbers(found: DesignReport, one: DesignAssessment, row: LimitRow) -> dict[str, Any]:
-    """Return the numbers of the summary of one design."""
-    run = found.simulations.get(one.name)
-    budget = one.budget
-    good = good_range(one)
+def _design_record(found: DesignReport, one: DesignAssessment, row: LimitRow) -> dict[str, Any]:
+    """Return the summary of one design for JSON."""
+    budget, good = one.budget, good_range(one)
+    simulation = found.simulations.get(one.name)
     return {
         "method": one.design.method,
         "route": one.design.solver.route,
@@ -93,14 +94,14 @@ def _numbers(found: DesignReport, one: DesignAssessment, row: LimitRow) -> dict[
         "stable": one.stable,
         "spectral_radius": one.spectral_radius,
         "certified": one.certified,
-        "checks": [asdict(check) | {"passed": check.passed} for check in one.checks],
+        "checks": check_records(one.checks),
         "residual_nm": one.residual_nm,
         "turbulence_nm": None if budget is None else budget.turbulence_nm,
         "vibration_nm": None if budget is None else budget.vibration_nm,
         "noise_nm": None if budget is None else budget.noise_nm,
         "strehl": one.strehl,
-        "strehl_simulated": None if run is None else run.strehl,
-        "worst_strehl": _worst(one),
+        "strehl_simulated": None if simulation is None else simulation.strehl,
+        "worst_strehl": _worst_strehl(one),
         "good_errors_hz": None if good is None else [good.low_hz, good.high_hz],
         "above_limit_percent": row.above_limit_percent,
         "worst_nm": row.worst_nm,
@@ -111,5 +112,5 @@ def _numbers(found: DesignReport, one: DesignAssessment, row: LimitRow) -> dict[
     }
 
 
-def _worst(one: DesignAssessment) -> float:
+def _worst_strehl(one: DesignAssessment) -> float:
     return float(one.curve.strehl.min()) if one.stable else float("nan")

@@ -1,4 +1,4 @@
-"""The command robustness: filters designed anew at each error, or maps of fixed designs."""
+"""The command robustness: filters redesigned at each frequency error, or maps of gain files."""
 
 from __future__ import annotations
 
@@ -10,59 +10,60 @@ from typing import Any
 import numpy as np
 
 from lbt_synth import studies
-from lbt_synth.cli.output import Report, TableText, counting, fixed, progress
+from lbt_synth.cli.loop_inputs import load_designs, truth_at_sensor_gain
+from lbt_synth.cli.output import Report, TableText, format_fixed
 from lbt_synth.cli.output_files import require_outputs, write_outputs
-from lbt_synth.cli.simulate import named_designs, real_truth
+from lbt_synth.cli.progress import count_progress, track_progress
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import stable_sensor_gains
-from lbt_synth.models.loop_hardware import same_mirror
+from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.studies.robustness import METHODS
-from lbt_synth.validation import FloatArray, frozen, number
+from lbt_synth.validation import FloatArray, frozen_copy, number
 
-_MOST_VALUES = 2001  # of one axis
-_FEW = 8  # sensor gains that are all listed
+_MOST_VALUES = 2001  # of frequency errors or sensor gains
+_LISTED_GAINS = 8  # of more sensor gains, the table shows about so many
 
 
-def robustness(arguments: Namespace) -> Report:
-    """Strehl ratio over an error of the vibration frequency."""
+def run(arguments: Namespace) -> Report:
+    """Compute the Strehl ratio over an error of the vibration frequency."""
     require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
-    _require_matching_options(arguments)
+    _refuse_unused_options(arguments)
     config = load_config(arguments.config)
-    return _maps(config, arguments) if arguments.gains else _designed_anew(config, arguments)
+    return (_map_designs if arguments.gains else _redesign)(config, arguments)
 
 
-def _require_matching_options(arguments: Namespace) -> None:
-    """Refuse options of designing anew beside gain files, and those of maps without."""
-    anew = {"--sensor-gain": arguments.sensor_gain, "--gamma-ratio": arguments.gamma_ratio}
-    fixed = {
+def _refuse_unused_options(arguments: Namespace) -> None:
+    """Refuse the options of redesigning beside gain files, and those of maps without them."""
+    redesign = {"--sensor-gain": arguments.sensor_gain, "--gamma-ratio": arguments.gamma_ratio}
+    maps = {
         "--errors-hz": arguments.errors_hz,
         "--sensor-gains": arguments.sensor_gains,
         "--delay-errors": arguments.delay_errors,
     }
     if arguments.gains:
-        wrong = anew
-        reason = "is for designing anew, without gain files; the options of these are "
-        reason += ", ".join(fixed)
+        unused = redesign
+        reason = "is for redesigning, without gain files; the options of these are "
+        reason += ", ".join(maps)
     else:
-        wrong, reason = fixed, "goes with gain files, whose designs stay as they are; name some"
-    for option, value in wrong.items():
+        unused, reason = maps, "goes with gain files, whose designs stay as they are; name some"
+    for option, value in unused.items():
         if value is not None:
             raise ProblemError(f"{option} {reason}.")
 
 
-def _designed_anew(config: Config, arguments: Namespace) -> Report:
+def _redesign(config: Config, arguments: Namespace) -> Report:
     settings = config.settings
     ratio = arguments.gamma_ratio
     errors = settings.robustness.errors_hz
     rows = list(
-        progress(
+        track_progress(
             studies.robustness(
                 config.plant,
-                real_truth(config, arguments),
+                truth_at_sensor_gain(config, arguments.sensor_gain),
                 config.imaging,
                 errors_hz=errors,
                 gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
@@ -73,8 +74,9 @@ def _designed_anew(config: Config, arguments: Namespace) -> Report:
             quiet=arguments.json,
         )
     )
+    records = [asdict(row) for row in rows]
     report = Report(
-        data={"rows": [asdict(row) for row in rows]},
+        data={"rows": records},
         tables=[
             TableText(
                 title="Robustness to the vibration frequency",
@@ -92,11 +94,11 @@ def _designed_anew(config: Config, arguments: Namespace) -> Report:
                     (
                         f"{row.error_hz:+.2f}",
                         row.method,
-                        fixed(100 * row.strehl, 2),
-                        fixed(row.residual_nm, 1),
-                        fixed(row.vibration_nm, 1),
-                        fixed(row.turbulence_nm, 1),
-                        fixed(row.noise_nm, 1),
+                        format_fixed(100 * row.strehl, 2),
+                        format_fixed(row.residual_nm, 1),
+                        format_fixed(row.vibration_nm, 1),
+                        format_fixed(row.turbulence_nm, 1),
+                        format_fixed(row.noise_nm, 1),
                         row.stable,
                     )
                     for row in rows
@@ -104,40 +106,35 @@ def _designed_anew(config: Config, arguments: Namespace) -> Report:
             )
         ],
     )
-    write_outputs(
-        report,
-        arguments.output,
-        records=[asdict(row) for row in rows],
-        figure=lambda: robustness_figure(rows),
-    )
+    write_outputs(report, arguments.output, records=records, figure=lambda: robustness_figure(rows))
     return report
 
 
-def _maps(config: Config, arguments: Namespace) -> Report:
-    """Strehl ratio of the designs of gain files over error, sensor gain and delay error."""
+def _map_designs(config: Config, arguments: Namespace) -> Report:
+    """Map the Strehl ratio of gain files over frequency error, sensor gain and delay error."""
     settings = config.settings.robustness
-    errors = _values(arguments.errors_hz, "--errors-hz", _refined(settings.errors_hz))
-    gains = _values(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
+    errors = _parse_range(arguments.errors_hz, "--errors-hz", _refine(settings.errors_hz))
+    gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
     delays = arguments.delay_errors or settings.delay_errors_frames
     for gain in gains:
         number(gain, "--sensor-gains", above=0)
-    designs = named_designs(arguments.gains)
-    believed = {name: _believed_gain(name, d, config) for name, d in designs.items()}
+    designs = load_designs(arguments.gains)
+    assumed = {name: _assumed_gain(name, d, config) for name, d in designs.items()}
     maps = {}
     total = len(designs) * errors.size * gains.size * len(delays)
-    with counting(total=total, what="points", quiet=arguments.json) as count:
+    with count_progress(total=total, what="points", quiet=arguments.json) as count:
         for name, design in designs.items():
             found = robustness_map(
                 design,
                 config.truth,
                 config.imaging,
                 errors_hz=errors,
-                sensor_gains=gains / believed[name],
+                sensor_gains=gains / assumed[name],
                 delay_errors_frames=delays,
                 advance=count,
             )
-            maps[name] = replace(found, sensor_gains=frozen(gains))  # the real ones again
-    intervals = {name: _intervals(designs[name], maps[name], believed[name]) for name in designs}
+            maps[name] = replace(found, sensor_gains=frozen_copy(gains))  # the real ones again
+    intervals = {name: _stable_gains(designs[name], maps[name], assumed[name]) for name in designs}
     report = Report(
         data={
             "maps": {
@@ -145,29 +142,29 @@ def _maps(config: Config, arguments: Namespace) -> Report:
                 for name, found in maps.items()
             }
         },
-        tables=[_summary(name, found) for name, found in maps.items()],
+        tables=[_map_table(name, found) for name, found in maps.items()],
         notes=_map_notes(config, designs, maps, intervals),
     )
     write_outputs(
         report,
         arguments.output,
-        records=[record for name, found in maps.items() for record in _records(name, found)],
+        records=[record for name, found in maps.items() for record in _map_records(name, found)],
         figure=lambda: robustness_map_figure(maps),
     )
     return report
 
 
-def _refined(values: Sequence[float]) -> FloatArray:
-    """Return values in increasing order, with three more between any two of them."""
+def _refine(values: Sequence[float]) -> FloatArray:
+    """Sort values, and add three between any two of them."""
     known = np.unique(values)
     places = np.arange(4 * known.size - 3) / 4
     return np.asarray(np.interp(places, np.arange(known.size), known))
 
 
-def _values(
+def _parse_range(
     given: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
 ) -> FloatArray:
-    """Values of one axis: LOW HIGH COUNT of the command line, or those of the configuration."""
+    """Return the values of LOW HIGH COUNT, or those of the configuration where none are given."""
     if given is None:
         return np.array(default)
     low, high, count = (number(value, option) for value in given)
@@ -179,8 +176,8 @@ def _values(
     return np.linspace(low, high, int(count))
 
 
-def _believed_gain(name: str, design: Design, config: Config) -> float:
-    """Sensor gain that a design assumes, relative to the configuration's ``sensor.matrix``."""
+def _assumed_gain(name: str, design: Design, config: Config) -> float:
+    """Return the sensor gain that a design assumes, relative to ``sensor.matrix``."""
     own, here = design.hardware, config.hardware
     if own is None:
         raise ProblemError(f"{name} is a filter of a bare estimation problem; a map needs a loop.")
@@ -197,7 +194,7 @@ def _believed_gain(name: str, design: Design, config: Config) -> float:
     gain = 0.0
     if own.sensor.shape == unit.shape:
         gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
-    if not (gain > 0 and _alike(own.sensor, gain * unit) and _alike(own.influence, here.influence)):
+    if not (gain > 0 and _close(own.sensor, gain * unit) and _close(own.influence, here.influence)):
         raise ProblemError(
             f"{name} must have the configuration's sensor and influence matrices, up to a sensor "
             "gain; it has others. Design it for this configuration."
@@ -205,34 +202,36 @@ def _believed_gain(name: str, design: Design, config: Config) -> float:
     return gain
 
 
-def _alike(one: FloatArray, other: FloatArray) -> bool:
+def _close(one: FloatArray, other: FloatArray) -> bool:
     size = float(np.max(np.abs(other)))
     return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, atol=1e-12 * size)
 
 
-def _intervals(design: Design, found: RobustnessMap, believed: float) -> list[tuple[float, float]]:
-    """Interval of stable real sensor gains at each delay error, nan if none is found."""
-    assert design.hardware is not None  # _believed_gain has refused the others
-    out = []
+def _stable_gains(
+    design: Design, found: RobustnessMap, assumed: float
+) -> list[tuple[float, float]]:
+    """Return the interval of stable real sensor gains at each delay error, or nan for none."""
+    assert design.hardware is not None  # _assumed_gain has refused the others
+    intervals = []
     for delay, stable in zip(found.delay_errors_frames, found.stable, strict=True):
         real = replace(design.hardware, delay_frames=design.hardware.delay_frames + delay)
         # around the gain that the design assumes, if the loop is stable there
-        starts = [believed, *found.sensor_gains[stable]]
+        starts = [assumed, *found.sensor_gains[stable]]
         low = high = float("nan")
         for start in starts:
-            low, high = stable_sensor_gains(real, design.controller, nominal=start / believed)
+            low, high = stable_sensor_gains(real, design.controller, nominal=start / assumed)
             if not np.isnan(low):
                 break
-        out.append((low * believed, high * believed))
-    return out
+        intervals.append((low * assumed, high * assumed))
+    return intervals
 
 
-def _summary(name: str, found: RobustnessMap) -> TableText:
+def _map_table(name: str, found: RobustnessMap) -> TableText:
     gains = found.sensor_gains
-    if gains.size <= _FEW:
+    if gains.size <= _LISTED_GAINS:
         shown = np.arange(gains.size)
     else:  # some from end to end, and the one that is nearest to 1
-        some = np.linspace(0, gains.size - 1, _FEW - 1).round().astype(int)
+        some = np.linspace(0, gains.size - 1, _LISTED_GAINS - 1).round().astype(int)
         shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
     centre = np.nonzero(found.errors_hz == 0)[0]
     rows = []
@@ -246,8 +245,8 @@ def _summary(name: str, found: RobustnessMap) -> TableText:
                     f"{gains[j]:.3f}",
                     f"{delay:+g}",
                     stable,
-                    fixed(strehls[centre[0]], 2) if centre.size else None,
-                    fixed(strehls[worst], 2),
+                    format_fixed(strehls[centre[0]], 2) if centre.size else None,
+                    format_fixed(strehls[worst], 2),
                     f"{found.errors_hz[worst]:+.2f}" if stable else None,
                 )
             )
@@ -285,7 +284,7 @@ def _map_notes(
                 f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
                 f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
             )
-        if not same_mirror(own, config.hardware):
+        if not have_same_mirror(own, config.hardware):
             notes.append(
                 f"note: {name} was designed for another mirror than the configuration's, and its "
                 "map is that of its own."
@@ -293,7 +292,7 @@ def _map_notes(
     return notes
 
 
-def _records(name: str, found: RobustnessMap) -> list[dict[str, Any]]:
+def _map_records(name: str, found: RobustnessMap) -> list[dict[str, Any]]:
     return [
         {
             "file": name,

@@ -1,4 +1,4 @@
-"""Command ``study``: run, dry run, replay of a row."""
+"""The command study: run a study, say what it would cost, or replay one of its rows."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.cli.output import Report, TableText, counting, working
-from lbt_synth.cli.output_files import made_directory
+from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output_files import make_directory
+from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import write_study_page
 from lbt_synth.storage.atomic_files import refuse_replacing
@@ -28,41 +29,40 @@ from lbt_synth.studies import (
     study_statistics,
     summary_tables,
 )
-from lbt_synth.studies.study.cluster import connected
+from lbt_synth.studies.study.cluster import connect_cluster
 from lbt_synth.studies.study.output_files import read_failures
-from lbt_synth.studies.study.run import Whole, written_files
+from lbt_synth.studies.study.run import FinishedStudy, output_paths
 from lbt_synth.studies.study.store import PAGE, PRINT
 from lbt_synth.studies.study.summary import worst_table
 
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
-def study(arguments: Namespace) -> Report:
-    """Run a study, say what it will cost, or replay one of its rows."""
+def run(arguments: Namespace) -> Report:
+    """Run a study, say what it would cost, or replay one of its rows."""
     if arguments.jobs < 1:
         raise ProblemError(f"--jobs must be at least 1; got {arguments.jobs}.")
     folder = Path(arguments.output)
-    with working("reading the study, designing", quiet=arguments.json):
+    with show_spinner("reading the study, designing", quiet=arguments.json):
         loaded = load_study(arguments.study, directory=folder)
-    refuse_replacing(written_files(folder, loaded), loaded.inputs)
+    refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:
         return _dry_run(loaded, arguments)
     if arguments.row is not None:
         return _replay(loaded, folder, arguments)
-    return _run(loaded, folder, arguments)
+    return _run_study(loaded, folder, arguments)
 
 
-# ---------------------------------------------------------------- run
-def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
+def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     found: list[tuple[StudyStatistics, bool]] = []
     files = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
     with _engine(arguments) as (executor, workers):
-        made_directory(folder)
-        with counting(
+        make_directory(folder)
+        with count_progress(
             total=loaded.samples, what="samples", quiet=arguments.json, rate=True
         ) as count:
             try:
-                run = run_study(
+                study_run = run_study(
                     loaded,
                     folder,
                     executor=executor,
@@ -70,44 +70,47 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
                     workers=workers,
                     progress=count,
                     whole=lambda results: found.append(
-                        (_summarised(loaded, files, results), results.new)
+                        (_summarise(loaded, files, results), results.new)
                     ),
                 )
             except KeyboardInterrupt:
-                kept = f"lbt-synth: what is finished is kept in {folder}; start again, it goes on"
-                print(kept, file=sys.stderr)
+                note = (
+                    f"lbt-synth: what is finished is kept in {folder}; start it again to continue"
+                )
+                print(note, file=sys.stderr)
                 raise
     report = Report(
         data={
-            "samples": run.samples,
-            "computed": run.computed,
-            "failures": run.failures,
-            "retry": run.retry,
-            "computing_seconds": run.computing_s,
-            "seconds": run.seconds,
-            "files": [str(path) for path in (run.results, run.failed, *files)],
+            "samples": study_run.samples,
+            "computed": study_run.computed,
+            "failures": study_run.failures,
+            "retry": study_run.retry,
+            "computing_seconds": study_run.computing_s,
+            "seconds": study_run.seconds,
+            "files": [str(path) for path in (study_run.results, study_run.failed, *files)],
         }
     )
     [(statistics, new)] = found
     varying = [p.name for p in loaded.parameters if p.distribution.varies]
     report.data["statistics"] = asdict(statistics)
-    report.tables = [_text_of(table) for table in summary_tables(statistics)]
+    report.tables = [_printed_table(table) for table in summary_tables(statistics)]
     report.tables += [
-        _text_of(worst_table(each, varying), rows=_WORST) for each in statistics.controllers
+        _printed_table(worst_table(each, varying), rows=_WORST) for each in statistics.controllers
     ]
     report.notes.append(
-        f"{run.computed} of {run.samples} samples computed in {_duration(run.computing_s)}; with "
-        f"tables and page {_duration(run.seconds)}."
+        f"{study_run.computed} of {study_run.samples} samples computed in "
+        f"{_duration(study_run.computing_s)}; with tables and page {_duration(study_run.seconds)}."
         if new
-        else f"{folder} is finished: {run.samples} samples in {run.results.name}; none computed."
+        else f"{folder} is finished: {study_run.samples} samples in {study_run.results.name}; none "
+        "computed."
     )
     report.notes += _sampling_notes(loaded)
-    if run.failures:
+    if study_run.failures:
         report.notes.append(
-            f"note: {run.failures} results failed, see {run.failed}."
+            f"note: {study_run.failures} results failed, see {study_run.failed}."
             + (
                 " Those that ended their process are tried again if it is started again."
-                if run.retry
+                if study_run.retry
                 else ""
             )
         )
@@ -118,16 +121,16 @@ def _run(loaded: Study, folder: Path, arguments: Namespace) -> Report:
 
 @contextlib.contextmanager
 def _engine(arguments: Namespace) -> Iterator[tuple[Executor | None, int | None]]:
-    """Give the executor of ``--dask`` and its workers, or none for ``--jobs``."""
+    """Yield the executor of ``--dask`` and its workers, or None for both with ``--jobs``."""
     if arguments.dask is None:
         yield None, None
         return
-    with connected(arguments.dask) as cluster:
+    with connect_cluster(arguments.dask) as cluster:
         yield cluster.executor, cluster.workers
 
 
-def _summarised(loaded: Study, files: Sequence[Path], results: Whole) -> StudyStatistics:
-    """Compute the statistics of a whole study, and write its page if it is not there."""
+def _summarise(loaded: Study, files: Sequence[Path], results: FinishedStudy) -> StudyStatistics:
+    """Compute the statistics of a finished study, and write its page if it is missing."""
     page, *pdf = files
     statistics = study_statistics(
         results.columns,
@@ -150,7 +153,7 @@ def _summarised(loaded: Study, files: Sequence[Path], results: Whole) -> StudySt
     return statistics
 
 
-def _text_of(table: Table, rows: int | None = None) -> TableText:
+def _printed_table(table: Table, rows: int | None = None) -> TableText:
     cells = [
         [cell.text if isinstance(cell, Cell) else cell for cell in row] for row in table.rows[:rows]
     ]
@@ -180,11 +183,10 @@ def _sampling_notes(loaded: Study) -> list[str]:
     ]
 
 
-# ---------------------------------------------------------------- dry run
 def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     with _engine(arguments) as (_, workers):
         count = workers or arguments.jobs
-    with working("measuring a batch", quiet=arguments.json):
+    with show_spinner("measuring a batch", quiet=arguments.json):
         cost = estimate_study(loaded, workers=count, local=workers is None)
     where = f"{count} {'process' if count == 1 else 'processes'}"
     if workers is not None:
@@ -236,39 +238,40 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     )
 
 
-# ---------------------------------------------------------------- replay
 def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
-        made_directory(folder)
-    with working("replaying", quiet=arguments.json):
-        again = replay_row(loaded, folder, arguments.row)
-    names = loaded.result_columns
+        make_directory(folder)
+    with show_spinner("replaying", quiet=arguments.json):
+        replay = replay_row(loaded, folder, arguments.row)
     data: dict[str, Any] = {
-        "row": again.row,
-        "parameters": again.parameters,
-        "stored": again.stored,
-        "fresh": again.fresh,
-        "failures": [asdict(failure) for failure in again.failures],
-        "files": [str(path) for path in again.files],
+        "row": replay.row,
+        "parameters": replay.parameters,
+        "stored": replay.stored,
+        "fresh": replay.fresh,
+        "failures": [asdict(failure) for failure in replay.failures],
+        "files": [str(path) for path in replay.files],
     }
     return Report(
         data=data,
         tables=[
             TableText(
-                title=f"Row {again.row}",
+                title=f"Row {replay.row}",
                 headings=("parameter", "value"),
-                rows=list(again.parameters.items()),
+                rows=list(replay.parameters.items()),
             ),
             TableText(
                 title="Results",
                 headings=("result", "stored", "now"),
-                rows=[(name, again.stored.get(name), again.fresh.get(name)) for name in names],
+                rows=[
+                    (name, replay.stored.get(name), replay.fresh.get(name))
+                    for name in loaded.result_columns
+                ],
             ),
         ],
         notes=[
-            *([] if again.stored else ["note: the study has no result of this row yet."]),
-            *(f"failed: {failure.controller}: {failure.error}" for failure in again.failures),
-            *([f"note: {again.unwritten}"] if again.unwritten else []),
-            *(f"written: {path}" for path in again.files),
+            *([] if replay.stored else ["note: the study has no result of this row yet."]),
+            *(f"failed: {failure.controller}: {failure.error}" for failure in replay.failures),
+            *([f"note: {replay.unwritten}"] if replay.unwritten else []),
+            *(f"written: {path}" for path in replay.files),
         ],
     )

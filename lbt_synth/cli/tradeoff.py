@@ -6,8 +6,9 @@ from argparse import Namespace
 from dataclasses import fields
 from typing import Any
 
-from lbt_synth.cli.output import Report, TableText, progress
+from lbt_synth.cli.output import Report, TableText
 from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.progress import track_progress
 from lbt_synth.config import load_config
 from lbt_synth.report.figures import tradeoff_figure
 from lbt_synth.studies import TradeoffPoint, tradeoff
@@ -15,14 +16,14 @@ from lbt_synth.studies.tradeoff import FAMILIES
 from lbt_synth.validation import integer
 
 
-def tradeoff_command(arguments: Namespace) -> Report:
-    """Make filters from the least norm to the least variance."""
+def run(arguments: Namespace) -> Report:
+    """Design filters from the least norm to the least variance, and compare them."""
     require_outputs(arguments.output, inputs=[arguments.config])
     count = integer(arguments.points, "--points", at_least=2)
     taps = integer(arguments.taps, "--taps", at_least=1)
     config = load_config(arguments.config)
     points = list(
-        progress(
+        track_progress(
             tradeoff(config.plant, points=count, taps=taps),
             total=count * len(FAMILIES),
             what="filters",

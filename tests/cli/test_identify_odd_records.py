@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from support.commands import run
 from support.recorded_loops import spliced_record
-from test_cli import run
 
 
 def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys) -> None:

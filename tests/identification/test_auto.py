@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from support.recorded_loops import LINE, RATE, spliced_record
 
 import lbt_synth as lbt
@@ -24,3 +25,20 @@ def test_a_design_is_doubted_where_the_gains_disagree() -> None:
         notes = (str(error),)
     assert any("sensor gain" in note for note in notes)
     assert lbt.design_from_record(first).notes == ()
+
+
+def test_a_design_needs_a_delay_and_data():
+    noise = np.random.default_rng(0).standard_normal((9000, 1))
+    with pytest.raises(lbt.errors.ProblemError, match="needs the delay"):
+        lbt.design_from_record(
+            lbt.identification.loop_record(noise, noise, frame_rate_hz=RATE, unit="nm")
+        )
+    with pytest.raises(lbt.errors.ProblemError, match="LoopRecord"):
+        lbt.design_from_record(noise)
+    short = lbt.identification.loop_record(
+        noise[:900], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+    )
+    with pytest.raises(lbt.errors.ProblemError, match="4096"):
+        lbt.design_from_record(short)
+    with pytest.raises(lbt.errors.ProblemError, match="method"):
+        lbt.design_from_record(short, method="magic")

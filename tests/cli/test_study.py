@@ -1,4 +1,4 @@
-"""``lbt-synth study`` as it is used: run, killed, interrupted, replayed, on Dask."""
+"""The command study: run, killed, interrupted, replayed, on Dask."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import run
 from support.studies import study_file
 from test_campaign import alive, wait_for
-from test_cli import run
 from test_study_run import TWO, assert_whole, quick, table
 
 import lbt_synth as lbt
-from lbt_synth.studies.study.cluster import connected
-from lbt_synth.studies.study.store import part_list
+from lbt_synth.studies.study.cluster import connect_cluster
+from lbt_synth.studies.study.store import list_parts
 
 PARAMETERS = (
     "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, truth.sensor_gain: {uniform: [0.5, 1]}, "
@@ -48,7 +48,6 @@ def children(pid):
     return []
 
 
-# ---------------------------------------------------------------- run and replay
 def test_the_command(tmp_path, capsys):
     path = study_file(tmp_path, samples="200", controllers=TWO, parameters=PARAMETERS)
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--dry-run")
@@ -137,17 +136,16 @@ def test_dask_without_its_package(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-# ---------------------------------------------------------------- killed and interrupted
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_killed_it_goes_on_where_it_was(tmp_path, capsys, jobs):
     path = study_file(tmp_path, samples="600", parameters=PARAMETERS)
     folder = tmp_path / "out"
     first = started(path, "-o", folder, "--jobs", jobs)
-    wait_for(lambda: len(part_list(folder)) >= 2, seconds=120)
+    wait_for(lambda: len(list_parts(folder)) >= 2, seconds=120)
     workers = children(first.pid)
     first.send_signal(signal.SIGKILL)
     first.communicate()
-    kept = {(part.start, part.stop): part.path.stat().st_mtime_ns for part in part_list(folder)}
+    kept = {(part.start, part.stop): part.path.stat().st_mtime_ns for part in list_parts(folder)}
     assert sum(stop - start for start, stop in kept) < 600
     wait_for(lambda: not any(alive(pid) for pid in workers))  # none is left behind
     status, out, error = run(capsys, "study", path, "-o", folder)
@@ -166,17 +164,17 @@ def test_an_interrupt_ends_it_at_once(tmp_path):
     path = study_file(tmp_path, samples="300000", parameters=PARAMETERS)
     folder = tmp_path / "out"
     first = started(path, "-o", folder, "--jobs", "2")
-    wait_for(lambda: len(part_list(folder)) >= 2, seconds=120)
+    wait_for(lambda: len(list_parts(folder)) >= 2, seconds=120)
     workers = children(first.pid)
     before = time.monotonic()
     first.send_signal(signal.SIGINT)
     out, error = first.communicate(timeout=60)
     assert time.monotonic() - before < 30
     assert (first.returncode, out) == (130, "")
-    kept = f"lbt-synth: what is finished is kept in {folder}; start again, it goes on"
+    kept = f"lbt-synth: what is finished is kept in {folder}; start it again to continue"
     assert error.splitlines() == [kept, "lbt-synth: interrupted"]
     wait_for(lambda: not any(alive(pid) for pid in workers))
-    assert len(part_list(folder)) >= 2
+    assert len(list_parts(folder)) >= 2
     assert not list(folder.rglob(".*.npz*"))
 
 
@@ -185,7 +183,7 @@ def test_two_in_one_directory(tmp_path, capsys):
     folder = tmp_path / "out"
     first = started(path, "-o", folder)
     try:
-        wait_for(lambda: len(part_list(folder)) >= 1, seconds=120)
+        wait_for(lambda: len(list_parts(folder)) >= 1, seconds=120)
         status, _, error = run(capsys, "study", path, "-o", folder)
         assert status == 2
         assert "another study is running in" in error
@@ -194,7 +192,6 @@ def test_two_in_one_directory(tmp_path, capsys):
         first.communicate()
 
 
-# ---------------------------------------------------------------- Dask
 @pytest.fixture(scope="module")
 def cluster():
     distributed = pytest.importorskip("distributed")
@@ -287,7 +284,7 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
 def test_dask_logs_no_tracebacks(capsys, cluster):
     """A scheduler that is gone is told by our error alone."""
     logger = logging.getLogger("distributed.client")
-    with connected(cluster.scheduler_address):
+    with connect_cluster(cluster.scheduler_address):
         logger.error("a traceback")
         assert not logger.isEnabledFor(logging.ERROR)
     assert logger.isEnabledFor(logging.ERROR)

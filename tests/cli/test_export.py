@@ -1,4 +1,4 @@
-"""``lbt-synth export``, and the cost that ``show`` prints."""
+"""The command export."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from scipy.io import loadmat
+from support.commands import run
 from support.compiled import Compiled
 from support.exports import lbt_config, lbt_designs, transfer_functions
 
 import lbt_synth as lbt
-from lbt_synth.cli.main import main
 
 
 @pytest.fixture
@@ -25,15 +25,6 @@ def loaded():
 @pytest.fixture
 def designs():
     return lbt_designs()
-
-
-def run(capsys, *arguments):
-    try:
-        status = main([str(a) for a in arguments])
-    except SystemExit as stop:  # argparse
-        status = stop.code
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
 
 
 @pytest.fixture(scope="module")
@@ -109,18 +100,6 @@ def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys):
     assert status == 0
     assert re.search(r"note: in single precision commands are off by [\d.]+ of the largest", text)
     assert "note:" not in run(capsys, *arguments)[1]
-
-
-@pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_show_prints_the_cost(capsys, designs, gains, name):
-    cost = lbt.interop.frame_cost(designs[name])
-    status, text, _ = run(capsys, "show", gains[name])
-    assert status == 0
-    assert re.search(rf"multiplications a frame +{cost.multiplications} +\({cost.form}\)", text)
-    assert re.search(rf"coefficients, single +{cost.coefficient_bytes_single} +bytes", text)
-    data = json.loads(run(capsys, "show", gains[name], "--json")[1])["frame_cost"]
-    assert data["dense_additions"] == cost.dense_additions
-    assert data["state_bytes_double"] == cost.state_bytes_double
 
 
 BAD = [

@@ -1,4 +1,4 @@
-"""Telemetry at the command line."""
+"""The command telemetry, and the telemetry of simulate."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import sys
 
 import numpy as np
 import pytest
+from support.commands import run
 from support.plants import LBT_YAML
-from test_cli import run
 from test_telemetry import full, same
 
 import lbt_synth as lbt
-from lbt_synth.files.telemetry.aot import losses
+from lbt_synth.files.telemetry.aot import lost_fields
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_conversion_to_the_standard_says_what_is_lost(tmp_path, capsys, night):
     assert status == 0
     assert "the AOT standard has no place for residual_nm, total_nm, controller" in text
     seen = lbt.files.load_telemetry(night)
-    assert same(seen, lbt.files.load_telemetry(out), but=losses(seen), rtol=1e-14)
+    assert same(seen, lbt.files.load_telemetry(out), but=lost_fields(seen), rtol=1e-14)
     status, text, _ = run(capsys, "telemetry", out, "--json", "-o", tmp_path / "b.aot.fits")
     assert status == 0
     assert json.loads(text)["lost"] == []

@@ -7,8 +7,8 @@ import json
 
 import numpy as np
 import pytest
+from support.commands import run
 from support.plants import LBT_YAML
-from test_cli import run
 
 import lbt_synth as lbt
 

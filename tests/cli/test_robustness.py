@@ -1,4 +1,4 @@
-"""The command robustness with gain files."""
+"""The command robustness, without and with gain files."""
 
 from __future__ import annotations
 
@@ -8,13 +8,24 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from support.commands import run
 from support.plants import LBT_YAML
-from test_cli import run
 from test_map import single
 
 import lbt_synth as lbt
 
 CONFIG = str(LBT_YAML)
+
+
+def test_robustness(tmp_path, capsys):
+    table, figure = tmp_path / "r.csv", tmp_path / "r.png"
+    status, text, _ = run(capsys, "robustness", CONFIG, "-o", table, "-o", figure)
+    assert status == 0
+    assert "error [Hz]" in text
+    lines = table.read_text().splitlines()
+    assert lines[0].startswith("error_hz,method,strehl,residual_nm")
+    assert len(lines) == 31
+    assert figure.exists()
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +40,7 @@ def kalman(settings):
 
 @pytest.fixture(scope="module")
 def robust(settings):
-    return lbt.hinf(settings.plant, gamma_ratio=1.2, method="riccati")
+    return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,151 @@
+"""The command auto: from a record to a gain file, tested on unseen data."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+
+from lbt_synth.cli.identification_files import (
+    figure_path,
+    model_text,
+    require_model_name,
+    require_places,
+)
+from lbt_synth.cli.identification_tables import add_model, add_record, marked_note
+from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.progress import count_progress
+from lbt_synth.cli.record_arguments import identification_options, read_record
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import save_gain
+from lbt_synth.files.gain_file.store import require_gain_name
+from lbt_synth.identification import (
+    LoopRecord,
+    RecordedDesign,
+    SpectrumRecord,
+    design_from_record,
+)
+from lbt_synth.identification.prediction.comparison import RAN
+from lbt_synth.loop import Imaging, close_loop, loop_margins
+from lbt_synth.report.figures import identification_figure
+from lbt_synth.report.figures.style import save_figure
+from lbt_synth.storage.atomic_files import write_atomically
+
+_MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
+
+
+def run(arguments: Namespace) -> Report:
+    """Identify a loop, design its controller, test it on unseen data, write its gain file."""
+    output = Path(require_gain_name(arguments.output))
+    figure_file = figure_path(arguments, output)
+    model_file = require_model_name(
+        output.with_suffix(".yaml") if arguments.model is None else Path(arguments.model)
+    )
+    require_places(arguments, output, model_file, figure_file)
+    record = read_record(arguments)
+    if isinstance(record, SpectrumRecord):
+        raise ProblemError(
+            "auto tests its design on the recorded series; got a spectrum. Try lbt-synth identify "
+            "and lbt-synth design."
+        )
+    with count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count:
+        found = design_from_record(
+            record,
+            method=arguments.method,
+            gamma_ratio=arguments.gamma_ratio,
+            imaging=Imaging(
+                diameter_m=record.diameter_m,
+                obstruction=0.0 if record.obstruction is None else record.obstruction,
+                wavelength_um=arguments.wavelength_um,
+            ),
+            progress=count,
+            **identification_options(arguments, record),
+        )
+    report = Report(data={"source": str(arguments.file)})
+    add_record(report, record)
+    add_model(report, found.model)
+    _add_comparison(report, found, record)
+    _add_certificate(report, found)
+    # everything is computed before the first file is written
+    text = model_text(found.model, arguments, record)
+    figure = None
+    if figure_file is not None:
+        figure = identification_figure(found.model, designs={found.name: found.design})
+    report.note_written(save_gain(output, found.design))
+    report.note_written(write_atomically(model_file, text), "model")
+    if figure_file is not None:
+        report.note_written(save_figure(figure, figure_file), "figure")
+    return report
+
+
+def _add_comparison(report: Report, found: RecordedDesign, record: LoopRecord) -> None:
+    """Add what the second half of the data says of a design from the first."""
+    table = found.held_out
+    report.tables.append(
+        TableText(
+            title="Residual on the second half of the record, by models of the first",
+            headings=(
+                "controller",
+                "data [nm]",
+                "+-",
+                "model [nm]",
+                "data/model",
+                "Strehl, data",
+                "Strehl, model",
+            ),
+            rows=[
+                (
+                    entry.name,
+                    format_fixed(entry.replayed_nm, 2),
+                    format_fixed(entry.replayed_error_nm, 2),
+                    format_fixed(entry.model_nm, 2),
+                    format_fixed(entry.ratio, 3),
+                    format_fixed(entry.strehl, 3),
+                    format_fixed(entry.model_strehl, 3),
+                )
+                for entry in table.entries
+            ],
+        )
+    )
+    report.notes += [f"note: {note}" for note in table.notes]
+    report.data["held_out"] = [
+        {
+            "name": entry.name,
+            "data_nm": entry.replayed_nm,
+            "data_error_nm": entry.replayed_error_nm,
+            "model_nm": entry.model_nm,
+            "strehl": entry.strehl,
+            "model_strehl": entry.model_strehl,
+        }
+        for entry in table.entries
+    ]
+    best = table[found.name]
+    report.data["gain_over_what_ran"] = None
+    if record.commands is not None:
+        ran = table[RAN]
+        report.notes.append(
+            f"gain over what ran, on unseen data: residual {ran.replayed_nm:.4g} -> "
+            f"{best.replayed_nm:.4g} nm, Strehl ratio of tip and tilt {ran.strehl:.3f} -> "
+            f"{best.strehl:.3f}."
+        )
+        report.data["gain_over_what_ran"] = {
+            "residual_nm": [ran.replayed_nm, best.replayed_nm],
+            "strehl": [ran.strehl, best.strehl],
+        }
+    if abs(best.deviations) > _MOST_DEVIATIONS:
+        more = "more" if best.deviations > 0 else "less"
+        report.notes.append(
+            f"warning: on unseen data the {found.name} leaves {more} than the model expects, by "
+            f"{abs(best.deviations):.1f} standard errors: the disturbance changed, or the model "
+            "leaves something out."
+        )
+    report.notes += [marked_note(note) for note in found.notes]
+
+
+def _add_certificate(report: Report, found: RecordedDesign) -> None:
+    loop = close_loop(found.model.hardware, found.design.controller)
+    margins = loop_margins(loop)
+    report.data["certificate"] = found.design.certificate.passed
+    report.notes.append(
+        f"certified: spectral radius of the loop {loop.spectral_radius:.6f}, modulus margin "
+        f"{margins.modulus:.3f}."
+    )

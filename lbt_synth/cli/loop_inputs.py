@@ -1,0 +1,46 @@
+"""Designs and truths that several commands put into a loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from lbt_synth.config import Config
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import load_gain
+from lbt_synth.models import Truth
+from lbt_synth.models.loop_hardware import loop_differences
+
+
+def load_designs(paths: list[str]) -> dict[str, Design]:
+    """Load designs, named by the stems of their files or, where these repeat, by longer tails."""
+    if len({Path(path).resolve() for path in paths}) != len(paths):
+        raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
+    stems = [Path(path).stem for path in paths]
+    names = stems if len(set(stems)) == len(stems) else _distinct_tails(paths)
+    return {name: load_gain(path) for name, path in zip(names, paths, strict=True)}
+
+
+def _distinct_tails(paths: list[str]) -> list[str]:
+    """Return the last parts of different paths, as few as distinguish all of them."""
+    whole = [Path(path).resolve().parts for path in paths]
+    for count in range(1, max(map(len, whole))):
+        names = ["/".join(parts[-count:]) for parts in whole]
+        if len(set(names)) == len(names):
+            return names
+    return paths
+
+
+def loop_difference_notes(config: Config, design: Design) -> list[str]:
+    """Say where a design was made for another loop than the configuration's."""
+    if design.hardware is None:
+        return []
+    return [f"note: {text}" for text in loop_differences(design.hardware, config.hardware)]
+
+
+def truth_at_sensor_gain(config: Config, sensor_gain: float | None) -> Truth:
+    """Return the configuration's truth, at the real sensor gain of the command line if given."""
+    if sensor_gain is None:
+        return config.truth
+    return replace(config.truth, sensor_gain=sensor_gain / config.sensor_gain)

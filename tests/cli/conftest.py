@@ -1,0 +1,36 @@
+"""Files that the tests of several commands read."""
+
+from __future__ import annotations
+
+import pytest
+from support.night import GAIN, simulated_night
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+
+
+@pytest.fixture(scope="session")
+def gains(tmp_path_factory):
+    """Gain files of three designs for the LBT, by their names."""
+    folder = tmp_path_factory.mktemp("gains")
+    config = lbt.load_config(LBT_YAML)
+    designs = {
+        "kalman": lbt.kalman(config.plant),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
+        "integrator": lbt.integrator(config.hardware, gain=0.5),
+    }
+    return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in designs.items()}
+
+
+@pytest.fixture(scope="session")
+def recorded_loop():
+    """A loop of two axes that ran with an integrator: its simulation, hardware and design."""
+    return simulated_night()
+
+
+@pytest.fixture(scope="session")
+def recorded_night(recorded_loop, tmp_path_factory):
+    """The telemetry of that loop."""
+    simulation, path, ran = recorded_loop
+    seen = lbt.files.telemetry_from_simulation(simulation, path, sensor_gain=GAIN, design=ran)
+    return lbt.files.save_telemetry(tmp_path_factory.mktemp("night") / "night.fits", seen)

@@ -1,0 +1,120 @@
+"""The command auto: good records, and bad ones."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.commands import run
+from support.night import GAIN, NOISE
+
+import lbt_synth as lbt
+
+
+@pytest.fixture(scope="module")
+def made(recorded_night, tmp_path_factory):
+    """Everything that auto writes, and what it says."""
+    import contextlib
+    import io
+
+    from lbt_synth.cli.main import main
+
+    out = tmp_path_factory.mktemp("auto") / "tt.fits"
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        assert main(["auto", str(recorded_night), "-o", str(out), "--json"]) == 0
+    return out, json.loads(text.getvalue())
+
+
+def test_auto_tests_its_design_on_unseen_data(made, recorded_loop):
+    out, data = made
+    rows = {row["name"]: row for row in data["held_out"]}
+    assert list(rows) == [
+        "what ran",
+        "best integrator",
+        "Kalman filter",
+        "least-squares predictor",
+        "limit of performance",
+    ]
+    kalman = rows["Kalman filter"]
+    assert kalman["data_nm"] < 0.5 * rows["what ran"]["data_nm"]
+    assert kalman["data_nm"] < 1.02 * rows["least-squares predictor"]["data_nm"]
+    assert kalman["data_nm"] == pytest.approx(kalman["model_nm"], rel=0.1)
+    # what ran is what the simulation left in its second half
+    run_, _, _ = recorded_loop
+    half = run_.residual_nm[0, len(run_.residual_nm[0]) // 2 :]
+    true = np.sqrt(np.sum(np.mean(half**2, axis=0)))
+    gain = data["axes"][0]["sensor_gain"]
+    assert rows["what ran"]["data_nm"] == pytest.approx(true * GAIN / gain, rel=0.05)
+    assert data["gain_over_what_ran"]["residual_nm"][1] == kalman["data_nm"]
+    assert data["certificate"] is True
+    assert lbt.load_gain(out).certificate.passed
+    assert lbt.load_config(data["model"]).plant.vibrations
+    assert out.with_suffix(".png").is_file()
+
+
+def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
+    out = tmp_path / "h.npz"
+    status, text, error = run(
+        capsys,
+        "auto",
+        recorded_night,
+        "-o",
+        out,
+        "--method",
+        "hinf",
+        "--gamma-ratio",
+        1.3,
+        "--no-figure",
+        "--model",
+        tmp_path / "m.yml",
+        "--sensor-gain",
+        GAIN,
+    )
+    assert (status, error) == (0, "")
+    assert "gain over what ran, on unseen data: residual" in text
+    assert "sensor gain given." in text
+    assert "H-infinity filter" in text
+    assert not (tmp_path / "h.png").exists()
+    assert (tmp_path / "m.yml").is_file()
+
+
+def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
+    run_, _, _ = recorded_loop
+    file = tmp_path / "open.npy"
+    noise = np.random.default_rng(0).standard_normal(len(run_.total_nm[0]))
+    np.save(file, run_.total_nm[0][:, 0] + NOISE * noise)
+    status, text, error = run(
+        capsys,
+        "auto",
+        file,
+        "-o",
+        tmp_path / "t.fits",
+        "--kind",
+        "open-loop",
+        "--frame-rate-hz",
+        1000,
+        "--delay-frames",
+        2,
+        "--unit",
+        "nm",
+        "--no-figure",
+    )
+    assert (status, error) == (0, "")
+    assert "what ran" not in text
+    assert "Kalman filter" in text
+    assert lbt.load_config(tmp_path / "t.yaml").plant.hardware.modes == 1
+
+
+def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
+    for options, words in (
+        (("-o", tmp_path / "t.fits", "--gamma-ratio", 0.5), "gamma_ratio"),
+        (("-o", tmp_path / "t.txt"), "must end in"),
+        (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.fits"), "must end in .yaml"),
+        (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.json"), "must end in .yaml"),
+    ):
+        status, _, error = run(capsys, "auto", recorded_night, *options)
+        assert status == 2
+        assert words in error
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,166 @@
+"""The command line as a user meets it: bad input, exit codes, help, imports."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.commands import run
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+from lbt_synth.cli.parser import COMMANDS
+
+CONFIG = str(LBT_YAML)
+
+
+BAD = [
+    (("design", CONFIG, "--method", "hinf", "--gamma", "10", "-o", "OUT.fits"), 1, "at least 15"),
+    (("design", CONFIG, "--method", "hinf", "--gamma", "nan", "-o", "OUT.fits"), 2, "finite"),
+    (
+        ("design", CONFIG, "--method", "hinf", "--gamma-ratio", "0.5", "-o", "OUT.fits"),
+        2,
+        "at least 1",
+    ),
+    (
+        ("design", CONFIG, "--method", "kalman", "--gamma", "200", "-o", "OUT.fits"),
+        2,
+        "goes with --method hinf",
+    ),
+    (
+        ("design", CONFIG, "--method", "kalman", "--route", "lmi", "-o", "OUT.fits"),
+        2,
+        "takes riccati or sdp",
+    ),
+    (
+        ("design", CONFIG, "--method", "kalman", "--gain", "0.5", "-o", "OUT.fits"),
+        2,
+        "goes with --method integrator",
+    ),
+    (
+        ("design", CONFIG, "--method", "integrator", "--gain", "1.5", "-o", "OUT.fits"),
+        1,
+        "failed its certificate",
+    ),
+    (("design", CONFIG, "--method", "kalman", "-o", "OUT.txt"), 2, "must end in .fits"),
+    (("design", CONFIG, "--method", "kalman", "-o", "none/OUT.fits"), 2, "cannot write"),
+    (("design", "none.yaml", "--method", "kalman", "-o", "OUT.fits"), 2, "cannot read none.yaml"),
+    (("design", CONFIG, "--method", "magic", "-o", "OUT.fits"), 2, "invalid choice"),
+    (("design", CONFIG), 2, "required"),
+    (("show", "none.fits"), 2, "cannot read none.fits"),
+    (("show", CONFIG), 2, "must end in"),
+    (("verify", "DAMAGED.fits"), 2, "damaged"),
+    (("sigma", "DAMAGED.fits", "-o", "OUT.png"), 2, "damaged"),
+    (("sigma", "KALMAN", "-o", "OUT.gif"), 2, "must end in .png"),
+    (("sigma", "KALMAN", "KALMAN", "-o", "OUT.png"), 2, "given once"),
+    (("sigma", "KALMAN", "--sensor-gain", "-1", "-o", "OUT.png"), 2, "above 0"),
+    (("simulate", CONFIG, "KALMAN", "--frames", "0"), 2, "at least 1"),
+    (("simulate", CONFIG, "KALMAN", "--frames", "many"), 2, "invalid int"),
+    (("simulate", CONFIG, "KALMAN", "-o", "OUT.doc"), 2, "must end in .png"),
+    (("robustness", CONFIG, "-o", "OUT.xls"), 2, "must end in .csv"),
+    (("robustness", CONFIG, "--gamma-ratio", "nan"), 2, "finite"),
+    (("design", CONFIG, "--method", "hinf", "--gamma", "1e300", "-o", "OUT.fits"), 2, "at most"),
+    (("simulate", CONFIG, "KALMAN", "--frames", "99999999999999"), 2, "must fit into"),
+    (("simulate", CONFIG, "KALMAN", "-o", "none/OUT.png"), 2, "no directory none"),
+    (("robustness", CONFIG, "-o", "OUT.csv", "-o", "none/OUT.png"), 2, "no directory none"),
+    (("paper", "-o", "FILE"), 2, "cannot make the directory"),
+    (("frobnicate",), 2, "invalid choice"),
+    ((), 2, "required"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "expected", "text"), BAD)
+def test_bad_input(tmp_path, capsys, monkeypatch, gains, arguments, expected, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DAMAGED.fits").write_bytes(gains["kalman"].read_bytes()[:4000])
+    (tmp_path / "FILE").write_text("")
+    before = sorted(os.listdir(tmp_path))
+    arguments = [str(gains["kalman"]) if a == "KALMAN" else a for a in arguments]
+    status, out, error = run(capsys, *arguments)
+    assert status == expected
+    assert out == ""
+    assert text in error
+    assert "Traceback" not in error
+    assert sorted(os.listdir(tmp_path)) == before  # nothing half-written
+
+
+def test_one_line_an_error(capsys):
+    _, _, error = run(capsys, "show", "none.fits")
+    assert error.startswith("lbt-synth: error: ")
+    assert error.count("\n") == 1
+
+
+def test_version_and_help(capsys):
+    assert run(capsys, "--version")[1] == f"lbt-synth {lbt.__version__}\n"
+    status, text, _ = run(capsys, "--help")
+    assert status == 0
+    for command in ("design", "show", "verify", "sigma", "simulate", "robustness", "paper"):
+        assert command in text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_module_of_its_name(command):
+    module = importlib.import_module(f"lbt_synth.cli.{command.replace('-', '_')}")
+    assert callable(module.run)
+    assert module.__doc__.startswith(f"The command {command}: ")
+
+
+def loaded_after(code):
+    """Modules in memory after a fresh interpreter ran some code."""
+    script = f"{code}\nimport sys\nprint('\\n'.join(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import lbt_synth",
+        "from lbt_synth.cli.main import build_parser; build_parser().format_help()",
+    ],
+)
+def test_imports_are_quick(code):
+    """Nothing heavier than the standard library before a name is used."""
+    heavy = {
+        "cvxpy",
+        "control",
+        "matplotlib",
+        "astropy",
+        "scipy",
+        "pydantic",
+        "rich",
+        "numpy",
+        "bokeh",
+        "jinja2",
+    }
+    assert not heavy & loaded_after(code)
+
+
+def test_designing_needs_no_solver_that_it_does_not_use():
+    code = (
+        "import lbt_synth as lbt\n"
+        "p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)\n"
+        "lbt.kalman(p)"
+    )
+    assert not {"cvxpy", "control", "matplotlib", "astropy"} & loaded_after(code)
+
+
+def test_the_console_script_survives_a_closed_pipe():
+    script = f"{sys.executable} -m lbt_synth.cli.main design --help | head -1"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the device is Linux's own")
+def test_output_that_cannot_be_written(gains):
+    script = f"{sys.executable} -m lbt_synth.cli.main verify {gains['kalman']} > /dev/full"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert "cannot write the output" in done.stderr

@@ -1,0 +1,41 @@
+"""The command show."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from support.commands import run
+from support.exports import lbt_designs
+
+import lbt_synth as lbt
+
+
+@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
+def test_show_and_verify(capsys, gains, name):
+    status, text, _ = run(capsys, "show", gains[name], "--matrices")
+    assert status == 0
+    assert "stable sensor gains, from" in text
+    status, text, _ = run(capsys, "show", gains[name], "--json", "--matrices")
+    data = json.loads(text)
+    assert status == 0
+    assert data["margins"]["modulus"] > 0
+    status, text, _ = run(capsys, "verify", gains[name])
+    assert status == 0
+    assert "verified" in text
+    assert json.loads(run(capsys, "verify", gains[name], "--json")[1])["passed"] is True
+
+
+@pytest.mark.parametrize("name", ["kalman", "turned"])
+def test_show_prints_the_cost(tmp_path, capsys, name):
+    design = lbt_designs()[name]
+    gain = lbt.save_gain(tmp_path / f"{name}.fits", design)
+    cost = lbt.interop.frame_cost(design)
+    status, text, _ = run(capsys, "show", gain)
+    assert status == 0
+    assert re.search(rf"multiplications a frame +{cost.multiplications} +\({cost.form}\)", text)
+    assert re.search(rf"coefficients, single +{cost.coefficient_bytes_single} +bytes", text)
+    data = json.loads(run(capsys, "show", gain, "--json")[1])["frame_cost"]
+    assert data["dense_additions"] == cost.dense_additions
+    assert data["state_bytes_double"] == cost.state_bytes_double

@@ -1,0 +1,49 @@
+"""The command simulate."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from support.commands import run
+from support.plants import LBT_YAML
+
+CONFIG = str(LBT_YAML)
+
+
+def test_simulate(tmp_path, capsys, gains):
+    out = tmp_path / "run.png"
+    arguments = ("simulate", CONFIG, gains["kalman"], "--frames", 2000, "--cases", 2)
+    status, text, _ = run(capsys, *arguments, "-o", out)
+    assert status == 0
+    assert "Strehl ratio" in text
+    assert out.exists()
+    data = json.loads(run(capsys, *arguments, "--json")[1])
+    assert len(data["strehl"]) == 2
+    assert data["strehl_exact"] == pytest.approx(0.836, abs=0.002)
+    again = json.loads(run(capsys, *arguments, "--json")[1])
+    assert again == data  # seeds make runs repeatable
+    dim = json.loads(run(capsys, *arguments, "--json", "--sensor-gain", 0.4)[1])
+    assert dim["sensor_gain"] == 0.4
+    assert dim["strehl_exact"] < data["strehl_exact"]
+
+
+def test_an_unstable_loop_has_status_1(capsys, gains):
+    status, out, error = run(
+        capsys, "simulate", CONFIG, gains["hinf"], "--sensor-gain", 0.3, "--json"
+    )
+    assert status == 1
+    assert json.loads(out)["error"] == "UnstableLoopError"
+    assert "the closed loop must be stable" in error
+
+
+def test_a_controller_for_another_loop_gets_a_note(tmp_path, capsys, gains):
+    text = LBT_YAML.read_text().replace("delay_frames: 2.0", "delay_frames: 2.4")
+    (tmp_path / "other.yaml").write_text(text)
+    status, out, _ = run(
+        capsys, "simulate", tmp_path / "other.yaml", gains["kalman"], "--frames", 500, "--cases", 1
+    )
+    assert status == 0
+    assert "note: designed for a delay of 2 frames, run with 2.4." in out
+    assert "scatter" not in out  # one run has none
+    assert "1 run of 500 frames" in out

@@ -1,0 +1,15 @@
+"""Commands of ``lbt-synth``, run in the process of the tests."""
+
+from __future__ import annotations
+
+from lbt_synth.cli.main import main
+
+
+def run(capsys, *arguments):
+    """Exit status, standard output and standard error of one command."""
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as stop:  # argparse
+        status = stop.code
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
