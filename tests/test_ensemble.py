@@ -175,7 +175,7 @@ def test_unstable_loops_are_told(kalman):
 
 
 def test_a_mirror_with_dynamics(kalman):
-    shell = lbt.models.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.from_bandwidth(
         natural_frequency_hz=50, damping=0.5, bandwidth_hz=300
     )
     design = lbt.kalman(plant(mirror=shell))
@@ -275,7 +275,7 @@ def test_a_peak_upon_much_that_is_flat(distance):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_states_in_any_units_leave_the_same(seed):
-    shell = lbt.models.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.from_bandwidth(
         natural_frequency_hz=50, damping=0.5, bandwidth_hz=600
     )
     design = lbt.kalman(plant(mirror=shell, delay_frames=3))
@@ -477,12 +477,12 @@ WRONG = [
     ({"sensor_gain": [np.nan, 1]}, lbt.errors.ProblemError, "finite"),
     ({"noise_nm": -1.0}, lbt.errors.ProblemError, "noise_nm must be at least 0"),
     ({"delay_frames": [0.5, 2]}, lbt.errors.ProblemError, "delay_frames must be at least 1"),
-    ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, lbt.errors.DimensionError, "one entry a loop"),
+    ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, lbt.errors.DimensionError, "one entry per loop"),
     ({"sensor_gain": []}, lbt.errors.DimensionError, "at least one loop"),
     ({"turbulence": "von Karman"}, lbt.errors.ProblemError, "turbulence must be"),
     ({"vibrations": [LINE]}, lbt.errors.ProblemError, "EnsembleVibration"),
-    ({"turbulence": (AIR, AIR, AIR)}, lbt.errors.DimensionError, "one entry a mode"),
-    ({"noise_nm": np.ones((2, 3))}, lbt.errors.DimensionError, "one column a measurement"),
+    ({"turbulence": (AIR, AIR, AIR)}, lbt.errors.DimensionError, "one entry per mode"),
+    ({"noise_nm": np.ones((2, 3))}, lbt.errors.DimensionError, "one column per measurement"),
     (
         {"turbulence": lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
         lbt.errors.ProblemError,
@@ -551,7 +551,7 @@ def test_frequencies_of_flows():
 
 def test_controllers_that_do_not_fit(kalman):
     ensemble = lbt.loop.LoopEnsemble(loops=3)
-    with pytest.raises(lbt.errors.DimensionError, match=r"one a loop \(3\)"):
+    with pytest.raises(lbt.errors.DimensionError, match=r"one per loop \(3\)"):
         lbt.loop.ensemble_residuals([kalman.controller] * 2, kalman.hardware, ensemble)
     small = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     with pytest.raises(lbt.errors.DimensionError, match="map 1 measurements"):

@@ -2,7 +2,7 @@
 
 A controller, designed here or elsewhere, is closed around the sensor, the delay and the mirror.
 Residuals are exact integrals over spectra, not averages over a simulation.
-The least residual of any linear controller stands beside them.
+They can be compared with the least residual that any linear controller leaves.
 """
 
 import lazy_loader

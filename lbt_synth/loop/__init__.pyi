@@ -1,4 +1,5 @@
 from .budget import ResidualBudget as ResidualBudget
+from .budget import model_budget as model_budget
 from .budget import residual_budget as residual_budget
 from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
@@ -14,7 +15,6 @@ from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins
 from .margins import stable_sensor_gains as stable_sensor_gains
 from .mirror_settling import settling_error as settling_error
-from .model_truth import model_budget as model_budget
 from .simulation.block_filtering import filter_series as filter_series
 from .simulation.run import Simulation as Simulation
 from .simulation.run import simulate as simulate

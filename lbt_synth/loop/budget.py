@@ -1,8 +1,8 @@
-"""Residual of a closed loop without noise of sampling: the exact answer.
+"""The exact residual of one closed loop, by origin: turbulence, vibrations, noise.
 
-White noise and auto-regressive disturbances by a Lyapunov equation, spectra by
-adaptive quadrature on panels that crowd at the closed loop's resonances, sinusoids by
-the frequency response.
+White noise and auto-regressive disturbances are solved by a Lyapunov equation, spectra by
+adaptive quadrature on panels that crowd at the loop's resonances, sinusoids by the frequency
+response.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import adaptive_integral
-from lbt_synth.loop.closed_loop import ClosedLoop
-from lbt_synth.models import ARModel, Spectrum, Truth, Vibration
+from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
+from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
+from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.models.truth import fitted_direction, stationary_vibrations
-from lbt_synth.validation import ComplexArray, FloatArray, frozen
+from lbt_synth.models.truth import checked_direction, stationary_vibrations
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,18 +42,18 @@ class ResidualBudget:
     @property
     def gaussian_nm2(self) -> FloatArray:
         """Covariance of all that is Gaussian [nm^2]."""
-        return frozen(self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2)
+        return frozen_copy(self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2)
 
     @property
     def vibration_nm2(self) -> FloatArray:
         """Covariance of all vibrations, the sinusoids by their mean power [nm^2]."""
         a = self.line_amplitudes_nm
-        return frozen(self.random_vibration_nm2 + np.real(a.T @ a.conj()) / 2)
+        return frozen_copy(self.random_vibration_nm2 + np.real(a.T @ a.conj()) / 2)
 
     @property
     def total_nm2(self) -> FloatArray:
         """Covariance of the residual [nm^2]."""
-        return frozen(self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2)
+        return frozen_copy(self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2)
 
     @property
     def rms_nm(self) -> float:
@@ -132,7 +133,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     random_vibration = np.zeros((n, n))
     lines = []
     for vibration in stationary_vibrations(truth.vibrations):
-        direction = fitted_direction(vibration, loop.hardware)
+        direction = checked_direction(vibration, loop.hardware)
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(loop.hardware.frame_rate_hz)
             random_vibration += ar_covariance(loop, model, direction[None])
@@ -140,29 +141,92 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
             response = loop.sensitivity([vibration.frequency_hz])[0]
             lines.append(vibration.amplitude_nm * response @ direction)
     return ResidualBudget(
-        turbulence_nm2=frozen(turbulence),
-        noise_nm2=frozen(noise_covariance(loop, truth)),
-        random_vibration_nm2=frozen(random_vibration),
+        turbulence_nm2=frozen_copy(turbulence),
+        noise_nm2=frozen_copy(noise_covariance(loop, truth)),
+        random_vibration_nm2=frozen_copy(random_vibration),
         line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
     )
 
 
+def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
+    """Exact stationary residual of a loop where a plant's model is the truth.
+
+    Each mode has its own turbulence and each measurement its own noise, as in the plant.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        A loop of the plant's hardware, around any controller.
+    plant : TipTiltPlant
+        Turbulence, vibrations and noise.
+
+    Returns
+    -------
+    ResidualBudget
+        Covariances by origin.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is unstable or marginally stable.
+    ProblemError
+        If the loop has another sensor, mirror or delay than the plant.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
+    >>> design = lbt.kalman(plant)
+    >>> loop = lbt.close_loop(plant.hardware, design.controller)
+    >>> bool(abs(lbt.loop.model_budget(loop, plant).rms_nm / design.rms - 1) < 1e-9)
+    True
+    """
+    require_instance(plant, TipTiltPlant)
+    require_instance(loop, ClosedLoop)
+    one, other = loop.hardware, plant.hardware
+    pairs = [(loop.sensor_gain * one.sensor, other.sensor), (one.influence, other.influence)]
+    alike = (
+        all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=0) for a, b in pairs)
+        and one.delay_frames == other.delay_frames
+        and have_same_mirror(one, other)
+    )
+    if not alike:
+        raise ProblemError(
+            "the loop must have the plant's sensor, mirror and delay; got another. Close it with "
+            "close_loop(plant.hardware, controller)."
+        )
+    loop.require_stable()
+    n, s = one.modes, loop.system
+    turbulence, vibration = np.zeros((2, n, n))
+    for model, direction in zip(plant.turbulence, np.eye(n), strict=True):
+        turbulence += ar_covariance(loop, model, direction[None])
+    for line in plant.vibrations:
+        direction = checked_direction(line, one)
+        vibration += ar_covariance(loop, line.ar_model(one.frame_rate_hz), direction[None])
+    entry, through = s.B[:, n:], s.D[:n, n:]
+    states = stationary_covariance(s.A, entry @ plant.R @ entry.T)
+    noise = s.C[:n] @ states @ s.C[:n].T + through @ plant.R @ through.T
+    return ResidualBudget(
+        turbulence_nm2=frozen_copy(turbulence),
+        noise_nm2=frozen_copy(noise),
+        random_vibration_nm2=frozen_copy(vibration),
+        line_amplitudes_nm=np.zeros((0, n), dtype=np.complex128),
+    )
+
+
 def noise_covariance(loop: ClosedLoop, truth: Truth) -> FloatArray:
-    """Covariance of the residual that a truth's white noise on each measurement leaves."""
+    """Covariance of the residual that white noise on each measurement leaves."""
     n, s = loop.hardware.modes, loop.system.balanced()
-    noise_nm = truth.noise_of(loop.hardware.n_measurements)
+    noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
     B, D = s.B[:, n:] * noise_nm, s.D[:n, n:] * noise_nm
     states = stationary_covariance(s.A, B @ B.T)
     return np.asarray(s.C[:n] @ states @ s.C[:n].T + D @ D.T)
 
 
 def ar_covariance(loop: ClosedLoop, model: ARModel, directions: FloatArray) -> FloatArray:
-    """Covariance of the residual that independent AR processes, one a direction, leave."""
-    if not np.isclose(model.frame_rate_hz, loop.hardware.frame_rate_hz, rtol=1e-9):
-        raise ProblemError(
-            f"a disturbance must be sampled at the loop's {loop.hardware.frame_rate_hz:.6g} Hz; "
-            f"got {model.frame_rate_hz:.6g} Hz."
-        )
+    """Covariance of the residual that independent AR processes leave, one per direction."""
+    require_loop_rate(model.frame_rate_hz, loop.hardware)
     total = np.zeros((loop.hardware.modes, loop.hardware.modes))
     for direction in directions:
         total += _directed_covariance(loop, model, direction)
@@ -201,14 +265,14 @@ def resonance_edges(loop: ClosedLoop) -> FloatArray:
     """Panels of (0, Nyquist) [Hz]: geometric, and more of them around each pole."""
     nyquist = loop.hardware.frame_rate_hz / 2
     edges = [np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(loop.system.poles)]
-    return frozen(distinct_edges(np.concatenate(edges)) * nyquist)
+    return frozen_copy(distinct_edges(np.concatenate(edges)) * nyquist)
 
 
 def pole_edges(poles: ComplexArray) -> FloatArray:
-    """Edges of panels around sharp poles, in units of the Nyquist frequency; in no order.
+    """Edges of panels around sharp poles, in units of the Nyquist frequency, unsorted.
 
-    They widen with the distance until other panels are as fine: a narrow peak's flank that lies
-    in one long panel is between the nodes of its halves, too.
+    The panels widen with the distance from the pole until other panels are as fine. A flank of a
+    narrow peak must not lie in one long panel: the nodes of its halves would miss it, too.
     """
     edges = [np.zeros(0)]
     for pole in np.ravel(poles):
@@ -221,6 +285,6 @@ def pole_edges(poles: ComplexArray) -> FloatArray:
 
 
 def distinct_edges(edges: FloatArray) -> FloatArray:
-    """Sort edges into (0, 1), without those that coincide."""
+    """Sort edges into (0, 1), and drop those that coincide."""
     grid = np.unique(np.clip(edges, 0, 1))
     return np.asarray(grid[np.concatenate([[True], np.diff(grid) > 1e-12])])

@@ -1,4 +1,4 @@
-"""The loop closed around a controller, as one linear system."""
+"""The loop closed around one controller, as a linear system."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class ClosedLoop:
         UnstableLoopError
             With the spectral radius.
         """
-        radius = self.spectral_radius
-        if not radius < 1 - STABILITY_MARGIN:
+        if not self.is_stable:
+            radius = self.spectral_radius
             word = "a marginally stable" if radius < 1 + STABILITY_MARGIN else "an unstable"
             raise UnstableLoopError(
                 f"the closed loop must be stable; got {word} one (spectral radius "
@@ -82,24 +82,24 @@ class ClosedLoop:
     def output_sensitivity(self) -> StateSpace:
         """System from measurement noise to measurement, ``(I + loop)^-1``."""
         n, m = self.hardware.modes, self.hardware.n_commands
-        return self._part(slice(n + m, None), slice(n, None))
+        return self._subsystem(slice(n + m, None), slice(n, None))
 
     def rejection(self) -> StateSpace:
         """System from the total phase to the residual."""
         n = self.hardware.modes
-        return self._part(slice(n), slice(n))
+        return self._subsystem(slice(n), slice(n))
 
     def noise_propagation(self) -> StateSpace:
         """System from the measurement noise to the residual."""
         n = self.hardware.modes
-        return self._part(slice(n), slice(n, None))
+        return self._subsystem(slice(n), slice(n, None))
 
     def commanding(self) -> StateSpace:
         """System from ``[phi_tot, noise]`` to the command."""
         n, m = self.hardware.modes, self.hardware.n_commands
-        return self._part(slice(n, n + m), slice(None))
+        return self._subsystem(slice(n, n + m), slice(None))
 
-    def _part(self, outputs: slice, inputs: slice) -> StateSpace:
+    def _subsystem(self, outputs: slice, inputs: slice) -> StateSpace:
         s = self.system
         return StateSpace(
             A=s.A, B=s.B[:, inputs], C=s.C[outputs], D=s.D[outputs, inputs], dt_s=s.dt_s
@@ -146,21 +146,13 @@ def close_loops(
 ) -> list[ClosedLoop]:
     """Return the loops closed at several sensor gains."""
     gains = [number(gain, "sensor_gain", above=0) for gain in sensor_gains]
-    A0, A1, inputs, outputs0, outputs1, direct = _loop_matrices(hardware, controller)
+    A0, A1, B, C0, C1, D = _loop_matrices(hardware, controller)
+    systems = (
+        StateSpace(A=A0 + g * A1, B=B, C=C0 + g * C1, D=D, dt_s=hardware.dt_s) for g in gains
+    )
     return [
-        ClosedLoop(
-            system=StateSpace(
-                A=A0 + gain * A1,
-                B=inputs,
-                C=outputs0 + gain * outputs1,
-                D=direct,
-                dt_s=hardware.dt_s,
-            ),
-            hardware=hardware,
-            controller=controller,
-            sensor_gain=gain,
-        )
-        for gain in gains
+        ClosedLoop(system=system, hardware=hardware, controller=controller, sensor_gain=gain)
+        for system, gain in zip(systems, gains, strict=True)
     ]
 
 
@@ -181,10 +173,7 @@ def spectral_radii(
 
 
 def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:
-    """Parts of the loop, each affine in the sensor gain g: ``A = A0 + g A1``, ``C = C0 + g C1``.
-
-    State: controller, mirror (its past commands, if it settles), last residual phi_res(k-1).
-    """
+    """Matrices of :func:`loop_matrices` for a controller of the loop's sizes."""
     require_matching_controller(hardware, controller)
     k = controller.to_statespace()
     return loop_matrices(
@@ -199,9 +188,9 @@ def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[Floa
 
 
 def require_matching_controller(hardware: LoopHardware, controller: Controller) -> None:
-    """Raise if a controller has other sizes or another sampling period than a loop."""
+    """Raise if a controller does not have a loop's sizes and sampling period."""
     m, q = hardware.n_commands, hardware.n_measurements
-    if (controller.C.shape[0], controller.B.shape[1]) != (m, q):
+    if controller.D.shape != (m, q):
         raise DimensionError(
             f"the controller must map {q} measurements to {m} commands; got "
             f"{controller.B.shape[1]} to {controller.C.shape[0]}."
@@ -210,6 +199,15 @@ def require_matching_controller(hardware: LoopHardware, controller: Controller) 
         raise ProblemError(
             f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
             f"designed for {1 / controller.dt_s:.6g} Hz. Design it for this frame rate."
+        )
+
+
+def require_loop_rate(frame_rate_hz: float, hardware: LoopHardware) -> None:
+    """Raise if a sampled disturbance does not have the loop's frame rate."""
+    if not np.isclose(frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
+        raise ProblemError(
+            f"a disturbance must be sampled at the loop's {hardware.frame_rate_hz:.6g} Hz; "
+            f"got {frame_rate_hz:.6g} Hz."
         )
 
 
@@ -225,7 +223,9 @@ def loop_matrices(
 ) -> tuple[FloatArray, ...]:
     """Close the loop around a controller in the textbook form, or around each of a stack.
 
-    Shapes: sensor, influence (q, n).
+    ``sensor`` is (q, n), ``influence`` (n, m). Return ``A0, A1, B, C0, C1, D``, affine in the
+    sensor gain g as in ``A0 + g A1``. The state is that of the controller, of the mirror (its past
+    commands, if it settles), and the last residual phi_res(k-1).
     """
     lead, order = A.shape[:-2], A.shape[-1]
     (q, n), m = sensor.shape, influence.shape[1]

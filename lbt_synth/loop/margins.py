@@ -1,4 +1,4 @@
-"""Stability margins of a loop, and the sensor gains for which it is stable."""
+"""Stability margins of a loop, and the interval of sensor gains that keeps it stable."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def stable_sensor_gains(
 
 
 def _crossings(loop: ClosedLoop, index: int) -> list[tuple[float, float]]:
-    """Frequencies [Hz] where one broken loop has unit gain, with its distance from -1 [rad].
+    """Frequencies [Hz] where one broken loop has unit gain, and its phase from -1 there [rad].
 
     With measurement i broken and the rest closed, ``1 + l_i = 1 / S_ii``.
     """

@@ -1,4 +1,4 @@
-"""What is left of the assumption that the mirror has settled: phi_cor(k-1) = N u(k-2)."""
+"""The error of assuming that the mirror settles at once: phi_cor(k-1) = N u(k-2)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from lbt_synth.linear import StateSpace
 from lbt_synth.loop.budget import ResidualBudget, residual_budget
 from lbt_synth.loop.closed_loop import ClosedLoop
-from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models import Truth
 
 
 def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
@@ -41,7 +41,7 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
     ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
     ... )
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell)
@@ -57,16 +57,15 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     >>> 0 < missed.rms_nm < lbt.residual_budget(loop, shake).rms_nm
     True
     """
-    real = loop.hardware
-    settled = replace(real, mirror=None)
-    return residual_budget(replace(loop, system=_difference_loop(loop, settled)), truth)
+    return residual_budget(replace(loop, system=_difference_loop(loop)), truth)
 
 
-def _difference_loop(loop: ClosedLoop, settled: LoopHardware) -> StateSpace:
-    """Loop whose first outputs are the difference of the two positions."""
+def _difference_loop(loop: ClosedLoop) -> StateSpace:
+    """Loop whose first outputs are the settled mirror's position less the real one."""
     s, n, m = loop.system, loop.hardware.modes, loop.hardware.n_commands
     each, command = np.eye(m), slice(n, n + m)
-    ideal, real = settled.mirror_system.whole, loop.hardware.mirror_system.whole
+    ideal = replace(loop.hardware, mirror=None).mirror_system.whole
+    real = loop.hardware.mirror_system.whole
     sizes = [s.n_states, ideal.n_states * m, real.n_states * m]
     A = np.zeros((sum(sizes), sum(sizes)))
     B = np.zeros((len(A), s.B.shape[1]))
@@ -84,6 +83,6 @@ def _difference_loop(loop: ClosedLoop, settled: LoopHardware) -> StateSpace:
         rows[:, : sizes[0]] += mirror.D * shape @ s.C[command]
         direct += mirror.D * shape @ s.D[command]
         start += size
-    # of a mirror that settles at once nothing is left, not even rounding
+    # a mirror that settles at once leaves nothing, not even rounding
     C[:n], D[:n] = (0.0, 0.0) if loop.hardware.mirror is None else (rows, direct)
     return StateSpace(A=A, B=B, C=C, D=D, dt_s=s.dt_s)

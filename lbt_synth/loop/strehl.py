@@ -1,4 +1,4 @@
-"""Strehl ratio of a jittering image, by the exact integral over the optical transfer function.
+"""Strehl ratio of a jittering image, an exact integral over the optical transfer function.
 
 A long exposure multiplies the transfer function by the characteristic function
 of the jitter. For an image that moves by Gaussian jitter of covariance S and by
@@ -9,7 +9,7 @@ sinusoids of complex amplitude a::
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -31,7 +31,7 @@ from lbt_synth.validation import (
 )
 
 _DIRECTIONS = 64
-_FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])
+_FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])  # to be tried
 _STRIPS = np.linspace(0.2, 4, 20)
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
@@ -161,9 +161,7 @@ def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: 
 
 
 def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any) -> FloatArray:
-    """Strehl ratios of many jitters.
-
-    Shapes: covariance_nm2 (p, n, n), line_amplitudes_nm (p, s, n) -> (p,).
+    """Strehl ratios (p,) of jitters of covariances (p, n, n) and sinusoids (p, s, n).
 
     Examples
     --------
@@ -215,7 +213,7 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
 
 
 def _gaussian_transfer(forms: FloatArray, squares: FloatArray) -> FloatArray:
-    """Transfer of Gaussian jitters (p, nodes); those that share one are computed once."""
+    """Transfer functions (p, nodes) of Gaussian jitters; equal ones are computed once."""
     if len(forms) > 1 and np.array_equal(forms[0], forms[-1]):
         unique, which = np.unique(forms, axis=0, return_inverse=True)
         return np.exp(-2 * np.pi**2 * (unique @ squares))[which.ravel()]
@@ -223,7 +221,7 @@ def _gaussian_transfer(forms: FloatArray, squares: FloatArray) -> FloatArray:
 
 
 def jitter_spread_nm(covariance_nm2: FloatArray, line_amplitudes_nm: ComplexArray) -> FloatArray:
-    """How far jitter of covariances (p, n, n) and sinusoids (p, s, n) moves an image [nm], (p,)."""
+    """How far covariances (p, n, n) and sinusoids (p, s, n) of jitter move an image [nm], (p,)."""
     deviation = np.sqrt(np.max(np.diagonal(covariance_nm2, axis1=1, axis2=2), axis=1))
     return np.asarray(deviation + np.sum(np.abs(line_amplitudes_nm), axis=(1, 2)))
 
@@ -234,14 +232,14 @@ def widest_jitter_nm(imaging: Imaging) -> float:
 
 
 def _quadratic_form(matrices: FloatArray) -> FloatArray:
-    """Coefficients of the quadratic forms of symmetric matrices, to go with the squares of f."""
+    """Coefficients of symmetric matrices' quadratic forms, as factors of the squares of f."""
     if matrices.shape[-1] == 1:
         return np.concatenate([matrices[..., 0], np.zeros((*matrices.shape[:-2], 2))], axis=-1)
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
 
 
 def _group_by_rule(rules: IntArray) -> Iterator[tuple[IntArray, list[int]]]:
-    """Yield the indices of the points that share a rule, with the rule."""
+    """Yield each rule with the indices of the jitters that share it."""
     unique, own = np.unique(rules, axis=0, return_inverse=True)
     for i, rule in enumerate(unique.tolist()):
         yield np.flatnonzero(own.reshape(-1) == i), rule
@@ -250,10 +248,10 @@ def _group_by_rule(rules: IntArray) -> Iterator[tuple[IntArray, list[int]]]:
 def _choose_rules(
     covariance: FloatArray, lines: ComplexArray, spread: FloatArray, cycles_per_nm: float
 ) -> IntArray:
-    """Fineness and number of directions of the nodes that each point needs, (p, 2).
+    """Fineness and number of directions of the nodes that each jitter needs, (p, 2).
 
     Beyond some 5 turns of phase over the pupil the nodes are made denser. Where the jitter is
-    the same in all directions, or small, fewer of them do: the equidistant sum over N
+    the same in all directions, or small, fewer directions are enough: the equidistant sum over N
     directions of half a turn misses only harmonics from 2 N on, which decay faster than
     ``exp(-2 N t)`` times the largest value of the integrand on a strip of width t.
     """
@@ -327,7 +325,7 @@ def _weighted_otf(
 ) -> tuple[FloatArray, FloatArray]:
     """Nodes as (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1.
 
-    They fill half the plane; with ``quadrant``, a quarter of it.
+    The nodes fill half the plane; with ``quadrant``, a quarter of it.
     """
     eps = obstruction
     kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
@@ -352,14 +350,13 @@ def _cartesian_otf(obstruction: float) -> tuple[FloatArray, FloatArray, FloatArr
     return x, nodes_y, weight / weight.sum()
 
 
-def annular_otf(radius: FloatArray, obstruction: Sequence[float] | float) -> FloatArray:
+def annular_otf(radius: FloatArray, obstruction: float) -> FloatArray:
     """Diffraction-limited transfer function of an annular pupil, at radius f lambda / D.
 
-    Autocorrelation of the annulus: overlap of the discs, less twice that of disc
-    and obstruction, plus that of the obstructions.
+    It is the autocorrelation of the annulus: the overlap of the two discs, less twice that of
+    disc and obstruction, plus that of the obstructions.
     """
-    rho = np.asarray(radius, dtype=np.float64)
-    eps = float(np.asarray(obstruction))
+    rho, eps = np.asarray(radius, dtype=np.float64), obstruction
     overlap = _lens(rho, 0.5, 0.5)
     if eps > 0:
         overlap = overlap - 2 * _lens(rho, 0.5, eps / 2) + _lens(rho, eps / 2, eps / 2)
@@ -372,10 +369,6 @@ def _lens(distance: FloatArray, large: float, small: float) -> FloatArray:
     cos_large = np.clip((d**2 + large**2 - small**2) / (2 * d * large), -1, 1)
     cos_small = np.clip((d**2 + small**2 - large**2) / (2 * d * small), -1, 1)
     kite = (-d + small + large) * (d + small - large) * (d - small + large) * (d + small + large)
-    area = (
-        large**2 * np.arccos(cos_large)
-        + small**2 * np.arccos(cos_small)
-        - np.sqrt(np.maximum(kite, 0)) / 2
-    )
-    inside = distance <= large - small
-    return np.asarray(np.where(inside, np.pi * small**2, area))
+    sectors = large**2 * np.arccos(cos_large) + small**2 * np.arccos(cos_small)
+    area = sectors - np.sqrt(np.maximum(kite, 0)) / 2
+    return np.asarray(np.where(distance <= large - small, np.pi * small**2, area))

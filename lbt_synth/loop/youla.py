@@ -1,14 +1,13 @@
-"""Controllers from filters of the pseudo-open-loop measurement (the Youla parameter).
+"""Controllers made of a filter of the pseudo-open-loop measurement, the Youla parameter.
 
-The path from command to measurement is a known delay, so the measurement that there would
-be without any correction is known to the controller::
+The path from command to measurement is known, and so is the measurement ybar that there would
+be without any correction::
 
     ybar(k) = y(k) + sensor_matrix influence_matrix (c[0] u(k-1) + c[1] u(k-2) + ...)
 
-with the mirror's taps c, or the same by the states of its dynamics.
-
-Every controller that stabilises the loop is a stable filter from ybar to u, and the closed
-loop is affine in that filter (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom.
+with the mirror's taps c (computed by its states where it has dynamics). Every controller that
+stabilises the loop is a stable filter from ybar to u, and the closed loop is affine in that
+filter (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom.
 Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223).
 """
 
@@ -58,33 +57,26 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
         )
     A, B, C, D = parameter.A, parameter.B, parameter.C, parameter.D
     mirror, each, n = hardware.mirror_system.whole, np.eye(m), len(A)
-    # without feedthrough the last command is read from the state: u(k-1) = C x(k)
+    # Without feedthrough the last command is read from the state: u(k-1) = C x(k)
     stored = m if np.any(D) else 0
     size = n + stored + mirror.n_states * m
-    last = np.zeros((m, size))  # u(k-1) from the state [x, u(k-1) if stored, mirror]
+    last = np.zeros((m, size))  # reads u(k-1) from the state [x, u(k-1) if stored, mirror]
     if stored:
         last[:, n : n + m] = each
     else:
         last[:, :n] = C
-    seen = mirror.D * last
-    seen[:, n + stored :] += np.kron(mirror.C, each)
-    believed = hardware.sensor @ hardware.influence @ seen  # ybar = y + believed s
-    moved = np.kron(mirror.B[:, None], each) @ last
-    moved[:, n + stored :] += np.kron(mirror.A, each)
-    new_state = np.hstack([A, np.zeros((n, size - n))]) + B @ believed
-    rows, entry = [new_state], np.zeros((size, q))
+    position = mirror.D * last
+    position[:, n + stored :] += np.kron(mirror.C, each)
+    correction = hardware.sensor @ hardware.influence @ position  # ybar = y + correction s
+    next_mirror = np.kron(mirror.B[:, None], each) @ last
+    next_mirror[:, n + stored :] += np.kron(mirror.A, each)
+    next_filter = np.hstack([A, np.zeros((n, size - n))]) + B @ correction
+    rows, entry = [next_filter], np.zeros((size, q))
     entry[:n] = B
-    read = np.zeros((m, size))
     if stored:
-        rows.append(C @ new_state + D @ believed)
+        rows.append(C @ next_filter + D @ correction)
         entry[n : n + m] = C @ B + D
-        read[:, n : n + m] = each
-    else:
-        read[:, :n] = C
+    # the rows that read u(k-1) from the old state read u(k) from the new one
     return Controller(
-        A=np.vstack([*rows, moved]),
-        B=entry,
-        C=read,
-        D=np.zeros((m, q)),
-        dt_s=hardware.dt_s,
+        A=np.vstack([*rows, next_mirror]), B=entry, C=last, D=np.zeros((m, q)), dt_s=hardware.dt_s
     )

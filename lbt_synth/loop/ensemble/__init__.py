@@ -1,1 +1,1 @@
-"""Many loops at once, exactly."""
+"""Exact residuals of many loops at once."""

@@ -1,4 +1,4 @@
-"""Covariances that auto-regressive processes leave in stacks of loops: Lyapunov equations."""
+"""Residuals that auto-regressive processes leave in batched loops, by Lyapunov equations."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 def process_covariances(
     loops: BatchedLoops, process: ARModel | ModalTurbulence, directions: FloatArray
 ) -> FloatArray:
-    """Covariance (k, n, n) of the residual that one process a loop leaves, along a direction.
+    """Covariance (k, n, n) of the residual that a process, or one per loop, leaves.
 
-    Shapes: directions (n,).
+    ``directions`` is (n,), or (k, n) with one per loop.
     """
     if isinstance(process, ARModel):
         coefficients, drive = process.coefficients[None], np.array([process.driving_rms_nm])
@@ -43,8 +43,8 @@ def process_covariances(
     if not np.all(residuals < _RESIDUAL):
         worst = float(np.max(np.nan_to_num(residuals, nan=np.inf)))
         raise ProblemError(
-            "the covariance of a process in a loop was not found: relative residual "
-            f"{worst:.3g} of its Lyapunov equation. The process or the loop is nearly a random "
+            "the covariance of a process in a loop was not found: its Lyapunov equation has the "
+            f"relative residual {worst:.3g}. The process or the loop is nearly a random "
             "walk; damp it."
         )
     return np.asarray(C @ X @ transpose(C))
@@ -57,14 +57,14 @@ def add_process(
     process: ARModel | ModalTurbulence,
     direction: FloatArray,
 ) -> None:
-    """Add to ``total[rows]`` what a process leaves in all pieces that it reaches.
+    """Add to ``total[rows]`` (p, n, n) what a process leaves in all subloops that it reaches.
 
-    Shapes: total (p, n, n), rows (k,), loops list of (w,), direction (n,).
+    ``loops`` holds the modes and the loops (k) of each subloop; ``direction`` is (n,) or (k, n).
     """
-    reached = [(modes, stack) for modes, stack in loops if np.any(direction[..., modes])]
+    reached = [(modes, batch) for modes, batch in loops if np.any(direction[..., modes])]
     if not reached:
         return
     modes = np.concatenate([modes for modes, _ in reached])
-    stack = join_subloops([stack for _, stack in reached])
+    joined = join_subloops([batch for _, batch in reached])
     at = (rows[:, None, None], *np.ix_(modes, modes))
-    total[at] += process_covariances(stack, process, direction[..., modes])
+    total[at] += process_covariances(joined, process, direction[..., modes])

@@ -1,4 +1,4 @@
-"""Closed loops of one piece at many sensor gains and delays, as stacks of systems.
+"""One subloop closed at many sensor gains and delays, as arrays of state matrices.
 
 Between two whole delays a settled mirror shows the commands of two frames within an exposure,
 so that every matrix of the loop is affine in the fraction, as it is in the sensor gain.
@@ -22,19 +22,18 @@ from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 class DelayGroup:
     """Loops whose mirror is ``(1 - fraction) first + fraction second``."""
 
-    rows: IntArray  # (k,): which loops
-    fraction: FloatArray  # (k,): how much of the second
-    # first, second: Two mirrors with the same states
-    first: Response
+    rows: IntArray  # which loops, (k,)
+    fraction: FloatArray  # (k,)
+    first: Response  # the two mirrors have the same states
     second: Response
 
     def take(self, which: IntArray) -> DelayGroup:
-        """Return some of its loops."""
+        """Return some of the group's loops."""
         return replace(self, rows=self.rows[which], fraction=self.fraction[which])
 
 
 def group_by_delay(hardware: LoopHardware, delay_frames: FloatArray) -> Iterator[DelayGroup]:
-    """Yield the loops by the whole part of their delay; by the delay if the mirror moves."""
+    """Yield the loops by the whole part of their delay, or by their delay with a moving mirror."""
     if hardware.mirror is None:
         lead = np.floor(delay_frames - 1).astype(np.int64)
         fraction = delay_frames - 1 - lead
@@ -77,11 +76,13 @@ class BatchedLoops:
         return np.asarray(self.C @ states + self.D[..., :n])
 
 
-def close_batched_loops(part: Subloop, group: DelayGroup, sensor_gains: FloatArray) -> BatchedLoops:
-    """Close the loops of a group around a piece. Shapes: sensor_gains (k,)."""
-    controllers = part.controllers(group.rows)
+def close_subloop(subloop: Subloop, group: DelayGroup, sensor_gains: FloatArray) -> BatchedLoops:
+    """Close a subloop with the delays of a group, at the sensor gains (k,)."""
+    controllers = subloop.controllers(group.rows)
     ends = [
-        loop_matrices(*controllers, mirror=mirror, sensor=part.sensor, influence=part.influence)
+        loop_matrices(
+            *controllers, mirror=mirror, sensor=subloop.sensor, influence=subloop.influence
+        )
         for mirror in (group.first, group.second)
     ]
     share = group.fraction[:, None, None]
@@ -89,23 +90,23 @@ def close_batched_loops(part: Subloop, group: DelayGroup, sensor_gains: FloatArr
         one if one is two or not group.fraction.any() else one + share * (two - one)
         for one, two in zip(*ends, strict=True)
     )
-    gain, n, count = sensor_gains[:, None, None], part.modes.size, group.rows.size
+    gain, n, count = sensor_gains[:, None, None], subloop.modes.size, group.rows.size
     B, D = (np.broadcast_to(m, (count, *m.shape[1:])) for m in (B, D[:, :n]))
     return BatchedLoops(A=A0 + gain * A1, B=B, C=(C0 + gain * C1)[:, :n], D=D)
 
 
-def join_subloops(stacks: list[BatchedLoops]) -> BatchedLoops:
-    """Put loops that know nothing of each other into one system, only from the total phase."""
-    if len(stacks) == 1:
-        return stacks[0]
-    count = len(stacks[0].A)
-    s = np.cumsum([0] + [stack.A.shape[1] for stack in stacks])
-    n = np.cumsum([0] + [stack.C.shape[1] for stack in stacks])
+def join_subloops(subloops: list[BatchedLoops]) -> BatchedLoops:
+    """Join independent subloops into block-diagonal loops, driven by the total phase only."""
+    if len(subloops) == 1:
+        return subloops[0]
+    count = len(subloops[0].A)
+    s = np.cumsum([0] + [loop.A.shape[1] for loop in subloops])
+    n = np.cumsum([0] + [loop.C.shape[1] for loop in subloops])
     A, B = np.zeros((count, s[-1], s[-1])), np.zeros((count, s[-1], n[-1]))
     C, D = np.zeros((count, n[-1], s[-1])), np.zeros((count, n[-1], n[-1]))
-    for i, stack in enumerate(stacks):
+    for i, loop in enumerate(subloops):
         x, r = slice(s[i], s[i + 1]), slice(n[i], n[i + 1])
-        modes = slice(stack.C.shape[1])
-        A[:, x, x], B[:, x, r] = stack.A, stack.B[..., modes]
-        C[:, r, x], D[:, r, r] = stack.C, stack.D[..., modes]
+        modes = slice(loop.C.shape[1])
+        A[:, x, x], B[:, x, r] = loop.A, loop.B[..., modes]
+        C[:, r, x], D[:, r, r] = loop.C, loop.D[..., modes]
     return BatchedLoops(A=A, B=B, C=C, D=D)

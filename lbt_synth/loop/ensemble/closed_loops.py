@@ -1,4 +1,4 @@
-"""Many closed loops, piece by piece and delay by delay, and which of them are stable."""
+"""Many closed loops by subloop and by whole delay, with their poles and their stability."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.ensemble.batched_loops import (
     BatchedLoops,
     DelayGroup,
-    close_batched_loops,
+    close_subloop,
     group_by_delay,
 )
 from lbt_synth.loop.ensemble.subloops import Subloop
@@ -23,14 +23,14 @@ _AT_ONCE = 256  # loops that share frequencies
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopGroup:
-    """Loops of one piece and one whole delay."""
+    """The loops of one subloop that have the same whole delay."""
 
-    mirrors: DelayGroup  # Which loops, and their mirrors
-    loops: BatchedLoops  # The loops
-    poles: ComplexArray  # (k, s): their poles
+    mirrors: DelayGroup
+    loops: BatchedLoops
+    poles: ComplexArray  # (k, s)
 
     def batches(self, stable: BoolArray) -> Iterator[LoopGroup]:
-        """Yield the stable loops, those with alike distances from instability together."""
+        """Yield batches of the stable loops, sorted by their distance from instability."""
         found = np.flatnonzero(stable[self.mirrors.rows])
         order = found[np.argsort(_radius(self.poles[found]), kind="stable")]
         for start in range(0, order.size, _AT_ONCE):
@@ -44,57 +44,45 @@ class LoopGroup:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ClosedLoops:
-    """Loops of the same sensor and mirror around the pieces of controllers."""
+    """Loops with the same sensor and mirror, at p sensor gains and delays."""
 
-    hardware: LoopHardware  # Sensor and mirror
-    sensor_gains: FloatArray  # (p,): real sensor gains
-    # list of (LoopPart, list of LoopGroup): each piece with its loops by their whole delays, the
-    # same rows for all pieces
-    pieces: list[tuple[Subloop, list[LoopGroup]]]
-    stable: BoolArray  # (p,): which loops are stable
+    hardware: LoopHardware
+    sensor_gains: FloatArray  # (p,)
+    subloops: list[tuple[Subloop, list[LoopGroup]]]  # each with its groups, the same rows in all
+    stable: BoolArray  # (p,)
 
     @classmethod
     def of(
         cls,
-        parts: list[Subloop],
+        subloops: list[Subloop],
         rest: list[FloatArray],
         hardware: LoopHardware,
         sensor_gains: FloatArray,
         delay_frames: FloatArray,
     ) -> ClosedLoops:
-        """Close the loops; pieces that are alike are closed once.
-
-        Shapes: parts, rest list of (N, s, s), sensor_gains, delay_frames (p,).
-        """
+        """Close the loops, equal subloops only once; ``rest`` are the states without modes."""
         stable = np.ones(sensor_gains.size, dtype=np.bool_)
         for A in rest:
             if A.shape[-1]:
                 stable &= _radius(np.linalg.eigvals(A).astype(np.complex128)) < 1 - STABILITY_MARGIN
-        pieces: list[tuple[Subloop, list[LoopGroup]]] = []
-        for part in parts:
-            alike = next((groups for other, groups in pieces if other.equals(part)), None)
-            if alike is None:
-                alike = []
+        closed: list[tuple[Subloop, list[LoopGroup]]] = []
+        for subloop in subloops:
+            groups = next((known for other, known in closed if other.equals(subloop)), None)
+            if groups is None:
+                groups = []
                 for mirrors in group_by_delay(hardware, delay_frames):
-                    loops = close_batched_loops(part, mirrors, sensor_gains[mirrors.rows])
+                    loops = close_subloop(subloop, mirrors, sensor_gains[mirrors.rows])
                     poles = np.linalg.eigvals(loops.A).astype(np.complex128)
                     stable[mirrors.rows] &= _radius(poles) < 1 - STABILITY_MARGIN
-                    alike.append(LoopGroup(mirrors=mirrors, loops=loops, poles=poles))
-            pieces.append((part, alike))
-        return cls(hardware=hardware, sensor_gains=sensor_gains, pieces=pieces, stable=stable)
-
-    @property
-    def modes(self) -> int:
-        """Number of modes n."""
-        return self.hardware.modes
+                    groups.append(LoopGroup(mirrors=mirrors, loops=loops, poles=poles))
+            closed.append((subloop, groups))
+        return cls(hardware=hardware, sensor_gains=sensor_gains, subloops=closed, stable=stable)
 
     def by_delay(self) -> Iterator[tuple[IntArray, list[tuple[IntArray, BatchedLoops]]]]:
-        """Yield the rows of each whole delay, with the modes and loops of each piece."""
-        for whole, group in enumerate(self.pieces[0][1]):
-            yield (
-                group.mirrors.rows,
-                [(part.modes, groups[whole].loops) for part, groups in self.pieces],
-            )
+        """Yield the rows of each whole delay, with the modes and loops of each subloop."""
+        for i, group in enumerate(self.subloops[0][1]):
+            loops = [(subloop.modes, groups[i].loops) for subloop, groups in self.subloops]
+            yield group.mirrors.rows, loops
 
 
 def _radius(poles: ComplexArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Exact residuals of many loops at once: other sensor gains, delays, noise and weather."""
+"""Evaluates controllers in an ensemble of loops: exact residuals by origin."""
 
 from __future__ import annotations
 
@@ -7,34 +7,34 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import DimensionError
 from lbt_synth.linear import Controller
-from lbt_synth.loop.closed_loop import require_matching_controller
+from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
 from lbt_synth.loop.ensemble.ar_covariances import PROCESSES
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
-from lbt_synth.loop.ensemble.loop_ensemble import LoopEnsemble, Turbulence, turbulence_rows
+from lbt_synth.loop.ensemble.loop_ensemble import LoopEnsemble, turbulence_rows
 from lbt_synth.loop.ensemble.residuals import EnsembleResiduals
 from lbt_synth.loop.ensemble.subloops import split_into_subloops
 from lbt_synth.loop.ensemble.turbulence_and_noise import turbulence_and_noise_covariances
 from lbt_synth.loop.ensemble.vibrations import vibration_residuals
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, instance
+from lbt_synth.validation import FloatArray, require_instance
 
 
 def ensemble_residuals(
     controller: Any, hardware: LoopHardware, ensemble: LoopEnsemble
 ) -> EnsembleResiduals:
-    """Evaluate a controller exactly in many loops, or many controllers in a loop each.
+    """Evaluate a controller exactly in many loops, or many controllers in one loop each.
 
     The answers are those of :func:`residual_budget`, loop by loop: stability by eigenvalues,
-    spectra and noise by quadrature laid to the closed loops' poles, auto-regressive processes by
-    Lyapunov equations, sinusoids by the closed loops' response. Tip and tilt that know nothing of
-    each other are evaluated apart, and once if they are alike.
+    spectra and noise by quadrature refined around the closed loops' poles, auto-regressive
+    processes by Lyapunov equations, sinusoids by the closed loops' response. Independent tip and
+    tilt are evaluated separately, and only once if they are equal.
 
     Parameters
     ----------
     controller : Controller or sequence of Controller
-        One controller for all loops, or one a loop with as many states each.
+        One controller for all loops, or one per loop, all with as many states.
     hardware : LoopHardware
         Sensor and mirror of all loops; the ensemble may have other delays.
     ensemble : LoopEnsemble
@@ -70,8 +70,8 @@ def ensemble_residuals(
     >>> found.rms_nm.round(1).tolist()
     [195.4, 181.9, nan]
     """
-    instance(hardware, LoopHardware)
-    instance(ensemble, LoopEnsemble)
+    require_instance(hardware, LoopHardware)
+    require_instance(ensemble, LoopEnsemble)
     matrices = _controller_matrices(controller, hardware, ensemble.loops)
     return residuals_from_matrices(matrices, hardware, ensemble)
 
@@ -79,14 +79,16 @@ def ensemble_residuals(
 def residuals_from_matrices(
     matrices: tuple[FloatArray, ...], hardware: LoopHardware, ensemble: LoopEnsemble
 ) -> EnsembleResiduals:
-    """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each; see above."""
+    """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
     turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
-    _require_frame_rate(turbulence, hardware)
-    # loops that differ by their sinusoids and resonances only are closed once
+    for spectrum, _ in turbulence:
+        if isinstance(spectrum, PROCESSES):
+            require_loop_rate(spectrum.frame_rate_hz, hardware)
+    # loops that differ only in their vibrations are closed once
     points, which = ensemble.distinct(hardware, apart=len(matrices[0]) > 1)
-    parts, rest = split_into_subloops(matrices, hardware)
+    subloops, rest = split_into_subloops(matrices, hardware)
     loops = ClosedLoops.of(
-        parts, rest, hardware, ensemble.gains()[points], ensemble.delays(hardware)[points]
+        subloops, rest, hardware, ensemble.gains()[points], ensemble.delays(hardware)[points]
     )
     turbulence_nm2, noise_nm2 = turbulence_and_noise_covariances(
         loops,
@@ -111,34 +113,21 @@ def _controller_matrices(
     """Return controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
     each = [controller] if isinstance(controller, Controller) else list(controller)
     for one in each:
-        instance(one, Controller)
+        require_instance(one, Controller)
         require_matching_controller(hardware, one)
     if len(each) not in (1, count) or len({one.n_states for one in each}) != 1:
         raise DimensionError(
-            f"give one controller, or one a loop ({count}) with as many states each; got "
+            f"give one controller, or one per loop ({count}) with as many states each; got "
             f"{len(each)} with {sorted({one.n_states for one in each})} states."
         )
     return textbook_matrices(each)
 
 
 def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:
-    """Return controllers of as many states each as ``A, B, C, D`` in textbook form, balanced.
+    """Return controllers with equal numbers of states as balanced ``A, B, C, D``, textbook form.
 
-    In states of comparable units an entry that is tiny beside the others does nothing.
+    Only in states of comparable units does an entry that is tiny beside the others do nothing.
     """
     systems = [controller.to_statespace() for controller in controllers]
     systems = [system.balanced() if system.n_states else system for system in systems]
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
-
-
-def _require_frame_rate(
-    turbulence: list[tuple[Turbulence, tuple[int, ...]]], hardware: LoopHardware
-) -> None:
-    for spectrum, _ in turbulence:
-        if isinstance(spectrum, PROCESSES) and not np.isclose(
-            spectrum.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9
-        ):
-            raise ProblemError(
-                f"a disturbance must be sampled at the loop's {hardware.frame_rate_hz:.6g} Hz; got "
-                f"{spectrum.frame_rate_hz:.6g} Hz."
-            )

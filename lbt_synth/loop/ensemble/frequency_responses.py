@@ -1,4 +1,4 @@
-"""Frequency responses of many systems at the same frequencies."""
+"""Frequency responses of many systems at the same frequencies, by partial fractions."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_PROBES = 5  # points at which partial fractions are held against linear systems
+_PROBES = 5  # frequencies at which partial fractions are checked by solving linear systems
 _AGREEMENT = 1e-9
 
 
 def batched_response(
     A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, z: ComplexArray
 ) -> ComplexArray:
-    """Transfer matrices of a stack of systems, by partial fractions.
+    """Transfer matrices (k, f, m, q) of k systems at f points z, by partial fractions.
 
-    Where a system has no eigenvectors to speak of, which shows at some probes, the points are
-    solved one by one. Shapes: A, B, C, D (k, s, s), z (f,) -> (k, f, m, q).
+    A system whose eigenvectors are nearly dependent fails at some probes; its points are then
+    solved one by one.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What many loops meet: arrays with one entry a loop."""
+"""An ensemble of loops: gains, delays, noise, turbulence, vibrations, one entry per loop."""
 
 from __future__ import annotations
 
@@ -11,14 +11,21 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
 from lbt_synth.models.spectra import spectrum_key
-from lbt_synth.validation import FloatArray, IntArray, frozen, instance, real_array, sequence
+from lbt_synth.validation import (
+    FloatArray,
+    IntArray,
+    frozen_copy,
+    real_array,
+    require_instance,
+    sequence,
+)
 
 Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleVibration:
-    """A vibration that is another one in each of p loops.
+    """A vibration that differs between p loops.
 
     Parameters
     ----------
@@ -64,15 +71,15 @@ class EnsembleVibration:
         size = np.linalg.norm(direction, axis=-1, keepdims=True)
         if direction.ndim not in (1, 2) or not np.all(size > 0):
             raise ProblemError(
-                "direction must be a vector over the modes, or one a loop, and not zero; got shape "
-                f"{direction.shape}."
+                "direction must be a vector over the modes, or one per loop, and not zero; got "
+                f"shape {direction.shape}."
             )
-        object.__setattr__(self, "direction", frozen(direction / size))
+        object.__setattr__(self, "direction", frozen_copy(direction / size))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopEnsemble:
-    """What p loops meet that have the same sensor and mirror.
+    """Conditions of p loops with the same sensor and mirror.
 
     Parameters
     ----------
@@ -83,12 +90,12 @@ class LoopEnsemble:
     noise_nm : float, (p,) or (p, q) array_like, optional
         Standard deviation of the noise on each measurement per frame [nm].
     turbulence : Spectrum, FrozenFlows, ModalTurbulence, sequence of these, or None, optional
-        Spectrum of each mode, the modes independent: one for all of them, or one a mode. A
-        FrozenFlows or ModalTurbulence holds one a loop, any other spectrum serves all loops.
+        Spectrum of each mode, the modes independent: one for all of them, or one per mode. A
+        FrozenFlows or ModalTurbulence holds one per loop, any other spectrum serves all loops.
     vibrations : sequence of EnsembleVibration, optional
         The vibrations.
     loops : int, optional
-        Number of loops p, where no array tells it.
+        Number of loops p, where no array gives it.
 
     Raises
     ------
@@ -116,7 +123,7 @@ class LoopEnsemble:
         set_ = object.__setattr__
         set_(self, "vibrations", sequence(self.vibrations, "vibrations"))
         for line in self.vibrations:
-            instance(line, EnsembleVibration)
+            require_instance(line, EnsembleVibration)
         given = {"sensor_gain": self.sensor_gain, "noise_nm": self.noise_nm}
         given |= {} if self.delay_frames is None else {"delay_frames": self.delay_frames}
         for name, bound in (("sensor_gain", 0.0), ("noise_nm", 0.0), ("delay_frames", 1.0)):
@@ -130,26 +137,21 @@ class LoopEnsemble:
         lengths |= {} if self.loops == 0 else {"loops": self.loops}
         if len(set(lengths.values()) - {1}) > 1:
             text = ", ".join(f"{name} {length}" for name, length in lengths.items())
-            raise DimensionError(f"all must have one entry a loop; got {text}.")
+            raise DimensionError(f"all must have one entry per loop; got {text}.")
         if 0 in lengths.values():
             raise DimensionError("an ensemble needs at least one loop; got none.")
         set_(self, "loops", max(lengths.values(), default=1))
 
     def _arrays(self) -> dict[str, Any]:
-        """Return what has one entry a loop, by name."""
+        """Return what has one entry per loop, by name."""
         out: dict[str, Any] = {}
         for name in ("sensor_gain", "noise_nm", "delay_frames"):
             if np.ndim(getattr(self, name)):
                 out[name] = getattr(self, name)
         for i, line in enumerate(self.vibrations):
-            for name, scalar in (
-                ("frequency_hz", 0),
-                ("rms_nm", 0),
-                ("damping", 0),
-                ("direction", 1),
-            ):
+            for name in ("frequency_hz", "rms_nm", "damping", "direction"):
                 value = getattr(line, name)
-                if value is not None and np.ndim(value) > scalar:
+                if value is not None and np.ndim(value) > (name == "direction"):
                     out[f"{name} of vibration {i}"] = value
         each = self.turbulence if isinstance(self.turbulence, Sequence) else (self.turbulence,)
         for part in each:
@@ -179,7 +181,7 @@ class LoopEnsemble:
         given = given[:, None] if given.ndim == 1 else given
         if given.ndim == 2 and given.shape[1] not in (1, q):
             raise DimensionError(
-                f"noise_nm must have one column a measurement ({q}); got {given.shape[1]}."
+                f"noise_nm must have one column per measurement ({q}); got {given.shape[1]}."
             )
         return np.broadcast_to(given, (self.loops, q))
 
@@ -188,7 +190,7 @@ class LoopEnsemble:
         n, given = hardware.modes, self.turbulence
         each = tuple(given) if isinstance(given, Sequence) else (given,) * n
         if len(each) != n:
-            raise DimensionError(f"turbulence must have one entry a mode ({n}); got {len(each)}.")
+            raise DimensionError(f"turbulence must have one entry per mode ({n}); got {len(each)}.")
         found: dict[object, tuple[Turbulence, tuple[int, ...]]] = {}
         for mode, part in enumerate(each):
             if part is None:
@@ -199,9 +201,9 @@ class LoopEnsemble:
         return list(found.values())
 
     def distinct(self, hardware: LoopHardware, *, apart: bool) -> tuple[IntArray, IntArray]:
-        """Return one row of each loop that differs by more than its vibrations, and which is whose.
+        """Return rows that differ by more than their vibrations, and which of them each loop has.
 
-        With ``apart`` all rows differ: each has its own controller.
+        With ``apart`` all rows differ, as each has its own controller.
         """
         rows = np.arange(self.loops)
         columns = [self.gains(), self.delays(hardware), *self.noise(hardware).T]
@@ -227,7 +229,7 @@ class LoopEnsemble:
         for line in self.vibrations:
             if line.direction.shape[-1] != hardware.modes:
                 raise DimensionError(
-                    f"the direction of a vibration must have {hardware.modes} components, one a "
+                    f"the direction of a vibration must have {hardware.modes} components, one per "
                     f"mode; got {line.direction.shape[-1]}."
                 )
             if not np.max(line.frequency_hz) < nyquist:

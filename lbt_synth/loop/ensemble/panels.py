@@ -1,4 +1,4 @@
-"""Panels of quadrature that are laid to the poles of many loops."""
+"""Panels of quadrature that are refined around the poles of many loops."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_NARROWEST = 1e-10  # width of a pole that panels are fitted to, as a part of Nyquist
+_NARROWEST = 1e-10  # pole width that panels are still refined to, as a fraction of Nyquist
 _PANEL = 2.0  # length of a panel over its distance from a pole, or over the pole's width
 
 
 def graded_edges(poles: ComplexArray) -> FloatArray:
-    """Panels of (0, 1), in parts of Nyquist, that are short where a pole is near.
+    """Panels of (0, 1), as fractions of Nyquist, that are short where a pole is near.
 
     A panel is halved while it is longer than twice its distance from a pole, or than twice
     the width of a pole that it holds.

@@ -1,4 +1,4 @@
-"""Residuals of many loops, by origin."""
+"""The residuals of many loops by origin, and their Strehl ratios."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ class EnsembleResiduals:
         found = np.flatnonzero(self.stable)
         out[found] = 0.0
         spread = jitter_spread_nm(gaussian[found], lines[found])
-        seen = found[spread <= widest_jitter_nm(imaging)]
-        out[seen] = jitter_strehls(gaussian[seen], imaging=imaging, line_amplitudes_nm=lines[seen])
+        near = found[spread <= widest_jitter_nm(imaging)]
+        out[near] = jitter_strehls(gaussian[near], imaging=imaging, line_amplitudes_nm=lines[near])
         return out
 
     def _vibration_nm2(self) -> FloatArray:

@@ -1,7 +1,7 @@
-"""Covariances that spectra and white noise leave in the loops of one piece, by quadrature.
+"""Residuals that spectra and white noise leave in the loops of one subloop, by quadrature.
 
-One set of frequencies serves all loops of a batch. It is laid to all their poles, which are
-known, so that a rule of fixed order does.
+One set of frequencies serves all loops of a batch. It is refined around all their poles, which
+are known, so that a rule of fixed order is enough.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import gauss_panels, panel_rule
-from lbt_synth.linear.state_space import swept_response
+from lbt_synth.linear.state_space import schur_response
 from lbt_synth.loop.ensemble.batched_loops import DelayGroup
 from lbt_synth.loop.ensemble.frequency_responses import batched_response
 from lbt_synth.loop.ensemble.loop_ensemble import Turbulence
@@ -23,36 +23,34 @@ from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.turbulence.atmosphere import LOWEST
 from lbt_synth.validation import ComplexArray, FloatArray
 
-ORDER = 10  # nodes a panel
+ORDER = 10  # nodes per panel
 _RIPPLES = np.concatenate([np.arange(1, 3, 0.5), np.arange(3, 26, 1.25), np.geomspace(26, 60, 8)])
-_ALIKE, _STEP = 3.5, 0.08  # winds further apart share panels that widen with frequency
-_FLAT = 0.02  # of the frequency V / L0, below which a spectrum is flat
-_SETTLED, _HALVINGS = 1e-8, 20  # of a panel of a spectrum of unknown shape
-_COVERED = 1e-6  # part of Nyquist above which there are geometric panels in any case
+_ALIKE, _STEP = 3.5, 0.08  # winds of a larger ratio share panels that widen with frequency
+_FLAT = 0.02  # a spectrum is flat below this fraction of the frequency V / L0
+_SETTLED, _HALVINGS = 1e-8, 20  # of the panels of a spectrum of unknown shape
+_COVERED = 1e-6  # fraction of Nyquist above which there are geometric panels in any case
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SampledResponses:
-    """Frequencies of a batch of loops, and what one piece answers there."""
+    """Responses of a subloop's elements at the f frequencies of a quadrature."""
 
-    # frequency_hz, weight_hz (f,): nodes and weights of the rule [Hz]
     frequency_hz: FloatArray
     weight_hz: FloatArray
-    delay: ComplexArray  # (f,): ``z^-1`` at each
-    # first, second (f,): the two mirrors of the group
-    first: ComplexArray
+    delay: ComplexArray  # ``z^-1``
+    first: ComplexArray  # of the group's two mirrors
     second: ComplexArray
-    controller: ComplexArray  # (f, m, q): the controllers
+    controller: ComplexArray  # (f, m, q), or (k, f, m, q) with one per loop
 
 
 def sample_responses(
-    part: Subloop,
+    subloop: Subloop,
     group: DelayGroup,
     poles: ComplexArray,
     spectra: list[Turbulence],
     frame_rate_hz: float,
 ) -> SampledResponses:
-    """Lay frequencies to the poles of a batch of loops, and evaluate a piece there."""
+    """Choose frequencies for the poles of a batch of loops, and evaluate a subloop there."""
     nyquist = frame_rate_hz / 2
     edges = [graded_edges(poles.ravel()) * nyquist]
     edges += [_breakpoints(spectrum, nyquist) for spectrum in spectra]
@@ -60,8 +58,8 @@ def sample_responses(
     z = np.exp(1j * np.pi * frequency / nyquist)
     ends = (group.first,) if group.first is group.second else (group.first, group.second)
     mirrors = [_response(m.A, m.B[:, None], m.C[None], np.array([[m.D]]), z) for m in ends]
-    A, B, C, D = part.controllers(group.rows)
-    if part.is_shared:
+    A, B, C, D = subloop.controllers(group.rows)
+    if subloop.is_shared:
         controller = _response(A[0], B[0], C[0], D[0], z)
     else:
         controller = batched_response(A, B, C, D, z)
@@ -81,7 +79,7 @@ def _response(
     """Transfer matrices (f, m, q) of one system, which may have no state."""
     if len(A) == 0:
         return np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
-    return swept_response(StateSpace(A=A, B=B, C=C, D=D).balanced(), z)
+    return schur_response(StateSpace(A=A, B=B, C=C, D=D).balanced(), z)
 
 
 def _breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
@@ -114,8 +112,8 @@ def _breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
 def _adaptive_breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     """Frequencies between which a spectrum of unknown shape needs no shorter panels [Hz].
 
-    Peaks that are narrower than its first panels are found where it says that it has kinks, or at
-    the poles if it is auto-regressive.
+    Peaks narrower than the first panels are found at the spectrum's breakpoints, or at its poles
+    if it is auto-regressive.
     """
     grid = np.geomspace(_COVERED, 1, 200) * nyquist_hz
     edges = [np.zeros(1), grid, breakpoints_below(spectrum, nyquist_hz)]
@@ -130,10 +128,8 @@ def _adaptive_breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray
         fine = _panel_integrals(spectrum, low, middle) + _panel_integrals(spectrum, middle, high)
         open_ = np.abs(fine - _panel_integrals(spectrum, low, high)) > _SETTLED * np.abs(fine)
         done.append(low[~open_])
-        low, high = (
-            np.concatenate([low[open_], middle[open_]]),
-            np.concatenate([middle[open_], high[open_]]),
-        )
+        ends = low[open_], middle[open_], high[open_]
+        low, high = np.concatenate(ends[:2]), np.concatenate(ends[1:])
         if not low.size:
             break
     return np.unique(np.concatenate([*done, low]))
@@ -146,43 +142,47 @@ def _panel_integrals(spectrum: Turbulence, low: FloatArray, high: FloatArray) ->
 
 
 def spectral_covariances(
-    part: Subloop,
+    subloop: Subloop,
     group: DelayGroup,
     sensor_gains: FloatArray,
-    sweep: SampledResponses,
+    samples: SampledResponses,
     turbulence: list[tuple[Turbulence, list[int]]],
     noise_nm: FloatArray,
     frame_rate_hz: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Covariances of the residual from turbulence and from noise.
+    """Covariances (k, n, n) of the residual from turbulence, and from noise (k, q).
 
-    Shapes: sensor_gains (k,), turbulence list of (Turbulence, list of int), noise_nm (k, q) ->
-    turbulence_nm2, noise_nm2 (k, n, n).
+    ``turbulence`` pairs each spectrum with its modes of the subloop.
     """
-    evaluate = _scalar_covariances if part.is_scalar else _matrix_covariances
-    densities = [(_weighted_density(spectrum, sweep), modes) for spectrum, modes in turbulence]
-    white = 2 / frame_rate_hz * sweep.weight_hz
-    return evaluate(part, group, sensor_gains, sweep, densities, noise_nm, white)
+    evaluate = _scalar_covariances if subloop.is_scalar else _matrix_covariances
+    densities = [(_weighted_density(spectrum, samples), modes) for spectrum, modes in turbulence]
+    white = 2 / frame_rate_hz * samples.weight_hz
+    return evaluate(subloop, group, sensor_gains, samples, densities, noise_nm, white)
 
 
-def _weighted_density(spectrum: Turbulence, sweep: SampledResponses) -> FloatArray:
+def _weighted_density(spectrum: Turbulence, samples: SampledResponses) -> FloatArray:
     """Spectrum times the weights, (f,) or (k, f)."""
-    density = spectrum.psd(sweep.frequency_hz)
-    return np.asarray(density[0] if len(density) == 1 else density) * sweep.weight_hz
+    density = spectrum.psd(samples.frequency_hz)
+    return np.asarray(density[0] if len(density) == 1 else density) * samples.weight_hz
 
 
 def _scalar_covariances(
-    part: Subloop,
+    subloop: Subloop,
     group: DelayGroup,
     gains: FloatArray,
-    sweep: SampledResponses,
+    samples: SampledResponses,
     densities: list[tuple[FloatArray, list[int]]],
     noise_nm: FloatArray,
     white: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """One mode, in real numbers: ``|S|^2 = 1 / |1 + g L|^2`` with the loop L at unit gain."""
-    unit = part.influence[0, 0] * part.sensor[0, 0] * sweep.controller[..., 0, 0] * sweep.delay
-    first, second = unit * sweep.first, unit * sweep.second
+    unit = (
+        subloop.influence[0, 0]
+        * subloop.sensor[0, 0]
+        * samples.controller[..., 0, 0]
+        * samples.delay
+    )
+    first, second = unit * samples.first, unit * samples.second
     real, imaginary = first.real, first.imag
     if group.fraction.any():
         share = group.fraction[:, None]
@@ -191,39 +191,39 @@ def _scalar_covariances(
     g = gains[:, None]
     # not 1 + 2 g Re L + g^2 |L|^2, which cancels next to instability
     rejection = 1 / ((1 + g * real) ** 2 + (g * imaginary) ** 2)
-    square = (real**2 + imaginary**2) / part.sensor[0, 0] ** 2
+    square = (real**2 + imaginary**2) / subloop.sensor[0, 0] ** 2
     turbulence = np.zeros(len(gains))
-    for density, _ in densities:  # all of them are of the one mode
+    for density, _ in densities:  # each is of the one mode
         turbulence += _integrate(rejection, density)
     noise = noise_nm[:, 0] ** 2 * _integrate(rejection * square, white)
     return turbulence[:, None, None], noise[:, None, None]
 
 
 def _integrate(values: FloatArray, density: FloatArray) -> FloatArray:
-    """Sum over the frequencies (k, f), with one density (f,) or one a loop (k, f)."""
+    """Sum over the frequencies (k, f), with one density (f,) or one per loop (k, f)."""
     if density.ndim == 1:
         return np.asarray(values @ density)
     return np.asarray(np.einsum("kf,kf->k", values, density))
 
 
 def _matrix_covariances(
-    part: Subloop,
+    subloop: Subloop,
     group: DelayGroup,
     gains: FloatArray,
-    sweep: SampledResponses,
+    samples: SampledResponses,
     densities: list[tuple[FloatArray, list[int]]],
     noise_nm: FloatArray,
     white: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Several modes, a loop at a time."""
-    n = part.modes.size
+    """Several modes, one loop at a time."""
+    n = subloop.modes.size
     turbulence, noise = np.zeros((2, len(gains), n, n))
     for k, gain in enumerate(gains):
         share = group.fraction[k]
-        mirror = (1 - share) * sweep.first + share * sweep.second
-        controller = sweep.controller if part.is_shared else sweep.controller[k]
-        path = part.influence @ (mirror[:, None, None] * controller)  # (f, n, q)
-        loop = path @ (gain * part.sensor) * sweep.delay[:, None, None]
+        mirror = (1 - share) * samples.first + share * samples.second
+        controller = samples.controller if subloop.is_shared else samples.controller[k]
+        path = subloop.influence @ (mirror[:, None, None] * controller)  # (f, n, q)
+        loop = path @ (gain * subloop.sensor) * samples.delay[:, None, None]
         S = inverses(np.eye(n) + loop)
         N = S @ (path * noise_nm[k])
         noise[k] = _gram(N, white)
@@ -233,14 +233,14 @@ def _matrix_covariances(
 
 
 def _gram(transfer: ComplexArray, density: FloatArray) -> FloatArray:
-    """Sum ``density T T*`` over the frequencies, real part."""
+    """Sum ``density T T*`` over the frequencies, real subloop."""
     parts = np.concatenate([transfer.real, transfer.imag], axis=2) * np.sqrt(density)[:, None, None]
     wide = np.swapaxes(parts, 0, 1).reshape(parts.shape[1], -1)
     return np.asarray(wide @ wide.T)
 
 
 def inverses(matrices: ComplexArray) -> ComplexArray:
-    """Inverses of a stack; those of two by two by their adjugates, several times faster."""
+    """Inverses of many matrices; two by two by their adjugates, several times faster."""
     if matrices.shape[-1] != 2:
         return np.asarray(np.linalg.inv(matrices))
     a, b, c, d = (matrices[..., i, j] for i in (0, 1) for j in (0, 1))

@@ -1,4 +1,4 @@
-"""A loop taken apart into pieces that know nothing of each other: tip, and tilt."""
+"""A loop split into independent subloops, such as tip and tilt."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ from scipy.sparse.csgraph import connected_components
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
-_ROUNDING = 1e-13  # entries this much smaller than the largest of their matrix are none
-_SAME = 1e-11  # relative difference of pieces that are the same
+_ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
+_SAME = 1e-11  # relative difference up to which two subloops are the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Subloop:
-    """A piece of a loop: some modes, and all that depends on them."""
+    """Some modes of a loop, and all that depends on them.
 
-    # modes, measurements (n,): which modes and measurements of the loop these are
-    modes: IntArray
+    The controllers ``A, B, C, D`` are in textbook form, (N, ., .) each: one for all loops, or one
+    per loop.
+    """
+
+    modes: IntArray  # indices in the whole loop
     measurements: IntArray
-    # A, B, C, D (N, s, s): controllers in textbook form: one for all loops, or one each
     A: FloatArray
     B: FloatArray
     C: FloatArray
     D: FloatArray
-    # sensor, influence (q, n): their sensor and influence matrices
-    sensor: FloatArray
-    influence: FloatArray
+    sensor: FloatArray  # (q, n)
+    influence: FloatArray  # (n, m)
 
     @property
     def is_shared(self) -> bool:
@@ -42,12 +43,12 @@ class Subloop:
         return self.sensor.shape == self.influence.shape == (1, 1)
 
     def controllers(self, rows: IntArray) -> tuple[FloatArray, ...]:
-        """Return the controllers ``A, B, C, D`` of some loops, one if it serves all."""
+        """Return the controllers ``A, B, C, D`` of some loops, or the one that serves all."""
         matrices = self.A, self.B, self.C, self.D
-        return matrices if self.is_shared else tuple(part[rows] for part in matrices)
+        return matrices if self.is_shared else tuple(matrix[rows] for matrix in matrices)
 
     def equals(self, other: Subloop) -> bool:
-        """Whether another piece behaves the same, to rounding."""
+        """Whether another subloop behaves the same, to rounding."""
         names = ("A", "B", "C", "D", "sensor", "influence")
         pairs = [(getattr(self, name), getattr(other, name)) for name in names]
         return all(
@@ -60,9 +61,7 @@ class Subloop:
 def split_into_subloops(
     matrices: tuple[FloatArray, ...], hardware: LoopHardware
 ) -> tuple[list[Subloop], list[FloatArray]]:
-    """Take a loop apart along what does not depend on each other.
-
-    Shapes: returns rest list of (N, s, s).
+    """Split a loop into independent subloops, and the state matrices that reach no mode.
 
     Examples
     --------
@@ -71,7 +70,7 @@ def split_into_subloops(
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
     >>> textbook = lbt.integrator(path, gain=0.5).controller.to_statespace()
     >>> matrices = tuple(m[None] for m in (textbook.A, textbook.B, textbook.C, textbook.D))
-    >>> [part.modes.tolist() for part in split_into_subloops(matrices, path)[0]]
+    >>> [subloop.modes.tolist() for subloop in split_into_subloops(matrices, path)[0]]
     [[0], [1]]
     """
     A, B, C, D = matrices
@@ -89,15 +88,15 @@ def split_into_subloops(
     ):
         links[np.ix_(rows, columns)] = _nonzero_entries(entries)
     _, label = connected_components(csr_matrix(links), directed=False)
-    parts, rest = [], []
-    for piece in np.unique(label):
-        own = label == piece
+    subloops, rest = [], []
+    for each in np.unique(label):
+        own = label == each
         states, modes = np.flatnonzero(own[x]), np.flatnonzero(own[r])
         inputs, commands = np.flatnonzero(own[y]), np.flatnonzero(own[u])
         if modes.size == 0:
             rest.append(A[:, states[:, None], states])
             continue
-        parts.append(
+        subloops.append(
             Subloop(
                 modes=modes,
                 measurements=inputs,
@@ -109,11 +108,11 @@ def split_into_subloops(
                 influence=influence[np.ix_(modes, commands)],
             )
         )
-    return parts, rest
+    return subloops, rest
 
 
 def _nonzero_entries(entries: FloatArray) -> BoolArray:
-    """Which entries of a stack are more than rounding, in any of its matrices."""
+    """Which entries are more than rounding in any of the matrices (N, ., .)."""
     sizes = np.abs(entries)
     largest = np.max(sizes, axis=(1, 2), keepdims=True, initial=0.0)
     return np.asarray(np.any(sizes > _ROUNDING * largest, axis=0))

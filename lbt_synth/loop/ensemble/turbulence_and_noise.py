@@ -1,4 +1,4 @@
-"""What turbulence and noise leave in many loops."""
+"""Residuals that turbulence and noise leave in many loops."""
 
 from __future__ import annotations
 
@@ -16,46 +16,45 @@ def turbulence_and_noise_covariances(
     turbulence: list[tuple[Turbulence, tuple[int, ...]]],
     noise_nm: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Covariances of the residual from turbulence and from noise.
+    """Covariances (p, n, n) of the residual from turbulence, and from noise (p, q).
 
-    Shapes: turbulence list of (Turbulence, tuple of int), noise_nm (p, q) -> turbulence_nm2,
-    noise_nm2 (p, n, n).
+    ``turbulence`` pairs each spectrum with its modes. Unstable loops have nan.
     """
-    rate, n = loops.hardware.frame_rate_hz, loops.modes
+    rate, n = loops.hardware.frame_rate_hz, loops.hardware.modes
     turbulence_nm2, noise_nm2 = np.full((2, loops.stable.size, n, n), np.nan)
     turbulence_nm2[loops.stable], noise_nm2[loops.stable] = 0.0, 0.0
-    for part, groups in loops.pieces:
+    for subloop, groups in loops.subloops:
         smooth = []
         for spectrum, modes in turbulence:
-            own = [j for j, mode in enumerate(part.modes) if mode in modes]
+            own = [j for j, mode in enumerate(subloop.modes) if mode in modes]
             if own and not isinstance(spectrum, PROCESSES):
                 smooth.append((spectrum, own))
         for group in groups:
             for batch in group.batches(loops.stable):
                 rows = batch.mirrors.rows
-                at = (rows[:, None, None], *np.ix_(part.modes, part.modes))
+                at = (rows[:, None, None], *np.ix_(subloop.modes, subloop.modes))
                 spectra = [(turbulence_rows(spectrum, rows), own) for spectrum, own in smooth]
-                sweep = sample_responses(
-                    part, batch.mirrors, batch.poles, [s for s, _ in spectra], rate
+                samples = sample_responses(
+                    subloop, batch.mirrors, batch.poles, [s for s, _ in spectra], rate
                 )
                 turbulence_nm2[at], noise_nm2[at] = spectral_covariances(
-                    part,
+                    subloop,
                     batch.mirrors,
                     loops.sensor_gains[rows],
-                    sweep,
+                    samples,
                     spectra,
-                    noise_nm[rows][:, part.measurements],
+                    noise_nm[rows][:, subloop.measurements],
                     rate,
                 )
     for spectrum, modes in turbulence:
-        if isinstance(spectrum, PROCESSES):
-            for rows, stacks in loops.by_delay():
-                found = np.flatnonzero(loops.stable[rows])
-                if not found.size:
-                    continue
-                chosen = [(own, stack.take(found)) for own, stack in stacks]
+        if not isinstance(spectrum, PROCESSES):
+            continue
+        for rows, subloops in loops.by_delay():
+            found = np.flatnonzero(loops.stable[rows])
+            if found.size:
+                chosen = [(own, closed.take(found)) for own, closed in subloops]
                 process = turbulence_rows(spectrum, rows[found])
-                assert isinstance(process, PROCESSES)  # rows of one are one
+                assert isinstance(process, PROCESSES)
                 for mode in modes:
                     add_process(turbulence_nm2, rows[found], chosen, process, np.eye(n)[mode])
     return turbulence_nm2, noise_nm2

@@ -22,8 +22,8 @@ from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum
 from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
 from lbt_synth.loop.least_residuals.residual_limit import mode_limit, truth_modes
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
-from lbt_synth.models.truth import fitted_direction
-from lbt_synth.validation import FloatArray, frozen, number
+from lbt_synth.models.truth import checked_direction
+from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _PANELS = 128  # over the band, at least
 _ORDER = 10
@@ -118,7 +118,7 @@ def least_worst_residual(
     line = SinusoidalVibration(
         frequency_hz=high, rms_nm=rms_nm, direction=tuple(np.ravel(direction))
     )
-    along = fitted_direction(line, hardware)
+    along = checked_direction(line, hardware)
     decoupled = truth_modes(hardware, truth, (along,))
     own = int(np.argmax(np.abs(decoupled.directions @ along)))
     reach = InnerFactor.of(hardware)
@@ -135,10 +135,10 @@ def least_worst_residual(
     return BandLimit(
         rms_nm=float(np.sqrt(variance.sum())),
         achieved_nm=float(np.sqrt(variance.sum() + saddle.gap)),
-        variance_nm2=frozen(variance),
-        directions=frozen(decoupled.directions),
-        frequency_hz=frozen(saddle.x * nyquist),
-        weight=frozen(saddle.weight),
+        variance_nm2=frozen_copy(variance),
+        directions=frozen_copy(decoupled.directions),
+        frequency_hz=frozen_copy(saddle.x * nyquist),
+        weight=frozen_copy(saddle.weight),
     )
 
 

@@ -14,8 +14,8 @@ from lbt_synth.loop.least_residuals.mode_spectra import (
 from lbt_synth.loop.least_residuals.plant_modes import plant_modes
 from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant, Truth, Vibration
-from lbt_synth.models.truth import fitted_direction, stationary_vibrations
-from lbt_synth.validation import FloatArray, frozen, instance
+from lbt_synth.models.truth import checked_direction, stationary_vibrations
+from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,7 +91,7 @@ def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth."""
     if isinstance(plant, FullStatePlant):
         return _residual_limit(InnerFactor.of(plant.hardware), plant_modes(plant))
-    lines = [(fitted_direction(line, plant.hardware), line) for line in plant.vibrations]
+    lines = [(checked_direction(line, plant.hardware), line) for line in plant.vibrations]
     modes = decoupled_modes(
         plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
     )
@@ -102,18 +102,18 @@ def truth_modes(
     hardware: LoopHardware, truth: Truth, directions: tuple[FloatArray, ...] = ()
 ) -> DecoupledModes:
     """Decouple the modes of a truth, its sinusoids left out."""
-    instance(hardware, LoopHardware)
-    instance(truth, Truth)
+    require_instance(hardware, LoopHardware)
+    require_instance(truth, Truth)
     lines = []
     for vibration in stationary_vibrations(truth.vibrations):
-        along = fitted_direction(vibration, hardware)
+        along = checked_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
             lines.append((along, vibration))
-    noise = np.diag((truth.noise_of(hardware.n_measurements) / truth.sensor_gain) ** 2)
+    noise = np.diag((truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain) ** 2)
     return decoupled_modes(
         hardware,
         noise_nm2=noise,
-        turbulence=truth.turbulence_of(hardware.modes),
+        turbulence=truth.turbulence_per_mode(hardware.modes),
         vibrations=lines,
         directions=directions,
     )
@@ -129,8 +129,8 @@ def _residual_limit(reach: InnerFactor, decoupled: DecoupledModes) -> ResidualLi
         found.append(known[key])
     variance, change = np.array(found).T
     return ResidualLimit(
-        variance_nm2=frozen(variance),
-        directions=frozen(decoupled.directions),
+        variance_nm2=frozen_copy(variance),
+        directions=frozen_copy(decoupled.directions),
         change=float(np.max(change)),
     )
 

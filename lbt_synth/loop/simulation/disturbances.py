@@ -9,7 +9,7 @@ from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, DriftingVibration, LoopHardware, Spectrum, Truth, Vibration
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.models.truth import fitted_direction
+from lbt_synth.models.truth import checked_direction
 from lbt_synth.validation import FloatArray
 
 # A spectrum is drawn on this many times the wanted frames, so that the period is not seen.
@@ -39,12 +39,12 @@ def draw_disturbance(
             drawn = _draw(spectrum, hardware, frames, cases * n, turbulence_rng)
             total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
     else:
-        spectra = truth.turbulence_of(n)
+        spectra = truth.turbulence_per_mode(n)
         for mode, (own, mode_rng) in enumerate(zip(spectra, turbulence_rng.spawn(n), strict=True)):
             if own is not None:
                 total[:, :, mode] += _draw(own, hardware, frames, cases, mode_rng)
     for vibration, line_rng in zip(truth.vibrations, line_rngs, strict=True):
-        direction = fitted_direction(vibration, hardware)
+        direction = checked_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(hardware.frame_rate_hz)
             motion = _draw_ar(model, frames, cases, line_rng)
@@ -64,7 +64,7 @@ def draw_noise(
 ) -> FloatArray:
     """Draw the measurement noise, (cases, frames, q) [nm]."""
     q = hardware.n_measurements
-    return truth.noise_of(q) * rng.standard_normal((cases, frames, q))
+    return truth.noise_per_measurement(q) * rng.standard_normal((cases, frames, q))
 
 
 def _draw(

@@ -14,7 +14,7 @@ from lbt_synth.loop.simulation.block_filtering import filter_series
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.validation import FloatArray, frozen, integer
+from lbt_synth.validation import FloatArray, frozen_copy, integer
 
 _SETTLED = 1e-4
 _MOST_SETTLING = 200_000
@@ -169,10 +169,10 @@ def simulate(
     n, m = hardware.modes, hardware.n_commands
     kept = outputs[:, settle:]
     return Simulation(
-        total_nm=frozen(total[:, settle:]),
-        residual_nm=frozen(kept[:, :, :n]),
-        commands=frozen(kept[:, :, n : n + m]),
-        measurements=frozen(kept[:, :, n + m :]),
+        total_nm=frozen_copy(total[:, settle:]),
+        residual_nm=frozen_copy(kept[:, :, :n]),
+        commands=frozen_copy(kept[:, :, n : n + m]),
+        measurements=frozen_copy(kept[:, :, n + m :]),
         frame_rate_hz=hardware.frame_rate_hz,
         seed=seed,
     )
