@@ -1,4 +1,4 @@
 """The least residual of any linear controller, by spectral factorisation.
 
-Nothing here knows of designs, Riccati equations or loops: it is a second opinion on them.
+It uses no design, no Riccati equation and no closed loop, and so is an independent check of them.
 """

@@ -3,7 +3,7 @@
 A sinusoid that is spread over the band like a probability density is a process, and its
 limit is a lower bound for every controller that has to face the worst frequency. The best
 filter for the worst density rejects all frequencies that have weight by the same factor
-and the others more, so its own worst case is that bound: the two meet (a saddle point).
+and the others more, so its own worst case equals that bound (a saddle point).
 Rejection is ``|P|^2 / Phi`` with P of a few coefficients, hence for a given P the density
 fills up ``Phi`` to a level proportional to ``|P|^2``; the level follows from the total, and P
 from the filled spectrum in turn.
@@ -25,12 +25,12 @@ from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.truth import checked_direction
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
-_PANELS = 128  # over the band, at least
+_PANELS = 128  # at least so many over the band
 _ORDER = 10
 _ROUNDS = 100
 _WHOLE_STEPS = 12
 _SETTLED = 1e-8  # relative gap of the variance at which the search ends
-_LARGEST_GAP = 0.1  # and with which it is still an answer
+_LARGEST_GAP = 0.1  # the largest relative gap of an answer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class BandLimit:
     variance_nm2 : (n,) ndarray
         The limit by direction, that of the sinusoid included [nm^2].
     directions : (n, n) ndarray
-        Directions over the modes, one a row, along which the loop decouples.
+        Directions over the modes, one per row, along which the loop decouples.
     frequency_hz : (f,) ndarray
         Frequencies in the band [Hz].
     weight : (f,) ndarray
@@ -114,24 +114,20 @@ def least_worst_residual(
     >>> round(limit.rms_nm, 4), round(limit.achieved_nm, 4)
     (4.0, 4.0)
     """
-    low, high = _checked_band(band_hz, hardware.frame_rate_hz / 2)
+    nyquist = hardware.frame_rate_hz / 2
+    low, high = _checked_band(band_hz, nyquist)
     line = SinusoidalVibration(
         frequency_hz=high, rms_nm=rms_nm, direction=tuple(np.ravel(direction))
     )
     along = checked_direction(line, hardware)
     decoupled = truth_modes(hardware, truth, (along,))
     own = int(np.argmax(np.abs(decoupled.directions @ along)))
-    reach = InnerFactor.of(hardware)
-    nyquist = hardware.frame_rate_hz / 2
+    inner = InnerFactor.of(hardware)
     saddle = _find_saddle(
-        reach, decoupled.modes[own], (low / nyquist, high / nyquist), line.rms_nm**2
+        inner, decoupled.modes[own], (low / nyquist, high / nyquist), line.rms_nm**2
     )
-    variance = np.array(
-        [
-            saddle.lower if i == own else mode_limit(reach, mode)[0]
-            for i, mode in enumerate(decoupled.modes)
-        ]
-    )
+    modes = enumerate(decoupled.modes)
+    variance = np.array([saddle.lower if i == own else mode_limit(inner, m)[0] for i, m in modes])
     return BandLimit(
         rms_nm=float(np.sqrt(variance.sum())),
         achieved_nm=float(np.sqrt(variance.sum() + saddle.gap)),
@@ -171,22 +167,18 @@ class _Saddle:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Band:
-    """One mode with a band, prepared for many densities.
+    """One mode with a band, prepared for many densities of the sinusoid."""
 
-    ``outside`` are the integrals of the logarithm outside the band; x, quadrature and weights
-    are nodes within it, base the spectrum with noise there.
-    """
-
-    reach: InnerFactor
+    inner: InnerFactor
     mode: ModeSpectrum
-    reference: float
-    outside: FloatArray
-    x: FloatArray
-    quadrature: FloatArray
-    base: FloatArray
+    reference: float  # unit of the logarithm [nm^2]
+    outside: FloatArray  # integrals of the logarithm outside the band
+    x: FloatArray  # nodes within the band, in units of Nyquist
+    quadrature: FloatArray  # their weights
+    base: FloatArray  # spectrum with noise there, without the sinusoid
 
-    def filled(self, shape: FloatArray, total: float) -> tuple[float, FloatArray]:
-        """Level, and what has to be added to the base to fill it up to ``level * shape``."""
+    def fill(self, shape: FloatArray, total: float) -> tuple[float, FloatArray]:
+        """Return the level, and what a ``total`` adds to fill the base up to ``level * shape``."""
         heights = self.base / shape
         order = np.argsort(heights, kind="stable")
         q = self.quadrature[order]
@@ -196,15 +188,15 @@ class _Band:
         level = float(levels[np.argmax(levels <= above)])
         return level, np.maximum(level * shape - self.base, 0.0)
 
-    def prediction(self, added: FloatArray) -> Prediction:
-        """Best prediction with some spectrum added within the band."""
+    def predict(self, added: FloatArray) -> Prediction:
+        """Return the best prediction with some spectrum added within the band."""
         noise = self.mode.noise_nm2
         if noise > 0:
             values = np.log1p((self.base - noise + added) / self.reference)
         else:
             values = np.log((self.base + added) / self.reference)
-        inside = (self.quadrature * values) @ self.reach.weights(self.x)
-        return Prediction.of(self.reach, self.outside + inside)
+        inside = (self.quadrature * values) @ self.inner.weights(self.x)
+        return Prediction.of(self.inner, self.outside + inside)
 
     def bounds(
         self, prediction: Prediction, added: FloatArray, worst: float
@@ -222,10 +214,10 @@ class _Band:
 
 
 def _find_saddle(
-    reach: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
+    inner: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
 ) -> _Saddle:
-    band = _prepare_band(reach, mode, ends, total)
-    if band is None:  # outside the band nothing is new: the line is known from its past, too
+    band = _prepare_band(inner, mode, ends, total)
+    if band is None:  # the spectrum vanishes outside the band: the line is known from its past
         x, q = gauss_panels(np.linspace(*ends, _PANELS + 1), _ORDER)
         return _Saddle(lower=0.0, gap=0.0, x=x, weight=q / q.sum())
     # between the nodes, too
@@ -234,8 +226,8 @@ def _find_saddle(
     shape, fine_shape = np.ones(band.x.size), np.ones(fine.size)
     best: _Saddle | None = None
     for rounds in range(_ROUNDS):
-        level, added = band.filled(shape, total)
-        prediction = band.prediction(added)
+        level, added = band.fill(shape, total)
+        prediction = band.predict(added)
         fine_power = prediction.error_power(fine)
         worst = float(np.max(fine_power / np.maximum(base, level * fine_shape)))
         lower, gap = band.bounds(prediction, added, worst)
@@ -244,11 +236,11 @@ def _find_saddle(
             best = _Saddle(lower=lower, gap=gap, x=band.x, weight=weight)
         if gap <= _SETTLED * lower:
             break
-        # by half a step where whole ones go back and forth
+        # half a step where whole ones oscillate
         share = 1.0 if rounds < _WHOLE_STEPS else 0.5
         shape = _step_towards(shape, prediction.error_power(band.x), share)
         fine_shape = _step_towards(fine_shape, fine_power, share)
-    assert best is not None  # of the first round
+    assert best is not None  # set in the first round
     if not best.gap <= _LARGEST_GAP * best.lower:
         raise NumericalError(
             f"the worst density of a sinusoid did not settle in {_ROUNDS} rounds: a gap of "
@@ -260,23 +252,21 @@ def _find_saddle(
 
 
 def _step_towards(shape: FloatArray, target: FloatArray, share: float) -> FloatArray:
-    """Geometric mean, kept off zero."""
+    """Weighted geometric mean, kept off zero."""
     mixed = shape ** (1 - share) * target**share
     return np.asarray(np.maximum(mixed, 1e-14 * np.max(mixed)))
 
 
 def _prepare_band(
-    reach: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
+    inner: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
 ) -> _Band | None:
     noise = mode.noise_nm2
     width = ends[1] - ends[0]
     reference = mode.reference()
     if noise == 0:
         reference = max(reference, total / width)
-        # the line fills the band: only outside of it may the spectrum vanish
-        panels = mode.log_moments(reach, reference, ends=ends, skip=True)
-    else:
-        panels = mode.log_moments(reach, reference, ends=ends)
+    # without noise the line fills the band, and the spectrum may vanish only outside of it
+    panels = mode.log_moments(inner, reference, ends=ends, skip=noise == 0)
     if panels is None:
         return None
     middle = (panels.low + panels.high) / 2
@@ -286,7 +276,7 @@ def _prepare_band(
     edges = edges[np.concatenate([[True], np.diff(edges) > 1e-4 * width / _PANELS])]
     x, q = gauss_panels(edges, _ORDER)
     return _Band(
-        reach=reach,
+        inner=inner,
         mode=mode,
         reference=reference,
         outside=panels.integrals[~inside].sum(axis=0),

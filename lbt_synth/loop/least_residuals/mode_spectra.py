@@ -1,4 +1,4 @@
-"""Modes that can be treated one by one: rotated directions, their spectra, their noise."""
+"""Decoupled modes: the directions along which a loop splits, with their spectra and noise."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
+from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.least_residuals.prediction import InnerFactor
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, Vibration
 from lbt_synth.models.spectra import breakpoints_below, spectrum_key
 from lbt_synth.validation import FloatArray
 
-_COUPLING = 1e-9  # relative size of what counts as coupled
+_COUPLING = 1e-9  # relative size above which an off-diagonal entry counts as coupling
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModeSpectrum:
     """One decoupled mode: its disturbance and the white noise on its measurement."""
 
-    rate_hz: float  # Frame rate [Hz]
-    parts: tuple[Spectrum, ...]  # Independent parts of the disturbance
-    noise_nm2: float  # Variance of the noise per frame, seen as a phase [nm^2]
+    rate_hz: float
+    parts: tuple[Spectrum, ...]  # independent parts of the disturbance
+    noise_nm2: float  # variance of the noise per frame, as a phase [nm^2]
 
     def power(self, x: FloatArray) -> FloatArray:
         """Two-sided disturbance spectrum per sample [nm^2] at x, in units of Nyquist."""
@@ -62,7 +63,7 @@ class ModeSpectrum:
 
     def log_moments(
         self,
-        reach: InnerFactor,
+        inner: InnerFactor,
         reference: float,
         *,
         ends: Sequence[float] = (),
@@ -70,7 +71,7 @@ class ModeSpectrum:
     ) -> RefinedPanels | None:
         """Integrals of ``log(Phi / reference)`` times the weights; None where Phi vanishes.
 
-        The two ``ends`` are ends of panels; with ``skip``, what lies between them is 0.
+        The two ``ends`` are edges of panels; with ``skip``, the integrand between them is 0.
         """
         noiseless = self.noise_nm2 == 0
 
@@ -80,14 +81,14 @@ class ModeSpectrum:
             if not np.all(np.isfinite(ratio)):
                 raise ProblemError(
                     f"the noise variance {self.noise_nm2:.3g} nm^2 is too small beside the "
-                    "disturbance to be told from zero; set noise_nm to 0."
+                    "disturbance to differ from zero; set noise_nm to 0."
                 )
             if skip:
                 ratio = np.where((x > ends[0]) & (x < ends[1]), 1.0, ratio)
             if noiseless and np.any(ratio == 0):
                 raise _VanishingError
             values = np.log(ratio) if noiseless else np.log1p(ratio)
-            return np.asarray(values[:, None] * reach.weights(x))
+            return np.asarray(values[:, None] * inner.weights(x))
 
         try:
             return refine_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
@@ -96,7 +97,7 @@ class ModeSpectrum:
 
 
 class _VanishingError(Exception):
-    """A spectrum without noise is zero over an interval: its process is known for ever."""
+    """A spectrum without noise is zero over an interval: the process can be predicted exactly."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,9 +116,9 @@ def decoupled_modes(
     vibrations: Sequence[tuple[FloatArray, Vibration]] = (),
     directions: Sequence[FloatArray] = (),
 ) -> DecoupledModes:
-    """Rotate the modes until disturbance and noise are diagonal.
+    """Rotate the modes until disturbance and noise (q, q) are diagonal.
 
-    Shapes: noise_nm2 (q, q), vibrations list of (direction, Vibration), directions list of (n,).
+    Vibrations come with their directions (n,); further ``directions`` must be axes, too.
     """
     n, rate = hardware.modes, hardware.frame_rate_hz
     noise = noise_on_modes(hardware, noise_nm2)
@@ -127,12 +128,9 @@ def decoupled_modes(
             f"{np.linalg.matrix_rank(hardware.influence)} for {n} modes. Leave out the modes that "
             "it cannot correct."
         )
-    for model in [t for t in turbulence if isinstance(t, ARModel)]:
-        if not np.isclose(model.frame_rate_hz, rate, rtol=1e-9):
-            raise ProblemError(
-                f"a disturbance must be sampled at the loop's {rate:.6g} Hz; "
-                f"got {model.frame_rate_hz:.6g} Hz."
-            )
+    for model in turbulence:
+        if isinstance(model, ARModel):
+            require_loop_rate(model.frame_rate_hz, hardware)
     # modes with the same spectrum may be turned into each other
     keys = [spectrum_key(spectrum) for spectrum in turbulence]
     kinds = dict(zip(keys, turbulence, strict=True))
@@ -148,15 +146,10 @@ def decoupled_modes(
     modes = []
     for axis in axes:
         own = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
-        parts = [] if kinds[own] is None else [kinds[own]]
-        parts += [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
-        modes.append(
-            ModeSpectrum(
-                rate_hz=rate,
-                parts=tuple(part for part in parts if part is not None),
-                noise_nm2=max(float(axis @ noise @ axis), 0.0),
-            )
-        )
+        lines = [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
+        parts = tuple(part for part in (kinds[own], *lines) if part is not None)
+        own_noise = max(float(axis @ noise @ axis), 0.0)
+        modes.append(ModeSpectrum(rate_hz=rate, parts=parts, noise_nm2=own_noise))
     return DecoupledModes(directions=axes, modes=tuple(modes))
 
 

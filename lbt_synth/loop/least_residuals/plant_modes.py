@@ -1,4 +1,4 @@
-"""Spectra of a plant that is given by its matrices alone."""
+"""Decoupled modes of a plant that is given by its matrices alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lbt_synth.loop.least_residuals.mode_spectra import (
     noise_on_modes,
 )
 from lbt_synth.models import FullStatePlant
-from lbt_synth.validation import ComplexArray, FloatArray, real_array
+from lbt_synth.validation import FloatArray, real_array
 
 _SAMPLES = 24  # frequencies at which the modes have to decouple
 
@@ -25,8 +25,8 @@ _SAMPLES = 24  # frequencies at which the modes have to decouple
 class ResponseSpectrum:
     """One-sided spectrum of one direction of a system driven by white noise."""
 
-    system: StateSpace  # From unit white noise to the modes
-    axis: FloatArray  # (n,): the direction
+    system: StateSpace  # from unit white noise to the modes
+    axis: FloatArray  # (n,)
 
     @property
     def breakpoints_hz(self) -> FloatArray:
@@ -40,13 +40,9 @@ class ResponseSpectrum:
     def psd(self, frequency_hz: Any) -> FloatArray:
         """Return the spectrum [nm^2/Hz]."""
         frequency = real_array(frequency_hz, "frequency_hz")
-        response = _modes_response(self.system, self.axis[None], frequency.ravel())[:, 0]
+        response = (self.axis[None] @ self.system.frequency_response(frequency.ravel()))[:, 0]
         power = np.sum(np.abs(response) ** 2, axis=-1)
         return np.asarray(2 * self.system.dt_s * power.reshape(frequency.shape))
-
-
-def _modes_response(system: StateSpace, rows: FloatArray, frequency_hz: FloatArray) -> ComplexArray:
-    return np.asarray(rows @ system.frequency_response(frequency_hz), dtype=np.complex128)
 
 
 def plant_modes(plant: FullStatePlant) -> DecoupledModes:
@@ -58,7 +54,7 @@ def plant_modes(plant: FullStatePlant) -> DecoupledModes:
             "a limit needs measurement noise that is independent of the disturbance; got a plant "
             "with B D' different from zero."
         )
-    # commands reach neither these states nor this output: the response to the disturbance alone
+    # the commands are left out: this is the response to the disturbance alone
     see = np.linalg.pinv(hardware.sensor)
     system = StateSpace(
         A=plant.A, B=plant.B, C=see @ plant.C, D=np.zeros_like(see @ plant.D), dt_s=plant.dt_s
@@ -78,14 +74,12 @@ def plant_modes(plant: FullStatePlant) -> DecoupledModes:
             "a limit needs modes that decouple; got disturbances of two modes that follow each "
             "other with a delay. Treat each mode by itself."
         )
-    return DecoupledModes(
-        directions=axes,
-        modes=tuple(
-            ModeSpectrum(
-                rate_hz=hardware.frame_rate_hz,
-                parts=(ResponseSpectrum(system=system, axis=axis),),
-                noise_nm2=max(float(axis @ noise @ axis), 0.0),
-            )
-            for axis in axes
-        ),
+    modes = tuple(
+        ModeSpectrum(
+            rate_hz=hardware.frame_rate_hz,
+            parts=(ResponseSpectrum(system=system, axis=axis),),
+            noise_nm2=max(float(axis @ noise @ axis), 0.0),
+        )
+        for axis in axes
     )
+    return DecoupledModes(directions=axes, modes=modes)

@@ -1,4 +1,4 @@
-"""What of a process cannot be known in time: the error of the best prediction.
+"""The best prediction of a process through a loop's delay, and its error.
 
 With the measured spectrum ``Phi = S + R = |F|^2``, F outer, and the path ``z^-1 M`` from a
 filter's output to the residual written as an inner factor times an outer one, the least
@@ -19,22 +19,22 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_FEW_DIGITS = 1e-2  # a quotient by less than this would lose more than two digits
+_FEW_DIGITS = 1e-2  # a division by less than this would lose more than two digits
 _REAL = 1e-7  # relative imaginary part of what counts as a real zero
-_ALIKE = 1e9  # condition of the zeros' Gram matrix beyond which they cannot be told apart
+_ALIKE = 1e9  # condition of the zeros' Gram matrix beyond which they count as equal
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InnerFactor:
-    """Inner factor of the path."""
+    """The inner factor of a loop's path: a pure delay and an all-pass factor."""
 
-    whole: int  # Frames of pure delay from the measured sample to the one that is corrected
-    zeros: tuple[float, ...]  # Zeros of the all-pass factor in the backward shift, in (-1, 1)
-    terms: int  # Cosine integrals that are needed, the mean included
+    whole: int  # frames of pure delay from the measured sample to the corrected one
+    zeros: tuple[float, ...]  # of the all-pass factor in the backward shift, in (-1, 1)
+    terms: int  # number of cosine integrals that are needed, the mean included
 
     @staticmethod
     def of(hardware: LoopHardware) -> InnerFactor:
-        """Inner factor of a loop's path."""
+        """Return the inner factor of a loop's path."""
         mirror = hardware.mirror_system
         found = mirror.core.zeros
         late = found[np.abs(found) > 1]  # on the circle: a stable inverse, in the limit
@@ -87,33 +87,33 @@ def _gram(zeros: tuple[float, ...]) -> FloatArray:
 class Prediction:
     """Best prediction of a process whose spectrum has given integrals of its logarithm."""
 
-    reach: InnerFactor  # Inner factor of the path
-    mean_log: float  # Mean of ``log(Phi / reference)``
-    coefficients: FloatArray  # (whole,): ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``
-    tails: FloatArray  # (zeros,): values at the zeros of the all-pass factor of what follows them
+    inner: InnerFactor
+    mean_log: float  # mean of ``log(Phi / reference)``
+    coefficients: FloatArray  # ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``, (whole,)
+    tails: FloatArray  # values of the later terms of F at the zeros of the all-pass factor
 
     @staticmethod
-    def of(reach: InnerFactor, moments: FloatArray) -> Prediction:
-        """From the integrals of the logarithm times the weights of a reach."""
+    def of(inner: InnerFactor, moments: FloatArray) -> Prediction:
+        """Predict from the integrals of the logarithm times the weights of an inner factor."""
         polynomial = np.polynomial.polynomial.polyval
-        f = _exponential(moments[: reach.terms])
-        whole, tails = reach.whole, np.zeros(len(reach.zeros))
-        for i, a in enumerate(reach.zeros):
-            if a in reach.by_weight:
-                value = float(np.exp(moments[reach.terms + reach.by_weight.index(a)]))
+        f = _exponential(moments[: inner.terms])
+        whole, tails = inner.whole, np.zeros(len(inner.zeros))
+        for i, a in enumerate(inner.zeros):
+            if a in inner.by_weight:
+                value = float(np.exp(moments[inner.terms + inner.by_weight.index(a)]))
                 tails[i] = (value - float(polynomial(a, f[:whole]))) / a**whole
             else:
                 tails[i] = float(polynomial(a, f[whole:]))
         return Prediction(
-            reach=reach, mean_log=float(moments[0]), coefficients=f[:whole], tails=tails
+            inner=inner, mean_log=float(moments[0]), coefficients=f[:whole], tails=tails
         )
 
     @property
     def _kernels(self) -> FloatArray:
         """Weights of the kernels ``1 / (1 - a z^-1)`` that the unreachable part is made of."""
-        if not self.reach.zeros:
+        if not self.inner.zeros:
             return np.zeros(0)
-        return np.asarray(np.linalg.solve(_gram(self.reach.zeros), self.tails))
+        return np.asarray(np.linalg.solve(_gram(self.inner.zeros), self.tails))
 
     @property
     def later_power(self) -> float:
@@ -134,13 +134,13 @@ class Prediction:
         part: ComplexArray = np.asarray(
             np.polynomial.polynomial.polyval(shift, self.coefficients), dtype=np.complex128
         )
-        for a, weight in zip(self.reach.zeros, self._kernels, strict=True):
-            part = part + weight * shift**self.reach.whole / (1 - a * shift)
+        for a, weight in zip(self.inner.zeros, self._kernels, strict=True):
+            part = part + weight * shift**self.inner.whole / (1 - a * shift)
         return np.asarray(np.abs(part) ** 2)
 
 
 def _exponential(c: FloatArray) -> FloatArray:
-    """Coefficients of ``exp(c_1 x + c_2 x^2 + ...)``, as many as there are c."""
+    """As many coefficients of ``exp(c_1 x + c_2 x^2 + ...)`` as there are of c."""
     f = np.zeros(c.size)
     f[0] = 1.0
     weighted = np.arange(c.size) * c

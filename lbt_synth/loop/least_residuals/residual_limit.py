@@ -27,7 +27,7 @@ class ResidualLimit:
     variance_nm2 : (n,) ndarray
         Least variance along each direction [nm^2].
     directions : (n, n) ndarray
-        Directions over the modes, one a row, along which the loop decouples.
+        Directions over the modes, one per row, along which the loop decouples.
     change : float
         What the last refinement of the integrals changed, relative to the variance; the
         largest over the directions.
@@ -83,19 +83,18 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     >>> round(float(limit.variance_nm2[0]), 8)  # 2^2 (1 + 0.5^2)
     5.0
     """
-    modes = truth_modes(hardware, truth)
-    return _residual_limit(InnerFactor.of(hardware), modes)
+    return _residual_limit(hardware, truth_modes(hardware, truth))
 
 
 def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth."""
     if isinstance(plant, FullStatePlant):
-        return _residual_limit(InnerFactor.of(plant.hardware), plant_modes(plant))
+        return _residual_limit(plant.hardware, plant_modes(plant))
     lines = [(checked_direction(line, plant.hardware), line) for line in plant.vibrations]
     modes = decoupled_modes(
         plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
     )
-    return _residual_limit(InnerFactor.of(plant.hardware), modes)
+    return _residual_limit(plant.hardware, modes)
 
 
 def truth_modes(
@@ -119,13 +118,14 @@ def truth_modes(
     )
 
 
-def _residual_limit(reach: InnerFactor, decoupled: DecoupledModes) -> ResidualLimit:
+def _residual_limit(hardware: LoopHardware, decoupled: DecoupledModes) -> ResidualLimit:
+    inner = InnerFactor.of(hardware)
     known: dict[tuple[object, ...], tuple[float, float]] = {}
     found = []
     for mode in decoupled.modes:
         key = (tuple(id(part) for part in mode.parts), mode.noise_nm2)
         if key not in known:
-            known[key] = mode_limit(reach, mode)
+            known[key] = mode_limit(inner, mode)
         found.append(known[key])
     variance, change = np.array(found).T
     return ResidualLimit(
@@ -135,13 +135,13 @@ def _residual_limit(reach: InnerFactor, decoupled: DecoupledModes) -> ResidualLi
     )
 
 
-def mode_limit(reach: InnerFactor, mode: ModeSpectrum) -> tuple[float, float]:
+def mode_limit(inner: InnerFactor, mode: ModeSpectrum) -> tuple[float, float]:
     """Least variance of one mode, and its relative change at the last refinement."""
     reference = mode.reference()
-    panels = mode.log_moments(reach, reference) if mode.parts and reference > 0 else None
-    if panels is None:  # nothing to correct, or nothing that is not known beforehand
+    panels = mode.log_moments(inner, reference) if mode.parts and reference > 0 else None
+    if panels is None:  # nothing to correct, or all of it can be predicted
         return 0.0, 0.0
     moments = panels.integrals.sum(axis=0)
-    variance = Prediction.of(reach, moments).variance(reference, mode.noise_nm2)
+    variance = Prediction.of(inner, moments).variance(reference, mode.noise_nm2)
     scale = min(1.0, float(moments[0])) if mode.noise_nm2 > 0 else 1.0
     return variance, panels.change / scale if scale > 0 else 0.0

@@ -1,9 +1,9 @@
-"""Linear systems driven by long series, by matrix products over blocks of frames.
+"""Filters long series with linear systems, by matrix products over blocks of frames.
 
 Within a block of b frames the outputs are a matrix times (state at the block's
 beginning, inputs of the block); the states at the beginnings obey a recursion
 with ``A^b``. One system, of any size, has many cases of inputs, and its recursion is
-solved by blocks again; a stack of small systems has one case each, and its recursion
+solved by blocks again; many small systems have one case each, and their recursion
 goes block by block, all systems at once. The result is that of the frame-by-frame
 recursion up to rounding.
 """
@@ -21,9 +21,9 @@ from lbt_synth.linear.batched import transpose
 from lbt_synth.validation import FloatArray, real_array
 
 _BLOCK = 8
-_STACK_BLOCK = 32  # of small systems: their products are small, and their recursion is slow
-_STEPS = 16  # of the recursion between blocks
-_CACHED = 500_000  # numbers of inputs and outputs worked on at once
+_BATCH_BLOCK = 32  # for many small systems: their products are small, their recursion is slow
+_STEPS = 16  # blocks per block of the recursion
+_CACHED = 500_000  # input and output values worked on at once
 
 
 def filter_series(system: StateSpace, inputs: Any) -> FloatArray:
@@ -76,7 +76,7 @@ def filter_series(system: StateSpace, inputs: Any) -> FloatArray:
 
 def _filter_batch(operators: _BlockOperators, u: FloatArray) -> FloatArray:
     cases, frames, m = u.shape
-    blocks = -(-frames // _BLOCK)
+    blocks = -(-frames // _BLOCK)  # rounded up
     if frames != blocks * _BLOCK:
         padded = np.zeros((cases, blocks * _BLOCK, m))
         padded[:, :frames] = u
@@ -89,10 +89,10 @@ def _filter_batch(operators: _BlockOperators, u: FloatArray) -> FloatArray:
 
 
 def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
-    """Compute the state after the last frame of ``x(k+1) = A x(k) + drive(k)``, from zero.
+    """Compute the state (n,) after the last frame of ``x(k+1) = A x(k) + drive(k)``, from zero.
 
-    By halves: two steps of A with two drives are one step of A^2 with ``A drive + drive``. Shapes:
-    A (n, n), drive (frames, n) -> (n,).
+    The drive (frames, n) is halved repeatedly: two steps of A with two drives are one step of A^2
+    with ``A drive + drive``.
 
     Examples
     --------
@@ -111,7 +111,7 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
 
 
 class BatchedSystems:
-    """Small systems of the same sizes, ready to be driven by one series each.
+    """Small systems of the same sizes that filter one series each.
 
     Parameters
     ----------
@@ -129,12 +129,12 @@ class BatchedSystems:
     """
 
     def __init__(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
-        self._operators = _block_operators(A, B, C, D, _STACK_BLOCK)
+        self._operators = _block_operators(A, B, C, D, _BATCH_BLOCK)
         self._outputs, self._inputs = D.shape[-2:]
 
     def filter(self, inputs: FloatArray, *, in_place: bool = False) -> FloatArray:
-        """Compute the outputs from zero states. Shapes: inputs (N, frames, m) -> (N, frames, p)."""
-        u, op, block = inputs, self._operators, _STACK_BLOCK
+        """Compute the outputs (N, frames, p) of inputs (N, frames, m) from zero states."""
+        u, op, block = inputs, self._operators, _BATCH_BLOCK
         count, frames, m = u.shape
         p, n = self._outputs, op.step.shape[-1]
         whole, tail = divmod(frames, block)
@@ -169,8 +169,8 @@ class BatchedSystems:
 def _block_states(step: FloatArray, drive: FloatArray) -> FloatArray:
     """States at the blocks' beginnings, (blocks, n, N), one block after the other.
 
-    The systems are the last axis, so that the products of all small matrices are a few
-    sums over long rows.
+    The systems are the last axis: the products of all small matrices are then a few sums over
+    long rows.
     """
     matrices = np.ascontiguousarray(step.transpose(2, 1, 0))  # (column, row, system)
     states = np.zeros_like(drive)
@@ -181,17 +181,15 @@ def _block_states(step: FloatArray, drive: FloatArray) -> FloatArray:
 
 
 class _BlockOperators(NamedTuple):
-    """What a block of frames does, transposed for row vectors; of one system or of each of many.
+    """Matrices of a block of frames, transposed for row vectors, of one system or of each of many.
 
-    ``step`` advances the state by a block, ``reach`` maps the block's inputs to
-    the state after it, ``observe`` the state before it and ``toeplitz`` the
-    inputs to the block's outputs.
+    Only ``step`` is not transposed.
     """
 
-    step: FloatArray
-    reach: FloatArray
-    observe: FloatArray
-    toeplitz: FloatArray
+    step: FloatArray  # advances the state by a block
+    reach: FloatArray  # from the block's inputs to the state after it
+    observe: FloatArray  # from the state before the block to its outputs
+    toeplitz: FloatArray  # from the block's inputs to its outputs
 
 
 def _block_operators(
@@ -217,13 +215,6 @@ def _block_operators(
     )
 
 
-def _powers(A: FloatArray, highest: int) -> list[FloatArray]:
-    powers = [np.eye(A.shape[0])]
-    for _ in range(highest):
-        powers.append(powers[-1] @ A)
-    return powers
-
-
 def _recursion(A: FloatArray, drive: FloatArray) -> FloatArray:
     """States ``x(j+1) = A x(j) + drive(j)`` from zero, for (cases, steps, n) drives."""
     cases, steps, n = drive.shape
@@ -236,7 +227,9 @@ def _recursion(A: FloatArray, drive: FloatArray) -> FloatArray:
     padded = np.zeros((cases, blocks * _STEPS, n))
     padded[:, :steps] = drive
     chunks = padded.reshape(cases, blocks, _STEPS, n)
-    powers = _powers(A, _STEPS)
+    powers = [np.eye(len(A))]
+    for _ in range(_STEPS):
+        powers.append(powers[-1] @ A)
     inside = np.zeros_like(chunks)  # states of each block when it begins at zero
     for j in range(_STEPS - 1):
         inside[:, :, j + 1] = inside[:, :, j] @ A.T + chunks[:, :, j]

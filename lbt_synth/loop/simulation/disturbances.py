@@ -1,4 +1,4 @@
-"""Random series of a truth's disturbances, stationary from their first frame."""
+"""Random series of a truth's disturbances and noise, stationary from their first frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.truth import checked_direction
 from lbt_synth.validation import FloatArray
 
-# A spectrum is drawn on this many times the wanted frames, so that the period is not seen.
+# A spectrum is drawn over this many times the wanted frames, which hides the series' period.
 _PERIODS = 4
 
 
@@ -27,9 +27,9 @@ def draw_disturbance(
 ) -> FloatArray:
     """Draw the total phase, (cases, frames, n) [nm].
 
-    Each part has a stream of its own: a truth with one vibration more keeps the
-    turbulence that it had. So has each mode where every mode has a spectrum of its own.
-    A vibration that drifts begins to in frame ``zero_frame``.
+    Each part has its own random stream: a truth with one more vibration keeps its turbulence.
+    So has each mode where the modes have different spectra. Time 0 of a vibration that drifts is
+    frame ``zero_frame``.
     """
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
@@ -75,7 +75,7 @@ def _draw(
     rate = hardware.frame_rate_hz
     length = next_fast_len(_PERIODS * frames, real=True)
     length += length % 2  # an even length has a bin at the Nyquist frequency
-    # E|X_k|^2 = power_k length^2 / 2; the two ends are real, of twice that variance
+    # E|X_k|^2 = power_k length^2 / 2; the two end bins are real, with twice that variance
     amplitude = length * np.sqrt(_bin_powers(spectrum, rate, length)) / 2
     out = np.empty((cases, frames))
     for case in range(cases):
@@ -87,7 +87,7 @@ def _draw(
 
 
 def _bin_powers(spectrum: Spectrum, rate: float, length: int) -> FloatArray:
-    """Power of the spectrum in each Fourier bin [nm^2], integrated, not sampled."""
+    """Power of the spectrum in each Fourier bin [nm^2], integrated rather than sampled."""
     width = rate / length
     ends = np.concatenate([[0.0], (np.arange(length // 2) + 0.5) * width, [rate / 2]])
     inside = breakpoints_below(spectrum, rate / 2)

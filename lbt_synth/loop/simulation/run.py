@@ -1,4 +1,4 @@
-"""Run a loop frame after frame: truth outside, controller inside."""
+"""Runs a loop in the time domain: random disturbances, any controller, all series."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.validation import FloatArray, frozen_copy, integer
 
-_SETTLED = 1e-4
-_MOST_SETTLING = 200_000
-_DEFAULT_SETTLING = 1000
+_SETTLED = 1e-4  # decay of the slowest mode after which a loop has settled
+_MOST_SETTLING = 200_000  # frames
+_DEFAULT_SETTLING = 1000  # frames
 _MOST_GIGABYTES = 8.0
 
 
@@ -141,7 +141,7 @@ def simulate(
         loop.require_stable()
         default = settling_frames(loop.spectral_radius)
     elif isinstance(controller, SteppedController):
-        loop, default = None, _DEFAULT_SETTLING
+        default = _DEFAULT_SETTLING
     else:
         raise ProblemError(
             "controller must be a Controller, or an object with step(y) and reset(); "
@@ -161,10 +161,9 @@ def simulate(
     size = {"frames": settle + frames, "cases": cases}
     total = draw_disturbance(truth, hardware, rng=disturbance_rng, zero_frame=settle, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
-    if loop is not None:
+    if isinstance(controller, Controller):
         outputs = filter_series(loop.system, np.concatenate([total, noise], axis=2))
     else:
-        assert not isinstance(controller, Controller)
         outputs = step_loop(controller, truth.sensor_gain, hardware, total, noise)
     n, m = hardware.modes, hardware.n_commands
     kept = outputs[:, settle:]
@@ -188,7 +187,7 @@ def settling_frames(radius: float) -> int:
 def step_controller(
     controller: SteppedController | RunningController, y: FloatArray, size: int, *, frame: int
 ) -> FloatArray:
-    """Give a controller its measurements, and return its commands if they are some."""
+    """Give a controller its measurements, and return its commands if they are finite."""
     u = np.asarray(controller.step(y), dtype=np.float64)
     finite = bool(np.all(np.isfinite(u)))
     if u.shape != (size,) or not finite:
@@ -209,7 +208,7 @@ def step_loop(
 ) -> FloatArray:
     """Run the loop one frame at a time, as written in :class:`LoopHardware`.
 
-    Shapes: returns (cases, frames, n + m + q).
+    Return ``phi_res, u, y`` side by side, (cases, frames, n + m + q).
     """
     cases, frames, n = total.shape
     m, q = hardware.n_commands, hardware.n_measurements
