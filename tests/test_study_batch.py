@@ -9,7 +9,7 @@ from support.studies import BASE, LBT_TEXT, study_file
 import lbt_synth as lbt
 from lbt_synth.studies.study import batch_evaluation
 from lbt_synth.studies.study import reference_evaluation as reference
-from lbt_synth.studies.study.sample_arrays import changes_beliefs_only, changes_numbers_only
+from lbt_synth.studies.study.sample_arrays import changes_assumptions_only, changes_numbers_only
 
 COUNT = 8
 LBT = LBT_TEXT.replace("kind: ar1", "kind: {kind}")
@@ -274,9 +274,9 @@ def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
         ("atmosphere", "seeing_wavelength_um"),
     ]
     assert not any(changes_numbers_only(study, keys) for keys in others)
-    assert changes_beliefs_only(study, ("model", "vibrations", 0, "rms_mas"))
-    assert changes_beliefs_only(study, ("model", "sensor_gain"))
-    assert not changes_beliefs_only(study, ("model", "turbulence", "driving_rms_nm"))
+    assert changes_assumptions_only(study, ("model", "vibrations", 0, "rms_mas"))
+    assert changes_assumptions_only(study, ("model", "sensor_gain"))
+    assert not changes_assumptions_only(study, ("model", "turbulence", "driving_rms_nm"))
 
 
 def test_two_answers_stop_a_study(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ from lbt_synth.design import Design, kalman, lqg, optimal_integrator
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, settling_error, strehl
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
-from lbt_synth.validation import instance
+from lbt_synth.validation import require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +81,7 @@ def mirror(
     --------
     >>> import lbt_synth as lbt
     >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
     ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=60
     ... )
     >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5, mirror=shell)
@@ -93,8 +93,8 @@ def mirror(
     """
     if not isinstance(plant, TipTiltPlant):
         raise ProblemError(f"a mirror study needs a TipTiltPlant; got {type(plant).__name__}.")
-    instance(truth, Truth)
-    instance(imaging, Imaging)
+    require_instance(truth, Truth)
+    require_instance(imaging, Imaging)
     hardware = plant.hardware
     settled = replace(plant, hardware=replace(hardware, mirror=None))
     designs: dict[str, Design] = {

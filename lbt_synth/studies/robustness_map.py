@@ -12,8 +12,15 @@ from lbt_synth.design import Design
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop import EnsembleVibration, Imaging, LoopEnsemble, ensemble_residuals
 from lbt_synth.models import LoopHardware, Truth, Vibration
-from lbt_synth.models.truth import fitted_direction, stationary_vibrations
-from lbt_synth.validation import BoolArray, FloatArray, frozen, instance, number, real_array
+from lbt_synth.models.truth import checked_direction, stationary_vibrations
+from lbt_synth.validation import (
+    BoolArray,
+    FloatArray,
+    frozen_copy,
+    number,
+    real_array,
+    require_instance,
+)
 
 _GAINS_AT_ONCE = 64
 
@@ -115,7 +122,7 @@ def robustness_map(
     True
     """
     for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
-        instance(value, kind)
+        require_instance(value, kind)
     hardware = design.hardware
     if hardware is None:
         raise ProblemError(
@@ -147,7 +154,7 @@ def robustness_map(
             ensemble = LoopEnsemble(
                 sensor_gain=np.repeat(part, errors.size),
                 delay_frames=hardware.delay_frames + delay,
-                noise_nm=truth.noise_of(hardware.n_measurements)[None],
+                noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
                 turbulence=truth.turbulence,
                 vibrations=tuple(
                     replace(line, frequency_hz=np.tile(line.frequency_hz, part.size))
@@ -165,8 +172,8 @@ def robustness_map(
         errors_hz=errors,
         sensor_gains=gains,
         delay_errors_frames=delays,
-        strehl=frozen(strehls),
-        residual_nm=frozen(residuals),
+        strehl=frozen_copy(strehls),
+        residual_nm=frozen_copy(residuals),
         stable=stable,
     )
 
@@ -194,7 +201,7 @@ def _shift_vibrations(
     nyquist = hardware.frame_rate_hz / 2
     moved = []
     for vibration in stationary_vibrations(truth.vibrations):
-        fitted_direction(vibration, hardware)
+        checked_direction(vibration, hardware)
         frequencies = vibration.frequency_hz - errors_hz
         wrong = ~((frequencies > 0) & (frequencies < nyquist))
         if np.any(wrong):

@@ -15,8 +15,8 @@ from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.config_paths import Keys
 from lbt_synth.studies.study.sample import make_sample
 from lbt_synth.studies.study.sample_arrays import (
-    BELIEVED_DELAY,
-    changes_beliefs_only,
+    ASSUMED_DELAY,
+    changes_assumptions_only,
     changes_numbers_only,
     make_sample_arrays,
 )
@@ -113,10 +113,10 @@ def _evaluate_groups(
 
     def together(keys: Keys) -> bool:
         """Whether samples that differ at a place fit in one ensemble."""
-        if not (changes_numbers_only(study, keys) or changes_beliefs_only(study, keys)):
+        if not (changes_numbers_only(study, keys) or changes_assumptions_only(study, keys)):
             return False
         return not for_sample or (
-            keys != BELIEVED_DELAY and changes_design_numbers_only(study, keys)
+            keys != ASSUMED_DELAY and changes_design_numbers_only(study, keys)
         )
 
     for group in _find_groups(study, values, together):

@@ -1,4 +1,4 @@
-"""A million samples as some hundred points: what charts of a study are drawn from."""
+"""Reduce a million samples to some hundred points for the charts of a study."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.studies.study.variance_index import is_list
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, IntArray, frozen_copy
 
 _POINTS = 200  # of a cumulative distribution
 _BINS = 30  # of a histogram, at most
 _CELLS = 32  # along either axis of a map, at most
-_WITHIN = 1, 99  # percentiles that a map reaches to; its outermost cells hold what is beyond
+_WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 
 
@@ -20,17 +20,14 @@ _PER_CELL = 8  # samples in a cell of a map on average, at least
 class BinnedMap:
     """Mean of a result over a grid of two parameters."""
 
-    # x, y (nx,): centres of the cells, or the values of a list
-    x: FloatArray
-    y: FloatArray
-    mean: FloatArray  # (ny, nx): mean in each cell; nan where there is no sample
-    samples: FloatArray  # (ny, nx): samples in each cell
+    x: FloatArray  # centres of the cells, or the values of a list, (nx,)
+    y: FloatArray  # (ny,)
+    mean: FloatArray  # (ny, nx); nan in a cell without samples
+    samples: FloatArray  # number in each cell, (ny, nx)
 
 
 def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points of the cumulative distribution of a sample, more of them in its tails.
-
-    Shapes: values (n,) -> level (k,), part (k,).
+    """Return levels (k,) and the part of the values at or below each, denser in the tails.
 
     Examples
     --------
@@ -54,17 +51,14 @@ def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return edges of bins and the part of the sample in each.
-
-    Shapes: values (n,) -> edges (k + 1,), part (k,).
-    """
+    """Return edges of bins (k + 1,) and the part of the values in each (k,)."""
     bins = int(np.clip(np.sqrt(len(values)), 4, _BINS))
     counts, edges = np.histogram(values, bins=bins)
     return edges, counts / len(values)
 
 
 def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return the values of a list and the part of the sample of each; None if it is no list."""
+    """Return the distinct values of a list parameter and their parts; None if it is no list."""
     if not is_list(np.sort(values)):
         return None
     found, counts = np.unique(values, return_counts=True)
@@ -72,9 +66,7 @@ def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
 
 
 def binned_map(x: FloatArray, y: FloatArray, result: FloatArray) -> BinnedMap:
-    """Mean of a result over a grid of two parameters that vary.
-
-    Shapes: x, y (n,), result (n,).
+    """Return the mean of a result (n,) over a grid of two varying parameters (n,).
 
     Examples
     --------
@@ -101,17 +93,17 @@ def binned_map(x: FloatArray, y: FloatArray, result: FloatArray) -> BinnedMap:
     np.divide(sums, samples, out=mean, where=samples > 0)
     shape = len(rows), len(columns)
     return BinnedMap(
-        x=frozen(columns),
-        y=frozen(rows),
-        mean=frozen(mean.reshape(shape)),
-        samples=frozen(samples.reshape(shape)),
+        x=frozen_copy(columns),
+        y=frozen_copy(rows),
+        mean=frozen_copy(mean.reshape(shape)),
+        samples=frozen_copy(samples.reshape(shape)),
     )
 
 
 def _assign_cells(
     values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
-) -> tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.int64]]]:
-    """Centres of the cells along one axis, and the cell of each sample."""
+) -> tuple[FloatArray, IntArray]:
+    """Return the centres of the cells along one axis, and the cell of each sample."""
     if listed is not None:
         return listed[0], np.searchsorted(listed[0], values)
     low, high = np.percentile(values, _WITHIN)

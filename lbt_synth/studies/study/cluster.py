@@ -1,4 +1,4 @@
-"""Dask: the only module that knows it (extra ``dask``)."""
+"""Connection to a Dask cluster, the only module that imports dask.distributed."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _VERSION = "lbt_synth:__version__"
 class Cluster:
     """A connection to a scheduler."""
 
-    executor: Executor  # Runs calls on the cluster
-    workers: int  # Threads of all its workers together
+    executor: Executor
+    workers: int  # threads of all its workers
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def connect_cluster(address: str) -> Iterator[Cluster]:
             '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
         ) from error
     try:
-        # a client of what is no address complains once more when it is thrown away
+        # a client made with an invalid address complains again when it is collected
         get_address_host_port(address if "://" in address else f"tcp://{address}", strict=True)
         client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
@@ -60,7 +60,7 @@ def connect_cluster(address: str) -> Iterator[Cluster]:
 
 @contextmanager
 def _silence_logging() -> Iterator[None]:
-    """Let nothing be logged: a lost scheduler is told by an error, not by tracebacks."""
+    """Disable logging: a lost scheduler raises an error, and its tracebacks say no more."""
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
@@ -70,12 +70,12 @@ def _silence_logging() -> Iterator[None]:
 
 
 def _require_versions(address: str, client: Any) -> None:
-    """Refuse a scheduler or workers that have not this lbt_synth: both read what they are sent."""
+    """Refuse a scheduler or worker without this version, as both unpickle what they receive."""
     try:
         found = {"scheduler": client.run_on_scheduler(pkgutil.resolve_name, _VERSION)}
     except ImportError as error:
         found = {"scheduler": error}
-    # the function is one of Python's own, so that it is there whatever else is not
+    # a function of the standard library exists on every worker
     found |= client.run(pkgutil.resolve_name, _VERSION, on_error="return")
     for name, version in found.items():
         if version != lbt_synth.__version__:

@@ -1,4 +1,4 @@
-"""Controllers against each other on the same samples."""
+"""Comparisons of controllers with each other on the same samples."""
 
 from __future__ import annotations
 
@@ -18,30 +18,25 @@ DIFFERENCES = (5.0, 25.0, 50.0, 75.0, 95.0)
 class Comparison:
     """Two controllers on the samples on which neither failed."""
 
-    # first, second: Their names
     first: str
     second: str
-    # better, equal: Samples in which the first has the higher Strehl ratio, and in which both have
-    # the same (both unstable, as a rule)
-    better: Share
-    equal: Share
-    # mean, mean_error: Mean of the first's Strehl ratio less the second's, and its standard error
-    mean: float
-    mean_error: float
-    difference: tuple[Percentile, ...]  # Percentiles of that difference
+    better: Share  # samples with a higher Strehl ratio of the first
+    equal: Share  # samples with the same, mostly as both are unstable
+    mean: float  # Strehl ratio of the first less the second
+    mean_error: float  # standard error of that mean
+    difference: tuple[Percentile, ...]  # of the same difference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loss:
     """What a controller loses against the best one of each sample."""
 
-    best: Share  # Samples in which no controller has a higher Strehl ratio
-    # Percentiles of the highest Strehl ratio less this one's: 50, 95 and 99
-    loss: tuple[Percentile, ...]
+    best: Share  # samples on which no controller has a higher Strehl ratio
+    loss: tuple[Percentile, ...]  # highest Strehl ratio less this one: 50th, 95th and 99th
 
 
 def mean_and_error(values: FloatArray) -> tuple[float, float]:
-    """Mean and its standard error for independent samples; nan where there are too few."""
+    """Return the mean and its standard error for independent samples; nan if too few."""
     n = len(values)
     mean = float(np.mean(values)) if n else np.nan
     return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan
@@ -65,17 +60,14 @@ def compare(first: ControllerSamples, second: ControllerSamples) -> Comparison:
 
 
 def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray, ...]:
-    """Return the best Strehl ratio of each sample less that of each controller.
-
-    Shapes: returns list of (m,).
-    """
+    """Return for each controller the best Strehl ratio less its own, on every sample (m,)."""
     whole = np.logical_and.reduce([each.evaluated for each in controllers])
     best = np.max([each.strehl[whole] for each in controllers], axis=0)
     return tuple(best - each.strehl[whole] for each in controllers)
 
 
 def losses(controllers: Sequence[ControllerSamples]) -> tuple[Loss, ...]:
-    """Loss of each controller against the best one of each sample."""
+    """Return the loss of each controller against the best one of each sample."""
     return tuple(
         Loss(
             best=share(int(np.count_nonzero(loss == 0)), len(loss)),

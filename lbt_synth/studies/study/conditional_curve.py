@@ -1,4 +1,4 @@
-"""The result given one parameter: a curve, and how far it goes up and down."""
+"""Strehl ratio as a function of one parameter: its curve and its swing."""
 
 from __future__ import annotations
 
@@ -8,33 +8,30 @@ import numpy as np
 
 from lbt_synth.studies.study.comparison import mean_and_error
 from lbt_synth.studies.study.variance_index import group_starts, is_list, value_starts
-from lbt_synth.validation import BoolArray, FloatArray, frozen
+from lbt_synth.validation import BoolArray, FloatArray, frozen_copy
 
-_GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # so many groups below that many samples
+_GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # samples, and groups if there are fewer
 _MOST_GROUPS = 32
 _MIDDLE = 0.05, 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ConditionalCurve:
-    """Strehl ratio over one parameter, all others as they come."""
+    """Strehl ratio in k groups of one parameter, whatever the others are; all arrays (k,)."""
 
-    parameter: FloatArray  # (k,): median of the parameter in each group, or the values of a list
-    # low_edge, high_edge (k,): least and greatest value of the parameter in each group
-    low_edge: FloatArray
-    high_edge: FloatArray
-    # mean, mean_error (k,): mean of the Strehl ratio in each group, and its standard error
-    mean: FloatArray
-    mean_error: FloatArray
-    # low, high (k,): its 10th and 90th percentiles
-    low: FloatArray
-    high: FloatArray
-    unstable: FloatArray  # (k,): part of the loops that are unstable
-    samples: FloatArray  # (k,): samples in each group
-    discrete: bool  # Whether the groups are the values of a list
+    parameter: FloatArray  # its median in each group, or the values of a list
+    low_edge: FloatArray  # its least value in each group
+    high_edge: FloatArray  # its greatest value in each group
+    mean: FloatArray  # Strehl ratio
+    mean_error: FloatArray  # standard error of the mean
+    low: FloatArray  # 10th percentile of the Strehl ratio
+    high: FloatArray  # 90th percentile
+    unstable: FloatArray  # part of the loops that are unstable
+    samples: FloatArray  # number in each group
+    discrete: bool  # whether the groups are the values of a list
 
     def swing(self) -> tuple[float, float]:
-        """Greatest less least mean over the middle 90 % of the samples, and its standard error."""
+        """Return greatest less least mean over the middle 90 % of samples, and its error."""
         end = np.cumsum(self.samples)
         centre = (end - self.samples / 2) / end[-1]
         inside = self.discrete | ((centre >= _MIDDLE[0]) & (centre <= _MIDDLE[1]))
@@ -48,9 +45,7 @@ class ConditionalCurve:
 def conditional_curve(
     ordered: FloatArray, strehl: FloatArray, unstable: BoolArray
 ) -> ConditionalCurve:
-    """Mean, percentiles and instability of a result in groups of one parameter.
-
-    Shapes: ordered (n,), strehl (n,), unstable (n,).
+    """Return the Strehl ratio (n,) in groups of a parameter, given in rising order (n,).
 
     Examples
     --------
@@ -74,29 +69,17 @@ def conditional_curve(
         low, high = np.percentile(here, (10, 90))
         mean, error = mean_and_error(here)
         rows.append(
-            (
-                (inside[(len(inside) - 1) // 2] + inside[len(inside) // 2]) / 2,
-                inside[0],
-                inside[-1],
-                mean,
-                error,
-                low,
-                high,
-                np.mean(unstable[first:last]),
-                last - first,
-            )
+            {
+                "parameter": (inside[(len(inside) - 1) // 2] + inside[len(inside) // 2]) / 2,
+                "low_edge": inside[0],
+                "high_edge": inside[-1],
+                "mean": mean,
+                "mean_error": error,
+                "low": low,
+                "high": high,
+                "unstable": np.mean(unstable[first:last]),
+                "samples": last - first,
+            }
         )
-    columns = [frozen(values) for values in zip(*rows, strict=True)]
-    parameter, low_edge, high_edge, means, errors, lows, highs, parts, samples = columns
-    return ConditionalCurve(
-        parameter=parameter,
-        low_edge=low_edge,
-        high_edge=high_edge,
-        mean=means,
-        mean_error=errors,
-        low=lows,
-        high=highs,
-        unstable=parts,
-        samples=samples,
-        discrete=discrete,
-    )
+    columns = {name: frozen_copy([row[name] for row in rows]) for name in rows[0]}
+    return ConditionalCurve(**columns, discrete=discrete)

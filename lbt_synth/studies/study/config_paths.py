@@ -1,4 +1,4 @@
-"""Places in a configuration by their paths, such as ``truth.vibrations[0].frequency_hz``."""
+"""Paths of numbers in a configuration, such as ``truth.vibrations[0].frequency_hz``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PART = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
 
 
 def parse_path(path: str) -> Keys:
-    """Return the keys of a path.
+    """Parse a path into its keys.
 
     Examples
     --------
@@ -82,26 +82,20 @@ def _describe(value: Any) -> str:
 
 
 def is_integer(content: Mapping[str, Any], keys: Keys) -> bool:
-    """Whether a place that :func:`require_number` lets pass takes integers only."""
-    return isinstance(number_at(content, keys), int)
-
-
-def number_at(content: Mapping[str, Any], keys: Keys) -> float | int:
-    """Return the number at a place that :func:`require_number` lets pass."""
+    """Whether a place that :func:`require_number` accepts takes integers only."""
     here: Any = content
     for key in keys:
         here = here[key]
-    number: float | int = here
-    return number
+    return isinstance(here, int)
 
 
 def set_number(
     content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]
 ) -> None:
-    """Put a number at its place, which :func:`require_number` lets pass in ``full``.
+    """Set the number at a place that :func:`require_number` accepts in ``full``.
 
-    Sections on the way that are not there are made, lists are taken from ``full``, the same
-    configuration with its defaults. A number that is an integer there stays one if it can.
+    ``full`` is the same configuration with its defaults. Missing sections on the way are added,
+    missing lists copied from ``full``. An integer there stays an integer if the value is whole.
     """
     here: Any = content
     whole: Any = full
@@ -110,12 +104,12 @@ def set_number(
         if isinstance(here, dict) and key not in here:
             here[key] = _copy_nested(whole) if isinstance(whole, list) else {}
         here = here[key]
-    stays = isinstance(whole[keys[-1]], int) and float(value).is_integer()
-    here[keys[-1]] = int(value) if stays else float(value)
+    whole_number = isinstance(whole[keys[-1]], int) and float(value).is_integer()
+    here[keys[-1]] = int(value) if whole_number else float(value)
 
 
 def nested_copy(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy whose sections and lists may be changed."""
+    """Copy a configuration with its sections and lists."""
     return {key: _copy_nested(value) for key, value in content.items()}
 
 

@@ -1,4 +1,4 @@
-"""What became of one controller on every sample: stable, unstable or failed."""
+"""One controller on every sample of a study: stable, unstable or failed."""
 
 from __future__ import annotations
 
@@ -16,17 +16,14 @@ PARTS = ("turbulence", "vibration", "noise")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerSamples:
-    """One controller on every sample."""
+    """One controller on n samples; all arrays (n,)."""
 
-    controller: str  # Its name
-    # (n,): strehl ratio; 0 where the loop is unstable, nan where the evaluation failed
-    strehl: FloatArray
-    # (n,): residual [nm rms]; inf where the loop is unstable, nan where the evaluation failed
-    residual_nm: FloatArray
-    evaluated: BoolArray  # (n,): where the evaluation did not fail
-    unstable: BoolArray  # (n,): where the loop is unstable
-    # (n,): parts of the residual [nm rms], as far as they are there
-    parts_nm: dict[str, FloatArray]
+    controller: str  # its name
+    strehl: FloatArray  # 0 where unstable, nan where the evaluation failed
+    residual_nm: FloatArray  # [nm rms]; inf where unstable, nan where the evaluation failed
+    evaluated: BoolArray  # where the evaluation did not fail
+    unstable: BoolArray
+    parts_nm: dict[str, FloatArray]  # of the residual, by origin [nm rms]
 
     @property
     def stable(self) -> BoolArray:
@@ -35,7 +32,7 @@ class ControllerSamples:
 
 
 def read_column(columns: Mapping[str, Any], name: str, size: int | None = None) -> FloatArray:
-    """Return a column of the results, of a given length."""
+    """Return a column of the results, of the given length if there is one."""
     if name not in columns:
         raise ProblemError(
             f"the results must have a column {name!r}; got {', '.join(map(repr, columns))}. "
@@ -51,9 +48,7 @@ def read_column(columns: Mapping[str, Any], name: str, size: int | None = None) 
 def read_controller_samples(
     columns: Mapping[str, Any], controller: str, size: int | None = None
 ) -> ControllerSamples:
-    """Read the columns of a controller.
-
-    Shapes: columns (n,).
+    """Read the columns of a controller, (n,) each.
 
     Examples
     --------
@@ -81,8 +76,8 @@ def read_controller_samples(
         )
     strehl = read_column(columns, f"{controller}.strehl", size)
     residual = read_column(columns, f"{controller}.residual_nm", size)
-    _require(controller, "strehl", strehl, stable, "within [0, 1]", most=1 + 1e-9)
-    _require(controller, "residual_nm", residual, stable, "at least 0", most=np.inf)
+    _require_range(controller, "strehl", strehl, stable, "within [0, 1]", most=1 + 1e-9)
+    _require_range(controller, "residual_nm", residual, stable, "at least 0", most=np.inf)
     parts = {
         part: read_column(columns, f"{controller}.{part}_nm", size)
         for part in PARTS
@@ -98,10 +93,10 @@ def read_controller_samples(
     )
 
 
-def _require(
+def _require_range(
     controller: str, name: str, values: FloatArray, where: BoolArray, demand: str, *, most: float
 ) -> None:
-    """Refuse values of stable loops that are no numbers, or out of range."""
+    """Refuse values of stable loops that are not finite, or out of range."""
     for wrong, error in (
         (where & ~np.isfinite(values), NonFiniteError),
         (where & ~((values >= 0) & (values <= most)), ProblemError),

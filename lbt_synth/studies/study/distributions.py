@@ -1,10 +1,9 @@
-"""Distributions of parameters, by their inverse cumulative distribution functions."""
+"""Distributions of a study's parameters, by their quantiles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -12,33 +11,39 @@ from scipy.special import ndtr, ndtri
 from lbt_synth.errors import ProblemError
 from lbt_synth.validation import FloatArray
 
-_EDGE = 2.0**-32  # no sample is nearer to the ends of (0, 1): the normal's would be infinite
+_EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
 
 
-class Distribution(Protocol):
-    """What a parameter may be."""
+class Distribution(ABC):
+    """Distribution of a parameter."""
+
+    __slots__ = ()
 
     @property
     def varies(self) -> bool:
         """Whether it takes a dimension of the sampling."""
-        ...
+        return True
 
     @property
+    @abstractmethod
     def text(self) -> str:
         """Description for people."""
-        ...
 
+    @abstractmethod
     def quantile(self, level: FloatArray) -> FloatArray:
-        """Return the values below which the shares ``level``, in [0, 1), of it lie."""
-        ...
+        """Return the value below which each share ``level``, in [0, 1), of it lies."""
 
+    @abstractmethod
     def extremes(self, samples: int) -> tuple[float, float]:
-        """Return the ends of what so many samples are expected to reach."""
-        ...
+        """Return the least and greatest value that so many samples are expected to reach."""
+
+    def median(self) -> float:
+        """Return the median."""
+        return float(self.quantile(np.array([0.5]))[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fixed:
+class Fixed(Distribution):
     """One value."""
 
     value: float
@@ -63,16 +68,11 @@ class Fixed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Uniform:
+class Uniform(Distribution):
     """Uniform between two ends."""
 
     low: float
     high: float
-
-    @property
-    def varies(self) -> bool:
-        """Whether it takes a dimension of the sampling."""
-        return True
 
     @property
     def text(self) -> str:
@@ -89,8 +89,8 @@ class Uniform:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Normal:
-    """Normal, cut at ``low`` and ``high`` where they are finite.
+class Normal(Distribution):
+    """Normal, cut at ``low`` and ``high`` if they are finite.
 
     Examples
     --------
@@ -116,11 +116,6 @@ class Normal:
             )
 
     @property
-    def varies(self) -> bool:
-        """Whether it takes a dimension of the sampling."""
-        return True
-
-    @property
     def text(self) -> str:
         """Description for people."""
         out = f"normal, {self.mean:g} with deviation {self.deviation:g}"
@@ -132,7 +127,7 @@ class Normal:
     def _cut(self) -> tuple[float, float, float]:
         """Probabilities of the ends, and +1, or -1 if both count from above.
 
-        Above the mean, 1 - F is what floating-point numbers resolve.
+        Floating-point numbers resolve 1 - F above the mean, and F below.
         """
         low, high = ((end - self.mean) / self.deviation for end in (self.low, self.high))
         if low > 0:
@@ -145,20 +140,20 @@ class Normal:
         share = np.clip(level, _EDGE, 1 - _EDGE)
         share = share if sign > 0 else 1 - share
         standard = sign * ndtri(start + share * (stop - start))
-        with np.errstate(over="ignore"):  # what is infinite is refused as a value
+        with np.errstate(over="ignore"):  # an infinite value is refused later
             found = self.mean + self.deviation * standard
         return np.clip(found, self.low, self.high)
 
     def extremes(self, samples: int) -> tuple[float, float]:
-        """Return the ends, or where half a sample is expected beyond."""
+        """Return the ends, or levels beyond which half a sample is expected."""
         inside = self.quantile(np.array([0.5 / samples, 1 - 0.5 / samples]))
         low = self.low if np.isfinite(self.low) else float(inside[0])
         return low, self.high if np.isfinite(self.high) else float(inside[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Listed:
-    """One of several values, by their weights.
+class Listed(Distribution):
+    """One of several values, chosen by weight.
 
     Examples
     --------
@@ -182,13 +177,13 @@ class Listed:
         shown = [f"{value:g}" for value in self.values]
         if len(set(self.weights)) > 1:
             shown = [f"{v} ({w:g})" for v, w in zip(shown, self.weights, strict=True)]
-        middle = ["..."] if len(shown) > 8 else []
-        shown = shown if not middle else shown[:4] + middle + shown[-3:]
+        if len(shown) > 8:
+            shown[4:-3] = ["..."]
         return f"one of {', '.join(shown)}"
 
     def quantile(self, level: FloatArray) -> FloatArray:
         """Return the values at levels in [0, 1)."""
-        shares = np.array(self.weights) / max(self.weights)  # large ones add up to no infinity
+        shares = np.array(self.weights) / max(self.weights)  # so that their sum cannot overflow
         bounds = np.cumsum(shares) / np.sum(shares)
         index = np.searchsorted(bounds[:-1], level, side="right")
         return np.array(self.values, dtype=np.float64)[index]
@@ -196,13 +191,3 @@ class Listed:
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the least and the largest."""
         return min(self.values), max(self.values)
-
-
-def median(distribution: Distribution) -> float:
-    """Return the median."""
-    return float(distribution.quantile(np.array([0.5]))[0])
-
-
-def equal_weights(values: Sequence[float]) -> tuple[float, ...]:
-    """Return a weight of 1 for each value."""
-    return (1.0,) * len(values)

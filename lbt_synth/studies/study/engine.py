@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import LbtSynthError, NumericalError
-from lbt_synth.storage.worker_processes import WorkerPool, one_thread_each
+from lbt_synth.storage.worker_processes import WorkerPool, limit_threads
 from lbt_synth.studies.study.batch_queue import BatchQueue
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.cluster import is_death_of_workers
@@ -87,7 +87,7 @@ def _open_workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
     if executor is not None or jobs == 1:
         yield _Workers(executor or _InlineExecutor(), None, jobs)
         return
-    with one_thread_each():
+    with limit_threads():
         pool = WorkerPool(jobs)
         workers = _Workers(pool.executor, pool, jobs)
         try:

@@ -1,4 +1,4 @@
-"""Read a study file and check all that can be known before any work."""
+"""Read a study file, and check all that can be checked before it runs."""
 
 from __future__ import annotations
 
@@ -19,19 +19,11 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.studies.study.config_paths import Keys, is_integer, parse_path, require_number
-from lbt_synth.studies.study.distributions import (
-    Distribution,
-    Fixed,
-    Listed,
-    Normal,
-    Uniform,
-    equal_weights,
-    median,
-)
+from lbt_synth.studies.study.distributions import Distribution, Fixed, Listed, Normal, Uniform
 from lbt_synth.studies.study.reference_evaluation import close_sample_loop
 from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.schema import ParameterSection, StudySection
-from lbt_synth.studies.study.store import read_manifest, require_same_study, stored_design
+from lbt_synth.studies.study.store import read_design, read_manifest, require_same_study
 from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController
 
 _MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
@@ -40,18 +32,18 @@ _MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
 def load_study(
     path: str | os.PathLike[str], *, directory: str | os.PathLike[str] | None = None
 ) -> Study:
-    """Read a study file, check it and make the designs that are for the whole study.
+    """Read a study file, check it, and design the controllers that are for the whole study.
 
-    Checked are the file, the configuration, the gain files, that every parameter is a number of
-    the configuration, and that the configuration takes the ends of each parameter, with the
-    others in the middle of their distributions.
+    It checks the file, the configuration and the gain files, that every parameter is a number of
+    the configuration, and that the configuration accepts the ends of each parameter, with the
+    others at their medians.
 
     Parameters
     ----------
     path : path-like
         The file (YAML).
     directory : path-like, optional
-        Directory of the study. If it was begun there, its designs are read instead of made anew.
+        Directory of the study. If it was begun there, its designs are read from it.
 
     Returns
     -------
@@ -67,7 +59,7 @@ def load_study(
     SynthesisError
         If a design cannot be made.
     OutputError
-        If the directory is of another study, or a design in it was changed.
+        If the directory belongs to another study, or a design in it was changed.
 
     Examples
     --------
@@ -112,15 +104,15 @@ def load_study(
                 name=name, request=None, design=gains[name][0], origin=str(files[name])
             )
         else:
-            assert section.design is not None  # the schema wants one of the two
+            assert section.design is not None  # the schema requires a file or a design
             request = DesignRequest(method=section.design, options=section.options)
             own = section.for_ == "sample"
             design = (
                 None if own else stored.get(name) or _make_design(name, request, config, source)
             )
-            words = "for each sample" if own else "for the configuration"
+            scope = "for each sample" if own else "for the configuration"
             entry = StudyController(
-                name=name, request=request, design=design, origin=f"{request.text} {words}"
+                name=name, request=request, design=design, origin=f"{request.text} {scope}"
             )
         controllers.append(entry)
         if entry.design is not None:
@@ -139,13 +131,11 @@ def load_study(
 
 
 def _read_designs(study: Study, directory: str | os.PathLike[str] | None) -> dict[str, Design]:
-    """Return the designs that a directory has of a study."""
-    manifest = None if directory is None else read_manifest(Path(directory))
-    if directory is None or manifest is None:
+    """Return the designs of a study in its directory, none if it was not begun there."""
+    if directory is None or (manifest := read_manifest(Path(directory))) is None:
         return {}
     require_same_study(manifest, study.digest, Path(directory))
-    found = {name: stored_design(Path(directory), name, manifest) for name in manifest["designs"]}
-    return {name: design for name, design in found.items() if design is not None}
+    return {name: read_design(Path(directory), name, manifest) for name in manifest["designs"]}
 
 
 def _make_design(name: str, request: DesignRequest, config: Config, source: Path) -> Design:
@@ -157,13 +147,13 @@ def _make_design(name: str, request: DesignRequest, config: Config, source: Path
 
 
 def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> str:
-    """Digest of what decides the results; not of the names of files, nor of the layout."""
-    said = settings.model_dump(by_alias=True, exclude={"config", "results"})
-    for section in said["controllers"].values():
+    """Return the digest of all that decides the results: not names of files, nor their format."""
+    study = settings.model_dump(by_alias=True, exclude={"config", "results"})
+    for section in study["controllers"].values():
         del section["file"]
     content = {
         "version": lbt_synth.__version__,
-        "study": said,
+        "study": study,
         "config": config.settings.model_dump(),
         "gains": gains,
     }
@@ -172,9 +162,9 @@ def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> st
 
 def _require_file_names(names: list[str], source: Path) -> None:
     """Refuse names that would give two controllers one file."""
-    seen: dict[str, str] = {}
+    first: dict[str, str] = {}
     for name in names:
-        other = seen.setdefault(name.casefold(), name)
+        other = first.setdefault(name.casefold(), name)
         if other != name:
             raise ConfigError(
                 f"{source}: controllers.{name}: its files could not be told from those of {other}; "
@@ -183,8 +173,8 @@ def _require_file_names(names: list[str], source: Path) -> None:
             )
         if name.casefold().startswith("row_"):
             raise ConfigError(
-                f"{source}: controllers.{name}: names that begin with row_ are those of samples "
-                "that are replayed; give another.",
+                f"{source}: controllers.{name}: names that begin with row_ are those of replayed "
+                "samples; give another.",
                 path=f"controllers.{name}",
             )
 
@@ -236,17 +226,14 @@ def _distribution(section: ParameterSection) -> Distribution:
     if section.normal is not None:
         given = {k: v for k, v in section.normal.model_dump().items() if v is not None}
         return Normal(**given)
-    assert section.list_ is not None  # the schema wants exactly one
-    weights = section.weights
-    return Listed(
-        values=tuple(section.list_),
-        weights=equal_weights(section.list_) if weights is None else tuple(weights),
-    )
+    assert section.list_ is not None  # the schema requires exactly one
+    weights = section.weights or [1.0] * len(section.list_)
+    return Listed(values=tuple(section.list_), weights=tuple(weights))
 
 
 def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
-    """Yield the middle, then the ends of each parameter with the others in the middle."""
-    centre = [median(parameter.distribution) for parameter in study.parameters]
+    """Yield the medians, then the ends of each parameter with the others at their medians."""
+    centre = [parameter.distribution.median() for parameter in study.parameters]
     yield "parameters in the middle", centre
     for i, parameter in enumerate(study.parameters):
         if not parameter.distribution.varies:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.errors import OutputError
-from lbt_synth.storage.atomic_files import write_atomically, writing_atomically
+from lbt_synth.storage.atomic_files import open_atomically, write_atomically
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.parquet import read_parquet, write_parquet
@@ -34,7 +34,7 @@ def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
     them all.
     """
     path = results_path(folder, study)
-    with writing_atomically(path) as stream:
+    with open_atomically(path) as stream:
         if study.settings.results == "parquet":
             write_parquet(stream, study.columns, _table_blocks(study, parts))
             return path

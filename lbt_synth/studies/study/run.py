@@ -14,7 +14,7 @@ from typing import Any
 import lbt_synth
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
-from lbt_synth.storage.worker_processes import alone_in
+from lbt_synth.storage.worker_processes import exclusive_lock
 from lbt_synth.studies.study.batch_evaluation import evaluate_samples
 from lbt_synth.studies.study.engine import Evaluate, run_batches
 from lbt_synth.studies.study.output_files import (
@@ -34,19 +34,19 @@ from lbt_synth.studies.study.store import (
     file_digest,
     list_parts,
     missing_rows,
+    read_design,
     read_manifest,
     read_part,
     remove_parts,
     remove_unfinished_files,
     require_same_study,
     require_unchanged,
-    stored_design,
     write_designs,
     write_manifest,
     write_part,
 )
 from lbt_synth.studies.study.study import Study
-from lbt_synth.validation import FloatArray, instance, integer
+from lbt_synth.validation import FloatArray, integer, require_instance
 
 _MOST_JOBS = 64
 
@@ -162,7 +162,7 @@ def run_study(
     >>> run.results.name, run.computed, again.computed
     ('results.csv', 4, 0)
     """
-    instance(study, Study)
+    require_instance(study, Study)
     jobs = integer(jobs, "jobs", at_least=1)
     most = max(_MOST_JOBS, 8 * (os.cpu_count() or 1))
     if jobs > most:
@@ -175,7 +175,7 @@ def run_study(
         require_parquet()
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
-    with alone_in(folder, "study"):
+    with exclusive_lock(folder, "study"):
         remove_unfinished_files(folder, [path.name for path in output_paths(folder, study)])
         manifest = _begin(folder, study)
         tables = (results_path(folder, study), folder / FAILED)
@@ -237,7 +237,7 @@ def _begin(folder: Path, study: Study) -> dict[str, Any]:
     if manifest is not None:
         require_same_study(manifest, study.digest, folder)
         for name in manifest["designs"]:
-            stored_design(folder, name, manifest)
+            read_design(folder, name, manifest)
     elif list_parts(folder):
         raise OutputError(
             f"{folder} holds parts of a study without its {MANIFEST}. Name another directory, or "

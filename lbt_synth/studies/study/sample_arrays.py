@@ -1,8 +1,8 @@
-"""What the loops of many samples meet, as arrays: the parameters that need no new configuration.
+"""Parameters of many samples as arrays, for an ensemble of loops.
 
 A parameter of the weather, of a true vibration, of the noise, the sensor gain or the delay
-changes numbers of an ensemble. All others make another configuration: samples with the same
-values of these are a group.
+changes numbers of an ensemble. Any other makes another configuration: samples that share the
+values of all these are a group.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
-BELIEVED_GAIN = ("model", "sensor_gain")
-BELIEVED_DELAY = ("loop", "delay_frames")
+ASSUMED_GAIN = ("model", "sensor_gain")
+ASSUMED_DELAY = ("loop", "delay_frames")
 _GAIN = ("truth", "sensor_gain")
 _VIBRATION_NUMBERS = ("frequency_hz", "rms_nm", "rms_mas", "damping")
 _NOISE_NUMBERS = (
@@ -46,12 +46,12 @@ _LONGEST_DELAY = 100.0  # frames
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SampleArrays:
-    """Values of some samples of one group, by the places that they are put to."""
+    """Parameters of b samples of one group."""
 
-    config: Config  # The configuration of one of the samples
-    count: int  # Number of samples b
-    places: dict[Keys, FloatArray]  # (b,): values at each place that varies
-    errors: dict[str, FloatArray]  # (b,): values of the parameters that are in no configuration
+    config: Config  # of one of the samples
+    count: int  # b
+    places: dict[Keys, FloatArray]  # values at each place that varies, (b,)
+    errors: dict[str, FloatArray]  # delay errors and noise factors, (b,)
 
     def take(self, which: IntArray) -> SampleArrays:
         """Return some of the samples."""
@@ -62,20 +62,20 @@ class SampleArrays:
             errors={name: values[which] for name, values in self.errors.items()},
         )
 
-    def number(self, *keys: str | int) -> FloatArray | None:
-        """Values at a place, None if it does not vary."""
+    def values_at(self, *keys: str | int) -> FloatArray | None:
+        """Return the values at a place, (b,), None if it does not vary."""
         return self.places.get(keys)
 
-    def flows(self) -> FrozenFlows | None:
-        """Frozen flows of the samples; None where the weather does not vary."""
-        varying = {name: self.number("atmosphere", name) for name in WEATHER}
+    def frozen_flows(self) -> FrozenFlows | None:
+        """Return the frozen flows of the samples, None if the weather does not vary."""
+        varying = {name: self.values_at("atmosphere", name) for name in WEATHER}
         varying = {name: values for name, values in varying.items() if values is not None}
         if not varying or self.config.atmosphere is None:
             return None
         return FrozenFlows(atmosphere=self.config.atmosphere, **varying)
 
-    def believed_noise(self) -> FloatArray:
-        """Noise that designs are told [nm], (b, 1) or (b, q)."""
+    def assumed_noise(self) -> FloatArray:
+        """Return the noise that designs assume [nm], (b, 1) or (b, q)."""
         settings = self.config.settings
         varying = [keys for keys in _NOISE_NUMBERS if keys in self.places]
         if not varying:
@@ -99,21 +99,23 @@ class SampleArrays:
             )
         return np.asarray(found)[which.reshape(-1)]
 
-    def believed_delay(self) -> FloatArray:
-        """Delay that designs are told [frames], (b,)."""
-        told = self.number(*BELIEVED_DELAY)
-        return np.full(self.count, self.config.hardware.delay_frames) if told is None else told
+    def assumed_delay(self) -> FloatArray:
+        """Return the delay that designs assume [frames], (b,)."""
+        delay = self.values_at(*ASSUMED_DELAY)
+        return np.full(self.count, self.config.hardware.delay_frames) if delay is None else delay
 
     def real_delay(self) -> FloatArray:
-        """Delay of the real loops [frames], (b,)."""
-        return np.asarray(self.believed_delay() + self.errors.get(DELAY_ERROR, 0.0))
+        """Return the delay of the real loops [frames], (b,)."""
+        return np.asarray(self.assumed_delay() + self.errors.get(DELAY_ERROR, 0.0))
 
-    def lines(self, owner: str, sections: Sequence[Any]) -> Iterator[tuple[dict[str, Any], str]]:
-        """Yield numbers and directions of the vibrations of a list, with the section's key."""
+    def vibrations(self, owner: str, sections: Sequence[Any]) -> Iterator[dict[str, Any]]:
+        """Yield numbers and direction of each vibration of a list of sections."""
         settings = self.config.settings
         for i, section in enumerate(sections):
             key = f"{owner}.vibrations[{i}]"
-            given = {name: self.number(owner, "vibrations", i, name) for name in _VIBRATION_NUMBERS}
+            given = {
+                name: self.values_at(owner, "vibrations", i, name) for name in _VIBRATION_NUMBERS
+            }
             rms = given["rms_nm"]
             if given["rms_mas"] is not None:
                 rms = given["rms_mas"] * convert_mas_to_nm(settings, 1.0, f"{key}.rms_mas")
@@ -126,54 +128,55 @@ class SampleArrays:
                     "direction": direction,
                 }
                 if getattr(section, "spread_hz", None) is None:
-                    yield numbers, key
+                    yield numbers
                     continue
-                # nothing varies of vibrations where one of them is several
+                # in a list with a spread vibration, no number of any vibration varies
                 whole = Vibration(**numbers)
                 for line in spread_vibration(whole, section, self.config.hardware.frame_rate_hz, i):
-                    yield {name: getattr(line, name) for name in numbers}, key
+                    yield {name: getattr(line, name) for name in numbers}
 
     def ensemble(self) -> LoopEnsemble:
-        """Return what the real loops meet."""
+        """Return the ensemble of the real loops."""
         config, settings = self.config, self.config.settings
-        gain = self.number(*_GAIN)
-        flows = self.flows()
+        gain = self.values_at(*_GAIN)
+        flows = self.frozen_flows()
         truth, turbulence = config.truth, config.truth.turbulence
         if flows is not None and settings.true_turbulence == "frozen_flow":
             turbulence = flows
         return LoopEnsemble(
             sensor_gain=truth.sensor_gain if gain is None else gain / config.sensor_gain,
             delay_frames=self.real_delay(),
-            noise_nm=self.believed_noise() * self._noise_factor(),
+            noise_nm=self.assumed_noise() * self._noise_factor(),
             turbulence=turbulence,
             vibrations=tuple(
-                EnsembleVibration(**numbers) for numbers, _ in self.lines(*_true_vibrations(config))
+                EnsembleVibration(**numbers)
+                for numbers in self.vibrations(*_true_vibrations(config))
             ),
             loops=self.count,
         )
 
     def valid(self) -> BoolArray:
-        """Which samples have numbers that the configuration takes; the others are refused."""
-        good = np.ones(self.count, dtype=np.bool_)
+        """Return which samples have numbers that the configuration accepts, (b,)."""
+        valid = np.ones(self.count, dtype=np.bool_)
         nyquist = self.config.hardware.frame_rate_hz / 2
         for keys, values in self.places.items():
-            if keys == BELIEVED_DELAY:
-                good &= (values >= 1) & (values <= _LONGEST_DELAY)
+            if keys == ASSUMED_DELAY:
+                valid &= (values >= 1) & (values <= _LONGEST_DELAY)
             elif keys == ("sensor", "pyramid", "read_noise_electrons"):
-                good &= values >= 0
+                valid &= values >= 0
             else:
                 highest = {"frequency_hz": nyquist, "damping": 1.0}.get(str(keys[-1]), np.inf)
-                good &= (values > 0) & (values < highest)
+                valid &= (values > 0) & (values < highest)
         real = self.real_delay()
-        good &= (real >= 1) & (real <= _LONGEST_DELAY)
-        return good & (self._noise_factor()[:, 0] >= 0)
+        valid &= (real >= 1) & (real <= _LONGEST_DELAY)
+        return valid & (self._noise_factor()[:, 0] >= 0)
 
     def _noise_factor(self) -> FloatArray:
         return np.broadcast_to(self.errors.get(NOISE_FACTOR, 1.0), (self.count,))[:, None]
 
 
 def _true_vibrations(config: Config) -> tuple[str, Sequence[Any]]:
-    """Return where the true vibrations stand, and their sections."""
+    """Return the owner of the true vibrations, truth or model, and their sections."""
     settings = config.settings
     if isinstance(settings.truth.vibrations, list):
         return "truth", settings.truth.vibrations
@@ -181,10 +184,10 @@ def _true_vibrations(config: Config) -> tuple[str, Sequence[Any]]:
 
 
 def changes_numbers_only(study: Study, keys: Keys) -> bool:
-    """Whether a parameter at a place only changes numbers of what the loops meet."""
+    """Whether a parameter at a place only changes numbers of the ensemble."""
     settings = study.config.settings
-    if keys in (_GAIN, BELIEVED_DELAY):
-        return True  # a list has other places, such as truth.sensor_gain[0]
+    if keys in (_GAIN, ASSUMED_DELAY):
+        return True  # an entry of a list has another place, such as truth.sensor_gain[0]
     if keys in _NOISE_NUMBERS:
         return not (
             settings.true_turbulence == "model" and turbulence_kinds(study.config) & {"ar2"}
@@ -197,11 +200,11 @@ def changes_numbers_only(study: Study, keys: Keys) -> bool:
     )
 
 
-def changes_beliefs_only(study: Study, keys: Keys) -> bool:
-    """Whether a parameter at a place changes what designs believe, and nothing else."""
+def changes_assumptions_only(study: Study, keys: Keys) -> bool:
+    """Whether a parameter at a place only changes what designs assume."""
     settings = study.config.settings
-    if keys == BELIEVED_GAIN:
-        # the real sensor is its matrix times truth.sensor_gain, whatever designs believe
+    if keys == ASSUMED_GAIN:
+        # the real sensor is its matrix times truth.sensor_gain, whatever designs assume
         return not isinstance(settings.truth.sensor_gain, list)
     return (
         is_vibration_number(keys, "model")
@@ -216,13 +219,13 @@ def is_vibration_number(keys: Keys, owner: str) -> bool:
 
 
 def turbulence_kinds(config: Config) -> set[str]:
-    """Return the kinds of turbulence that designs believe in."""
+    """Return the kinds of turbulence that designs assume."""
     given = config.settings.model.turbulence
     return {section.kind for section in (given if isinstance(given, list) else [given])}
 
 
 def make_sample_arrays(study: Study, sample: Sample, values: FloatArray) -> SampleArrays:
-    """Return the values of the samples of a group, of which one is given whole."""
+    """Return the arrays of a group of rows of ``Study.values``; the sample is one of them."""
     places: dict[Keys, FloatArray] = {}
     errors: dict[str, FloatArray] = {}
     for parameter, column in zip(study.parameters, values.T, strict=True):

@@ -1,4 +1,4 @@
-"""Kalman filters of many samples at once, each told its own sample."""
+"""Design the Kalman filters of many samples at once, each for its own sample."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from lbt_synth.config import Config
 from lbt_synth.config.plant_and_truth import assumed_gains
 from lbt_synth.config.schema import Ar1Section
 from lbt_synth.design.modal import ModalFilters, modal_filters
-from lbt_synth.models import ARModel, ModalTurbulence, Vibration
+from lbt_synth.models import ModalTurbulence, Vibration
 from lbt_synth.models.turbulence.ar_models import ar1_flows
 from lbt_synth.studies.study.config_paths import Keys
 from lbt_synth.studies.study.sample_arrays import (
-    BELIEVED_GAIN,
+    ASSUMED_GAIN,
     WEATHER,
     SampleArrays,
     is_vibration_number,
@@ -25,15 +25,18 @@ Matrices = tuple[FloatArray, ...]
 
 
 def is_kalman_for_sample(controller: StudyController) -> bool:
-    """Whether a controller is a Kalman filter that is designed for each sample."""
+    """Whether a controller is a Kalman filter without options, designed for each sample."""
     request = controller.request
-    if request is None or controller.design is not None:
-        return False
-    return request.method == "kalman" and not request.options
+    return (
+        request is not None
+        and controller.design is None
+        and request.method == "kalman"
+        and not request.options
+    )
 
 
 def has_independent_axes(config: Config) -> bool:
-    """Whether the Kalman filter of a configuration is one of each axis by itself."""
+    """Whether the Kalman filter of a configuration separates into one per axis."""
     hardware, settings = config.hardware, config.settings
     diagonal = all(
         matrix.shape[0] == matrix.shape[1] and not np.any(matrix - np.diag(np.diag(matrix)))
@@ -47,27 +50,26 @@ def has_independent_axes(config: Config) -> bool:
 
 
 def changes_design_numbers_only(study: Study, keys: Keys) -> bool:
-    """Whether a parameter at a place only changes numbers of the designs of axes."""
+    """Whether a parameter at a place only changes numbers of the designs."""
     kinds = turbulence_kinds(study.config)
     if keys[0] == "atmosphere":
         return keys[1] in WEATHER and "ar2" not in kinds
     if keys[0] == "sensor":
         return "ar2" not in kinds
-    return keys[0] == "truth" or keys == BELIEVED_GAIN or is_vibration_number(keys, "model")
+    return keys[0] == "truth" or keys == ASSUMED_GAIN or is_vibration_number(keys, "model")
 
 
-def design_for_samples(rows: SampleArrays) -> Matrices:
-    """Design a Kalman filter for each sample and axis."""
-    config, count = rows.config, rows.count
+def design_for_samples(arrays: SampleArrays) -> Matrices:
+    """Design a Kalman filter for each sample, and return their textbook matrices."""
+    config, count = arrays.config, arrays.count
     hardware = config.hardware
     axes = hardware.modes
-    noise = np.broadcast_to(rows.believed_noise(), (count, axes))
-    gains = _believed_gains(rows)
-    numbers = _vibrations_by_axis(rows)
+    noise = np.broadcast_to(arrays.assumed_noise(), (count, axes))
+    gains = _assumed_gains(arrays)
+    numbers = _vibrations_by_axis(arrays)
     designs: list[ModalFilters] = []
     for axis in range(axes):
-        same = axis > 0 and _is_like_first_axis(rows, numbers, noise, gains, axis)
-        if same:
+        if axis > 0 and _is_like_first_axis(arrays, numbers, noise, gains, axis):
             designs.append(designs[0])
             continue
         lines = {
@@ -77,7 +79,7 @@ def design_for_samples(rows: SampleArrays) -> Matrices:
         }
         designs.append(
             modal_filters(
-                _turbulence(rows, axis),
+                _turbulence(arrays, axis),
                 noise_nm=noise[:, axis],
                 vibrations=lines,
                 delay_frames=hardware.delay_frames,
@@ -88,33 +90,30 @@ def design_for_samples(rows: SampleArrays) -> Matrices:
     return _combine_axes(designs)
 
 
-def _believed_gains(rows: SampleArrays) -> FloatArray:
-    """Sensor gain of each axis that designs believe in, (b, axes)."""
-    given = rows.number(*BELIEVED_GAIN)
-    each = assumed_gains(rows.config.settings) if given is None else given[:, None]
-    return np.broadcast_to(each, (rows.count, rows.config.hardware.modes))
+def _assumed_gains(arrays: SampleArrays) -> FloatArray:
+    """Return the sensor gain that designs assume, (b, axes)."""
+    given = arrays.values_at(*ASSUMED_GAIN)
+    each = assumed_gains(arrays.config.settings) if given is None else given[:, None]
+    return np.broadcast_to(each, (arrays.count, arrays.config.hardware.modes))
 
 
-def _vibrations_by_axis(rows: SampleArrays) -> list[FloatArray]:
-    """Frequency, damping and rms of the vibrations of each axis that designs believe in.
-
-    One array (lines, b, 3) an axis.
-    """
-    axes = rows.config.hardware.modes
+def _vibrations_by_axis(arrays: SampleArrays) -> list[FloatArray]:
+    """Return frequency, damping and rms of the assumed vibrations, (lines, b, 3) per axis."""
+    axes = arrays.config.hardware.modes
     found: list[list[FloatArray]] = [[] for _ in range(axes)]
-    sections = rows.config.settings.model.vibrations or ()
-    for numbers, _ in rows.lines("model", sections):
+    sections = arrays.config.settings.model.vibrations or ()
+    for numbers in arrays.vibrations("model", sections):
         axis = int(np.argmax(np.abs(numbers["direction"])))
         each = [numbers[name] for name in ("frequency_hz", "damping", "rms_nm")]
-        found[axis].append(np.stack([np.broadcast_to(v, (rows.count,)) for v in each], axis=1))
-    return [np.array(lines).reshape(len(lines), rows.count, 3) for lines in found]
+        found[axis].append(np.stack([np.broadcast_to(v, (arrays.count,)) for v in each], axis=1))
+    return [np.array(lines).reshape(len(lines), arrays.count, 3) for lines in found]
 
 
 def _is_like_first_axis(
-    rows: SampleArrays, numbers: list[FloatArray], noise: FloatArray, gains: FloatArray, axis: int
+    arrays: SampleArrays, numbers: list[FloatArray], noise: FloatArray, gains: FloatArray, axis: int
 ) -> bool:
-    """Whether an axis is designed for the same as the first."""
-    settings = rows.config.settings
+    """Whether an axis has the same design as the first."""
+    settings = arrays.config.settings
     return (
         not isinstance(settings.model.turbulence, list)
         and numbers[axis].shape == numbers[0].shape
@@ -124,28 +123,28 @@ def _is_like_first_axis(
     )
 
 
-def _turbulence(rows: SampleArrays, axis: int) -> ModalTurbulence:
-    """Turbulence of one axis that designs believe in, one process a sample."""
-    config: Config = rows.config
+def _turbulence(arrays: SampleArrays, axis: int) -> ModalTurbulence:
+    """Return the turbulence that designs assume on one axis, one process per sample."""
+    config = arrays.config
     given = config.settings.model.turbulence
     section = given[axis] if isinstance(given, list) else given
     rate = config.hardware.frame_rate_hz
-    flows = rows.flows()
+    flows = arrays.frozen_flows()
     if isinstance(section, Ar1Section) and flows is not None:
         coefficients, driving = ar1_flows(flows, frame_rate_hz=rate)
         return ModalTurbulence(
             coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=rate
         )
-    model: ARModel = config.plant.turbulence[axis]
+    model = config.plant.turbulence[axis]
     return ModalTurbulence(
-        coefficients=np.tile(model.coefficients, (rows.count, 1)),
-        driving_rms_nm=np.full(rows.count, model.driving_rms_nm),
+        coefficients=np.tile(model.coefficients, (arrays.count, 1)),
+        driving_rms_nm=np.full(arrays.count, model.driving_rms_nm),
         frame_rate_hz=rate,
     )
 
 
 def _combine_axes(designs: list[ModalFilters]) -> Matrices:
-    """Put the controllers of all axes into one, in textbook form."""
+    """Combine the controllers of all axes into one, in textbook form."""
     sizes = [design.A.shape[1] for design in designs]
     count, axes, states = len(designs[0].A), len(designs), sum(sizes)
     A, B = np.zeros((count, states, states)), np.zeros((count, states, axes))

@@ -1,7 +1,7 @@
 """The directory of a study: its manifest, its designs, and a part for each finished batch.
 
-A part is written whole or not at all, and named by its rows, so that what is missing can be
-seen from the names, whatever the batches were.
+A part is written completely or not at all, and named by its rows, so that the names show which
+rows are missing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import OutputError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest
-from lbt_synth.storage import array_file as archive
+from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.study import Study
@@ -33,7 +33,7 @@ SCHEMA, SCHEMA_VERSION = "lbt_synth study", 1
 MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
-_UNFINISHED = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # what files.write_atomically writes first
+_UNFINISHED = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # the temporary files of write_atomically
 _MANIFEST_KINDS: dict[str, type | tuple[type, ...]] = {
     "digest": str,
     "designs": dict,
@@ -49,12 +49,11 @@ RowRange = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """A finished batch in a file."""
+    """A file with a finished batch: rows from start up to stop, which is not included."""
 
-    # start, stop: Its rows, the last not included
     start: int
     stop: int
-    path: Path  # The file
+    path: Path
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
@@ -82,7 +81,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def require_same_study(manifest: Mapping[str, Any], digest: str, folder: Path) -> None:
-    """Refuse a directory of another study than that of a digest."""
+    """Refuse a directory whose study has another digest."""
     if manifest["digest"] == digest:
         return
     version = manifest.get("version")
@@ -95,14 +94,11 @@ def require_same_study(manifest: Mapping[str, Any], digest: str, folder: Path) -
     raise OutputError(f"{folder} {why}. Name another directory, or delete it.", path=folder)
 
 
-def stored_design(folder: Path, name: str, manifest: Mapping[str, Any]) -> Design | None:
-    """Return the design that a study wrote for a controller, None if it wrote none."""
-    expected = manifest["designs"].get(name)
-    if expected is None:
-        return None
+def read_design(folder: Path, name: str, manifest: Mapping[str, Any]) -> Design:
+    """Return the design that a study wrote for a controller."""
     path = folder / f"{name}.fits"
     design, digest = load_with_digest(path)
-    if digest != expected:
+    if digest != manifest["designs"][name]:
         raise OutputError(
             f"{path} is not the design that the study was begun with. Put that back, or name "
             "another directory.",
@@ -112,7 +108,7 @@ def stored_design(folder: Path, name: str, manifest: Mapping[str, Any]) -> Desig
 
 
 def write_designs(folder: Path, study: Study) -> dict[str, str]:
-    """Write the designs that are for the whole study, and return the digests of their files."""
+    """Write the designs for the whole study, and return the digests of their files."""
     digests = {}
     for controller in study.controllers:
         if controller.request is not None and controller.design is not None:
@@ -128,7 +124,7 @@ def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def list_parts(folder: Path) -> list[Part]:
-    """Return the parts that are there, in the order of their rows."""
+    """Return the parts in a directory, in the order of their rows."""
     parts = []
     with contextlib.suppress(FileNotFoundError, NotADirectoryError):
         for path in (folder / PARTS).iterdir():
@@ -148,14 +144,9 @@ def list_parts(folder: Path) -> list[Part]:
 
 def missing_rows(parts: list[Part], samples: int) -> list[RowRange]:
     """Return the ranges of rows that no part has."""
-    out, reached = [], 0
-    for part in parts:
-        if part.start > reached:
-            out.append((reached, part.start))
-        reached = part.stop
-    if reached < samples:
-        out.append((reached, samples))
-    return out
+    starts = [*(part.start for part in parts), samples]
+    stops = [0, *(part.stop for part in parts)]
+    return [(a, b) for a, b in zip(stops, starts, strict=True) if a < b]
 
 
 def write_part(folder: Path, study: Study, batch: BatchResult, seconds: float) -> Part:
@@ -169,8 +160,8 @@ def write_part(folder: Path, study: Study, batch: BatchResult, seconds: float) -
         "failures": [asdict(failure) for failure in batch.failures],
         "seconds": seconds,
     }
-    meta["digest"] = archive.digest(arrays, meta)
-    write_atomically(path, archive.npz_bytes(arrays, json.dumps(meta)))
+    meta["digest"] = array_file.digest(arrays, meta)
+    write_atomically(path, array_file.npz_bytes(arrays, json.dumps(meta)))
     return Part(start=batch.start, stop=stop, path=path)
 
 
@@ -178,11 +169,11 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
     """Return the results of a part, (rows, result columns), its failures and its seconds."""
     path = part.path
     try:
-        arrays, text = archive.read_npz(path.read_bytes())
+        arrays, text = array_file.read_npz(path.read_bytes())
         meta = json.loads(text)
         results = arrays["RESULTS"]
         failures = tuple(Failure(**failure) for failure in meta["failures"])
-        whole = meta["digest"] == archive.digest(arrays, meta)
+        whole = meta["digest"] == array_file.digest(arrays, meta)
         seconds = float(meta["seconds"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _damage_error(path) from error
@@ -200,15 +191,15 @@ def _damage_error(path: Path) -> OutputError:
 
 
 def read_blocks(parts: list[Part], study: Study, size: int) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the results of all parts again in blocks of so many rows, the last one shorter."""
+    """Yield the first row and the results of blocks of so many rows, the last one shorter."""
     held: list[FloatArray] = []
     start, rows = 0, 0
     for part in parts:
         results = read_part(part, study)[0]
         while rows + len(results) >= size:
-            taken = size - rows
-            yield start, np.concatenate([*held, results[:taken]])
-            held, results = [], results[taken:]
+            count = size - rows
+            yield start, np.concatenate([*held, results[:count]])
+            held, results = [], results[count:]
             start, rows = start + size, 0
         held.append(results)
         rows += len(results)
@@ -217,7 +208,7 @@ def read_blocks(parts: list[Part], study: Study, size: int) -> Iterator[tuple[in
 
 
 def remove_unfinished_files(folder: Path, names: Collection[str]) -> None:
-    """Remove what a process that was killed had begun to write: parts, and files of some names."""
+    """Remove what a killed process left unfinished: parts, and files of the given names."""
     for place in (folder, folder / PARTS):
         with contextlib.suppress(OSError):
             for path in list(place.iterdir()):
@@ -236,7 +227,7 @@ def file_digest(path: Path) -> str:
 
 
 def require_unchanged(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Refuse tables of a finished study that are not as they were written."""
+    """Refuse tables of a finished study that were changed."""
     for name, digest in manifest.get("tables", {}).items():
         path = folder / name
         if path.exists() and file_digest(path) != digest:
