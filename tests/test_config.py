@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-from lbt_synth.config.robust import robust_design
+from lbt_synth.config.robust import design_robust
 
 GOOD = YAML(typ="safe", pure=True).load(LBT_YAML.read_text())
 
@@ -373,7 +373,7 @@ def test_axes_that_differ(tmp_path):
     assert [m.order for m in config.plant.turbulence] == [1, 2]
     assert config.truth.turbulence == config.plant.turbulence
     assert config.truth.vibrations == config.plant.vibrations
-    assert config.truth.noise_of(2).tolist() == config.noise_nm.tolist() == [15.5, 6.0]
+    assert config.truth.noise_per_measurement(2).tolist() == config.noise_nm.tolist() == [15.5, 6.0]
     assert config.truth.sensor_gain == pytest.approx(0.5)
     assert config.sensor_gain == pytest.approx(0.8)
     np.testing.assert_array_equal(config.hardware.sensor, np.diag([0.9, 0.7]))
@@ -416,7 +416,7 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     robust = {"bands": [band], "functions": 8, "states": None, "modulus_margin": 0.3}
     content = small(design={"robust": robust})
     config = lbt.load_config(write(tmp_path, content))
-    robust_design(config)  # with the model's turbulence, as there is no atmosphere
+    design_robust(config)  # with the model's turbulence, as there is no atmosphere
     for change, text in (
         ({"turbulence": "frozen_flow"}, "atmosphere is missing: design.robust.turbulence"),
         (
@@ -426,8 +426,8 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     ):
         content["design"] = {"robust": {**robust, **change}}
         with pytest.raises(lbt.errors.ConfigError, match=text):
-            robust_design(lbt.load_config(write(tmp_path, content)))
+            design_robust(lbt.load_config(write(tmp_path, content)))
     content["design"] = {"robust": {**robust, "command_step_nm": 500.0}}
     content["model"]["turbulence"] = [AR, OTHER]
     with pytest.raises(lbt.errors.ConfigError, match="hold under one turbulence for all axes"):
-        robust_design(lbt.load_config(write(tmp_path, content)))
+        design_robust(lbt.load_config(write(tmp_path, content)))

@@ -14,9 +14,9 @@ from support.plants import LBT_YAML, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.interop.specula.cases import _vibration, case_of
+from lbt_synth.interop.specula.json_cases import _build_vibration, make_case
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
-from lbt_synth.models.truth import fitted_direction
+from lbt_synth.models.truth import checked_direction
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
 
@@ -114,7 +114,9 @@ def test_the_drawn_resonance_has_its_rms_and_its_decay():
         assert series[:, frame].std() == pytest.approx(100, rel=0.07)
     early, late = series[:, :2], series[:, 2400:2402]  # before the drift, and after it
     for pair, hz in ((early, 17), (late, 23)):
-        model = lbt.Vibration(frequency_hz=17, damping=0.02, rms_nm=100).moved(hz).ar_model(800)
+        model = (
+            lbt.Vibration(frequency_hz=17, damping=0.02, rms_nm=100).at_frequency(hz).ar_model(800)
+        )
         a1, a2 = model.coefficients
         correlation = np.mean(pair[:, 0] * pair[:, 1]) / np.mean(pair**2)
         assert correlation == pytest.approx(a1 / (1 - a2), abs=1.5e-3)
@@ -180,9 +182,9 @@ def test_wrong_drifts_are_refused():
     with pytest.raises(
         lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"
     ):
-        fitted_direction(drifting(end_hz=500), PATH)
+        checked_direction(drifting(end_hz=500), PATH)
     with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
-        fitted_direction(drifting(direction=(1, 0)), PATH)
+        checked_direction(drifting(direction=(1, 0)), PATH)
 
 
 # --------------------------------------------------------------------------
@@ -254,5 +256,5 @@ def test_the_commands_simulate_it_or_refuse(tmp_path, capsys):
 def test_a_case_of_an_end_to_end_run_keeps_it():
     setup = lbt.load_config(LBT_YAML).end_to_end
     line = drifting(direction=(1, 0), damping=0.01)
-    case = json.loads(json.dumps(case_of(setup, None, vibrations=[line])))
-    assert _vibration(case["vibrations"][0]) == line
+    case = json.loads(json.dumps(make_case(setup, None, vibrations=[line])))
+    assert _build_vibration(case["vibrations"][0]) == line

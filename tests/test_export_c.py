@@ -15,7 +15,7 @@ from support.compiled import STRICT, Compiled, compiler
 from support.exports import bare_design, lbt_config, lbt_designs, relative
 
 import lbt_synth as lbt
-from lbt_synth.interop.rehearsal import WrittenTerms, rehearsed_error
+from lbt_synth.interop.export_checks import WrittenTerms, rehearsal_error
 
 FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
@@ -58,7 +58,7 @@ def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, 
     design, single = designs[name], precision == "single"
     written = lbt.interop.export_c(tmp_path / "ctl.c", design, precision=precision)
     theirs = Compiled(written.files[0], single=single)
-    assert rehearsed_error(design, theirs) == written.error
+    assert rehearsal_error(design, theirs) == written.error
     assert 0 < written.error < LIMITS[precision]
     if single:
         assert written.error_single == written.error

@@ -1,4 +1,4 @@
-"""The axes of a configuration: how many, and what is given once or for each of them."""
+"""Axes and measurements of a configuration: how many, and what a file gives for each."""
 
 from __future__ import annotations
 
@@ -12,44 +12,45 @@ from lbt_synth.errors import ConfigError
 T = TypeVar("T")
 
 
-def axes_of(settings: FileSection) -> int:
-    """Return the number of modes n: of ``loop.axes``, else of the matrices, else 2."""
+def count_axes(settings: FileSection) -> int:
+    """Return the number of modes n: ``loop.axes``, else that of the matrices, else 2."""
     sensor, influence = settings.sensor.matrix, settings.mirror.influence_matrix
     sizes = [
         *([("sensor.matrix", "columns", len(sensor[0]))] if sensor else []),
         *([("mirror.influence_matrix", "rows", len(influence))] if influence else []),
     ]
-    asked = settings.loop.axes
-    if asked is None:
+    axes = settings.loop.axes
+    if axes is None:
         return sizes[0][2] if sizes else 2
     for key, word, size in sizes:
-        if size != asked:
+        if size != axes:
             raise ConfigError(
-                f"{key} must have {asked} {word}, as loop.axes says; got {size}.", path=key
+                f"{key} must have {axes} {word}, as loop.axes says; got {size}.", path=key
             )
-    return asked
+    return axes
 
 
-def measurements_of(settings: FileSection) -> int:
-    """Return the number of measurements q: rows of ``sensor.matrix``, else one an axis."""
+def count_measurements(settings: FileSection) -> int:
+    """Return the number of measurements q: rows of ``sensor.matrix``, else one per axis."""
     sensor = settings.sensor.matrix
-    return len(sensor) if sensor else axes_of(settings)
+    return len(sensor) if sensor else count_axes(settings)
 
 
-def fitted(values: list[T], count: int, key: str, what: str) -> list[T]:
-    """Return a list that has one value for each of ``count`` axes or measurements."""
+def require_length(values: list[T], count: int, key: str, what: str) -> list[T]:
+    """Return a list that must have one value for each of ``count`` axes or measurements."""
     if len(values) != count:
         raise ConfigError(
-            f"{key}: must be one for all, or a list of one {what} ({count}); got {len(values)}.",
+            f"{key}: must be one for all, or a list of one per {what} ({count}); got "
+            f"{len(values)}.",
             path=key,
         )
     return values
 
 
-def directions_of(
+def vibration_directions(
     section: VibrationSection | TrueVibrationSection, axes: int, key: str
 ) -> list[tuple[float, ...]]:
-    """Return the directions of the vibrations that one entry of a list makes."""
+    """Return the directions of the vibrations that one entry of a list describes."""
     if axes == 1:
         if section.axis in ("tilt", "both") or section.direction_deg is not None:
             raise ConfigError(

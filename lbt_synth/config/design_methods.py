@@ -1,4 +1,4 @@
-"""Designs by the names of their methods, with what a configuration says of them."""
+"""Methods of synthesis by name: their routes and options, and the design for a configuration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lbt_synth.config.load import Config
-from lbt_synth.config.robust import robust_design
+from lbt_synth.config.robust import design_robust
 from lbt_synth.design import (
     Design,
     hinf,
@@ -19,7 +19,7 @@ from lbt_synth.design import (
     polytopic,
 )
 
-ROUTES: Mapping[str, tuple[str, ...]] = {
+METHOD_ROUTES: Mapping[str, tuple[str, ...]] = {
     "kalman": ("riccati", "sdp"),
     "hinf": ("lmi", "riccati"),
     "mixed": (),
@@ -28,7 +28,7 @@ ROUTES: Mapping[str, tuple[str, ...]] = {
     "integrator": (),
     "robust": (),
 }
-OWNERS: Mapping[str, tuple[str, ...]] = {  # methods that an option goes with
+OPTION_METHODS: Mapping[str, tuple[str, ...]] = {  # the methods that take an option
     "gamma": ("hinf", "mixed"),
     "gamma_ratio": ("hinf", "mixed"),
     "rms": ("mixed",),
@@ -38,33 +38,33 @@ OWNERS: Mapping[str, tuple[str, ...]] = {  # methods that an option goes with
     "gain": ("integrator",),
     "command_weight": ("lqg",),
 }
-WITHOUT_HORIZON = ("integrator", "robust", "lqg")
+METHODS_WITHOUT_HORIZON = ("integrator", "robust", "lqg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignRequest:
-    """A method of synthesis and its options; what is not given is the configuration's."""
+    """A method of synthesis and its options; the configuration gives the others."""
 
-    method: str  # One of ``ROUTES``
-    # Those of ``OWNERS``, ``route`` and ``horizon``; none of them None
+    method: str  # a key of METHOD_ROUTES
+    # keys: ``route``, ``horizon`` and those of OPTION_METHODS; no value is None
     options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def text(self) -> str:
-        """Description for people."""
+        """Method and options as people read them."""
         given = ", ".join(f"{name} {value}" for name, value in self.options.items())
         return f"{self.method} ({given})" if given else self.method
 
 
-def designed(config: Config, request: DesignRequest) -> Design:
-    """Design for a configuration as it stands.
+def design_by_method(config: Config, request: DesignRequest) -> Design:
+    """Design a controller for a configuration.
 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.config.design_methods import DesignRequest, designed
+    >>> from lbt_synth.config.design_methods import DesignRequest, design_by_method
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> designed(config, DesignRequest(method="integrator", options={"gain": 0.4})).gain
+    >>> design_by_method(config, DesignRequest(method="integrator", options={"gain": 0.4})).gain
     0.4
     """
     method, options = request.method, request.options
@@ -76,7 +76,7 @@ def designed(config: Config, request: DesignRequest) -> Design:
             return integrator(config.hardware, gain=options["gain"])
         return optimal_integrator(config.hardware, config.truth)
     if method == "robust":
-        return robust_design(config)
+        return design_robust(config)
     if method == "lqg":
         weight = options.get("command_weight", defaults.command_weight)
         return lqg(config.plant, command_weight=weight)

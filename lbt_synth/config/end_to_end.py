@@ -1,23 +1,26 @@
-"""From a configuration to an end-to-end simulation."""
+"""Build the end-to-end simulation that a configuration describes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from lbt_synth.config.required_sections import needed_atmosphere, needed_telescope
+from lbt_synth.config.error_context import name_key
+from lbt_synth.config.required_sections import require_atmosphere, require_telescope
 from lbt_synth.config.schema import FileSection
-from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.errors import ConfigError
 from lbt_synth.interop import EndToEndSetup, EndToEndSystem
 from lbt_synth.models import LoopHardware, Truth
 
 _HINT = "an end-to-end simulation needs it"
 
 
-def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth) -> EndToEndSetup:
+def build_end_to_end_setup(
+    settings: FileSection, hardware: LoopHardware, truth: Truth
+) -> EndToEndSetup:
     """Build the simulation that a configuration describes."""
-    pyramid, asked = settings.sensor.pyramid, settings.end_to_end
-    telescope = needed_telescope(settings, _HINT)
-    air = needed_atmosphere(settings, _HINT)
+    pyramid, section = settings.sensor.pyramid, settings.end_to_end
+    telescope = require_telescope(settings, _HINT)
+    air = require_atmosphere(settings, _HINT)
     if pyramid is None:
         raise ConfigError(f"the key sensor.pyramid is missing; {_HINT}.", path="sensor.pyramid")
     if air.outer_scale_m is None:
@@ -40,16 +43,16 @@ def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth
     if settings.mirror.modes is None:
         raise ConfigError(f"the key mirror.modes is missing; {_HINT}.", path="mirror.modes")
     for key in ("sensor.matrix", "mirror.influence_matrix"):
-        section, name = key.split(".")
-        if getattr(getattr(settings, section), name) is not None:
+        part, name = key.split(".")
+        if getattr(getattr(settings, part), name) is not None:
             raise ConfigError(
                 f"{key} must be left out for an end-to-end simulation: its sensor and mirror are "
                 "calibrated in nanometres of each mode.",
                 path=key,
             )
-    # what the design assumes of the sensor's gain is no part of the optics
+    # the optics do not depend on the sensor gain that the design assumes
     modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=2)
-    try:
+    with name_key("end_to_end"):
         system = EndToEndSystem(
             hardware=modal,
             diameter_m=telescope.diameter_m,
@@ -58,27 +61,25 @@ def end_to_end_setup(settings: FileSection, hardware: LoopHardware, truth: Truth
             seeing_wavelength_um=air.seeing_wavelength_um,
             outer_scale_m=air.outer_scale_m,
             wind_speed_m_s=air.wind_speed_m_s,
-            wind_direction_deg=asked.wind_direction_deg,
+            wind_direction_deg=section.wind_direction_deg,
             sensing_wavelength_um=pyramid.wavelength_um,
             modulation_lambda_over_d=pyramid.modulation_lambda_over_d,
             subapertures_across=pyramid.subapertures_across,
             photons=pyramid.photons,
             read_noise_electrons=pyramid.read_noise_electrons,
             modes=settings.mirror.modes,
-            actuators_across=asked.actuators_across,
+            actuators_across=section.actuators_across,
             imaging_wavelength_um=settings.imaging.wavelength_um,
-            pixels=asked.pixels,
-            calibration_nm=asked.calibration_nm,
+            pixels=section.pixels,
+            calibration_nm=section.calibration_nm,
         )
         return EndToEndSetup(
             system=system,
             vibrations=truth.vibrations,
-            frames=asked.frames,
-            settle_frames=asked.settle_frames,
+            frames=section.frames,
+            settle_frames=section.settle_frames,
             seed=settings.simulation.seed,
-            gain=asked.gain,
-            leak=asked.leak,
-            leak_from_mode=asked.leak_from_mode,
+            gain=section.gain,
+            leak=section.leak,
+            leak_from_mode=section.leak_from_mode,
         )
-    except ProblemError as error:
-        raise ConfigError(f"end_to_end: {error}", path="end_to_end") from error

@@ -1,4 +1,4 @@
-"""The configuration of an identified system."""
+"""Write an identified model as a configuration, with its standard errors as comments."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from lbt_synth.config.schema import FileSection
-from lbt_synth.config.schema_errors import described
+from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
 from lbt_synth.models import ARModel
@@ -55,7 +55,7 @@ def identified_config(
     Raises
     ------
     ProblemError
-        If the model has another number of axes, or a value that no configuration can have.
+        If the model has another number of axes, or a value that no configuration accepts.
 
     Examples
     --------
@@ -74,7 +74,10 @@ def identified_config(
         raise ProblemError(
             "obstruction is a fraction of diameter_m, which is missing. Give both, or neither."
         )
-    comments = {"": title, "sensor.noise_nm": _errors("nm", [axis.noise_error_nm for axis in axes])}
+    comments = {
+        "": title,
+        "sensor.noise_nm": _error_comment("nm", [axis.noise_error_nm for axis in axes]),
+    }
     content: dict[str, Any] = {"version": 1}
     if diameter_m is not None:
         content["telescope"] = {"diameter_m": diameter_m}
@@ -88,8 +91,8 @@ def identified_config(
         "frame_rate_hz": number(model.frame_rate_hz, "frame_rate_hz", above=0),
         "delay_frames": number(model.delay_frames, "delay_frames", at_least=1),
     }
-    lines = _vibrations(axes, comments)
-    content["model"] = {"turbulence": [_turbulence(axis.turbulence) for axis in axes]}
+    lines = _vibration_sections(axes, comments)
+    content["model"] = {"turbulence": [_turbulence_section(axis.turbulence) for axis in axes]}
     for index, axis in enumerate(axes):
         rms = f"rms {axis.turbulence.rms_nm:.4g} nm"
         comments[f"model.turbulence[{index}]"] = f"{_AXES[index]}, {rms}"
@@ -100,7 +103,7 @@ def identified_config(
     gains = [float(axis.sensor_gain) for axis in axes]
     if any(gain != 1 for gain in gains):
         content["model"]["sensor_gain"] = content["truth"]["sensor_gain"] = gains
-        comments["model.sensor_gain"] = _errors(
+        comments["model.sensor_gain"] = _error_comment(
             "", [axis.sensor_gain_error or 0.0 for axis in axes]
         )
     content["imaging"] = {"wavelength_um": wavelength_um}
@@ -110,12 +113,12 @@ def identified_config(
         settings = FileSection.model_validate(content)
     except ValidationError as error:
         raise ProblemError(
-            f"the model cannot be written as a configuration: {described(error)[0]}"
+            f"the model cannot be written as a configuration: {describe_error(error)[0]}"
         ) from error
     return settings, {key: text for key, text in comments.items() if text}
 
 
-def _turbulence(model: ARModel) -> dict[str, Any]:
+def _turbulence_section(model: ARModel) -> dict[str, Any]:
     return {
         "kind": "ar",
         "coefficients": model.coefficients.tolist(),
@@ -123,17 +126,19 @@ def _turbulence(model: ARModel) -> dict[str, Any]:
     }
 
 
-def _vibrations(axes: Sequence[IdentifiedAxis], comments: dict[str, str]) -> list[dict[str, Any]]:
-    """Return the lines of all axes, tip first, and comment on their errors."""
+def _vibration_sections(
+    axes: Sequence[IdentifiedAxis], comments: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Return the vibrations of all axes, tip first; add comments on their errors."""
     out: list[dict[str, Any]] = []
     for name, axis in zip(_AXES, axes, strict=False):
         for line in axis.parts:
             path = f"model.vibrations[{len(out)}]"
-            comments[f"{path}.frequency_hz"] = _of_kind(line.kind) + _errors(
+            comments[f"{path}.frequency_hz"] = _kind_comment(line.kind) + _error_comment(
                 "Hz", [line.frequency_error_hz]
             )
-            comments[f"{path}.damping"] = _errors("", [line.damping_error])
-            comments[f"{path}.rms_nm"] = _errors("nm", [line.rms_error_nm])
+            comments[f"{path}.damping"] = _error_comment("", [line.damping_error])
+            comments[f"{path}.rms_nm"] = _error_comment("nm", [line.rms_error_nm])
             entry: dict[str, Any] = {} if len(axes) == 1 else {"axis": name}
             out.append(
                 entry
@@ -146,13 +151,13 @@ def _vibrations(axes: Sequence[IdentifiedAxis], comments: dict[str, str]) -> lis
     return out
 
 
-def _of_kind(kind: str) -> str:
-    """Return what a resonance that is no narrow line is."""
+def _kind_comment(kind: str) -> str:
+    """Return the comment on a resonance that is no narrow line."""
     return {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}[kind]
 
 
-def _errors(unit: str, errors: Sequence[float]) -> str:
-    """Return standard errors as a comment, nothing where none is known."""
+def _error_comment(unit: str, errors: Sequence[float]) -> str:
+    """Return standard errors as a comment, empty if none is known."""
     known = [math.isfinite(error) and error > 0 for error in errors]
     if not any(known):
         return ""

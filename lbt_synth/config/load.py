@@ -1,4 +1,4 @@
-"""Read a configuration file and build the objects it describes."""
+"""Read a configuration file and build the objects that it describes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,17 @@ from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from lbt_synth.config.builders import noise_of, plant_of, reference_gain, truth_of
-from lbt_synth.config.end_to_end import end_to_end_setup
-from lbt_synth.config.required_sections import atmosphere_of, needed_atmosphere
+from lbt_synth.config.end_to_end import build_end_to_end_setup
+from lbt_synth.config.error_context import name_file
+from lbt_synth.config.plant_and_truth import (
+    build_plant,
+    build_truth,
+    measurement_noise_nm,
+    reference_gain,
+)
+from lbt_synth.config.required_sections import build_atmosphere, require_atmosphere
 from lbt_synth.config.schema import FileSection
-from lbt_synth.config.schema_errors import described
+from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
@@ -46,7 +52,7 @@ class Config:
         Measurement noise per frame [nm], of all measurements or of each.
     sensor_gain : float
         Sensor gain that the design assumes, with which single real gains are compared: the
-        mean of ``model.sensor_gain`` where it is a list.
+        mean of ``model.sensor_gain`` if it is a list.
     source : pathlib.Path
         The file.
     """
@@ -65,22 +71,18 @@ class Config:
         """The loop."""
         return self.plant.hardware
 
-    def air(self, reason: str) -> Atmosphere:
-        """Return the atmosphere; raises ConfigError with the reason where the file has none."""
-        try:
-            needed_atmosphere(self.settings, reason)
-        except ConfigError as error:
-            raise ConfigError(f"{self.source}: {error}", path=error.path) from error
-        assert self.atmosphere is not None  # built from the section that is there
+    def require_atmosphere(self, reason: str) -> Atmosphere:
+        """Return the atmosphere; raise ConfigError with the reason if the file has none."""
+        with name_file(self.source):
+            require_atmosphere(self.settings, reason)
+        assert self.atmosphere is not None  # built from the section, which is there
         return self.atmosphere
 
     @property
     def end_to_end(self) -> EndToEndSetup:
-        """The end-to-end simulation; raises ConfigError if the file cannot describe one."""
-        try:
-            return end_to_end_setup(self.settings, self.hardware, self.truth)
-        except ConfigError as error:
-            raise ConfigError(f"{self.source}: {error}", path=error.path) from error
+        """The end-to-end simulation; ConfigError if the file does not describe one."""
+        with name_file(self.source):
+            return build_end_to_end_setup(self.settings, self.hardware, self.truth)
 
 
 def load_config(path: str | os.PathLike[str]) -> Config:
@@ -110,15 +112,15 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     (800.0, (8, 8))
     """
     source = Path(path)
-    return config_of(validated(FileSection, read_mapping(source), source), source)
+    return build_config(validate_sections(FileSection, read_mapping(source), source), source)
 
 
-def validated(schema: type[Checked], raw: Mapping[str, Any], source: Path) -> Checked:
-    """Return the sections of a file, checked."""
+def validate_sections(schema: type[Checked], raw: Mapping[str, Any], source: Path) -> Checked:
+    """Check the mapping of a file against its schema, and return its sections."""
     try:
         return schema.model_validate(raw)
     except ValidationError as error:
-        message, key = described(error, schema)
+        message, key = describe_error(error, schema)
         raise ConfigError(f"{source}: {message}", path=key) from error
 
 
@@ -144,13 +146,13 @@ def read_mapping(source: Path) -> dict[str, Any]:
     return raw
 
 
-def config_of(settings: FileSection, source: Path) -> Config:
-    """Build what the settings of a file describe."""
+def build_config(settings: FileSection, source: Path) -> Config:
+    """Build the objects that the settings of a file describe."""
     try:
-        atmosphere = atmosphere_of(settings)
-        noise_nm = noise_of(settings)
-        plant = plant_of(settings, atmosphere, noise_nm)
-        truth = truth_of(settings, atmosphere, noise_nm, plant)
+        atmosphere = build_atmosphere(settings)
+        noise_nm = measurement_noise_nm(settings)
+        plant = build_plant(settings, atmosphere, noise_nm)
+        truth = build_truth(settings, atmosphere, noise_nm, plant)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}", path=error.path) from error
     except ProblemError as error:

@@ -1,4 +1,4 @@
-"""Sections that a configuration may leave out, and what cannot do without them."""
+"""The optional sections telescope and atmosphere, and what is built from them."""
 
 from __future__ import annotations
 
@@ -7,33 +7,35 @@ from lbt_synth.errors import ConfigError
 from lbt_synth.models import Atmosphere, nm_per_mas
 
 
-def needed_telescope(settings: FileSection, reason: str) -> TelescopeSection:
-    """Return the section ``telescope``."""
+def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
+    """Return the section ``telescope``; raise ConfigError with the reason if it is missing."""
     if settings.telescope is None:
         raise ConfigError(f"the key telescope is missing: {reason}.", path="telescope")
     return settings.telescope
 
 
-def needed_atmosphere(settings: FileSection, reason: str) -> AtmosphereSection:
-    """Return the section ``atmosphere``."""
+def require_atmosphere(settings: FileSection, reason: str) -> AtmosphereSection:
+    """Return the section ``atmosphere``; raise ConfigError with the reason if it is missing."""
     if settings.atmosphere is None:
         raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
     return settings.atmosphere
 
 
-def nm_of_mas(settings: FileSection, mas: float, key: str) -> float:
+def convert_mas_to_nm(settings: FileSection, mas: float, key: str) -> float:
     """Convert an angle of the file [mas] to a wavefront [nm rms]."""
     reason = f"{key} is in mas, and a wavefront in nm needs telescope.diameter_m"
-    telescope = needed_telescope(settings, f"{reason}. Give it, or the value in nm")
+    telescope = require_telescope(settings, f"{reason}. Give it, or the value in nm")
     return mas * nm_per_mas(telescope.diameter_m)
 
 
-def atmosphere_of(settings: FileSection) -> Atmosphere | None:
-    """Build the atmosphere of a file, None if it has none."""
+def build_atmosphere(settings: FileSection) -> Atmosphere | None:
+    """Build the atmosphere of a configuration, None if it has none."""
     air = settings.atmosphere
     if air is None:
         return None
-    telescope = needed_telescope(settings, "the turbulence of atmosphere is that over its diameter")
+    telescope = require_telescope(
+        settings, "the turbulence of atmosphere is that over its diameter"
+    )
     return Atmosphere(
         seeing_arcsec=air.seeing_arcsec,
         seeing_wavelength_um=air.seeing_wavelength_um,

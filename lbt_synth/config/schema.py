@@ -1,4 +1,4 @@
-"""Schema of a configuration file. Keys carry their units; unknown keys are refused."""
+"""The schema of a configuration file, with units in its keys; unknown keys are refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_val
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Damping = Annotated[float, Field(gt=0, lt=1)]
-ONE, EACH = "one", "each"  # one for all axes, or a list of one an axis
+ONE, EACH = "one", "each"  # one value for all axes, or a list with one per axis
 
 
 def _one_or_each(value: Any) -> str:
@@ -98,7 +98,7 @@ class LocalLoopSection(Section):
 
 
 class MirrorSection(Section):
-    """Deformable mirror; ``modes`` counts those that are controlled: by hundreds, or end to end."""
+    """Deformable mirror; ``modes`` counts the controlled ones, for modal designs and end to end."""
 
     modes: Annotated[int, Field(ge=1)] | None = None
     influence_matrix: list[list[float]] | None = None
@@ -188,7 +188,7 @@ TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discrim
 
 
 class ModelSection(Section):
-    """What the design believes; leave ``vibrations`` out for a plant without any."""
+    """What the design assumes; leave ``vibrations`` out for a plant without any."""
 
     turbulence: Annotated[
         Annotated[TurbulenceSection, Tag(ONE)]
@@ -200,7 +200,7 @@ class ModelSection(Section):
 
 
 class TruthSection(Section):
-    """What the loop really meets; ``vibrations: model`` are those of the model."""
+    """What the real loop meets; ``vibrations: model`` takes those of the model."""
 
     turbulence: Literal["frozen_flow", "model", "none"] | None = None
     vibrations: Annotated[
@@ -242,7 +242,7 @@ class AttenuationSection(Section):
 
 
 class MirrorUncertaintySection(Section):
-    """Relative size of what is not known of the mirror, in a band."""
+    """Relative uncertainty of the mirror in a band."""
 
     relative: Positive
     low_hz: Annotated[float, Field(ge=0)]
@@ -296,7 +296,7 @@ class RobustnessSection(Section):
 
 
 class EndToEndSection(Section):
-    """The end-to-end simulation; the other sections say what it is of."""
+    """The end-to-end simulation; the other sections describe its system."""
 
     pixels: Annotated[int, Field(ge=8)] = 60
     frames: Annotated[int, Field(ge=2)] = 1600
@@ -328,10 +328,10 @@ class FileSection(Section):
 
     @property
     def usual_turbulence(self) -> str:
-        """Turbulence of a truth that names none: that of the atmosphere, if there is one."""
+        """Turbulence of a truth that names none: frozen_flow if there is an atmosphere."""
         return "model" if self.atmosphere is None else "frozen_flow"
 
     @property
     def true_turbulence(self) -> str:
-        """Turbulence that the loop meets: frozen_flow, model or none."""
+        """Turbulence that the real loop meets: frozen_flow, model or none."""
         return self.truth.turbulence or self.usual_turbulence

@@ -1,4 +1,4 @@
-"""What a configuration has wrong, in one sentence with the path of the key."""
+"""The first mistake in a configuration, as one sentence with the path of its key."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from pydantic import BaseModel, ValidationError
 from lbt_synth.config.schema import EACH, ONE, FileSection
 
 
-def described(error: ValidationError, schema: type[BaseModel] = FileSection) -> tuple[str, str]:
+def describe_error(
+    error: ValidationError, schema: type[BaseModel] = FileSection
+) -> tuple[str, str]:
     """Return one sentence on the first mistake, and the path of its key."""
     details = error.errors()
-    # an unknown key tells more than the missing one that it was meant to be
+    # an unknown key says more than the missing one that it was meant to be
     first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
     location = tuple(p for p in first["loc"] if p not in ("ar1", "ar2", "ar", ONE, EACH))
     key = _key_path(location)
     more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
-        known = _fields_at(schema, location[:-1])
+        known = _list_keys(schema, location[:-1])
         close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
         hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
         return f"unknown key {key}; {hint}{more}", key
@@ -45,8 +47,8 @@ def _key_path(location: tuple[int | str, ...]) -> str:
     return out
 
 
-def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Names of the keys known at a place of the schema."""
+def _list_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys that the schema knows at a location."""
     here: list[type[BaseModel]] = [model]
     chosen_name = False  # the next part is a name that the file chooses, a key of a mapping
     for part in location:
@@ -60,13 +62,13 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[
             if part == (field.alias or name)
         ]
         chosen_name = any(get_origin(field.annotation) is dict for field in fields)
-        here = [found for field in fields for found in _models_in(field.annotation)]
+        here = [found for field in fields for found in _find_models(field.annotation)]
     return sorted(
         {field.alias or name for section in here for name, field in section.model_fields.items()}
     )
 
 
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
+def _find_models(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [m for arg in getattr(annotation, "__args__", ()) for m in _models_in(arg)]
+    return [m for arg in getattr(annotation, "__args__", ()) for m in _find_models(arg)]

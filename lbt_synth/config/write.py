@@ -1,4 +1,4 @@
-"""Write a configuration file: what was set, in the order of the schema, with comments."""
+"""Write a configuration file: the values that were set, in schema order, with comments."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ruamel.yaml.error import YAMLError
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ProblemError
 from lbt_synth.storage.atomic_files import write_atomically
-from lbt_synth.validation import instance
+from lbt_synth.validation import require_instance
 
 _COLUMN = 40  # where comments begin
 
 
 def config_text(settings: FileSection, comments: Mapping[str, str] | None = None) -> str:
     """Return the YAML of a configuration; see :func:`save_config`."""
-    instance(settings, FileSection)
+    require_instance(settings, FileSection)
     content = settings.model_dump(exclude_unset=True)
     left = dict(comments or {})
     head = left.pop("", "")
@@ -31,7 +31,7 @@ def config_text(settings: FileSection, comments: Mapping[str, str] | None = None
     for number, (key, value) in enumerate(content.items()):
         if number > 0:
             out.append("")
-        out += _lines(key, value, key, 0, left)
+        out += _write_key(key, value, key, 0, left)
     if left:
         raise ProblemError(
             f"comments must be on keys that are written; got one on {next(iter(left))}, which is "
@@ -55,7 +55,7 @@ def save_config(
     *,
     comments: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write a configuration file that reads as it is, whole or not at all.
+    """Write a configuration file that loads with the same values, whole or not at all.
 
     Only what was set is written; defaults stay out. Numbers keep all their digits. The text is
     read again before it is written.
@@ -101,16 +101,18 @@ def save_config(
     return write_atomically(path, config_text(settings, comments).encode())
 
 
-def _lines(key: str, value: Any, path: str, depth: int, comments: dict[str, str]) -> Iterator[str]:
-    """Lines of one key; the comments that they take are taken out of the mapping."""
+def _write_key(
+    key: str, value: Any, path: str, depth: int, comments: dict[str, str]
+) -> Iterator[str]:
+    """Yield the lines of a key; the comments used are removed from the mapping."""
     start = f"{'  ' * depth}{key}:"
     listed = isinstance(value, list) and bool(value) and isinstance(value[0], dict)
     if isinstance(value, dict) and value:
-        yield _commented(start, comments.pop(path, ""))
+        yield _append_comment(start, comments.pop(path, ""))
         for name, inner in value.items():
-            yield from _lines(name, inner, f"{path}.{name}", depth + 1, comments)
+            yield from _write_key(name, inner, f"{path}.{name}", depth + 1, comments)
     elif listed:
-        yield _commented(start, comments.pop(path, ""))
+        yield _append_comment(start, comments.pop(path, ""))
         for index, item in enumerate(value):
             own = f"{path}[{index}]"
             note = comments.pop(own, "")
@@ -119,24 +121,24 @@ def _lines(key: str, value: Any, path: str, depth: int, comments: dict[str, str]
             rows = [
                 row
                 for name, inner in item.items()
-                for row in _lines(name, inner, f"{own}.{name}", depth + 2, comments)
+                for row in _write_key(name, inner, f"{own}.{name}", depth + 2, comments)
             ]
             rows[0] = f"{'  ' * (depth + 1)}- {rows[0].lstrip()}"
             yield from rows
     else:
-        yield _commented(f"{start} {_flow(value)}", comments.pop(path, ""))
+        yield _append_comment(f"{start} {_inline_value(value)}", comments.pop(path, ""))
 
 
-def _commented(line: str, comment: str) -> str:
+def _append_comment(line: str, comment: str) -> str:
     return f"{line:<{_COLUMN - 2}}  # {comment}" if comment else line
 
 
-def _flow(value: Any) -> str:
-    """One value on one line."""
+def _inline_value(value: Any) -> str:
+    """Return a value on one line."""
     if isinstance(value, list):
-        return f"[{', '.join(_flow(item) for item in value)}]"
+        return f"[{', '.join(_inline_value(item) for item in value)}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{k}: {_flow(v)}' for k, v in value.items())}}}"
+        return f"{{{', '.join(f'{k}: {_inline_value(v)}' for k, v in value.items())}}}"
     if value is None:
         return "null"
     if isinstance(value, float):

@@ -1,8 +1,8 @@
 """Controllers in other people's programs.
 
-A controller becomes C99 source, a MATLAB file or a SPECULA filter.
-Each export is rehearsed beside the controller before it is written.
-The end-to-end simulation runs a design on optics simulated by SPECULA.
+One folder per program: ``c`` writes C99 source, ``iir`` a filter file of SPECULA, ``matlab`` a
+MATLAB file. Before a file is written, what it holds is run beside the controller.
+``specula`` runs a design end to end, on optics simulated by SPECULA.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Where a file comes from, in words that are safe in any comment."""
+"""Where an exported file comes from, in text that is safe inside any comment."""
 
 from __future__ import annotations
 
@@ -6,48 +6,26 @@ import re
 from collections.abc import Sequence
 
 import lbt_synth
-from lbt_synth.design import Design, certify_loop
-from lbt_synth.errors import CertificateError, NumericalError, ProblemError
-from lbt_synth.linear import Controller
-from lbt_synth.validation import instance
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
 
-# no asterisk, backslash or question mark: no end of a comment, spliced line or trigraph
+# without *, \ and ? no text ends a comment, splices lines or makes a trigraph
 _UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def plain_text(text: str) -> str:
-    """Return a text of plain characters only; every other one becomes an underscore."""
+    """Replace every character that is not safe in a comment with an underscore."""
     return _UNSAFE.sub("_", text)
 
 
-def require_sound(design: Design, written: Controller | None = None) -> None:
-    """Refuse a design that is not certified, or whose loop what is written would not hold."""
-    instance(design, Design)
-    if not design.certificate.passed:
-        failed = tuple(check.name for check in design.certificate.checks if not check.passed)
-        raise CertificateError(
-            f"only a certified design is exported; this one failed: {'; '.join(failed)}.",
-            failed=failed,
-        )
-    if design.hardware is None:
-        return
-    check = certify_loop(design.hardware, written or design.controller)
-    if not check.passed:
-        raise NumericalError(
-            "the loop closed around the numbers as they would be written is unstable: "
-            f"{check.name} {check.value:.12g}, limit {check.limit:.12g}. Try double precision.",
-            residual=check.value,
-        )
-
-
-def as_sentences(lines: Sequence[tuple[str, str]]) -> list[str]:
-    """Return lines of provenance as texts."""
+def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:
+    """Join each label and its text."""
     return [f"{label}: {text}" if label else text for label, text in lines]
 
 
-def provenance(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
-    """Return labels and texts that say what a file holds and where it comes from."""
+def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
+    """Return labelled lines on a file: version, method, gain file, loop, units, certificate."""
     if gain_digest is not None and not (
         isinstance(gain_digest, str) and _DIGEST.fullmatch(gain_digest)
     ):

@@ -1,1 +1,1 @@
-"""A controller as C99 source."""
+"""Export of a controller as C99 source."""

@@ -1,1 +1,1 @@
-"""A controller as a transfer-function file of SPECULA."""
+"""Export of a controller as transfer functions for SPECULA's IirFilter."""

@@ -1,4 +1,4 @@
-"""Transfer functions of controllers, their coefficients exact before they are rounded once."""
+"""Transfer functions of a controller, computed exactly and rounded once."""
 
 from __future__ import annotations
 
@@ -11,30 +11,29 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.validation import BoolArray, FloatArray
 
-_COUPLED = 1e-9  # of the largest entry, in balanced units: less is what a solver leaves over
-_NOTHING = 1e-40  # of the largest entry: no digit of any coefficient depends on it
+_COUPLED = 1e-9  # of the largest balanced entry; less is what a solver leaves of a zero
+_NEGLIGIBLE = 1e-40  # of the largest entry; no digit of any coefficient depends on less
 _MOST_STATES = 40
 
 
 def axis_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArray]]:
-    """Numerator and denominator of each axis, coefficients ascending in z.
+    """Return numerator and denominator (k,) of each axis, coefficients ascending in z.
 
     States that an axis does not drive, or does not show in its command, are left out; common
-    factors of z are divided out. Denominators are monic; both have the same length. Shapes: returns
-    list of (k,).
+    factors of z are divided out. Denominators are monic; both have the same length.
     """
     m, q = len(controller.C), controller.B.shape[1]
     if m != q:
         raise ProblemError(
-            f"a filter an axis needs as many commands as measurements; got {m} commands and {q} "
+            f"a filter per axis needs as many commands as measurements; got {m} commands and {q} "
             "measurements. Use the gain file itself."
         )
     balanced = StateSpace(
         A=controller.A, B=controller.B, C=controller.C, D=controller.D, dt_s=controller.dt_s
     ).balanced()
-    links = {name: _links(getattr(balanced, name)) for name in "ABC"}
-    reached = [_closure(links["A"], links["B"][:, i]) for i in range(q)]
-    shown = [_closure(links["A"].T, links["C"][i]) for i in range(q)]
+    links = {name: _find_links(getattr(balanced, name)) for name in "ABC"}
+    reached = [_reach(links["A"], links["B"][:, i]) for i in range(q)]
+    shown = [_reach(links["A"].T, links["C"][i]) for i in range(q)]
     direct = np.abs(controller.D) > _COUPLED * max(
         np.max(np.abs(controller.D)), np.max(np.abs(controller.C @ controller.B))
     )
@@ -55,28 +54,29 @@ def axis_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
                 f"{own.size}. Use the gain file itself, or design with fewer states."
             )
         pairs.append(
-            _polynomials(
-                _quiet(balanced.A[np.ix_(own, own)]),
-                _quiet(balanced.B[own, i]),
-                _quiet(balanced.C[i, own]),
+            _exact_quotient(
+                _drop_negligible(balanced.A[np.ix_(own, own)]),
+                _drop_negligible(balanced.B[own, i]),
+                _drop_negligible(balanced.C[i, own]),
                 float(controller.D[i, i]),
             )
         )
     return pairs
 
 
-def _links(matrix: FloatArray) -> BoolArray:
+def _find_links(matrix: FloatArray) -> BoolArray:
+    """Return which entries couple, (rows, columns)."""
     return np.asarray(np.abs(matrix) > _COUPLED * np.max(np.abs(matrix), initial=0.0))
 
 
-def _quiet(matrix: FloatArray) -> FloatArray:
-    """Without entries so small that they only cost digits."""
+def _drop_negligible(matrix: FloatArray) -> FloatArray:
+    """Set entries to zero that are so small that they only cost digits."""
     size = np.max(np.abs(matrix), initial=0.0)
-    return np.where(np.abs(matrix) > _NOTHING * size, matrix, 0.0)
+    return np.where(np.abs(matrix) > _NEGLIGIBLE * size, matrix, 0.0)
 
 
-def _closure(steps: BoolArray, start: BoolArray) -> BoolArray:
-    """States that can be reached from some: ``steps[i, j]`` leads from j to i."""
+def _reach(steps: BoolArray, start: BoolArray) -> BoolArray:
+    """Return the states reached from ``start``, where ``steps[i, j]`` leads from j to i."""
     found = start.copy()
     while True:
         more = found | (steps @ found)
@@ -85,23 +85,23 @@ def _closure(steps: BoolArray, start: BoolArray) -> BoolArray:
         found = more
 
 
-def _polynomials(A: FloatArray, b: FloatArray, c: FloatArray, d: float) -> Any:
-    """``z c (zI - A)^-1 b + d`` as a quotient, by Faddeev and Leverrier's recursion in integers.
+def _exact_quotient(A: FloatArray, b: FloatArray, c: FloatArray, d: float) -> Any:
+    """Return ``z c (zI - A)^-1 b + d`` as a quotient, by the Faddeev-LeVerrier recursion.
 
     The entries are dyadic fractions, so a common power of two makes them integers; the
-    recursion's divisions then leave no remainder, and nothing is rounded before the end.
+    divisions of the recursion then leave no remainder, and only the result is rounded.
     """
     n = len(A)
-    (N, s), (B, sb), (C, sc) = (_integers(part) for part in (A, b, c))
+    (N, s), (B, sb), (C, sc) = (_scale_to_integers(part) for part in (A, b, c))
     den = [Fraction(0)] * n + [Fraction(1)]
     num = [Fraction(0)] * (n + 1)
-    M = _identity(n)  # adj(zI - N) = M_1 z^(n-1) + M_2 z^(n-2) + ...
+    M = np.eye(n, dtype=object)  # adj(zI - N) = M_1 z^(n-1) + M_2 z^(n-2) + ...
     for k in range(1, n + 1):
         num[n - k + 1] = Fraction(int(C @ M @ B), 1 << (s * (k - 1) + sb + sc))
         M = N @ M
         trace = -int(np.trace(M)) // k
         den[n - k] = Fraction(trace, 1 << (s * k))
-        M = M + trace * _identity(n)
+        M = M + trace * np.eye(n, dtype=object)
     exact = Fraction(d)
     num = [v + exact * w for v, w in zip(num, den, strict=True)]
     while len(den) > 1 and num[0] == 0 and den[0] == 0:
@@ -115,12 +115,8 @@ def _polynomials(A: FloatArray, b: FloatArray, c: FloatArray, d: float) -> Any:
         ) from error
 
 
-def _identity(n: int) -> Any:
-    return np.array([[int(i == j) for j in range(n)] for i in range(n)], dtype=object).reshape(n, n)
-
-
-def _integers(values: FloatArray) -> tuple[Any, int]:
-    """Integers and the power of two that they are to be divided by."""
+def _scale_to_integers(values: FloatArray) -> tuple[Any, int]:
+    """Return integers and the power of two by which to divide them."""
     ratios = [float(v).as_integer_ratio() for v in values.ravel()]
     power = max((bottom.bit_length() - 1 for _, bottom in ratios), default=0)
     whole = np.array([top * ((1 << power) // bottom) for top, bottom in ratios], dtype=object)

@@ -1,1 +1,1 @@
-"""A controller as a MATLAB file."""
+"""Export of a controller as a MATLAB file."""

@@ -1,1 +1,1 @@
-"""The whole adaptive-optics system, on optics simulated by SPECULA (an optional extra)."""
+"""The end-to-end simulation on optics simulated by SPECULA (an optional extra)."""

@@ -1,4 +1,4 @@
-"""Modes, interaction matrix and reconstructor of a system, kept by their content."""
+"""Calibration of an end-to-end system: modes, interaction matrix, reconstructor, cached."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from lbt_synth.interop.specula.optics import Modes, Optics, make_modes, specula_
 from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 from lbt_synth.storage.atomic_files import write_atomically
-from lbt_synth.validation import FloatArray, frozen, instance
+from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _LAYOUT = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
-    """What is measured once before a loop is closed.
+    """What is measured once, before a loop is closed.
 
     Attributes
     ----------
@@ -36,9 +36,9 @@ class Calibration:
     reference : (q,) ndarray
         Slopes of a flat wavefront.
     reconstructor : Reconstructor
-        Generalised inverse of the interaction matrix (slopes a nanometre of each mode).
+        Generalised inverse of the interaction matrix (slopes per nanometre of each mode).
     key : str
-        Digest of all that it depends on.
+        Digest of everything that it depends on.
     cached : bool
         Whether it came from the cache.
     """
@@ -51,7 +51,7 @@ class Calibration:
 
 
 def cache_directory(path: str | os.PathLike[str] | None = None) -> Path:
-    """Return the directory for calibrations and phase screens, made if it is not there."""
+    """Return the directory for calibrations and phase screens; create it if it is missing."""
     if path is None:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         path = Path(base) / "lbt_synth"
@@ -76,8 +76,8 @@ def calibrate(
     """Compute the modes, measure the interaction matrix without noise, and invert it.
 
     Each mode is pushed and pulled by ``system.calibration_nm`` on a flat wavefront. The
-    result is kept in a cache under a digest of all that it depends on, SPECULA's version
-    included; a damaged file is measured anew.
+    result is cached under a digest of everything that it depends on, including SPECULA's
+    version; what a damaged file held is measured again.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def calibrate(
     cache : path-like, optional
         Directory of the cache; see :func:`cache_directory`.
     progress : callable, optional
-        Called with the number of modes that were measured since its last call.
+        Called with the number of modes measured since its last call.
 
     Returns
     -------
@@ -114,17 +114,17 @@ def calibrate(
         ...
     lbt_synth.errors.ProblemError: expected an EndToEndSystem; got str.
     """
-    instance(system, EndToEndSystem)
+    require_instance(system, EndToEndSystem)
     facts = {"layout": _LAYOUT, "specula": specula_version(), **system.calibration_facts()}
     key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     path = cache_directory(cache) / f"calibration-{key[:16]}.npz"
-    found = _load(path, key)
+    found = _load_cached(path, key)
     if found is not None:
         if progress is not None:
             progress(system.modes)
         return found
     modes = make_modes(system)
-    reference, matrix = _measure(system, modes, progress)
+    reference, matrix = _measure_interaction(system, modes, progress)
     arrays: dict[str, npt.NDArray[Any]] = {
         "MASK": modes.mask.astype(np.uint8),
         "SHAPES": modes.shapes,
@@ -134,12 +134,13 @@ def calibrate(
     meta = {"key": key, "facts": facts}
     meta["digest"] = digest(arrays, meta)
     write_atomically(path, npz_bytes(arrays, json.dumps(meta)))
-    return _calibration(modes, reference, matrix, key, cached=False)
+    return _make_calibration(modes, reference, matrix, key, cached=False)
 
 
-def _measure(
+def _measure_interaction(
     system: EndToEndSystem, modes: Modes, progress: Callable[[int], None] | None
 ) -> tuple[FloatArray, FloatArray]:
+    """Return the slopes of a flat wavefront (q,), and the interaction matrix (q, modes)."""
     optics = Optics(system, modes)
     still, n = np.zeros(2), len(modes.shapes)
     reference = optics.expose(np.zeros(n), still)
@@ -154,22 +155,25 @@ def _measure(
     return reference, matrix
 
 
-def _load(path: Path, key: str) -> Calibration | None:
+def _load_cached(path: Path, key: str) -> Calibration | None:
+    """Return the calibration of a file, None if it is missing, damaged or another one."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         arrays, text = read_npz(path.read_bytes())
         meta = json.loads(text)
         if meta["key"] == key and meta["digest"] == digest(arrays, meta):
             modes = Modes(mask=arrays["MASK"] > 0, shapes=arrays["SHAPES"].astype(np.float32))
-            return _calibration(modes, arrays["REFERENCE"], arrays["INTERACTION"], key, cached=True)
+            return _make_calibration(
+                modes, arrays["REFERENCE"], arrays["INTERACTION"], key, cached=True
+            )
     return None
 
 
-def _calibration(
+def _make_calibration(
     modes: Modes, reference: FloatArray, matrix: FloatArray, key: str, *, cached: bool
 ) -> Calibration:
     return Calibration(
         modes=modes,
-        reference=frozen(reference),
+        reference=frozen_copy(reference),
         reconstructor=reconstructor(matrix),
         key=key,
         cached=cached,

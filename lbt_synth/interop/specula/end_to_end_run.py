@@ -1,4 +1,4 @@
-"""What an end-to-end simulation gives."""
+"""The result of an end-to-end simulation: series, mean image, Strehl ratio, optical gains."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class EndToEndRun:
     seed : int
         Seed of turbulence, vibrations and noise.
     settle_frames : int
-        Frames that were run before and dropped.
+        Frames run before these, and dropped.
     seconds : float
         Time that the loop took [s].
     """
@@ -68,8 +68,8 @@ class EndToEndRun:
     def strehl_error(self) -> float:
         """Standard error of the Strehl ratio, from eight batches of frames; nan for short runs.
 
-        It is that of this air: what changes more slowly than a batch counts too little, and other
-        seeds scatter by more.
+        It holds for this turbulence: what changes more slowly than a batch counts too little, and
+        other seeds scatter more.
         """
         batches = np.array_split(self.strehl_series, _BATCHES)
         if len(self.strehl_series) < 2 * _BATCHES:
@@ -89,37 +89,37 @@ class EndToEndRun:
 
     @property
     def optical_gain(self) -> FloatArray:
-        """Gain of the sensor in the loop, mode by mode, (modes,).
+        """Gain of the sensor in the loop, for each mode, (modes,).
 
-        Regression of the measurements on the true residual: the noise of a
-        measurement is that of a later frame than the residual it is of.
+        Regression of the measurements on the true residual, which does not yet contain the noise
+        of its measurement.
         """
-        return self._regressed(slice(None), axis=0)[0]
+        return self._regress(slice(None), axis=0)[0]
 
     @property
     def optical_gain_error(self) -> FloatArray:
         """Standard error of each optical gain, for noise that is white, (modes,)."""
-        return self._regressed(slice(None), axis=0)[1]
+        return self._regress(slice(None), axis=0)[1]
 
     @property
     def tip_tilt_gain(self) -> float:
         """Optical gain of tip and tilt together."""
-        return float(self._regressed(_TIP_TILT)[0])
+        return float(self._regress(_TIP_TILT)[0])
 
     @property
     def tip_tilt_gain_error(self) -> float:
         """Standard error of the optical gain of tip and tilt."""
-        return float(self._regressed(_TIP_TILT)[1])
+        return float(self._regress(_TIP_TILT)[1])
 
     @property
     def tip_tilt_noise_nm(self) -> float:
-        """What the optical gain does not explain of the measured tip and tilt [nm rms a mode]."""
-        return float(self._regressed(_TIP_TILT)[2])
+        """Measured tip and tilt that the optical gain does not explain [nm rms per mode]."""
+        return float(self._regress(_TIP_TILT)[2])
 
-    def _regressed(
+    def _regress(
         self, modes: slice, axis: int | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gain of some modes, each or together, its standard error, and what it leaves [nm rms]."""
+        """Return the gain of modes, each or together, its standard error, and the rest [nm rms]."""
         y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
         power = np.sum(phase**2, axis=axis)
         gain = np.asarray(np.sum(y * phase, axis=axis) / power)

@@ -1,8 +1,8 @@
-"""The optics, by SPECULA: air, pupil, mirror, pyramid, detector, camera.
+"""The optics, simulated by SPECULA: air, pupil, mirror, pyramid, detector, camera.
 
 The only module that imports SPECULA (Istituto Nazionale di Astrofisica, MIT licence). Its
-objects are triggered one frame at a time; what is ours is the controller, the delay and the
-bookkeeping of modes.
+objects are triggered one frame at a time; the controller, the delay and the bookkeeping of
+modes are ours.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.validation import FloatArray
 
 _SUPPORTED = "1.1"
-NO_CLAMP = -1e4  # a slope computer that sets negative pixels to zero loses a fifth of the gain
+NO_CLAMP = -1e4  # if negative pixels were set to zero, a fifth of the gain would be lost
 _PUPIL_GAP = 4  # subapertures between the four pupils on the detector
 _MARGIN = 4
 _FIELD_ARCSEC = 2.0
@@ -34,7 +34,7 @@ _PSF_SAMPLING = 3
 
 
 def specula_version() -> str:
-    """Version of the installed SPECULA."""
+    """Return the version of the installed SPECULA, which must be a supported one."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -52,12 +52,12 @@ def specula_version() -> str:
     return found
 
 
-def _part(module: str) -> Any:
-    """Class of SPECULA by the name of its module, after the library has been started."""
+def _specula_class(module: str) -> Any:
+    """Return a class or function of SPECULA (``module:name``); initialise the library first."""
     specula_version()
     import specula
 
-    if specula.global_precision is None:  # nobody has started it: CPU, single precision
+    if specula.global_precision is None:  # not initialised yet: CPU, single precision
         specula.init(-1, precision=1, log_level=logging.ERROR)
     path, _, name = module.rpartition(":")
     return getattr(importlib.import_module(f"specula.{path}"), name)
@@ -67,22 +67,21 @@ def _part(module: str) -> Any:
 class Modes:
     """Modes of the mirror over the illuminated pixels of the pupil."""
 
-    mask: npt.NDArray[np.bool_]  # (pixels, pixels): illuminated pixels
-    # (modes, illuminated): shapes of rms 1, orthogonal to each other and to piston; tip and tilt
-    # first
+    mask: npt.NDArray[np.bool_]  # illuminated pixels, (pixels, pixels)
+    # (modes, illuminated), of rms 1, orthogonal to each other and to piston, tip and tilt first
     shapes: npt.NDArray[np.float32]
 
     def coefficients(self, phase_nm: npt.NDArray[np.float32]) -> FloatArray:
-        """Return the modal coefficients of a phase (illuminated,) [nm]."""
+        """Return the modal coefficients (modes,) of a phase (illuminated,) [nm]."""
         projected = np.asarray(self.shapes @ phase_nm, dtype=np.float64)
         return np.asarray(projected / self.shapes.shape[1])
 
 
 def make_modes(system: EndToEndSystem) -> Modes:
-    """Compute Karhunen-Loeve modes of the influence functions, tip and tilt before them."""
-    influence = _part("lib.compute_zonal_ifunc:compute_zonal_ifunc")
-    modal_base = _part("lib.modal_base_generator:make_modal_base_from_ifs_fft")
-    mask = _pupil(system, _parameters(system)).A
+    """Compute Karhunen-Loeve modes of the influence functions, after tip and tilt."""
+    influence = _specula_class("lib.compute_zonal_ifunc:compute_zonal_ifunc")
+    modal_base = _specula_class("lib.modal_base_generator:make_modal_base_from_ifs_fft")
+    mask = _make_pupil(system, _make_parameters(system)).A
     functions, _, _, _ = influence(
         system.pixels,
         system.actuators_across,
@@ -110,18 +109,18 @@ def make_modes(system: EndToEndSystem) -> Modes:
     return Modes(mask=mask > 0, shapes=np.ascontiguousarray(shapes[: system.modes], np.float32))
 
 
-def _parameters(system: EndToEndSystem) -> Any:
-    make = _part("data_objects.simul_params:SimulParams")
+def _make_parameters(system: EndToEndSystem) -> Any:
+    make = _specula_class("data_objects.simul_params:SimulParams")
     return make(system.pixels, system.pixel_m, time_step=1 / system.frame_rate_hz)
 
 
-def _pupil(system: EndToEndSystem, parameters: Any) -> Any:
-    make = _part("data_objects.pupilstop:Pupilstop")
+def _make_pupil(system: EndToEndSystem, parameters: Any) -> Any:
+    make = _specula_class("data_objects.pupilstop:Pupilstop")
     return make(parameters, mask_diam=1.0, obs_diam=system.obstruction)
 
 
 def _discard_damaged(files: Iterable[Path]) -> None:
-    """Delete phase screens that are cut off: they are drawn anew."""
+    """Delete truncated phase screens, so that they are computed again."""
     from astropy.io import fits
 
     for file in files:
@@ -136,18 +135,8 @@ def _discard_damaged(files: Iterable[Path]) -> None:
 class Optics:
     """One optical train, exposed frame after frame.
 
-    Parameters
-    ----------
-    system : EndToEndSystem
-        What it is of.
-    modes : Modes
-        Shapes of the mirror.
-    screens : pathlib.Path or None
-        Directory for phase screens; None for no turbulence.
-    frames : int, optional
-        Frames that will be exposed, for the size of the screens.
-    seed : int or None, optional
-        Seed of the turbulence and of the detector's noise; None for a detector without noise.
+    ``screens`` is the directory of the phase screens, None for no turbulence; their size
+    depends on the ``frames`` that will be exposed. Without a seed the detector has no noise.
     """
 
     def __init__(
@@ -164,16 +153,18 @@ class Optics:
         self._time_ns = 0
         self._weather: list[Any] = []  # seeing, speed and direction of the wind
         self._where = np.nonzero(modes.mask)
-        self._value = _part("base_value:BaseValue")
-        parameters = _parameters(system)
-        self._pupil = _pupil(system, parameters)
-        self._commands = self._input(np.zeros(len(modes.shapes)))
-        self._tilts = self._input(np.zeros(2))
-        mirror = self._mirror(parameters, modes.shapes, self._commands, -1)
-        shaker = self._mirror(parameters, modes.shapes[:2], self._tilts, 1)
-        air = self._air(screens, frames, seed, parameters) if screens is not None else None
-        source = _part("data_objects.source:Source")([0, 0], 0, 1e3 * system.sensing_wavelength_um)
-        beam = _part("processing_objects.atmo_propagation:AtmoPropagation")(
+        self._value = _specula_class("base_value:BaseValue")
+        parameters = _make_parameters(system)
+        self._pupil = _make_pupil(system, parameters)
+        self._commands = self._make_input(np.zeros(len(modes.shapes)))
+        self._tilts = self._make_input(np.zeros(2))
+        mirror = self._make_mirror(parameters, modes.shapes, self._commands, -1)
+        shaker = self._make_mirror(parameters, modes.shapes[:2], self._tilts, 1)
+        air = self._make_air(screens, frames, seed, parameters) if screens is not None else None
+        source = _specula_class("data_objects.source:Source")(
+            [0, 0], 0, 1e3 * system.sensing_wavelength_um
+        )
+        beam = _specula_class("processing_objects.atmo_propagation:AtmoPropagation")(
             parameters, {"star": source}
         )
         if air is not None:
@@ -182,10 +173,10 @@ class Optics:
             [self._pupil, mirror.outputs["out_layer"], shaker.outputs["out_layer"]]
         )
         self._field = beam.outputs["out_star_ef"]
-        pyramid, indices = self._pyramid(parameters)
-        detector = self._detector(parameters, pyramid, seed)
-        self._slopes = self._slope_computer(detector, indices)
-        self._camera = _part("processing_objects.psf:PSF")(
+        pyramid, indices = self._make_pyramid(parameters)
+        detector = self._make_detector(parameters, pyramid, seed)
+        self._slopes = self._make_slope_computer(detector, indices)
+        self._camera = _specula_class("processing_objects.psf:PSF")(
             parameters, 1e3 * system.imaging_wavelength_um, nd=_PSF_SAMPLING
         )
         self._camera.inputs["in_ef"].set(self._field)
@@ -194,17 +185,14 @@ class Optics:
             self._train.insert(0, air)
         for part in (*self._train, self._camera):
             part.setup()
-        # photons a subaperture, over the whole detector
+        # photons per subaperture, over the whole detector
         flux = system.photons * len(indices.ind_pup) * system.frame_rate_hz
         self._field.S0 = flux / float(self._field.masked_area())
 
     def expose(
         self, commands_nm: FloatArray, tilts_nm: Sequence[float] | FloatArray, *, seeing: float = 1
     ) -> FloatArray:
-        """Expose one frame and return its slopes.
-
-        Shapes: commands_nm (modes,), tilts_nm (2,) -> (q,).
-        """
+        """Expose one frame with commands (modes,) and tilts (2,), and return its slopes (q,)."""
         self._time_ns += self._step_ns
         self._commands.value[:] = commands_nm
         self._tilts.value[:] = tilts_nm
@@ -216,7 +204,7 @@ class Optics:
         return np.array(self._slopes.outputs["out_slopes"].slopes, dtype=np.float64)
 
     def image(self) -> tuple[float, FloatArray]:
-        """Return the Strehl ratio and the image of the frame that was exposed last."""
+        """Return the Strehl ratio and the image of the last frame."""
         self._trigger([self._camera])
         return float(self._camera.sr.value), np.array(self._camera.psf.value, dtype=np.float64)
 
@@ -235,7 +223,7 @@ class Optics:
         rows, columns = self._camera.out_size
         return int(rows), int(columns)
 
-    def _input(self, value: FloatArray) -> Any:
+    def _make_input(self, value: FloatArray) -> Any:
         return self._value(value=np.array(value, dtype=np.float32), precision=1)
 
     def _trigger(self, parts: Sequence[Any]) -> None:
@@ -244,15 +232,17 @@ class Optics:
                 part.trigger()
                 part.post_trigger()
 
-    def _mirror(self, parameters: Any, shapes: Any, commands: Any, sign: int) -> Any:
-        functions = _part("data_objects.ifunc:IFunc")(
+    def _make_mirror(self, parameters: Any, shapes: Any, commands: Any, sign: int) -> Any:
+        functions = _specula_class("data_objects.ifunc:IFunc")(
             ifunc=shapes, mask=self.modes.mask.astype(np.float32)
         )
-        mirror = _part("processing_objects.dm:DM")(parameters, 0, ifunc=functions, sign=sign)
+        mirror = _specula_class("processing_objects.dm:DM")(
+            parameters, 0, ifunc=functions, sign=sign
+        )
         mirror.inputs["in_command"].set(commands)
         return mirror
 
-    def _air(self, screens: Path, frames: int, seed: int | None, parameters: Any) -> Any:
+    def _make_air(self, screens: Path, frames: int, seed: int | None, parameters: Any) -> Any:
         system = self.system
         side = system.screen_pixels(frames)
         if side > _LARGEST_SCREEN:
@@ -261,9 +251,9 @@ class Optics:
                 f"at {system.wind_speed_m_s:g} m/s need {side}. Run fewer frames, with several "
                 "seeds."
             )
-        air = self._evolution(screens, side, (seed or 0) + 1, parameters)
+        air = self._make_evolution(screens, side, (seed or 0) + 1, parameters)
         self._weather = [
-            self._input(np.array([value]))
+            self._make_input(np.array([value]))
             for value in (
                 system.reference_seeing_arcsec,
                 system.wind_speed_m_s,
@@ -275,14 +265,14 @@ class Optics:
             air.inputs[name].set(given)
         return air
 
-    def _evolution(self, screens: Path, side: int, seed: int, parameters: Any) -> Any:
-        """Air with a screen from a directory of its own: the name of a screen rounds its pixel."""
+    def _make_evolution(self, screens: Path, side: int, seed: int, parameters: Any) -> Any:
+        """Make air whose screen has its own directory: SPECULA's file name rounds the pixel."""
         facts = [self.system.pixel_m, self.system.outer_scale_m, side, specula_version()]
         folder = screens / hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             _discard_damaged(folder.glob(f"ps_seed{seed}_*.fits"))
-            return _part("processing_objects.atmo_evolution:AtmoEvolution")(
+            return _specula_class("processing_objects.atmo_evolution:AtmoEvolution")(
                 parameters,
                 self.system.outer_scale_m,
                 [0.0],
@@ -298,13 +288,13 @@ class Optics:
                 path=folder,
             ) from error
 
-    def _pyramid(self, parameters: Any) -> tuple[Any, Any]:
+    def _make_pyramid(self, parameters: Any) -> tuple[Any, Any]:
         system = self.system
         across = system.subapertures_across
         side = 2 * across + _PUPIL_GAP + 2 * _MARGIN
         natural = system.sensing_wavelength_um * 1e-6 / system.pixel_m * 180 * 3600 / np.pi
         steps = 4 * int(np.ceil(2 * np.pi * system.modulation_lambda_over_d / 4))
-        pyramid = _part("processing_objects.modulated_pyramid:ModulatedPyramid")(
+        pyramid = _specula_class("processing_objects.modulated_pyramid:ModulatedPyramid")(
             parameters,
             1e3 * system.sensing_wavelength_um,
             min(natural, _FIELD_ARCSEC),
@@ -323,14 +313,14 @@ class Optics:
         radius = np.hypot(columns - x[:, None, None], rows - y[:, None, None])
         lit = (radius <= across / 2) & (radius >= system.obstruction * across / 2)
         indices = np.stack([np.flatnonzero(one) for one in lit], axis=1)
-        return pyramid, _part("data_objects.pupdata:PupData")(
+        return pyramid, _specula_class("data_objects.pupdata:PupData")(
             ind_pup=indices, radius=np.full(4, across / 2), cx=x, cy=y, framesize=[side, side]
         )
 
-    def _detector(self, parameters: Any, pyramid: Any, seed: int | None) -> Any:
+    def _make_detector(self, parameters: Any, pyramid: Any, seed: int | None) -> Any:
         side = pyramid.final_ccd_side
         noisy = seed is not None
-        detector = _part("processing_objects.ccd:CCD")(
+        detector = _specula_class("processing_objects.ccd:CCD")(
             parameters,
             [side, side],
             1 / self.system.frame_rate_hz,
@@ -344,8 +334,8 @@ class Optics:
         detector.inputs["in_i"].set(pyramid.outputs["out_i"])
         return detector
 
-    def _slope_computer(self, detector: Any, indices: Any) -> Any:
-        computer = _part("processing_objects.pyr_slopec:PyrSlopec")(
+    def _make_slope_computer(self, detector: Any, indices: Any) -> Any:
+        computer = _specula_class("processing_objects.pyr_slopec:PyrSlopec")(
             indices, norm_factor=self.system.photons, thr_value=NO_CLAMP
         )
         computer.inputs["in_pixels"].set(detector.outputs["out_pixels"])

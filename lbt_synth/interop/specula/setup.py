@@ -1,4 +1,4 @@
-"""A system, its vibrations and the integrators of its modes: all a run needs but the filter."""
+"""Set-up of an end-to-end simulation: system, vibrations, frames, integrators of the modes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from lbt_synth.design.modal import MixedController
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.specula.calibration import Calibration
 from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
-from lbt_synth.interop.specula.run import RAMP_FRAMES, checked_seed, run_end_to_end
+from lbt_synth.interop.specula.simulation import RAMP_FRAMES, checked_seed, run_end_to_end
 from lbt_synth.interop.specula.system import EndToEndSystem
-from lbt_synth.models.loop_hardware import same_mirror
+from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.models.truth import TrueVibration
-from lbt_synth.validation import FloatArray, instance, integer, number
+from lbt_synth.validation import FloatArray, integer, number, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,7 +36,7 @@ class EndToEndSetup:
     leak : float
         Leak of the integrators from mode ``leak_from_mode`` on; those before have none.
         A pyramid can trap a corner of the mirror at whole turns of the phase; a leak
-        lets go of it.
+        frees it.
     leak_from_mode : int
         First mode with a leak, counted from 0.
 
@@ -63,7 +63,7 @@ class EndToEndSetup:
     leak_from_mode: int = 50
 
     def __post_init__(self) -> None:
-        instance(self.system, EndToEndSystem)
+        require_instance(self.system, EndToEndSystem)
         object.__setattr__(self, "vibrations", tuple(self.vibrations))
         for name, least in (("frames", 2), ("settle_frames", RAMP_FRAMES)):
             object.__setattr__(self, name, integer(getattr(self, name), name, at_least=least))
@@ -112,7 +112,7 @@ class EndToEndSetup:
                 f"and {mine.delay_frames:g} frames; got one for {hardware.frame_rate_hz:g} Hz and "
                 f"{hardware.delay_frames:g} frames. Design it from this configuration."
             )
-        if hardware is not None and not same_mirror(hardware, mine):
+        if hardware is not None and not have_same_mirror(hardware, mine):
             raise ProblemError(
                 "the filter was designed for another mirror than that of the configuration. Design "
                 "for its mirror.local_loop, best with --method lqg."

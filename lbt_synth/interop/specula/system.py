@@ -1,4 +1,4 @@
-"""What an end-to-end simulation is of: telescope, air, pyramid, mirror, camera."""
+"""The system of an end-to-end simulation: telescope, air, pyramid, mirror, camera."""
 
 from __future__ import annotations
 
@@ -10,10 +10,25 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import instance, integer, number
+from lbt_synth.validation import integer, number, require_instance
 
-_REFERENCE_UM = 0.5  # wavelength at which seeing is handed over
+_REFERENCE_UM = 0.5  # wavelength at which SPECULA takes the seeing
 _MOST_PIXELS = 1024
+_LIMITS: dict[str, dict[str, Any]] = {
+    "diameter_m": {"above": 0},
+    "seeing_arcsec": {"above": 0},
+    "outer_scale_m": {"above": 0},
+    "wind_speed_m_s": {"above": 0},
+    "photons": {"above": 0},
+    "sensing_wavelength_um": {"above": 0},
+    "modulation_lambda_over_d": {"above": 0},
+    "seeing_wavelength_um": {"above": 0},
+    "imaging_wavelength_um": {"above": 0},
+    "calibration_nm": {"above": 0},
+    "obstruction": {"at_least": 0, "below": 1},
+    "read_noise_electrons": {"at_least": 0},
+    "wind_direction_deg": {},
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,7 +39,7 @@ class EndToEndSystem:
     ----------
     hardware : LoopHardware
         Frame rate and delay, or the response of a slow mirror; its sensor and influence
-        matrices are the identity, for optics take their places.
+        matrices are the identity, because the optics replace them.
     diameter_m : float
         Telescope diameter [m].
     obstruction : float
@@ -42,13 +57,13 @@ class EndToEndSystem:
     subapertures_across : int
         Subapertures across the pupil.
     photons : float
-        Photons a subaperture and a frame.
+        Photons per subaperture and frame.
     read_noise_electrons : float
-        Read noise of a pixel [electrons].
+        Read noise per pixel [electrons].
     modes : int, optional
-        Modes of the mirror that are controlled, tip and tilt first.
+        Controlled modes of the mirror, tip and tilt first.
     actuators_across : int, optional
-        Actuators on a diameter of the mirror, in concentric rings.
+        Actuators across the mirror, in concentric rings.
     seeing_wavelength_um : float, optional
         Wavelength of the seeing [um].
     imaging_wavelength_um : float, optional
@@ -93,7 +108,7 @@ class EndToEndSystem:
     calibration_nm: float = 20.0
 
     def __post_init__(self) -> None:
-        instance(self.hardware, LoopHardware)
+        require_instance(self.hardware, LoopHardware)
         for matrix, name in (
             (self.hardware.sensor, "sensor_matrix"),
             (self.hardware.influence, "influence_matrix"),
@@ -103,28 +118,8 @@ class EndToEndSystem:
                     f"the hardware of an end-to-end simulation must have two modes and the "
                     f"identity as its {name}, for the optics take its place; got {matrix.shape}."
                 )
-        for name in (
-            "diameter_m",
-            "seeing_arcsec",
-            "outer_scale_m",
-            "wind_speed_m_s",
-            "photons",
-            "sensing_wavelength_um",
-            "modulation_lambda_over_d",
-            "seeing_wavelength_um",
-            "imaging_wavelength_um",
-            "calibration_nm",
-        ):
-            object.__setattr__(self, name, number(getattr(self, name), name, above=0))
-        checked = {
-            "obstruction": number(self.obstruction, "obstruction", at_least=0, below=1),
-            "read_noise_electrons": number(
-                self.read_noise_electrons, "read_noise_electrons", at_least=0
-            ),
-            "wind_direction_deg": number(self.wind_direction_deg, "wind_direction_deg"),
-        }
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        for name, limits in _LIMITS.items():
+            object.__setattr__(self, name, number(getattr(self, name), name, **limits))
         for name, least in (
             ("subapertures_across", 2),
             ("modes", 3),
@@ -151,11 +146,11 @@ class EndToEndSystem:
 
     @property
     def reference_seeing_arcsec(self) -> float:
-        """Seeing at 0.5 um [arcsec]: it goes with the wavelength to the power of -1/5."""
+        """Seeing at 0.5 um [arcsec]; seeing varies as the wavelength to the power of -1/5."""
         return float(self.seeing_arcsec * (self.seeing_wavelength_um / _REFERENCE_UM) ** 0.2)
 
     def screen_pixels(self, frames: int) -> int:
-        """Side of a square phase screen that does not come round within some frames.
+        """Return the side of a square phase screen that does not repeat within some frames.
 
         Parameters
         ----------
@@ -165,7 +160,7 @@ class EndToEndSystem:
         Returns
         -------
         int
-            A power of two; the screen is at least six outer scales long, too, for it is
+            A power of two. The screen is also at least six outer scales long, because it is
             periodic and holds nothing slower.
         """
         travelled = frames / self.frame_rate_hz * self.wind_speed_m_s

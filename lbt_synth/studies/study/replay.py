@@ -1,4 +1,4 @@
-"""One row of a study again: its configuration, its designs, its results computed anew."""
+"""Replay one row of a study: its configuration, its designs, and its results once more."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from lbt_synth.config.load import validate_sections
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.models import ARModel
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.config_paths import nested_copy
@@ -25,6 +24,7 @@ from lbt_synth.studies.study.reference_evaluation import (
     evaluate_row,
 )
 from lbt_synth.studies.study.sample import Sample, make_sample
+from lbt_synth.studies.study.sample_arrays import turbulence_kinds
 from lbt_synth.studies.study.store import (
     list_parts,
     read_manifest,
@@ -41,7 +41,7 @@ _NOISELESS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Replay:
-    """A row of a study, computed anew.
+    """A row of a study, computed again.
 
     Attributes
     ----------
@@ -50,15 +50,15 @@ class Replay:
     parameters : dict of str to float
         Its parameters.
     stored : dict of str to float
-        Its results as the study has them; empty if it has none yet.
+        Its results in the study; empty if it has none yet.
     fresh : dict of str to float
-        Its results computed now, point by point; without what failed.
+        Its results computed now, by the reference evaluation; without those that failed.
     failures : tuple of Failure
         What failed now.
     files : tuple of pathlib.Path
-        What was written: the configuration, and the designs that are for this sample.
+        Files that were written: the configuration, and the designs for this sample.
     unwritten : str
-        Why there is no configuration of it; empty if there is one.
+        Why there is no configuration; empty if there is one.
     """
 
     row: int
@@ -71,11 +71,11 @@ class Replay:
 
 
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
-    """Compute one row of a study anew, and write it as a configuration.
+    """Compute one row of a study again, and write it as a configuration.
 
     ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with the
-    seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs for
-    each sample were told the delay and the noise of ``config``; they are ``row_N_NAME.fits``.
+    seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs
+    for each sample, which assume the delay and the noise of ``config``, are ``row_N_NAME.fits``.
 
     Parameters
     ----------
@@ -94,9 +94,9 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     Raises
     ------
     ProblemError
-        If the study has no such row, or its numbers make no configuration.
+        If the study has no such row, or the configuration refuses its numbers.
     OutputError
-        If the directory is of another study, or cannot be written.
+        If the directory belongs to another study, or cannot be written.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     sample = make_sample(study, values)
     return Replay(
         row=row,
-        parameters=study.named(values),
+        parameters=study.parameters_by_name(values),
         stored=stored,
         fresh=fresh,
         failures=failures,
@@ -131,6 +131,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
 
 
 def _write_files(study: Study, folder: Path, row: int, sample: Sample) -> tuple[Path, ...]:
+    """Write the configuration of a sample and its own designs, and return their paths."""
     own = [controller for controller in study.controllers if controller.for_sample]
     path = folder / f"row_{row}.yaml"
     gains = {c.name: folder / f"row_{row}_{c.name}.fits" for c in own}
@@ -149,15 +150,13 @@ def _write_files(study: Study, folder: Path, row: int, sample: Sample) -> tuple[
 
 
 def row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
-    """Return the configuration of the loop that a sample really meets, and comments on it."""
+    """Return the configuration of the real loop of a sample, and comments on it."""
     content = nested_copy(sample.config.settings.model_dump(exclude_unset=True))
-    comments = {
-        "": f"Row {row} of the study {study.source.name}: the loop that the sample really meets."
-    }
+    comments = {"": f"Row {row} of the study {study.source.name}: the real loop of the sample."}
     if sample.delay_error_frames != 0:
         content["loop"]["delay_frames"] = sample.hardware.delay_frames
-        told = sample.config.hardware.delay_frames
-        comments["loop.delay_frames"] = f"designs were told {told:.12g} ({DELAY_ERROR})"
+        assumed = sample.config.hardware.delay_frames
+        comments["loop.delay_frames"] = f"designs assume {assumed:.12g} ({DELAY_ERROR})"
     if sample.noise_factor != 1:
         _set_noise(content, sample, comments)
     content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)
@@ -166,24 +165,21 @@ def row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, d
 
 
 def _set_noise(content: dict[str, Any], sample: Sample, comments: dict[str, str]) -> None:
-    """Write the real noise in, and what the configuration computes from the one it was told."""
-    told = sample.config
+    """Set the real noise, and keep the turbulence that was fitted with the assumed noise."""
+    config = sample.config
     for name in ("noise_mas", "pyramid"):
         content["sensor"].pop(name, None)
     content["sensor"]["noise_nm"] = np.asarray(sample.truth.noise_nm).tolist()
-    told_nm = ", ".join(f"{value:.12g}" for value in np.ravel(told.noise_nm))
-    comments["sensor.noise_nm"] = f"designs were told {told_nm} ({NOISE_FACTOR})"
-    given = told.settings.model.turbulence
-    kinds = {section.kind for section in (given if isinstance(given, list) else [given])}
-    if "ar2" in kinds:  # fitted above the noise that designs were told
-        sections = [_ar_section(model) for model in told.plant.turbulence]
+    assumed_nm = ", ".join(f"{value:.12g}" for value in np.ravel(config.noise_nm))
+    comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
+    if "ar2" in turbulence_kinds(config):  # fitted above the noise that designs assume
+        sections = [
+            {
+                "kind": "ar",
+                "coefficients": np.asarray(model.coefficients).tolist(),
+                "driving_rms_nm": model.driving_rms_nm,
+            }
+            for model in config.plant.turbulence
+        ]
         same = all(section == sections[0] for section in sections)
         content["model"]["turbulence"] = sections[0] if same else sections
-
-
-def _ar_section(model: ARModel) -> dict[str, Any]:
-    return {
-        "kind": "ar",
-        "coefficients": np.asarray(model.coefficients).tolist(),
-        "driving_rms_nm": model.driving_rms_nm,
-    }

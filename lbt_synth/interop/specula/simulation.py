@@ -1,4 +1,4 @@
-"""Close the loop around the optics."""
+"""The end-to-end simulation: a controller in closed loop with SPECULA's optics."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
 from lbt_synth.interop.specula.optics import Modes, Optics
 from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
-from lbt_synth.loop.simulation.run import SteppedController, stepped
+from lbt_synth.loop.simulation.run import SteppedController, step_controller
 from lbt_synth.models import Truth
 from lbt_synth.models.truth import TrueVibration
-from lbt_synth.validation import FloatArray, instance, integer
+from lbt_synth.validation import FloatArray, integer, require_instance
 
-_SCREENS = "screens"
 RAMP_FRAMES = 200
-_LARGEST_SEED = 2**31 - 2  # the optics draw from twice that, in 32 bits
+_LARGEST_SEED = 2**31 - 2  # the detector doubles it, in 32 bits
 
 
 def run_end_to_end(
@@ -36,7 +35,7 @@ def run_end_to_end(
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> EndToEndRun:
-    """Close the loop with a pyramid, a mirror and moving air, all of SPECULA.
+    """Close the loop with a pyramid, a mirror and moving air, all simulated by SPECULA.
 
     In frame k, as in :class:`LoopHardware`: the controller is given y(k), the modal
     coefficients of the slopes of exposure k-1, and returns u(k); the mirror of exposure k
@@ -55,8 +54,8 @@ def run_end_to_end(
     controller : object with ``step(y)`` and ``reset()``
         From modal measurements to modal commands, (modes,), such as :class:`MixedController`.
     vibrations : sequence of Vibration, SinusoidalVibration or DriftingVibration, optional
-        Vibrations of tip and tilt; their direction has two components. One that drifts
-        begins to with the exposure.
+        Vibrations of tip and tilt; their direction has two components. A drift begins with
+        the exposure.
     frames : int, optional
         Frames of the exposure.
     settle_frames : int, optional
@@ -64,11 +63,11 @@ def run_end_to_end(
     seed : int, optional
         Seed of turbulence, vibrations and noise.
     calibration : Calibration, optional
-        That of the system; by default from the cache, or measured.
+        Calibration of the system; by default from the cache, or measured.
     cache : path-like, optional
         Directory for calibrations and phase screens.
     progress : callable, optional
-        Called with the number of frames that were run since its last call.
+        Called with the number of frames run since its last call.
 
     Returns
     -------
@@ -80,8 +79,8 @@ def run_end_to_end(
     MissingExtraError
         If SPECULA is missing.
     ProblemError
-        If a value is out of range, or the controller returns something else than one
-        finite command a mode.
+        If a value is out of range, or the controller does not return one finite command per
+        mode.
     OutputError
         If the cache cannot be written.
 
@@ -93,7 +92,7 @@ def run_end_to_end(
     >>> control = setup.controller(design)
     >>> run = lbt.interop.run_end_to_end(setup.system, control)        # doctest: +SKIP
 
-    It takes half a minute; what cannot run is refused before:
+    It takes half a minute; what cannot run is refused at once:
 
     >>> lbt.interop.run_end_to_end(setup.system, design)
     Traceback (most recent call last):
@@ -101,7 +100,7 @@ def run_end_to_end(
     lbt_synth.errors.ProblemError: controller must have step(y) and reset(), as MixedController \
 has; got FilterDesign.
     """
-    instance(system, EndToEndSystem)
+    require_instance(system, EndToEndSystem)
     if not isinstance(controller, SteppedController):
         raise ProblemError(
             "controller must have step(y) and reset(), as MixedController has; "
@@ -122,13 +121,13 @@ has; got FilterDesign.
     )[0]
     if calibration is None:
         calibration = calibrate(system, cache=cache)
-    screens = cache_directory(cache) / _SCREENS
+    screens = cache_directory(cache) / "screens"
     optics = Optics(system, calibration.modes, screens=screens, frames=total, seed=seed)
     started = time.perf_counter()
-    recorded = _close(optics, calibration, controller, tilts, settle, progress)
+    fields = _run_frames(optics, calibration, controller, tilts, settle, progress)
     return EndToEndRun(
         system=system,
-        **recorded,
+        **fields,
         psf_pixel_mas=optics.psf_pixel_mas,
         seed=seed,
         settle_frames=settle,
@@ -137,14 +136,14 @@ has; got FilterDesign.
 
 
 def checked_seed(seed: int) -> int:
-    """Return a seed that each part of the optics can take."""
+    """Return a seed that every part of the optics accepts."""
     checked = integer(seed, "seed", at_least=0)
     if checked > _LARGEST_SEED:
         raise ProblemError(f"seed must be at most {_LARGEST_SEED}; got {checked}.")
     return checked
 
 
-def _close(
+def _run_frames(
     optics: Optics,
     calibration: Calibration,
     controller: SteppedController,
@@ -152,6 +151,7 @@ def _close(
     settle: int,
     progress: Callable[[int], None] | None,
 ) -> dict[str, FloatArray]:
+    """Run all frames; return the series and the mean image after those that settle."""
     modes, system = calibration.modes, optics.system
     inverse, n = calibration.reconstructor.matrix, len(calibration.modes.shapes)
     taps = system.hardware.mirror_taps
@@ -164,13 +164,13 @@ def _close(
     controller.reset()
     for k in range(len(tilts)):
         y = inverse @ (slopes - calibration.reference)
-        past = np.vstack([stepped(controller, y, n, frame=k), past[:-1]])
+        past = np.vstack([step_controller(controller, y, n, frame=k), past[:-1]])
         slopes = optics.expose(taps @ past, tilts[k], seeing=min(1.0, (k + 1) / RAMP_FRAMES))
         row = k - settle
         if row >= 0:
             strehl[row], frame = optics.image()
             psf += frame
-            residual, others[row] = _residual(modes, optics)
+            residual, others[row] = _measure_residual(modes, optics)
             for name, value in zip(out, (y, past[0], residual), strict=True):
                 out[name][row] = value
         if progress is not None:
@@ -183,8 +183,8 @@ def _close(
     }
 
 
-def _residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:
-    """Modal coefficients of the residual, and the Strehl ratio of all but tip and tilt."""
+def _measure_residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:
+    """Return the residual of each mode (modes,), and the Strehl ratio without tip and tilt."""
     phase = optics.phase_nm()
     coefficients = modes.coefficients(phase)
     rest = phase - coefficients[:2].astype(np.float32) @ modes.shapes[:2]

@@ -1,4 +1,4 @@
-"""A controller as a MATLAB file."""
+"""Export a controller as a MATLAB file, in both output conventions."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 import lbt_synth
 from lbt_synth.design import Design
 from lbt_synth.errors import OutputError
-from lbt_synth.interop.exported import Exported
-from lbt_synth.interop.provenance import as_sentences, provenance, require_sound
-from lbt_synth.interop.rehearsal import MatrixForm, rehearsed_error
+from lbt_synth.interop.export_checks import MatrixForm, rehearsal_error, require_exportable
+from lbt_synth.interop.exported_files import Exported
+from lbt_synth.interop.provenance import join_labels, provenance_lines
 from lbt_synth.linear import StateSpace
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import FloatArray
@@ -29,7 +29,7 @@ _CONVENTION = (
 
 
 class _Textbook:
-    """A system in the textbook form, stepped."""
+    """A system stepped in the textbook form: the command, then the new state."""
 
     def __init__(self, system: StateSpace) -> None:
         self._system = system
@@ -52,7 +52,7 @@ def export_mat(
 
     The structures ``textbook`` and ``new_state`` each have A, B, C and D. In MATLAB,
     ``sys = ss(textbook.A, textbook.B, textbook.C, textbook.D, dt_s)``. Beside them: ``dt_s``
-    [s], ``convention``, ``provenance`` (text), and for a loop ``frame_rate_hz`` and
+    [s], ``convention``, ``provenance_lines`` (text), and for a loop ``frame_rate_hz`` and
     ``delay_frames``.
 
     Parameters
@@ -62,7 +62,7 @@ def export_mat(
     design : Design
         The design.
     gain_digest : str, optional
-        SHA-256 of the gain file, for ``provenance`` (64 hexadecimal digits).
+        SHA-256 of the gain file, for ``provenance_lines`` (64 hexadecimal digits).
 
     Returns
     -------
@@ -88,30 +88,29 @@ def export_mat(
     target = Path(path)
     if target.suffix.lower() != ".mat":
         raise OutputError(f"a MATLAB file must end in .mat; got {target.name!r}.", path=target)
-    require_sound(design)
-    lines = provenance(design, gain_digest)
+    require_exportable(design)
     textbook = design.controller.to_statespace()
     content: dict[str, Any] = {
         "textbook": {name: getattr(textbook, name) for name in "ABCD"},
         "new_state": {name: getattr(design.controller, name) for name in "ABCD"},
         "dt_s": design.controller.dt_s,
         "convention": _CONVENTION,
-        "provenance": "\n".join(as_sentences(lines)),
+        "provenance": "\n".join(join_labels(provenance_lines(design, gain_digest))),
     }
     if design.hardware is not None:
         content["frame_rate_hz"] = design.hardware.frame_rate_hz
         content["delay_frames"] = design.hardware.delay_frames
-    error = rehearsed_error(design, _Textbook(textbook))
-    single = rehearsed_error(design, MatrixForm(design.controller, np.float32))
+    error = rehearsal_error(design, _Textbook(textbook))
+    single = rehearsal_error(design, MatrixForm(design.controller, np.float32))
     written = write_atomically(target, _mat_bytes(content))
     return Exported(files=(written,), error=error, error_single=single)
 
 
 def _mat_bytes(content: dict[str, Any]) -> bytes:
-    """Write a version 5 file without its date: the same design is the same file."""
+    """Return a version 5 file without its date: the same design gives the same file."""
     from scipy.io import savemat
 
-    buffer: Any = io.BytesIO()  # scipy's own annotation knows names of files only
+    buffer: Any = io.BytesIO()  # scipy's own annotation allows only file names
     savemat(buffer, content, format="5", oned_as="column")
     text = f"MATLAB 5.0 MAT-file, written by lbt_synth {lbt_synth.__version__}"
     return text.ljust(_TEXT_BYTES).encode("ascii") + bytes(buffer.getvalue()[_TEXT_BYTES:])

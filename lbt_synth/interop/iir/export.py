@@ -1,4 +1,4 @@
-"""A controller as a transfer-function file of SPECULA."""
+"""Export a controller as transfer functions, in the file that SPECULA's IirFilter loads."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design import Design, certify_loop
 from lbt_synth.errors import NumericalError, OutputError
-from lbt_synth.interop.exported import Exported
+from lbt_synth.interop.export_checks import rehearsal_error, require_exportable
+from lbt_synth.interop.exported_files import Exported
 from lbt_synth.interop.iir.polynomials import axis_polynomials
-from lbt_synth.interop.provenance import as_sentences, provenance, require_sound
-from lbt_synth.interop.rehearsal import rehearsed_error
+from lbt_synth.interop.provenance import join_labels, provenance_lines
 from lbt_synth.linear import Controller
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.fits import fits_bytes
-from lbt_synth.validation import FloatArray, frozen, number
+from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _LAYOUT_VERSION = 1  # of SPECULA's IirFilterData
 
@@ -26,12 +26,7 @@ _LAYOUT_VERSION = 1  # of SPECULA's IirFilterData
 class DirectForm:
     """Transfer functions stepped as SPECULA's IirFilter does: past inputs and past outputs.
 
-    Parameters
-    ----------
-    num, den : (m, k) ndarray
-        Coefficients ascending in z, right-aligned.
-    dtype : dtype
-        Precision of everything.
+    Coefficients (m, k) ascend in z and are right-aligned; ``dtype`` is the precision throughout.
     """
 
     def __init__(self, num: FloatArray, den: FloatArray, dtype: Any = np.float64) -> None:
@@ -61,11 +56,11 @@ def export_iir(
     tolerance: float = 1e-6,
     gain_digest: str | None = None,
 ) -> Exported:
-    """Write a controller as a file of SPECULA's ``IirFilterData``, one transfer function an axis.
+    """Write a controller as a file of SPECULA's ``IirFilterData``, one transfer function per axis.
 
     The coefficients are computed exactly and rounded once. Even so a transfer function loses
-    digits with its order, above all in single precision: it is run beside the controller in
-    the closed loop, in both precisions, before anything is written.
+    digits with its order, above all in single precision: before anything is written, it is run
+    beside the controller in the closed loop, in both precisions.
 
     Parameters
     ----------
@@ -109,10 +104,10 @@ def export_iir(
             f"an IIR filter file must end in .fits; got {target.name!r}.", path=target
         )
     tolerance = number(tolerance, "tolerance", above=0)
-    require_sound(design)
-    lines = provenance(design, gain_digest)
-    num, den = _aligned(axis_polynomials(design.controller))
-    error, single = (_error(design, num, den, dtype) for dtype in (np.float64, np.float32))
+    require_exportable(design)
+    lines = provenance_lines(design, gain_digest)
+    num, den = _align(axis_polynomials(design.controller))
+    error, single = (_rehearse(design, num, den, dtype) for dtype in (np.float64, np.float32))
     if not error <= tolerance:
         raise NumericalError(
             f"the transfer function must give the commands of the controller to {tolerance:.3g} of "
@@ -129,12 +124,12 @@ def export_iir(
         "ERROR64": (error, "commands in double precision, relative"),
     }
     arrays = {"ORDNUM": count, "ORDDEN": count, "NUM": num, "DEN": den}
-    written = write_atomically(target, fits_bytes(cards, arrays, comments=as_sentences(lines)))
+    written = write_atomically(target, fits_bytes(cards, arrays, comments=join_labels(lines)))
     return Exported(files=(written,), error=error, error_single=single)
 
 
-def _aligned(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """Stack polynomials of any length: highest powers in the last column."""
+def _align(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Stack polynomials of any length with the highest powers in the last column."""
     length = max(len(den) for _, den in pairs)
     num, den = (
         np.array([np.pad(pair[i], (length - len(pair[i]), 0)) for pair in pairs]) for i in (0, 1)
@@ -142,18 +137,18 @@ def _aligned(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, Fl
     return num, den
 
 
-def _error(design: Design, num: FloatArray, den: FloatArray, dtype: Any) -> float:
-    """Error of the rehearsal; inf where the loop is unstable, however slowly it grows."""
+def _rehearse(design: Design, num: FloatArray, den: FloatArray, dtype: Any) -> float:
+    """Return the rehearsal's error; inf where the loop is unstable, however slowly it grows."""
     if design.hardware is not None:
-        top, bottom = (frozen(part.astype(dtype)) for part in (num, den))
-        written = _as_controller(top, bottom, design.controller.dt_s)
+        top, bottom = (frozen_copy(part.astype(dtype)) for part in (num, den))
+        written = _build_controller(top, bottom, design.controller.dt_s)
         if not certify_loop(design.hardware, written).passed:
             return float("inf")
-    return rehearsed_error(design, DirectForm(num, den, dtype))
+    return rehearsal_error(design, DirectForm(num, den, dtype))
 
 
-def _as_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
-    """Return the controller of these coefficients; each axis ends with its command as a state."""
+def _build_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
+    """Build the controller of these coefficients; the last state of each axis is its command."""
     axes = []
     for top, bottom in zip(num, den, strict=True):
         n = len(bottom) - 1
@@ -168,7 +163,7 @@ def _as_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
     return Controller(
         A=block_diag(*(A for A, _ in axes)),
         B=block_diag(*(B for _, B in axes)),
-        C=frozen(np.kron(np.eye(m), np.eye(size)[-1:])),
+        C=frozen_copy(np.kron(np.eye(m), np.eye(size)[-1:])),
         D=np.zeros((m, m)),
         dt_s=dt_s,
     )

@@ -1,4 +1,4 @@
-"""What a controller costs a frame."""
+"""Arithmetic and memory that a controller needs per frame."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.validation import FloatArray
 
-_SMALL = 256  # entries of [[A, B], [C, D]] up to which zeros are not counted
-_LONGEST = 4096  # terms written out one by one
+_SMALL = 256  # up to so many entries of [[A, B], [C, D]], every term is written out
+_LONGEST = 4096  # terms that are written out at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +25,7 @@ class FrameCost:
         "straight line" where the exported source writes each non-zero term out, "loops" where
         it multiplies by whole matrices.
     multiplications, additions : int
-        Of the exported source, a frame; factors of 1 and -1 are no multiplications.
+        Per frame of the exported source; factors of 1 and -1 are no multiplications.
     coefficients : int
         Numbers that the exported source stores.
     states : int
@@ -101,10 +101,10 @@ def frame_cost(design: Design | Controller) -> FrameCost:
     controller = design.controller if isinstance(design, Design) else design
     if not isinstance(controller, Controller):
         raise ProblemError(f"expected a Design or a Controller; got {type(design).__name__}.")
-    whole = as_one(controller)
+    whole = block_matrix(controller)
     rows, columns = whole.shape
     terms = np.count_nonzero(whole, axis=1)
-    written = written_out(controller)
+    written = has_straight_line_form(controller)
     factors = int(np.count_nonzero((whole != 0) & (np.abs(whole) != 1)))
     return FrameCost(
         form="straight line" if written else "loops",
@@ -118,13 +118,13 @@ def frame_cost(design: Design | Controller) -> FrameCost:
     )
 
 
-def as_one(controller: Controller) -> FloatArray:
+def block_matrix(controller: Controller) -> FloatArray:
     """Return ``[[A, B], [C, D]]``."""
     return np.block([[controller.A, controller.B], [controller.C, controller.D]])
 
 
-def written_out(controller: Controller) -> bool:
-    """Whether each non-zero term is written out: few of them, or half of them zero."""
-    whole = as_one(controller)
+def has_straight_line_form(controller: Controller) -> bool:
+    """Return whether each non-zero term is written out: there are few, or half are zero."""
+    whole = block_matrix(controller)
     terms = int(np.count_nonzero(whole))
     return whole.size <= _SMALL or (2 * terms <= whole.size and terms <= _LONGEST)

@@ -1,4 +1,4 @@
-"""End-to-end runs as cases of a campaign: all that decides a run, in what JSON can hold."""
+"""End-to-end runs described in JSON, so that a study of many can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -26,14 +26,17 @@ _SETUP = ("frames", "settle_frames", "seed", "gain", "leak", "leak_from_mode")
 _MATRICES = ("A", "B", "C", "D")
 
 
-def case_of(
+def make_case(
     setup: EndToEndSetup,
     controller: Controller | None,
     *,
     vibrations: Sequence[TrueVibration] = (),
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Return the case of one run: other vibrations and another seed than the set-up's."""
+    """Return what decides a run, in values that JSON can hold.
+
+    Vibrations and seed replace those of the set-up.
+    """
     system = {
         field.name: getattr(setup.system, field.name)
         for field in fields(EndToEndSystem)
@@ -41,7 +44,7 @@ def case_of(
     }
     hardware = setup.system.hardware
     return {
-        "versions": {name: _version(name) for name in ("lbt-synth", "specula")},
+        "versions": {name: _installed_version(name) for name in ("lbt-synth", "specula")},
         "system": system,
         "hardware": {
             "frame_rate_hz": hardware.frame_rate_hz,
@@ -60,20 +63,17 @@ def case_of(
 def run_case(
     case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
 ) -> dict[str, Any]:
-    """Run one case of :func:`case_of`."""
-    system = EndToEndSystem(hardware=_hardware(case["hardware"]), **case["system"])
-    lines = tuple(_vibration(line) for line in case["vibrations"])
+    """Run a case made by :func:`make_case`, and summarize it."""
+    system = EndToEndSystem(hardware=_build_hardware(case["hardware"]), **case["system"])
+    lines = tuple(_build_vibration(line) for line in case["vibrations"])
     setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
     matrices = case["controller"]
-    run = setup.run(
-        None if matrices is None else Controller(**matrices),
-        cache=cache,
-    )
-    return summary(run)
+    controller = None if matrices is None else Controller(**matrices)
+    return summarize_run(setup.run(controller, cache=cache))
 
 
-def summary(run: EndToEndRun) -> dict[str, Any]:
-    """Return the figures of a run."""
+def summarize_run(run: EndToEndRun) -> dict[str, Any]:
+    """Return the main numbers of a run."""
     rms = run.rms_nm
     return {
         "strehl": run.strehl,
@@ -88,19 +88,19 @@ def summary(run: EndToEndRun) -> dict[str, Any]:
     }
 
 
-def _version(package: str) -> str | None:
+def _installed_version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
 
 
-def _hardware(path: Mapping[str, Any]) -> LoopHardware:
+def _build_hardware(path: Mapping[str, Any]) -> LoopHardware:
     mirror = path["mirror"]
     return LoopHardware(**{**path, "mirror": None if mirror is None else PositionLoop(**mirror)})
 
 
-def _vibration(line: Mapping[str, Any]) -> TrueVibration:
+def _build_vibration(line: Mapping[str, Any]) -> TrueVibration:
     values = {**line, "direction": tuple(line["direction"])}
     if "start_hz" in line:
         return DriftingVibration(**values)

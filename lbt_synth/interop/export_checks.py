@@ -1,4 +1,4 @@
-"""Another form of a controller run beside it, before a file of it is written."""
+"""Checks before an export: the certificate, and a rehearsal of the file beside the controller."""
 
 from __future__ import annotations
 
@@ -7,22 +7,42 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
-from lbt_synth.interop.cost import as_one
+from lbt_synth.design import Design, certify_loop
+from lbt_synth.errors import CertificateError, NumericalError, ProblemError
+from lbt_synth.interop.arithmetic_cost import block_matrix
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.run import SteppedController, step_loop
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, require_instance
 
 FRAMES = 2000
-_POLE = 0.99  # of the phase that the rehearsed loop meets
+_POLE = 0.99  # of the random phase that disturbs the rehearsed loop
+
+
+def require_exportable(design: Design, written: Controller | None = None) -> None:
+    """Refuse a design that is not certified, or whose loop is unstable with the written numbers."""
+    require_instance(design, Design)
+    if not design.certificate.passed:
+        failed = tuple(check.name for check in design.certificate.checks if not check.passed)
+        raise CertificateError(
+            f"only a certified design is exported; this one failed: {'; '.join(failed)}.",
+            failed=failed,
+        )
+    if design.hardware is None:
+        return
+    check = certify_loop(design.hardware, written or design.controller)
+    if not check.passed:
+        raise NumericalError(
+            "the loop closed around the numbers as they would be written is unstable: "
+            f"{check.name} {check.value:.12g}, limit {check.limit:.12g}. Try double precision.",
+            residual=check.value,
+        )
 
 
 class MatrixForm:
     """A controller in new-state form, stepped in a given precision."""
 
     def __init__(self, controller: Controller, dtype: Any) -> None:
-        with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is found
+        with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is noticed
             self._matrices = [getattr(controller, name).astype(dtype) for name in "ABCD"]
         self._dtype = dtype
         self.reset()
@@ -48,10 +68,10 @@ class WrittenTerms:
     """
 
     def __init__(self, controller: Controller, dtype: Any) -> None:
-        with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is found
-            whole = as_one(controller).astype(dtype)
+        with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is noticed
+            whole = block_matrix(controller).astype(dtype)
         n = controller.n_states
-        self._rows = [_terms(whole[:n]), _terms(whole[n:])]
+        self._rows = [_list_terms(whole[:n]), _list_terms(whole[n:])]
         self._dtype, self._n = dtype, n
         self.reset()
 
@@ -69,14 +89,14 @@ class WrittenTerms:
         return np.asarray(np.add.accumulate(new * known[new_places])[-1], dtype=np.float64)
 
 
-def _terms(rows: npt.NDArray[Any]) -> tuple[npt.NDArray[np.intp], npt.NDArray[Any]]:
+def _list_terms(rows: npt.NDArray[Any]) -> tuple[npt.NDArray[np.intp], npt.NDArray[Any]]:
     """Places and factors of the terms, (longest row, rows); short rows end with zeros."""
     length = max(1, int(np.max(np.count_nonzero(rows, axis=1), initial=0)))
     places = np.argsort(rows == 0, axis=1, kind="stable")[:, :length]
     return places.T, np.ascontiguousarray(np.take_along_axis(rows, places, axis=1).T)
 
 
-def rehearsed_error(design: Design, other: SteppedController) -> float:
+def rehearsal_error(design: Design, other: SteppedController) -> float:
     """Largest difference of commands from the controller's, over the largest command.
 
     Both close the loop of the design around the same disturbance (a process of the first

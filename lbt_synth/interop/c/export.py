@@ -1,4 +1,4 @@
-"""A controller as C99 source."""
+"""Export a controller as C99 source and header, which render_code writes."""
 
 from __future__ import annotations
 
@@ -11,17 +11,22 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
-from lbt_synth.interop.c.text import header_text, source_text
-from lbt_synth.interop.exported import Exported
-from lbt_synth.interop.provenance import provenance, require_sound
-from lbt_synth.interop.rehearsal import FRAMES, WrittenTerms, rehearsed_error
+from lbt_synth.interop.c.code import render_code
+from lbt_synth.interop.export_checks import (
+    FRAMES,
+    WrittenTerms,
+    rehearsal_error,
+    require_exportable,
+)
+from lbt_synth.interop.exported_files import Exported
+from lbt_synth.interop.provenance import provenance_lines
 from lbt_synth.linear import Controller
 from lbt_synth.storage.atomic_files import write_together
 from lbt_synth.validation import choice
 
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
-_LONGEST = 25  # with "_reset" 31 characters, what C99 promises to tell apart
+_LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_reset"
 _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
@@ -57,8 +62,8 @@ def export_c(
     Returns
     -------
     Exported
-        Source and header, and the error of the chosen precision and of single: the terms
-        added as they stand in the source, by a processor that rounds each of them.
+        Source and header, and the error of the chosen precision and of single: terms are
+        added in the order of the source, by a processor that rounds each of them.
 
     Raises
     ------
@@ -92,11 +97,11 @@ def export_c(
     choice(precision, "precision", ("double", "single"))
     prefix = require_identifier(target.stem if name is None else name)
     single = precision == "single"
-    require_sound(design)
-    controller = _rounded(design.controller) if single else design.controller
-    require_sound(design, controller)
+    require_exportable(design)
+    controller = _round_to_single(design.controller) if single else design.controller
+    require_exportable(design, controller)
     error_double, error_single = (
-        rehearsed_error(design, WrittenTerms(design.controller, dtype))
+        rehearsal_error(design, WrittenTerms(design.controller, dtype))
         for dtype in (np.float64, np.float32)
     )
     error = error_single if single else error_double
@@ -108,24 +113,20 @@ def export_c(
             status="arithmetic",
             residual=error,
         )
-    lines = provenance(design, gain_digest)
-    if single:  # the figure in double precision would be that of this machine's products
+    lines = provenance_lines(design, gain_digest)
+    if single:  # in double precision the figure would depend on this machine's matrix products
         lines.append(("precision", f"single: commands within {error:.1e} of the largest one"))
+    source_text, header_text = render_code(
+        prefix, header.name, controller, lines, single=single, gain_digest=gain_digest
+    )
     written = write_together(
-        {
-            target: source_text(prefix, header.name, controller, lines, single=single).encode(
-                "ascii"
-            ),
-            header: header_text(
-                prefix, controller, lines, single=single, gain_digest=gain_digest
-            ).encode("ascii"),
-        }
+        {target: source_text.encode("ascii"), header: header_text.encode("ascii")}
     )
     return Exported(files=written, error=error, error_single=error_single)
 
 
 def require_identifier(name: str) -> str:
-    """Return a prefix that makes C and C++ identifiers which no one has reserved."""
+    """Return a prefix whose names are C and C++ identifiers that no standard reserves."""
     if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name) or len(name) > _LONGEST:
         raise ProblemError(
             f"the prefix of the C names must begin with a letter, hold letters, digits and single "
@@ -135,8 +136,8 @@ def require_identifier(name: str) -> str:
     return name
 
 
-def _rounded(controller: Controller) -> Controller:
-    """Round to single precision."""
+def _round_to_single(controller: Controller) -> Controller:
+    """Round the coefficients to single precision."""
     matrices = {name: getattr(controller, name) for name in "ABCD"}
     for name, values in matrices.items():
         largest = float(np.max(np.abs(values)))

@@ -1,4 +1,4 @@
-"""From the sections of a configuration to the plant and the truth."""
+"""Build the plant, the truth and the noise that a configuration describes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.config.axes import axes_of, directions_of, fitted, measurements_of
-from lbt_synth.config.required_sections import needed_atmosphere, needed_telescope, nm_of_mas
+from lbt_synth.config.axes import (
+    count_axes,
+    count_measurements,
+    require_length,
+    vibration_directions,
+)
+from lbt_synth.config.error_context import name_key
+from lbt_synth.config.required_sections import (
+    convert_mas_to_nm,
+    require_atmosphere,
+    require_telescope,
+)
 from lbt_synth.config.schema import (
     Ar1Section,
     Ar2Section,
@@ -18,7 +28,7 @@ from lbt_synth.config.schema import (
     TrueVibrationSection,
     VibrationSection,
 )
-from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.errors import ConfigError
 from lbt_synth.models import (
     ARModel,
     Atmosphere,
@@ -35,25 +45,27 @@ from lbt_synth.models import (
     pyramid_tilt_noise_nm,
     tip_tilt_plant,
 )
+from lbt_synth.models.plant.frequency_prior import line_frequencies, spread_lines
 from lbt_synth.models.truth import TrueVibration
-from lbt_synth.models.vibration_prior import line_frequencies, spread_lines
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
 
-def noise_of(settings: FileSection) -> float | FloatArray:
+def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
     """Return the noise per frame [nm], of all measurements or of each."""
     sensor = settings.sensor
     if isinstance(sensor.noise_nm, list):
-        return frozen(
-            fitted(sensor.noise_nm, measurements_of(settings), "sensor.noise_nm", "a measurement")
+        return frozen_copy(
+            require_length(
+                sensor.noise_nm, count_measurements(settings), "sensor.noise_nm", "measurement"
+            )
         )
     if sensor.noise_nm is not None:
         return sensor.noise_nm
     if sensor.noise_mas is not None:
-        return nm_of_mas(settings, sensor.noise_mas, "sensor.noise_mas")
+        return convert_mas_to_nm(settings, sensor.noise_mas, "sensor.noise_mas")
     pyramid = sensor.pyramid
     assert pyramid is not None  # the schema wants exactly one of the three
-    telescope = needed_telescope(
+    telescope = require_telescope(
         settings, "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm"
     )
     return pyramid_tilt_noise_nm(
@@ -66,84 +78,84 @@ def noise_of(settings: FileSection) -> float | FloatArray:
     )
 
 
-def believed_gains(settings: FileSection) -> FloatArray:
-    """Return the sensor gain of each measurement that the design assumes, (q,)."""
+def assumed_gains(settings: FileSection) -> FloatArray:
+    """Return the sensor gains that the design assumes, one per measurement, (q,)."""
     given = settings.model.sensor_gain
-    count = measurements_of(settings)
+    count = count_measurements(settings)
     if isinstance(given, list):
-        return frozen(fitted(given, count, "model.sensor_gain", "a measurement"))
-    return frozen(np.full(count, given))
+        return frozen_copy(require_length(given, count, "model.sensor_gain", "measurement"))
+    return frozen_copy(np.full(count, given))
 
 
 def reference_gain(settings: FileSection) -> float:
-    """Return what a single number for the sensor gain is compared with: the mean over the axes."""
+    """Return the assumed gain with which a single number is compared: the mean of the gains."""
     given = settings.model.sensor_gain
-    return float(np.mean(believed_gains(settings))) if isinstance(given, list) else given
+    return float(np.mean(assumed_gains(settings))) if isinstance(given, list) else given
 
 
-def plant_of(
+def build_plant(
     settings: FileSection, atmosphere: Atmosphere | None, noise_nm: float | FloatArray
 ) -> TipTiltPlant:
     """Build the plant of the design."""
-    loop, model, axes = settings.loop, settings.model, axes_of(settings)
+    loop, model, axes = settings.loop, settings.model, count_axes(settings)
     lines: list[Vibration] | None = None
     if model.vibrations is not None:
         lines = []
         for i, section in enumerate(model.vibrations):
             key = f"model.vibrations[{i}]"
-            _below_nyquist(section.frequency_hz, loop.frame_rate_hz, f"{key}.frequency_hz")
-            for direction in directions_of(section, axes, key):
+            _require_below_nyquist(section.frequency_hz, loop.frame_rate_hz, f"{key}.frequency_hz")
+            for direction in vibration_directions(section, axes, key):
                 line = Vibration(
                     frequency_hz=section.frequency_hz,
                     damping=section.damping,
-                    rms_nm=rms_nm(section, settings, key),
+                    rms_nm=vibration_rms_nm(section, settings, key),
                     direction=direction,
                 )
-                lines += lines_of(line, section, loop.frame_rate_hz, i)
+                lines += spread_vibration(line, section, loop.frame_rate_hz, i)
     return tip_tilt_plant(
         frame_rate_hz=loop.frame_rate_hz,
         delay_frames=loop.delay_frames,
-        turbulence=_turbulence(settings, atmosphere, noise_nm),
+        turbulence=_build_turbulence(settings, atmosphere, noise_nm),
         vibrations=lines,
         noise_nm=noise_nm,
         sensor_matrix=settings.sensor.matrix,
         influence_matrix=settings.mirror.influence_matrix,
-        sensor_gain=believed_gains(settings),
+        sensor_gain=assumed_gains(settings),
         modes=axes,
-        mirror=_mirror(settings.mirror.local_loop),
+        mirror=_build_mirror(settings.mirror.local_loop),
     )
 
 
-def _turbulence(
+def _build_turbulence(
     settings: FileSection, atmosphere: Atmosphere | None, noise_nm: float | FloatArray
 ) -> ARModel | list[ARModel]:
-    """Return one model for all axes, or one an axis where sections or noise differ."""
-    given, axes, key = settings.model.turbulence, axes_of(settings), "model.turbulence"
+    """Return one model for all axes, or one per axis where sections or noise differ."""
+    given, axes, key = settings.model.turbulence, count_axes(settings), "model.turbulence"
     if isinstance(given, list):
-        sections = fitted(given, axes, key, "an axis")
+        sections = require_length(given, axes, key, "axis")
     else:
         sections = [given] * axes
     noisy = np.ndim(noise_nm) == 1 and any(isinstance(s, Ar2Section) for s in sections)
-    if noisy and measurements_of(settings) != axes:
+    if noisy and count_measurements(settings) != axes:
         raise ConfigError(
             f"{key}: kind ar2 is fitted above the noise of its axis, but sensor.noise_nm has one "
-            f"a measurement, {np.size(noise_nm)} for {axes} axes. Give one noise for all, or kind "
-            "ar.",
+            f"per measurement, {np.size(noise_nm)} for {axes} axes. Give one noise for all, or "
+            "kind ar.",
             path=key,
         )
     if not isinstance(given, list) and not noisy:
-        noise = float(np.ravel(noise_nm)[0])  # ar2 alone reads it
-        return _turbulence_model(given, settings, atmosphere, noise, key)
+        noise = float(np.ravel(noise_nm)[0])  # only ar2 uses it
+        return _build_turbulence_model(given, settings, atmosphere, noise, key)
     noises = np.broadcast_to(noise_nm if noisy else np.ravel(noise_nm)[0], (axes,))
     return [
-        _turbulence_model(
+        _build_turbulence_model(
             section, settings, atmosphere, noise, f"{key}[{i}]" if isinstance(given, list) else key
         )
         for i, (section, noise) in enumerate(zip(sections, noises.tolist(), strict=True))
     ]
 
 
-def _turbulence_model(
+def _build_turbulence_model(
     section: Ar1Section | Ar2Section | ArSection,
     settings: FileSection,
     atmosphere: Atmosphere | None,
@@ -152,65 +164,56 @@ def _turbulence_model(
 ) -> ARModel:
     rate = settings.loop.frame_rate_hz
     if isinstance(section, ArSection):
-        try:
+        with name_key(f"{key}.coefficients"):
             return ARModel(
                 coefficients=np.array(section.coefficients),
                 driving_rms_nm=section.driving_rms_nm,
                 frame_rate_hz=rate,
             )
-        except ProblemError as error:
-            key = f"{key}.coefficients"
-            raise ConfigError(f"{key}: {error}", path=key) from error
-    needed_atmosphere(
+    require_atmosphere(
         settings, f"{key} of kind {section.kind} is computed from it. Give it, or kind ar"
     )
-    assert atmosphere is not None  # of the section that is there
+    assert atmosphere is not None  # built from the section, which is there
     if isinstance(section, Ar1Section):
         return ar1_turbulence(atmosphere, frame_rate_hz=rate)
     return ar2_turbulence(atmosphere, frame_rate_hz=rate, noise_nm=noise_nm)
 
 
-def _mirror(section: LocalLoopSection | None) -> PositionLoop | None:
-    """Return the mirror's local loop, None for a mirror that settles at once."""
+def _build_mirror(section: LocalLoopSection | None) -> PositionLoop | None:
+    """Build the mirror's local loop, None for a mirror that settles at once."""
     if section is None:
         return None
     given: dict[str, Any] = {k: v for k, v in section.model_dump().items() if v is not None}
-    make = PositionLoop if section.bandwidth_hz is None else PositionLoop.of_bandwidth
-    try:
+    make = PositionLoop if section.bandwidth_hz is None else PositionLoop.from_bandwidth
+    with name_key("mirror.local_loop"):
         return make(**given)
-    except ProblemError as error:
-        key = "mirror.local_loop"
-        raise ConfigError(f"{key}: {error}", path=key) from error
 
 
-def lines_of(
+def spread_vibration(
     line: Vibration, section: VibrationSection, frame_rate_hz: float, index: int
 ) -> list[Vibration]:
-    """Return the lines that stand for a vibration of the model."""
+    """Return the lines that represent a vibration of the model: several if it is spread."""
     if section.spread_hz is None:
         return [line]
-    key = f"model.vibrations[{index}].spread_hz"
-    try:
+    with name_key(f"model.vibrations[{index}].spread_hz"):
         frequencies = line_frequencies(
             line.frequency_hz, section.spread_hz, section.lines or 5, name="the half width"
         )
-        made = spread_lines(line, frequencies)
-        made[-1].ar_model(frame_rate_hz)
-    except ProblemError as error:
-        raise ConfigError(f"{key}: {error}", path=key) from error
-    return made
+        lines = spread_lines(line, frequencies)
+        lines[-1].ar_model(frame_rate_hz)  # the highest must lie below the Nyquist frequency
+    return lines
 
 
-def truth_of(
+def build_truth(
     settings: FileSection,
     atmosphere: Atmosphere | None,
     noise_nm: float | FloatArray,
     plant: TipTiltPlant,
 ) -> Truth:
-    """Build what the loop really meets."""
+    """Build the truth: turbulence, vibrations, noise and gain of the real loop."""
     kind = settings.true_turbulence
     if kind == "frozen_flow":
-        needed_atmosphere(
+        require_atmosphere(
             settings,
             "truth.turbulence: frozen_flow is its spectrum. Give it, or truth.turbulence: model",
         )
@@ -223,27 +226,31 @@ def truth_of(
     }
     return Truth(
         turbulence=spectra[kind],
-        vibrations=_true_vibrations(settings, plant),
+        vibrations=_build_true_vibrations(settings, plant),
         noise_nm=noise_nm,
         sensor_gain=_relative_gain(settings),
     )
 
 
-def _true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVibration, ...]:
+def _build_true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVibration, ...]:
     if not isinstance(settings.truth.vibrations, list):
         return plant.vibrations
     lines: list[TrueVibration] = []
     for i, section in enumerate(settings.truth.vibrations):
         key = f"truth.vibrations[{i}]"
-        _below_nyquist(section.frequency_hz, settings.loop.frame_rate_hz, f"{key}.frequency_hz")
-        for direction in directions_of(section, axes_of(settings), key):
+        _require_below_nyquist(
+            section.frequency_hz, settings.loop.frame_rate_hz, f"{key}.frequency_hz"
+        )
+        for direction in vibration_directions(section, count_axes(settings), key):
             size: dict[str, Any] = {
                 "frequency_hz": section.frequency_hz,
-                "rms_nm": rms_nm(section, settings, key),
+                "rms_nm": vibration_rms_nm(section, settings, key),
                 "direction": direction,
             }
             if section.kind == "drift":
-                lines.append(_drifting(section, size, settings.loop.frame_rate_hz, key))
+                lines.append(
+                    _build_drifting_vibration(section, size, settings.loop.frame_rate_hz, key)
+                )
             elif section.damping is None:
                 lines.append(SinusoidalVibration(**size))
             else:
@@ -251,15 +258,15 @@ def _true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVi
     return tuple(lines)
 
 
-def _drifting(
+def _build_drifting_vibration(
     section: TrueVibrationSection, size: dict[str, Any], frame_rate_hz: float, key: str
 ) -> DriftingVibration:
-    """Return a vibration that drifts from frequency_hz to end_hz."""
+    """Build a vibration that drifts from ``frequency_hz`` to ``end_hz``."""
     assert section.end_hz is not None  # the schema wants both with this kind
     assert section.duration_s is not None
-    _below_nyquist(section.end_hz, frame_rate_hz, f"{key}.end_hz")
+    _require_below_nyquist(section.end_hz, frame_rate_hz, f"{key}.end_hz")
     given = {name: value for name, value in size.items() if name != "frequency_hz"}
-    try:
+    with name_key(key):
         return DriftingVibration(
             **given,
             start_hz=section.frequency_hz,
@@ -267,17 +274,15 @@ def _drifting(
             duration_s=section.duration_s,
             damping=section.damping,
         )
-    except ProblemError as error:
-        raise ConfigError(f"{key}: {error}", path=key) from error
 
 
 def _relative_gain(settings: FileSection) -> float:
-    """Return the real sensor gain over that in the plant's sensor matrix."""
-    believed, given = believed_gains(settings), settings.truth.sensor_gain
+    """Return the real sensor gain divided by that in the plant's sensor matrix."""
+    assumed, given = assumed_gains(settings), settings.truth.sensor_gain
     if not isinstance(given, list):
         return given / reference_gain(settings)
     key = "truth.sensor_gain"
-    ratios = np.array(fitted(given, believed.size, key, "a measurement")) / believed
+    ratios = np.array(require_length(given, assumed.size, key, "measurement")) / assumed
     if np.ptp(ratios) > 1e-9 * ratios[0]:
         text = ", ".join(f"{ratio:.4g}" for ratio in ratios)
         raise ConfigError(
@@ -289,17 +294,17 @@ def _relative_gain(settings: FileSection) -> float:
     return float(ratios[0])
 
 
-def rms_nm(
+def vibration_rms_nm(
     section: VibrationSection | TrueVibrationSection | BandSection, settings: FileSection, key: str
 ) -> float:
-    """Return the deviation of a vibration [nm rms wavefront], given in nm or in mas."""
+    """Return the size of a vibration [nm rms wavefront], which the file gives in nm or mas."""
     if section.rms_nm is not None:
         return section.rms_nm
     assert section.rms_mas is not None  # the schema wants exactly one of the two
-    return nm_of_mas(settings, section.rms_mas, f"{key}.rms_mas")
+    return convert_mas_to_nm(settings, section.rms_mas, f"{key}.rms_mas")
 
 
-def _below_nyquist(frequency_hz: float, frame_rate_hz: float, key: str) -> None:
+def _require_below_nyquist(frequency_hz: float, frame_rate_hz: float, key: str) -> None:
     if not frequency_hz < frame_rate_hz / 2:
         raise ConfigError(
             f"{key}: must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "

@@ -1,4 +1,4 @@
-"""What an export is."""
+"""What an export returns: the files it wrote and the error of their arithmetic."""
 
 from __future__ import annotations
 
