@@ -25,11 +25,11 @@ import numpy as np
 import lbt_synth as lbt
 from lbt_synth.report.figures.style import (
     house_style,
-    looks,
     new_figure,
     number_ticks,
     save_figure,
 )
+from lbt_synth.report.line_styles import line_styles
 
 FILE = Path(__file__).parent / "data" / "eris_vibrations_psd.fits"
 BACKGROUND_NM2_HZ = 4e4  # at 1 Hz, falling with the square of the frequency; see docs/eris.md
@@ -248,7 +248,7 @@ def figure(
 ) -> Any:
     """Draw what the loops reject, and what they leave accumulated over the frequencies."""
     f = np.union1d(np.geomspace(0.5, 499.0, 1500), seen.frequency_hz)
-    whole = met.whole.turbulence_of(seen.axes)
+    whole = met.whole.turbulence_per_mode(seen.axes)
     with house_style():
         drawn = new_figure(9.5, 7.2)
         grid = drawn.subplots(
@@ -262,7 +262,7 @@ def figure(
             spectrum.axhline(lowest, color="0.6", linestyle=":", linewidth=1.0)
             spectrum.set_ylim(0.1, 1e6)
             spectrum.set_title(("tip", "tilt")[i])
-            for (name, loop), look in zip(loops.items(), looks(), strict=False):
+            for (name, loop), look in zip(loops.items(), line_styles(), strict=False):
                 rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
                 passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
                 rejection.loglog(f, np.sqrt(rejected), **(look | {"linewidth": 0.9}))

@@ -12,15 +12,15 @@ from matplotlib.figure import Figure
 from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
+from lbt_synth.report.line_styles import colour, dashes, marker_name
 from lbt_synth.report.page.blocks import Listing, Page, Paragraph, Section
-from lbt_synth.report.page.bokeh_charts import interactive
-from lbt_synth.report.page.charts import Area, Axis, Bars, Chart, Curve, Map, Panel, legend_of
+from lbt_synth.report.page.bokeh_charts import embed_charts
+from lbt_synth.report.page.charts import Area, Axis, Bars, Chart, Curve, Map, Panel, legend_entries
 from lbt_synth.report.page.html import page_html
-from lbt_synth.report.page.line_styles import colour, dashes, marker_name
-from lbt_synth.report.page.matplotlib_charts import chart_svg, draw_chart, drawing, height_of
-from lbt_synth.report.page.pdf import HEIGHT, by_sheets, height_of_block, page_pdf
-from lbt_synth.report.page.scales import ends_of, log_tick_texts, log_ticks, shortened
-from lbt_synth.report.page.typeset import BODY, MONO, mono_lines, width_of, wrapped
+from lbt_synth.report.page.matplotlib_charts import chart_height, chart_style, chart_svg, draw_chart
+from lbt_synth.report.page.pdf import HEIGHT, block_height, page_pdf, split_by_sheets
+from lbt_synth.report.page.scales import log_tick_texts, log_ticks, scale_ends, shorten
+from lbt_synth.report.page.typeset import BODY, MONO, mono_lines, text_width, wrap
 from lbt_synth.storage.tables import Cell, Table
 
 
@@ -131,9 +131,9 @@ def test_a_page_without_charts_has_no_script():
 
 def test_the_data_of_charts_are_those_given(plain):
     chart = every_mark()[0]
-    drawn = interactive([chart])
+    drawn = embed_charts([chart])
     numbers = json.dumps(drawn.embedding)
-    assert set(drawn.lines["lines"]) == set(legend_of(chart.panels)) - {"only named"}
+    assert set(drawn.lines["lines"]) == set(legend_entries(chart.panels)) - {"only named"}
     for identifiers in drawn.lines["lines"].values():
         for identifier in identifiers:
             assert numbers.count(f'"{identifier}"') >= 1
@@ -181,7 +181,7 @@ def test_unequal_looks_are_told_apart():
 )
 def test_ends_of_scales(axis, values, ends):
     curve = Curve(name="a", x=values, y=np.ones(len(values)))
-    found, _ = ends_of(Panel(x=axis, y=Axis(label="y"), marks=(curve,)))
+    found, _ = scale_ends(Panel(x=axis, y=Axis(label="y"), marks=(curve,)))
     assert found == pytest.approx(ends)
 
 
@@ -201,10 +201,10 @@ def test_ends_of_scales(axis, values, ends):
 def test_curves_are_not_cut_by_the_ends_of_their_scale(axis, marker, values, ends):
     curve = Curve(name="a", x=np.arange(len(values)), y=values, marker=marker)
     panel = Panel(x=Axis(label="x"), y=axis, marks=(curve,))
-    _, found = ends_of(panel)
+    _, found = scale_ends(panel)
     assert found == pytest.approx(ends)
     shaded = Area(name="b", x=curve.x, low=curve.y, high=curve.y)
-    standing = ends_of(Panel(x=Axis(label="x"), y=axis, marks=(curve, shaded)))[1]
+    standing = scale_ends(Panel(x=Axis(label="x"), y=axis, marks=(curve, shaded)))[1]
     assert standing[0] == pytest.approx(axis.low)
 
 
@@ -212,11 +212,11 @@ def test_both_renderers_leave_the_same_room():
     curve = Curve(name="a", x=[0.0, 1.0, 2.0], y=[0.0, 99.0, 100.0], marker="own")
     panel = Panel(x=Axis(label="x"), y=Axis(label="y", low=0.0), marks=(curve,))
     chart = Chart(key="room", title="t", caption="c", alt="a", panels=(panel,))
-    data = interactive([chart]).embedding["documents"]["page"]["roots"][0]["attributes"]
+    data = embed_charts([chart]).embedding["documents"]["page"]["roots"][0]["attributes"]
     ends = data["y_range"]["attributes"]
     assert (ends["start"], ends["end"]) == pytest.approx((-4.0, 104.0))
-    figure = Figure(figsize=(7, height_of(chart)))
-    draw_chart(figure, chart, left=0, top=height_of(chart))
+    figure = Figure(figsize=(7, chart_height(chart)))
+    draw_chart(figure, chart, left=0, top=chart_height(chart))
     assert figure.axes[0].get_ylim() == pytest.approx((-4.0, 104.0))
 
 
@@ -233,16 +233,16 @@ def test_ticks():
     assert log_tick_texts([1.2e5, 1.25e5]) == ["1.2·10⁵", "1.25·10⁵"]
     assert log_tick_texts([0.001, 0.1, 2, 10_000]) == ["0.001", "0.1", "2", "10000"]
     assert log_tick_texts([1e-6, 1.0, 2e5]) == ["10⁻⁶", "10⁰", "2·10⁵"]
-    assert shortened("abcdefghij", 5) == "ab…ij"
-    assert shortened("abc", 5) == "abc"
+    assert shorten("abcdefghij", 5) == "ab…ij"
+    assert shorten("abc", 5) == "abc"
 
 
 def test_lines_fit_their_width():
     words = "some words and an_extremely_long_name_" + 80 * "x" + " and the end"
-    lines = wrapped(words, BODY, 2.0)
-    assert all(width_of(line, BODY) <= 2.0 for line in lines)
+    lines = wrap(words, BODY, 2.0)
+    assert all(text_width(line, BODY) <= 2.0 for line in lines)
     assert "".join(lines).replace(" ", "") == words.replace(" ", "")
-    assert all(width_of(line, MONO) <= 3.0 for line in mono_lines(200 * "m", 3.0))
+    assert all(text_width(line, MONO) <= 3.0 for line in mono_lines(200 * "m", 3.0))
     assert mono_lines("a\n\nb", 3.0) == ["a", "", "b"]
 
 
@@ -274,9 +274,9 @@ def many_panels(count, title="p", columns=2):
 @pytest.mark.parametrize("count", [1, 6, 7, 40])
 def test_charts_that_are_too_high_go_on_on_the_next_sheet(count):
     chart = many_panels(count)
-    parts = list(by_sheets(chart))
+    parts = list(split_by_sheets(chart))
     assert sum(len(part.panels) for part in parts) == count
-    assert all(height_of_block(part) <= HEIGHT - 1.25 - 0.5 for part in parts)
+    assert all(block_height(part) <= HEIGHT - 1.25 - 0.5 for part in parts)
     assert [part.title for part in parts[:2]] == ["Many", "Many (continued)"][: len(parts)]
     page = Page(
         title="t",
@@ -295,14 +295,14 @@ def test_bars_fit_a_sheet():
     bars = tuple(Bars(name=f"c{i}", values=np.ones(60), look=i) for i in range(3))
     panel = Panel(x=Axis(label="x", low=0), y=Axis(label="y"), marks=bars, categories=names)
     chart = Chart(key="bars", title="t", caption="c", alt="a", panels=(panel,))
-    assert height_of_block(chart) <= HEIGHT - 1.25 - 0.5
+    assert block_height(chart) <= HEIGHT - 1.25 - 0.5
 
 
 def test_titles_of_panels_stay_in_their_drawing():
     title = "a very long name " * 10
     for columns in (1, 2, 3):
         figure = Figure(figsize=(7, 12))
-        with drawing():
+        with chart_style():
             draw_chart(figure, many_panels(columns, title, columns), left=0, top=12)
             figure.canvas.draw()
             for axes in figure.axes:

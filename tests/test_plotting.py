@@ -10,7 +10,7 @@ from lbt_synth.report.figures.style import save_figure
 def designs(config):
     return {
         "Kalman": lbt.kalman(config.plant),
-        "H-infinity": lbt.hinf(config.plant, gamma_ratio=1.2, method="riccati"),
+        "H-infinity": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
         "integrator": lbt.integrator(config.hardware, gain=0.5),
     }
 

@@ -22,7 +22,7 @@ from support.plants import LBT_YAML, lbt_axis_plant
 import lbt_synth as lbt
 from lbt_synth.design import Certificate, Check
 from lbt_synth.report.designs.page import design_page
-from lbt_synth.report.designs.report import possible_errors, steps_of
+from lbt_synth.report.designs.report import frequency_errors, count_steps
 from lbt_synth.report.designs.simulation import exact_spectrum, step_response
 from lbt_synth.report.designs.verdict import good_range, verdict
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
@@ -268,11 +268,11 @@ def test_a_truth_without_vibrations(config, designs):
 def test_errors_that_would_leave_the_band_are_left_out(config):
     line = lbt.models.SinusoidalVibration(frequency_hz=2.0, rms_nm=10)
     low = replace(config, truth=replace(config.truth, vibrations=(line,)))
-    errors = possible_errors(low)
+    errors = frequency_errors(low)
     assert errors[0] == -3.5
     assert errors[-1] < 2.0
     assert np.all(np.diff(errors) > 0)
-    assert possible_errors(config)[[0, -1]].tolist() == [-3.5, 3.5]
+    assert frequency_errors(config)[[0, -1]].tolist() == [-3.5, 3.5]
 
 
 def test_many_designs_fill_several_sheets(config):
@@ -366,7 +366,7 @@ def test_the_time_of_making(monkeypatch):
 def test_what_is_counted(config, designs):
     done = []
     lbt.report.design_report(config, designs, advance=done.append)
-    assert sum(done) == steps_of(3) - 1  # the unstable one is not simulated
+    assert sum(done) == count_steps(3) - 1  # the unstable one is not simulated
 
 
 # ---------------------------------------------------------------------------------------------

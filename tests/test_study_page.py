@@ -13,14 +13,14 @@ from support.study_pages import CONTROLLERS, INFO, PARAMETERS, page_of, results
 
 import lbt_synth as lbt
 from lbt_synth.report.page.blocks import Listing, Notice, Paragraph
-from lbt_synth.report.page.bokeh_charts import interactive
+from lbt_synth.report.page.bokeh_charts import embed_charts
 from lbt_synth.report.page.html import page_html
 from lbt_synth.report.study.charts import distribution_chart, loss_chart
 from lbt_synth.report.study.info import study_info
 from lbt_synth.report.study.page import study_page
 from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.studies.study.binning import binned_map, cumulative, histogram
-from lbt_synth.studies.study.sample_status import outcomes
+from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram
+from lbt_synth.studies.study.controller_samples import read_controller_samples
 from lbt_synth.studies.study.table_names import short_names
 
 
@@ -152,7 +152,7 @@ def test_columns_of_other_results_are_refused():
 
 def test_the_size_does_not_grow_with_the_samples():
     small, large = (
-        len(json.dumps(interactive(page_of(results(n)).charts).embedding)) for n in (4000, 200_000)
+        len(json.dumps(embed_charts(page_of(results(n)).charts).embedding)) for n in (4000, 200_000)
     )
     assert small < large < 1.4 * small
     assert large < 1e6
@@ -164,7 +164,7 @@ def test_the_size_does_not_grow_with_the_samples():
 @pytest.mark.parametrize("n", [1, 5, 400, 401, 50_000])
 def test_points_of_a_distribution_lie_on_it(n):
     values = np.round(np.random.default_rng(n).normal(size=n), 2)
-    level, part = cumulative(values)
+    level, part = cumulative_points(values)
     assert len(level) <= 500
     assert np.all(np.diff(level) > 0)
     expected = [np.mean(values <= each) for each in level]
@@ -196,7 +196,7 @@ def test_a_map_has_the_mean_of_each_cell():
 
 def test_charts_show_the_numbers_of_the_columns():
     columns = results()
-    found = [outcomes(columns, name) for name in CONTROLLERS]
+    found = [read_controller_samples(columns, name) for name in CONTROLLERS]
     curves = {c.name: c for c in distribution_chart(found).panels[0].marks if hasattr(c, "x")}
     sharp = found[1].strehl
     assert curves["sharp"].y[1] == pytest.approx(100 * np.mean(sharp == 0))

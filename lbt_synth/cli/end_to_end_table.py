@@ -9,7 +9,7 @@ from typing import Any
 
 from lbt_synth.cli.end_to_end_setup import calibrate_setup, load_setup
 from lbt_synth.cli.loop_inputs import load_designs
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
 from lbt_synth.cli.output_files import make_directory, records_csv
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
@@ -107,36 +107,18 @@ def _record(entry: EndToEndEntry) -> dict[str, Any]:
 
 
 def _printed_table(table: Sequence[EndToEndEntry], number: str) -> TableText:
-    return TableText(
-        title=f"Table {number} end to end: Strehl ratio [%] at 2.2 um",
-        headings=(
-            "row",
-            "method",
-            "end to end",
-            "scatter",
-            "seeds",
-            "paper",
-            "modal",
-            "optical gain",
-            "tip [nm]",
-            "tilt [nm]",
-            "other modes [%]",
-        ),
-        rows=[
-            (
-                entry.label,
-                entry.method,
-                f"{entry.strehl:.1f}",
-                format_fixed(entry.scatter, 1),
-                len(entry.strehls),
-                format_fixed(entry.paper, 1),
-                f"{entry.modal:.1f}",
-                f"{entry.optical_gain:.3f}",
-                f"{entry.tip_rms_nm:.0f}",
-                f"{entry.tilt_rms_nm:.0f}",
-                f"{entry.other_modes:.1f}",
-            )
-            for entry in table
-            if entry.table == number
-        ],
+    return tabulate(
+        f"Table {number} end to end: Strehl ratio [%] at 2.2 um",
+        [entry for entry in table if entry.table == number],
+        ("row", lambda entry: entry.label),
+        ("method", lambda entry: entry.method),
+        ("end to end", lambda entry: f"{entry.strehl:.1f}"),
+        ("scatter", lambda entry: format_fixed(entry.scatter, 1)),
+        ("seeds", lambda entry: len(entry.strehls)),
+        ("paper", lambda entry: format_fixed(entry.paper, 1)),
+        ("modal", lambda entry: f"{entry.modal:.1f}"),
+        ("optical gain", lambda entry: f"{entry.optical_gain:.3f}"),
+        ("tip [nm]", lambda entry: f"{entry.tip_rms_nm:.0f}"),
+        ("tilt [nm]", lambda entry: f"{entry.tilt_rms_nm:.0f}"),
+        ("other modes [%]", lambda entry: f"{entry.other_modes:.1f}"),
     )

@@ -8,12 +8,12 @@ from typing import Any
 
 from lbt_synth.cli.certificate_table import check_records
 from lbt_synth.cli.loop_inputs import load_designs
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, format_fixed, tabulate
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import DesignAssessment, DesignReport, design_report, write_report
-from lbt_synth.report.designs.report import steps_of
+from lbt_synth.report.designs.report import count_steps
 from lbt_synth.report.designs.verdict import good_range, verdict
 from lbt_synth.report.page.page_files import require_page_names
 from lbt_synth.report.provenance import require_letters, time_text
@@ -30,7 +30,7 @@ def run(arguments: Namespace) -> Report:
     config = load_config(arguments.config)
     designs = load_designs(arguments.gains)
     files = dict(zip(designs, arguments.gains, strict=True))
-    total = steps_of(len(designs)) + 1
+    total = count_steps(len(designs)) + 1
     with count_progress(total=total, what="report", quiet=arguments.json) as count:
         found = design_report(config, designs, gain_files=files, advance=count)
         written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
@@ -46,31 +46,22 @@ def run(arguments: Namespace) -> Report:
             "files": [str(path) for path in written],
         },
         tables=[
-            TableText(
-                title=f"Designs in the loop of {config.source.name}",
-                headings=(
-                    "design",
-                    "method",
-                    "stable",
-                    "certified",
-                    "residual [nm]",
-                    "Strehl [%]",
-                    "worst Strehl [%]",
+            tabulate(
+                f"Designs in the loop of {config.source.name}",
+                found.assessments,
+                ("design", lambda one: one.name),
+                ("method", lambda one: one.design.method),
+                ("stable", lambda one: one.stable),
+                ("certified", lambda one: one.certified),
+                ("residual [nm]", lambda one: format_fixed(one.residual_nm, 2)),
+                ("Strehl [%]", lambda one: format_fixed(100 * one.strehl, 2)),
+                ("worst Strehl [%]", lambda one: format_fixed(100 * _worst_strehl(one), 2)),
+                (
                     "modulus margin",
+                    lambda one: (
+                        None if one.margins is None else format_fixed(one.margins.modulus, 3)
+                    ),
                 ),
-                rows=[
-                    (
-                        one.name,
-                        one.design.method,
-                        one.stable,
-                        one.certified,
-                        format_fixed(one.residual_nm, 2),
-                        format_fixed(100 * one.strehl, 2),
-                        format_fixed(100 * _worst_strehl(one), 2),
-                        None if one.margins is None else format_fixed(one.margins.modulus, 3),
-                    )
-                    for one in found.assessments
-                ],
             )
         ],
         notes=[

@@ -8,14 +8,15 @@ from pathlib import Path
 
 from lbt_synth.design import FilterDesign
 from lbt_synth.files import save_gain
-from lbt_synth.report.figures.figures import robustness_figure, sigma_figure
+from lbt_synth.report.figures.robustness import robustness_figure
+from lbt_synth.report.figures.sigma import sigma_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
 from lbt_synth.studies.paper.parameters import PARAMETERS, VIBRATION_HZ
 from lbt_synth.studies.paper.published import TABLE_III
-from lbt_synth.studies.paper.tables import Comparison, compared, paper_filters, table_ii
+from lbt_synth.studies.paper.tables import TableEntry, compare_with_paper, paper_filters, table_ii
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -23,8 +24,8 @@ class PaperResult:
     """What :func:`write_paper` computed and wrote."""
 
     # table_ii, table_iii: Entries, ours beside the paper's
-    table_ii: list[Comparison]
-    table_iii: list[Comparison]
+    table_ii: list[TableEntry]
+    table_iii: list[TableEntry]
     # kalman, hinf: The two filters at the true frequency
     kalman: FilterDesign
     hinf: FilterDesign
@@ -34,7 +35,7 @@ class PaperResult:
 def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) -> PaperResult:
     """Write tables, figures and gain files of the comparison."""
     folder = Path(directory)
-    second, third = table_ii(), compared(rows)
+    second, third = table_ii(), compare_with_paper(rows)
     kalman_design, hinf_design = paper_filters()
     headings = ("row", "method", "strehl_percent", "paper_strehl_percent", "difference_points")
     files = [

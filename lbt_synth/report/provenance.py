@@ -16,7 +16,7 @@ import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
 
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
-_TURNING = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # directions of writing
+_WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ def require_letters(text: str, what: str) -> str:
     for letter in text:
         if (
             unicodedata.category(letter) in ("Cc", "Cs")
-            or unicodedata.bidirectional(letter) in _TURNING
+            or unicodedata.bidirectional(letter) in _WRITING_DIRECTIONS
             or letter in "\ufffe\uffff"
         ):
             raise ProblemError(
@@ -54,7 +54,7 @@ def require_letters(text: str, what: str) -> str:
     return text
 
 
-def time_of_making() -> datetime:
+def creation_time() -> datetime:
     """Return the time, in UTC: that of SOURCE_DATE_EPOCH if it is set, else now."""
     given = os.environ.get("SOURCE_DATE_EPOCH")
     if given is None:
@@ -72,12 +72,12 @@ def time_text(moment: datetime) -> str:
     return moment.strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def creator() -> str:
+def creator_name() -> str:
     """Program and version."""
     return f"lbt_synth {lbt_synth.__version__}"
 
 
-def versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
+def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
     """Return name and version of what makes a page; of ``extra`` distributions, too."""
     found = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
     for name in (*_DISTRIBUTIONS, *extra):

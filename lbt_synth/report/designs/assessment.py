@@ -124,7 +124,7 @@ class DesignAssessment:
         return float("nan") if self.budget is None else self.budget.rms_nm
 
 
-def assessed(
+def assess_design(
     name: str,
     design: Design,
     hardware: LoopHardware,
@@ -137,11 +137,11 @@ def assessed(
     assumed_gain: float,
 ) -> DesignAssessment:
     """Assess a design. Shapes: frequency_hz (f,)."""
-    require_fitting(name, design, hardware)
+    require_compatible(name, design, hardware)
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     budget = residual_budget(loop, truth) if loop.is_stable else None
     margins = loop_margins(loop) if loop.is_stable else None
-    checks, complaint = _recertified(design)
+    checks, complaint = _recertify(design)
     own = design.hardware
     carrier = LoopDesign(
         method=design.method,
@@ -177,8 +177,8 @@ def assessed(
         error_norms=largest_singular_values(design.error_system(), frequency_hz)
         if isinstance(design, EstimatorDesign)
         else None,
-        rejection=_norms(loop, frequency_hz, noise=False),
-        noise_transfer=_norms(loop, frequency_hz, noise=True),
+        rejection=_response_norms(loop, frequency_hz, noise=False),
+        noise_transfer=_response_norms(loop, frequency_hz, noise=True),
         curve=curve,
         map=replace(
             found, sensor_gains=frozen_copy(np.asarray(sensor_gains))
@@ -186,7 +186,7 @@ def assessed(
     )
 
 
-def require_fitting(name: str, design: Design, hardware: LoopHardware) -> None:
+def require_compatible(name: str, design: Design, hardware: LoopHardware) -> None:
     """Refuse a design that cannot be run in a loop."""
     own = design.hardware
     if own is None:
@@ -236,7 +236,7 @@ def stable_intervals(
     return sorted(found)
 
 
-def _recertified(design: Design) -> tuple[tuple[Check, ...], str]:
+def _recertify(design: Design) -> tuple[tuple[Check, ...], str]:
     """Return the checks of the certificate computed anew, or why that failed."""
     try:
         return design.recertify().checks, ""
@@ -244,7 +244,9 @@ def _recertified(design: Design) -> tuple[tuple[Check, ...], str]:
         return (), str(error)
 
 
-def _norms(loop: ClosedLoop, frequency_hz: FloatArray, *, noise: bool) -> FloatArray | None:
+def _response_norms(
+    loop: ClosedLoop, frequency_hz: FloatArray, *, noise: bool
+) -> FloatArray | None:
     if not loop.is_stable:
         return None
     response = loop.noise_transfer(frequency_hz) if noise else loop.sensitivity(frequency_hz)

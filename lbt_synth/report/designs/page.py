@@ -8,24 +8,22 @@ from pathlib import Path
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.truth import stationary_vibrations
-from lbt_synth.report.designs.charts import (
-    dynamics_charts,
-    robustness_charts,
-    simulation_charts,
-    transfer_charts,
-)
+from lbt_synth.report.designs.pole_and_step_charts import pole_and_step_charts
 from lbt_synth.report.designs.report import DesignReport
+from lbt_synth.report.designs.robustness_charts import robustness_charts
+from lbt_synth.report.designs.simulation_charts import simulation_charts
 from lbt_synth.report.designs.tables import (
     certificate_table,
     files_table,
     summary_table,
     versions_table,
 )
+from lbt_synth.report.designs.transfer_charts import transfer_charts
 from lbt_synth.report.designs.verdict import verdict
 from lbt_synth.report.number_text import listing_text, number_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
-from lbt_synth.report.provenance import creator, require_letters, time_text
+from lbt_synth.report.provenance import creator_name, require_letters, time_text
 
 
 def write_report(
@@ -91,7 +89,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
             blocks=tuple(_transfer(report)),
         ),
         Section(key="errors", title="Robustness", blocks=tuple(robustness_charts(report))),
-        Section(key="dynamics", title="Dynamics", blocks=tuple(dynamics_charts(report))),
+        Section(key="dynamics", title="Dynamics", blocks=tuple(pole_and_step_charts(report))),
         Section(key="simulation", title="Simulation", blocks=tuple(_simulation(report))),
         Section(key="certificates", title="Certificates", blocks=tuple(_certificates(report))),
         Section(
@@ -109,7 +107,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
         subtitle=f"{count} design{'s' if count > 1 else ''}: {names}. Made "
         f"{time_text(report.made)}.",
         sections=tuple(sections),
-        creator=creator(),
+        creator=creator_name(),
     )
 
 
@@ -175,7 +173,7 @@ def _transfer(report: DesignReport) -> list[Block]:
 
 
 def _distinct(report: DesignReport) -> list[float]:
-    noise = report.config.truth.noise_of(report.config.hardware.n_measurements)
+    noise = report.config.truth.noise_per_measurement(report.config.hardware.n_measurements)
     return sorted({float(value) for value in noise})
 
 

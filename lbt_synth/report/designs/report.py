@@ -15,18 +15,18 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.truth import stationary_vibrations
-from lbt_synth.report.designs.assessment import DesignAssessment, assessed, require_fitting
-from lbt_synth.report.designs.simulation import DesignSimulation, common_settling, simulated
-from lbt_synth.report.figures.figures import frequency_grid
+from lbt_synth.report.designs.assessment import DesignAssessment, assess_design, require_compatible
+from lbt_synth.report.designs.simulation import DesignSimulation, common_settling, simulate_design
+from lbt_synth.report.frequency_grid import frequency_grid
 from lbt_synth.report.provenance import (
     SourceFile,
+    creation_time,
+    program_versions,
     read_source,
     require_letters,
-    time_of_making,
-    versions,
 )
 from lbt_synth.studies import LimitRow, LimitStudy
-from lbt_synth.validation import FloatArray, frozen, instance
+from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _SOLVED = ("sdp", "lmi")  # routes of designs that a convex solver made
 _MOST_FRAMES = 8192  # of a simulated run
@@ -109,7 +109,7 @@ def design_report(
     gain_files : mapping of str to path-like, optional
         Files that designs came from, whose digests the report gives.
     advance : callable, optional
-        Called with a number of steps whenever they are done; there are :func:`steps_of` of them.
+        Called with a number of steps whenever they are done; there are :func:`count_steps` of them.
 
     Returns
     -------
@@ -134,28 +134,28 @@ def design_report(
     >>> one.certified, f"{one.residual_nm:.0f} nm, Strehl {one.strehl:.2f}"
     (True, '152 nm, Strehl 0.70')
     """
-    instance(config, Config)
+    require_instance(config, Config)
     if not 1 <= len(designs) <= _MOST_DESIGNS:
         raise ProblemError(f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}.")
     for name, design in designs.items():
-        instance(design, Design)
+        require_instance(design, Design)
         require_letters(name, "name of a design")
-        require_fitting(name, design, config.hardware)
-    made = time_of_making()
+        require_compatible(name, design, config.hardware)
+    made = creation_time()
     source, content = read_source(config.source, "configuration")
     files = [source]
     for name, path in (gain_files or {}).items():
         files.append(read_source(Path(path), f"gain file of {name}")[0])
     count = advance or (lambda _: None)
     truth, hardware = config.truth, config.hardware
-    errors = possible_errors(config)
+    errors = frequency_errors(config)
     lines_hz = sorted({line.frequency_hz for line in stationary_vibrations(truth.vibrations)})
-    grid = frozen(frequency_grid(hardware.frame_rate_hz, lines_hz))
+    grid = frozen_copy(frequency_grid(hardware.frame_rate_hz, lines_hz))
     settings = config.settings
     assessments = []
     for name, design in designs.items():
         assessments.append(
-            assessed(
+            assess_design(
                 name,
                 design,
                 hardware,
@@ -176,7 +176,7 @@ def design_report(
     )
     simulations = {}
     for one in stable:
-        simulations[one.name] = simulated(
+        simulations[one.name] = simulate_design(
             one.design,
             hardware,
             truth,
@@ -197,17 +197,17 @@ def design_report(
         frequency_hz=grid,
         errors_hz=errors,
         files=tuple(files),
-        versions=versions(("cvxpy", "clarabel") if solved else ()),
+        versions=program_versions(("cvxpy", "clarabel") if solved else ()),
         made=made,
     )
 
 
-def steps_of(designs: int) -> int:
+def count_steps(designs: int) -> int:
     """Return how many steps a report of so many designs counts, at most."""
     return 2 * designs + 1
 
 
-def possible_errors(config: Config) -> FloatArray:
+def frequency_errors(config: Config) -> FloatArray:
     """Frequency errors of the configuration, with three more between any two, and with 0.
 
     Those are left out that would move a true vibration to 0 or to the Nyquist frequency. Without
@@ -215,10 +215,10 @@ def possible_errors(config: Config) -> FloatArray:
     """
     lines = [line.frequency_hz for line in stationary_vibrations(config.truth.vibrations)]
     if not lines:
-        return frozen([0.0])
+        return frozen_copy([0.0])
     known = np.unique([*config.settings.robustness.errors_hz, 0.0])
     places = np.arange(4 * known.size - 3) / 4
     fine = np.interp(places, np.arange(known.size), known)
     nyquist = config.hardware.frame_rate_hz / 2
     kept = (min(lines) - fine > 0) & (max(lines) - fine < nyquist)
-    return frozen(fine[kept])
+    return frozen_copy(fine[kept])

@@ -10,8 +10,8 @@ from lbt_synth.design import Design
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, filter_series, simulate
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import LoopHardware, Truth, Vibration
-from lbt_synth.models.truth import fitted_direction, stationary_vibrations
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.models.truth import checked_direction, stationary_vibrations
+from lbt_synth.validation import FloatArray, frozen_copy
 
 STEP_NM = 100.0
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
@@ -44,7 +44,7 @@ class DesignSimulation:
     step_command_nm: FloatArray
 
 
-def simulated(
+def simulate_design(
     design: Design,
     hardware: LoopHardware,
     truth: Truth,
@@ -81,12 +81,12 @@ def simulated(
         residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
         scatter=float(np.std(strehls, ddof=1)) if cases > 1 else float("nan"),
         frames=frames,
-        time_s=frozen(np.arange(shown) / rate),
-        series_nm=frozen(run.residual_nm[0, :shown]),
-        frequency_hz=frozen(frequency[1:]),
-        open_nm2_hz=frozen(spectra[0][1:]),
-        residual_nm2_hz=frozen(spectra[1][1:]),
-        exact_nm2_hz=frozen(exact_spectrum(loop, truth, frequency, length)[1:]),
+        time_s=frozen_copy(np.arange(shown) / rate),
+        series_nm=frozen_copy(run.residual_nm[0, :shown]),
+        frequency_hz=frozen_copy(frequency[1:]),
+        open_nm2_hz=frozen_copy(spectra[0][1:]),
+        residual_nm2_hz=frozen_copy(spectra[1][1:]),
+        exact_nm2_hz=frozen_copy(exact_spectrum(loop, truth, frequency, length)[1:]),
         step_time_s=step_time_s,
         step_residual_nm=step_residual,
         step_command_nm=step_command,
@@ -109,7 +109,7 @@ def step_response(loop: ClosedLoop) -> tuple[FloatArray, FloatArray, FloatArray]
     inputs[:, 0] = STEP_NM
     outputs = filter_series(loop.system, inputs)
     time_s = np.arange(_STEP_FRAMES) / loop.hardware.frame_rate_hz
-    return frozen(time_s), frozen(outputs[:, 0]), frozen(outputs[:, n])
+    return frozen_copy(time_s), frozen_copy(outputs[:, 0]), frozen_copy(outputs[:, n])
 
 
 def exact_spectrum(
@@ -130,11 +130,11 @@ def exact_spectrum(
     for spectrum, modes in truth.turbulence_groups(n):
         gain = np.sum(np.abs(rejection[:, :, list(modes)]) ** 2, axis=(1, 2))
         total += gain * spectrum.psd(inside)
-    noise = loop.noise_transfer(inside) * truth.noise_of(loop.hardware.n_measurements)
+    noise = loop.noise_transfer(inside) * truth.noise_per_measurement(loop.hardware.n_measurements)
     total += np.sum(np.abs(noise) ** 2, axis=(1, 2)) * 2 / rate
     window = get_window("hann", length)
     for line in stationary_vibrations(truth.vibrations):
-        direction = fitted_direction(line, loop.hardware)
+        direction = checked_direction(line, loop.hardware)
         if isinstance(line, Vibration):
             gain = np.sum(np.abs(rejection @ direction) ** 2, axis=1)
             total += gain * line.ar_model(rate).psd(inside)

@@ -1,12 +1,12 @@
 from .end_to_end import end_to_end_figure as end_to_end_figure
-from .figures import loop_figure as loop_figure
-from .figures import robustness_figure as robustness_figure
-from .figures import sigma_figure as sigma_figure
-from .figures import simulation_figure as simulation_figure
 from .identification import identification_figure as identification_figure
 from .limits import limits_figure as limits_figure
+from .loop import loop_figure as loop_figure
 from .mirror import mirror_figure as mirror_figure
 from .modal import modal_figure as modal_figure
+from .robustness import robustness_figure as robustness_figure
 from .robustness_map import robustness_map_figure as robustness_map_figure
+from .sigma import sigma_figure as sigma_figure
+from .simulation import simulation_figure as simulation_figure
 from .tracking import tracking_figure as tracking_figure
 from .tradeoff import tradeoff_figure as tradeoff_figure

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.interop import EndToEndRun
-from lbt_synth.report.figures.style import COLOURS, house_style, new_figure
+from lbt_synth.report.figures.style import house_style, new_figure
+from lbt_synth.report.line_styles import COLOURS
 
 _SHOWN_MAS = 700.0
 

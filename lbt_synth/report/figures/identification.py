@@ -12,8 +12,9 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
-from lbt_synth.report.figures.style import COLOURS, LINES, house_style, new_figure, number_ticks
-from lbt_synth.validation import FloatArray, instance
+from lbt_synth.report.figures.style import house_style, new_figure, number_ticks
+from lbt_synth.report.line_styles import COLOURS, LINES
+from lbt_synth.validation import FloatArray, require_instance
 
 _BANDS = 240  # of the smoothed density
 _REFUSED = 1.6276  # of Kolmogorov's statistic at 1 %
@@ -61,7 +62,7 @@ def identification_figure(
     >>> len(lbt.report.figures.identification_figure(lbt.identify(record)).axes)
     3
     """
-    instance(model, IdentifiedModel)
+    require_instance(model, IdentifiedModel)
     residuals = _residuals(model, designs or {})
     columns = len(model.axes)
     with house_style():

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.figures.style import house_style, looks, new_figure, number_ticks
+from lbt_synth.report.figures.style import METHOD_LABELS, house_style, new_figure, number_ticks
+from lbt_synth.report.line_styles import line_styles
 from lbt_synth.studies import LimitStudy
-
-_NAMES = {"kalman": "Kalman", "hinf": r"H$_\infty$"}
 
 
 def limits_figure(study: LimitStudy) -> Any:
@@ -56,8 +55,8 @@ def limits_figure(study: LimitStudy) -> Any:
     with house_style():
         figure = new_figure(6.3, 3.8)
         axis = figure.subplots()
-        for row, curve, style in zip(study.rows, study.residual_nm, looks(), strict=False):
-            label = _NAMES.get(row.design, row.design)
+        for row, curve, style in zip(study.rows, study.residual_nm, line_styles(), strict=False):
+            label = METHOD_LABELS.get(row.design, row.design)
             if row.stable:
                 axis.plot(x, curve, label=label, **style)
             else:

@@ -8,8 +8,9 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.report.figures.style import COLOURS, house_style, new_figure
-from lbt_synth.validation import instance
+from lbt_synth.report.figures.style import house_style, new_figure
+from lbt_synth.report.line_styles import COLOURS
+from lbt_synth.validation import require_instance
 
 _MOST_POINTS = 4000
 _SHOWN = 5e-3  # taps beyond the last one of this size are not drawn
@@ -40,7 +41,7 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
     ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
     ... )
     >>> len(
@@ -50,7 +51,7 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
     """
     from matplotlib.ticker import MaxNLocator
 
-    instance(hardware, LoopHardware)
+    require_instance(hardware, LoopHardware)
     if hardware.mirror is None:
         raise ProblemError(
             "a figure of the mirror needs one with dynamics; got a mirror that settles at once. "

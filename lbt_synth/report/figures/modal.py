@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.report.figures.style import house_style, looks, new_figure, number_ticks
+from lbt_synth.report.figures.style import house_style, new_figure, number_ticks
+from lbt_synth.report.line_styles import line_styles
 from lbt_synth.validation import FloatArray, real_array
 
 _STEPS = "steps-mid"  # modes are counted, there is nothing between them
@@ -79,7 +80,7 @@ def modal_figure(
                 drawstyle=_STEPS,
                 label="turbulence",
             )
-        for (name, values), style in zip(curves.items(), looks(), strict=False):
+        for (name, values), style in zip(curves.items(), line_styles(), strict=False):
             axis.plot(modes, values, label=name, drawstyle=_STEPS, **style)
         axis.set_xscale("log")
         axis.set_yscale("log")

@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.figures.map_cells import bands, cell_edges
 from lbt_synth.report.figures.style import house_style, new_figure
+from lbt_synth.report.map_cells import (
+    STREHL_LEVELS,
+    cell_edges,
+    draw_cells,
+    marked_intervals,
+    strehl_scale,
+)
 from lbt_synth.studies import RobustnessMap
-
-_LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
 
 
 def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
@@ -59,14 +63,14 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
                 f"the maps must have the same delay errors {delays.tolist()}; got "
                 f"{found.delay_errors_frames.tolist()} for {name}."
             )
-    low, high = _limits(maps)
+    low, high = strehl_scale([found.strehl for found in maps.values()])
     with house_style():
         columns, rows = len(maps), len(delays)
         figure = new_figure(max(4.4, 1.3 + 2.6 * columns), 0.7 + 2.5 * rows)
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for column, (name, found) in enumerate(maps.items()):
             for row, panel in enumerate(panels[:, column]):
-                mesh = _panel(panel, found, row, low, high)
+                mesh = _draw_panel(panel, found, row, low, high)
                 panel.label_outer()
             panels[0, column].set_title(name)
         for row, delay in enumerate(delays):
@@ -79,39 +83,14 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
     return figure
 
 
-def _limits(maps: Mapping[str, RobustnessMap]) -> tuple[float, float]:
-    """Return the ends of the colour scale [%], the same for all panels."""
-    values = 100 * np.concatenate([found.strehl.ravel() for found in maps.values()])
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return 0.0, 100.0
-    low, high = float(values.min()), float(values.max())
-    return (low, high) if high - low > 1 else (low - 0.5, high + 0.5)
-
-
-def _panel(panel: Any, found: RobustnessMap, row: int, low: float, high: float) -> Any:
+def _draw_panel(panel: Any, found: RobustnessMap, row: int, low: float, high: float) -> Any:
     across, up = np.argsort(found.errors_hz), np.argsort(found.sensor_gains)
     errors, gains = found.errors_hz[across], found.sensor_gains[up]
     percent = 100 * found.strehl[row][np.ix_(up, across)]
-    panel.grid(False)
+    mesh = draw_cells(panel, errors, gains, percent, low=low, high=high, levels=STREHL_LEVELS)
     x, y = cell_edges(errors), cell_edges(gains)
-    mesh = panel.pcolormesh(
-        x, y, np.ma.masked_invalid(percent), cmap="viridis", vmin=low, vmax=high, rasterized=True
-    )
-    inside = percent[np.isfinite(percent)]
-    levels = [level for level in _LEVELS if inside.size and inside.min() < level < inside.max()]
-    if min(percent.shape) > 1 and levels:
-        lines = panel.contour(
-            errors,
-            gains,
-            np.ma.masked_invalid(percent),
-            levels=levels,
-            linewidths=0.8,
-            colors=["white" if level < (low + high) / 2 else "black" for level in levels],
-        )
-        panel.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
     height = y[-1] - y[0]
-    for bottom, top in bands(~found.stable[row][up], y):
+    for bottom, top in marked_intervals(~found.stable[row][up], y):
         panel.axhspan(bottom, top, facecolor="0.85", edgecolor="0.55", hatch="////", linewidth=0)
         if top - bottom < 0.08 * height:  # no room for a word
             continue

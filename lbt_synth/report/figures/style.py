@@ -1,4 +1,4 @@
-"""Look of the figures: told apart in grey and by the colour-blind."""
+"""Settings and axes that all figures share, and how a figure becomes a file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,7 @@ from lbt_synth.errors import OutputError
 from lbt_synth.storage.atomic_files import write_atomically
 
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
-# Okabe and Ito's palette, in an order that also darkens and lightens in grey
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)))
-MARKERS = ("o", "s", "^", "D", "v", "P")
+METHOD_LABELS = {"kalman": "Kalman", "hinf": r"H$_\infty$"}
 
 _STYLE: dict[str, Any] = {
     "font.size": 9,
@@ -47,12 +43,6 @@ def house_style() -> Iterator[None]:
 
     with mpl.rc_context(_STYLE):
         yield
-
-
-def looks() -> Iterator[dict[str, Any]]:
-    """Endless line styles, each with its own colour and dashes."""
-    for colour, line in cycle(zip(COLOURS, LINES, strict=True)):
-        yield {"color": colour, "linestyle": line}
 
 
 def new_figure(width_in: float, height_in: float) -> Any:

@@ -11,7 +11,8 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import TrackingUpdate
 from lbt_synth.loop import Simulation
 from lbt_synth.models import DriftingVibration
-from lbt_synth.report.figures.style import COLOURS, house_style, looks, new_figure, plain_ticks
+from lbt_synth.report.figures.style import house_style, new_figure, plain_ticks
+from lbt_synth.report.line_styles import COLOURS, line_styles
 from lbt_synth.validation import FloatArray, number
 
 
@@ -91,7 +92,7 @@ def tracking_figure(
         _draw_history(upper, history, start_s, last_s)
         upper.set(ylabel="frequency [Hz]")
         upper.legend(loc="best")
-        for (name, values), look in zip(residuals.items(), looks(), strict=False):
+        for (name, values), look in zip(residuals.items(), line_styles(), strict=False):
             middles = (np.arange(len(values)) + 0.5) * bin_s
             lower.plot(middles, values, label=name, **look)
         lower.set(xlabel="time [s]", ylabel=f"residual in {bin_s:g} s [nm rms]", yscale="log")

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.figures.style import MARKERS, house_style, looks, new_figure, number_ticks
+from lbt_synth.report.figures.style import house_style, new_figure, number_ticks
+from lbt_synth.report.line_styles import MARKERS, line_styles
 from lbt_synth.studies import TradeoffPoint
 
 _NAMES = {
@@ -54,7 +55,7 @@ def tradeoff_figure(points: Sequence[TradeoffPoint]) -> Any:
     with house_style():
         figure = new_figure(6.3, 5.4 if loops else 3.2)
         axes = list(np.atleast_1d(figure.subplots(1 + loops, 1, sharex=True)))
-        for family, style, marker in zip(families, looks(), MARKERS, strict=False):
+        for family, style, marker in zip(families, line_styles(), MARKERS, strict=False):
             own = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
             gamma = [p.gamma for p in own]
             label = _NAMES.get(family, family)

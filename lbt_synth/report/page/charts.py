@@ -14,8 +14,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.report.page.line_styles import MARKER_NAMES
-from lbt_synth.validation import FloatArray, choice, float_array, frozen
+from lbt_synth.report.line_styles import MARKER_NAMES
+from lbt_synth.validation import FloatArray, choice, float_array, frozen_copy
 
 _KEY = re.compile(r"[a-z][a-z0-9-]*")
 
@@ -144,7 +144,7 @@ class Map:
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "values"):
-            object.__setattr__(self, name, frozen(float_array(getattr(self, name), name)))
+            object.__setattr__(self, name, frozen_copy(float_array(getattr(self, name), name)))
         if self.values.shape != (self.y.size, self.x.size) or not self.values.size:
             raise DimensionError(
                 f"values must have a row for each of {self.y.size} y and a column for each of "
@@ -181,14 +181,14 @@ class Panel:
     def __post_init__(self) -> None:
         object.__setattr__(self, "marks", tuple(self.marks))
         object.__setattr__(self, "categories", tuple(self.categories))
-        for bars in self.of(Bars):
+        for bars in self.select(Bars):
             if bars.values.size != len(self.categories):
                 raise DimensionError(
                     f"bars must have a value for each of {len(self.categories)} categories; got "
                     f"{bars.values.size}."
                 )
 
-    def of(self, kind: Any) -> list[Any]:
+    def select(self, kind: Any) -> list[Any]:
         """Return what is drawn of one kind."""
         return [mark for mark in self.marks if isinstance(mark, kind)]
 
@@ -216,7 +216,7 @@ class Chart:
     @property
     def maps(self) -> list[Map]:
         """All maps of the chart."""
-        return [found for panel in self.panels for found in panel.of(Map)]
+        return [found for panel in self.panels for found in panel.select(Map)]
 
 
 def require_key(key: str) -> str:
@@ -229,7 +229,7 @@ def require_key(key: str) -> str:
     return key
 
 
-def legend_of(panels: Sequence[Panel]) -> dict[str, Mark]:
+def legend_entries(panels: Sequence[Panel]) -> dict[str, Mark]:
     """Return what a legend has to name, each by the first mark of that name."""
     found: dict[str, Mark] = {}
     for panel in panels:
@@ -245,7 +245,7 @@ def legend_of(panels: Sequence[Panel]) -> dict[str, Mark]:
 def _take_columns(mark: Any, *names: str) -> None:
     """Make columns of a mark read-only arrays of the same length."""
     for name in names:
-        object.__setattr__(mark, name, frozen(float_array(getattr(mark, name), name)))
+        object.__setattr__(mark, name, frozen_copy(float_array(getattr(mark, name), name)))
     shapes = {getattr(mark, name).shape for name in names}
     if len(shapes) != 1 or len(shapes.pop()) != 1:
         listing = ", ".join(f"{name} {getattr(mark, name).shape}" for name in names)

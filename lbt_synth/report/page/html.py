@@ -6,10 +6,20 @@ import json
 from importlib.resources import files
 from typing import Any
 
+from lbt_synth.report.line_styles import GREY, PALE, colour, dashes, marker_name
 from lbt_synth.report.page.blocks import Listing, Notice, Page, Paragraph
-from lbt_synth.report.page.bokeh_charts import bokeh_script, interactive
-from lbt_synth.report.page.charts import Area, Bars, Chart, Curve, Map, Mark, Rule, Span, legend_of
-from lbt_synth.report.page.line_styles import GREY, PALE, colour, dashes, marker_name
+from lbt_synth.report.page.bokeh_charts import bokeh_script, embed_charts
+from lbt_synth.report.page.charts import (
+    Area,
+    Bars,
+    Chart,
+    Curve,
+    Map,
+    Mark,
+    Rule,
+    Span,
+    legend_entries,
+)
 from lbt_synth.report.page.matplotlib_charts import chart_svg
 from lbt_synth.storage.tables import Table
 
@@ -37,19 +47,19 @@ def page_html(page: Page) -> bytes:
     )
     environment.globals["kind_of"] = lambda block: _KINDS[type(block)]
     environment.globals["parts_of"] = lambda table: list(table.by_columns(_COLUMNS))
-    drawn = interactive(page.charts)
+    drawn = embed_charts(page.charts)
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
     text = template.render(
         page=page,
         style=(here / "page.css").read_text(encoding="utf-8"),
         script=(here / "page.js").read_text(encoding="utf-8"),
         library=bokeh_script() if page.charts else "",
-        data=_as_script(drawn.embedding),
+        data=_script_json(drawn.embedding),
         places=drawn.places,
         legends={
             chart.key: [
                 (name, swatch(mark), " ".join(drawn.lines[chart.key].get(name, ())))
-                for name, mark in legend_of(chart.panels).items()
+                for name, mark in legend_entries(chart.panels).items()
             ]
             for chart in page.charts
         },
@@ -58,7 +68,7 @@ def page_html(page: Page) -> bytes:
     return text.encode()
 
 
-def _as_script(value: Any) -> str:
+def _script_json(value: Any) -> str:
     """JSON that cannot end the script element that it is in."""
     text = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
     for character in "<>&\u2028\u2029":

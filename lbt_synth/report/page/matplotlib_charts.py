@@ -9,14 +9,14 @@ import io
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from lbt_synth.report.figures.map_cells import bands, cell_edges
 from lbt_synth.report.figures.style import house_style
+from lbt_synth.report.line_styles import GREY, PALE, colour, dashes, marker_name
+from lbt_synth.report.map_cells import blank_cells, cell_edges, draw_cells
 from lbt_synth.report.page.charts import (
     Area,
     Bars,
@@ -27,11 +27,9 @@ from lbt_synth.report.page.charts import (
     Panel,
     Rule,
     Span,
-    legend_of,
+    legend_entries,
 )
-from lbt_synth.report.page.line_styles import GREY, PALE, colour, dashes, marker_name
-from lbt_synth.report.page.scales import ends_of, log_tick_texts, log_ticks, shortened
-from lbt_synth.validation import FloatArray
+from lbt_synth.report.page.scales import log_tick_texts, log_ticks, scale_ends, shorten
 
 WIDTH_IN = 7.0
 _PANEL_IN, _BAR_IN = 2.1, 0.24  # height of a panel, and of one bar
@@ -53,17 +51,17 @@ _SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 
 @contextmanager
-def drawing() -> Iterator[None]:
+def chart_style() -> Iterator[None]:
     """Set the house style for the time of a drawing; names are never mathematics in it."""
     import matplotlib as mpl
 
-    with house_style(), mpl.rc_context(_OWN), warnings.catch_warnings():
+    with house_style(), mpl.rc_context(_STYLE), warnings.catch_warnings():
         # a name in a script that the font does not have stays a name
         warnings.filterwarnings("ignore", message=r"Glyph .* missing")
         yield
 
 
-_OWN: dict[str, Any] = {
+_STYLE: dict[str, Any] = {
     "font.size": 8.5,
     "axes.labelsize": 8.5,
     "axes.titlesize": 8.5,
@@ -84,9 +82,9 @@ def chart_svg(chart: Chart) -> str:
     from matplotlib.figure import Figure
 
     buffer = io.BytesIO()
-    with drawing():
-        figure = Figure(figsize=(WIDTH_IN, height_of(chart)))
-        draw_chart(figure, chart, left=0, top=height_of(chart))
+    with chart_style():
+        figure = Figure(figsize=(WIDTH_IN, chart_height(chart)))
+        draw_chart(figure, chart, left=0, top=chart_height(chart))
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     root = ElementTree.fromstring(buffer.getvalue())
     for child in root.findall(f"{{{_SVG}}}metadata"):
@@ -111,7 +109,7 @@ def chart_svg(chart: Chart) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def height_of(chart: Chart, width: float = WIDTH_IN) -> float:
+def chart_height(chart: Chart, width: float = WIDTH_IN) -> float:
     """Height of a chart [inch] at a width."""
     scale = _SCALE if chart.maps else 0.0
     return _legend_height(chart, width) + sum(_row_heights(chart, width)) + scale
@@ -128,7 +126,7 @@ def draw_chart(
             (x / sheet_width, y / sheet_height, w / sheet_width, h / sheet_height)
         )
 
-    _legend(figure, chart, left, top, width)
+    _draw_legend(figure, chart, left, top, width)
     y = top - _legend_height(chart, width)
     image = None
     margin, cell = _left_margin(chart), width / chart.columns
@@ -163,10 +161,10 @@ def _row_heights(chart: Chart, width: float) -> list[float]:
         if panel.height_in is not None:
             return panel.height_in
         if panel.equal:
-            (x0, x1), (y0, y1) = ends_of(panel)
+            (x0, x1), (y0, y1) = scale_ends(panel)
             return min(inside * abs((y1 - y0) / (x1 - x0)), 5.0)
         if panel.categories:
-            bars = len(panel.categories) * max(1, len(panel.of(Bars)))
+            bars = len(panel.categories) * max(1, len(panel.select(Bars)))
             return min(max(0.8, _BAR_IN * bars + 0.2), _HIGHEST)
         return _PANEL_IN
 
@@ -178,33 +176,33 @@ def _row_heights(chart: Chart, width: float) -> list[float]:
 
 def _left_margin(chart: Chart) -> float:
     longest = max(
-        (len(shortened(name, 36)) for panel in chart.panels for name in panel.categories), default=0
+        (len(shorten(name, 36)) for panel in chart.panels for name in panel.categories), default=0
     )
     return _LEFT if longest == 0 else 0.25 + _LETTER * longest
 
 
 def _legend_columns(names: Sequence[str], width: float) -> int:
-    widest = 0.55 + _LETTER * max(len(shortened(name, _LONGEST)) for name in names)
+    widest = 0.55 + _LETTER * max(len(shorten(name, _LONGEST)) for name in names)
     return int(max(1, min(len(names), (width - 0.2) // widest)))
 
 
 def _legend_height(chart: Chart, width: float) -> float:
-    names = list(legend_of(chart.panels))
+    names = list(legend_entries(chart.panels))
     if not names:
         return 0.0
     return 0.1 + _LEGEND_ROW * -(-len(names) // _legend_columns(names, width))
 
 
-def _legend(figure: Any, chart: Chart, left: float, top: float, width: float) -> None:
-    entries = legend_of(chart.panels)
+def _draw_legend(figure: Any, chart: Chart, left: float, top: float, width: float) -> None:
+    entries = legend_entries(chart.panels)
     if not entries:
         return
     sheet = figure.get_size_inches()
     # a leading underscore would leave a name out
     names = [f" {name}" if name.startswith("_") else name for name in entries]
     figure.legend(
-        [_handle(mark) for mark in entries.values()],
-        [shortened(name, _LONGEST) for name in names],
+        [_legend_handle(mark) for mark in entries.values()],
+        [shorten(name, _LONGEST) for name in names],
         loc="upper center",
         bbox_to_anchor=((left + width / 2) / sheet[0], top / sheet[1]),
         ncols=_legend_columns(names, width),
@@ -213,7 +211,7 @@ def _legend(figure: Any, chart: Chart, left: float, top: float, width: float) ->
     )
 
 
-def _handle(mark: Mark) -> Any:
+def _legend_handle(mark: Mark) -> Any:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -252,7 +250,7 @@ def _rule_style(rule: Rule) -> dict[str, Any]:
 def _draw_panel(axes: Any, panel: Panel, letters: int) -> Any:
     """Draw a panel, its title of so many letters at most, and return its map if it has one."""
     image = None
-    axes.set_title(shortened(panel.title, letters), loc="left", fontweight="bold")
+    axes.set_title(shorten(panel.title, letters), loc="left", fontweight="bold")
     for mark in panel.marks:
         if isinstance(mark, Curve):
             if mark.x.size:
@@ -271,13 +269,13 @@ def _draw_panel(axes: Any, panel: Panel, letters: int) -> Any:
         elif isinstance(mark, Map):
             image = _draw_map(axes, mark)
     _draw_bars(axes, panel)
-    _scales(axes, panel)
+    _set_scales(axes, panel)
     return image
 
 
-def _scales(axes: Any, panel: Panel) -> None:
+def _set_scales(axes: Any, panel: Panel) -> None:
     for end, own, scale in (("x", panel.x, axes.xaxis), ("y", panel.y, axes.yaxis)):
-        low, high = ends_of(panel)[end == "y"]
+        low, high = scale_ends(panel)[end == "y"]
         if own.log:
             getattr(axes, f"set_{end}scale")("log")
             ticks = log_ticks(low, high)
@@ -287,7 +285,7 @@ def _scales(axes: Any, panel: Panel) -> None:
         getattr(axes, f"set_{end}label")(own.text)
     if panel.categories:
         axes.set_yticks(
-            range(len(panel.categories)), [shortened(name, 36) for name in panel.categories]
+            range(len(panel.categories)), [shorten(name, 36) for name in panel.categories]
         )
         axes.set_ylabel("")
         axes.tick_params(axis="y", length=0)
@@ -297,7 +295,7 @@ def _scales(axes: Any, panel: Panel) -> None:
 
 
 def _draw_bars(axes: Any, panel: Panel) -> None:
-    series = panel.of(Bars)
+    series = panel.select(Bars)
     for bars, (offset, height) in zip(series, bar_places(len(series)), strict=True):
         places = np.arange(len(panel.categories)) + offset
         drawn = np.isfinite(bars.values)
@@ -313,57 +311,18 @@ def bar_places(count: int) -> list[tuple[float, float]]:
 
 
 def _draw_map(axes: Any, found: Map) -> Any:
-    axes.grid(visible=False)
-    x, y = cell_edges(found.x), cell_edges(found.y)
-    blank = np.isnan(found.values)
-    image = axes.pcolormesh(
-        x,
-        y,
-        np.ma.masked_invalid(found.values),
-        cmap="viridis",
-        vmin=found.low,
-        vmax=found.high,
-        rasterized=True,
+    image = draw_cells(
+        axes,
+        found.x,
+        found.y,
+        found.values,
+        low=found.low,
+        high=found.high,
+        levels=found.levels,
     )
-    levels = levels_within(found)
-    if levels:
-        lines = axes.contour(
-            found.x,
-            found.y,
-            np.ma.masked_invalid(found.values),
-            levels=levels,
-            linewidths=0.8,
-            colors=[level_colour(found, level) for level in levels],
-        )
-        axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
-    for left, right, low, high in blank_cells(blank, x, y):
+    x, y = cell_edges(found.x), cell_edges(found.y)
+    for left, right, low, high in blank_cells(np.isnan(found.values), x, y):
         axes.fill_between(
             [left, right], low, high, facecolor=PALE, edgecolor="0.55", hatch="////", linewidth=0
         )
     return image
-
-
-def levels_within(found: Map) -> list[float]:
-    """Levels between the least and the largest value of a map."""
-    inside = found.values[np.isfinite(found.values)]
-    if min(found.values.shape) < 2 or not inside.size:
-        return []
-    return [level for level in found.levels if inside.min() < level < inside.max()]
-
-
-def level_colour(found: Map, level: float) -> str:
-    """Colour of a line that is seen on the colours around it."""
-    return "white" if level < (found.low + found.high) / 2 else "black"
-
-
-def blank_cells(
-    blank: Any, x: FloatArray, y: FloatArray
-) -> Iterator[tuple[float, float, float, float]]:
-    """Left, right, low and high end of rectangles that cover the cells without a value."""
-    whole = np.all(blank, axis=1)
-    for low, high in bands(whole, y):
-        yield float(x[0]), float(x[-1]), low, high
-    for row, (low, high) in enumerate(pairwise(y)):
-        if not whole[row]:
-            for left, right in bands(blank[row], x):
-                yield left, right, float(low), float(high)

@@ -10,7 +10,7 @@ from typing import Any
 
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.charts import Chart, Panel
-from lbt_synth.report.page.matplotlib_charts import draw_chart, drawing, height_of
+from lbt_synth.report.page.matplotlib_charts import chart_height, chart_style, draw_chart
 from lbt_synth.report.page.typeset import (
     BODY,
     BOLD,
@@ -18,8 +18,8 @@ from lbt_synth.report.page.typeset import (
     MONO,
     Style,
     mono_lines,
-    width_of,
-    wrapped,
+    text_width,
+    wrap,
 )
 from lbt_synth.storage.tables import Cell, Table
 
@@ -43,7 +43,7 @@ def page_pdf(page: Page) -> bytes:
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
-    with drawing():
+    with chart_style():
         sheets = _Sheets()
         sheets.words(page.title, Style(size=19, weight="bold"), after=0.08)
         sheets.words(page.subtitle, Style(size=9, ink="#4a5560"), after=0.25)
@@ -62,9 +62,9 @@ def page_pdf(page: Page) -> bytes:
                 for draw in draws:
                     draw(figure)
                 foot = f"page {number + 1} of {len(sheets.pages)}"
-                _text(figure, WIDTH - _SIDE - width_of(foot, LINE), 0.35, foot, LINE)
-                room = INSIDE - width_of(foot, LINE) - 0.3
-                _text(figure, _SIDE, 0.35, wrapped(page.title, LINE, room)[0], LINE)
+                _draw_text(figure, WIDTH - _SIDE - text_width(foot, LINE), 0.35, foot, LINE)
+                room = INSIDE - text_width(foot, LINE) - 0.3
+                _draw_text(figure, _SIDE, 0.35, wrap(page.title, LINE, room)[0], LINE)
                 pdf.savefig(figure)
     return buffer.getvalue()
 
@@ -93,8 +93,8 @@ class _Sheets:
         head = Style(size=14, weight="bold")
         opening = 0.0
         for block in section.blocks:  # up to the first thing that is no text
-            first_part = next(by_sheets(block)) if isinstance(block, Chart) else block
-            opening += height_of_block(first_part)
+            first_part = next(split_by_sheets(block)) if isinstance(block, Chart) else block
+            opening += block_height(first_part)
             if not isinstance(block, Paragraph | Notice):
                 break
         room = 0.45 + min(opening, _ROOM)
@@ -116,34 +116,36 @@ class _Sheets:
             for part in block.by_columns(_COLUMNS):
                 self.table(part)
         else:
-            for chart in by_sheets(block):
+            for chart in split_by_sheets(block):
                 self.chart(chart)
 
     def words(self, text: str, style: Style, *, after: float) -> None:
         """Lines of a text; a short one is kept together."""
-        lines = wrapped(text, style, INSIDE)
+        lines = wrap(text, style, INSIDE)
         if len(lines) <= _TOGETHER and self.y - len(lines) * style.leading < _BOTTOM:
             self.y = 0.0
         for line in lines:
             top = self.take(style.leading)
-            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=style))
+            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=style))
         self.y -= after
 
     def notice(self, notice: Notice) -> None:
         style = Style(
             size=9, weight="bold" if notice.tone == "bad" else "normal", ink=_INKS[notice.tone]
         )
-        lines = wrapped(notice.text, style, INSIDE - 0.3)
+        lines = wrap(notice.text, style, INSIDE - 0.3)
         height = len(lines) * style.leading + 0.16
         top = self.take(height + 0.1)
         tint = _TINTS.get(notice.tone, "#f4f6f8")
-        self.draw(partial(_box, left=_SIDE, top=top, width=INSIDE, height=height, shade=tint))
+        self.draw(partial(_draw_box, left=_SIDE, top=top, width=INSIDE, height=height, shade=tint))
         self.draw(
-            partial(_box, left=_SIDE, top=top, width=0.05, height=height, shade=_INKS[notice.tone])
+            partial(
+                _draw_box, left=_SIDE, top=top, width=0.05, height=height, shade=_INKS[notice.tone]
+            )
         )
         for i, line in enumerate(lines):
             at = top - 0.08 - i * style.leading
-            self.draw(partial(_line, top=at, left=_SIDE + 0.18, text=line, style=style))
+            self.draw(partial(_draw_line, top=at, left=_SIDE + 0.18, text=line, style=style))
 
     def listing(self, listing: Listing) -> None:
         lines = mono_lines(listing.text, INSIDE)
@@ -152,21 +154,21 @@ class _Sheets:
         self.words(listing.caption, BOLD, after=0.05)
         for line in lines:
             top = self.take(MONO.leading)
-            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=MONO))
+            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=MONO))
         self.y -= 0.1
 
     def chart(self, chart: Chart) -> None:
-        caption = wrapped(chart.caption, LINE, INSIDE)
-        title = wrapped(chart.title, BOLD, INSIDE)
-        top = self.take(height_of_block(chart))
+        caption = wrap(chart.caption, LINE, INSIDE)
+        title = wrap(chart.title, BOLD, INSIDE)
+        top = self.take(block_height(chart))
         for line in title:
-            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=BOLD))
+            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=BOLD))
             top -= BOLD.leading
         top -= 0.05
         self.draw(partial(draw_chart, chart=chart, left=_SIDE, top=top, width=INSIDE))
-        top -= height_of(chart, INSIDE) + 0.05
+        top -= chart_height(chart, INSIDE) + 0.05
         for line in caption:
-            self.draw(partial(_line, top=top, left=_SIDE, text=line, style=LINE))
+            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=LINE))
             top -= LINE.leading
 
     def table(self, table: Table) -> None:
@@ -208,7 +210,7 @@ class _Row:
         self.group = len(cells) == 1 and len(widths) > 1
         self.widths = [sum(widths)] if self.group else widths
         self.lines = [
-            wrapped(cell.text, self._style(cell), width - 2 * _PAD)
+            wrap(cell.text, self._style(cell), width - 2 * _PAD)
             for cell, width in zip(cells, self.widths, strict=True)
         ]
         self.height = max(len(lines) for lines in self.lines) * LINE.leading + 0.07
@@ -222,7 +224,7 @@ class _Row:
         left = _SIDE
         bottom = top - self.height
         if self.group:
-            _box(
+            _draw_box(
                 figure,
                 left=left,
                 top=top,
@@ -235,17 +237,19 @@ class _Row:
         ):
             style = self._style(cell)
             if cell.tone == "bad":
-                _box(
+                _draw_box(
                     figure, left=left, top=top, width=width, height=self.height, shade=_TINTS["bad"]
                 )
             for j, line in enumerate(lines):
                 at = left + _PAD
                 if i > 0 and i not in self.words:
-                    at = left + width - _PAD - width_of(line, style)
-                _line(figure, top=top - 0.035 - j * style.leading, left=at, text=line, style=style)
+                    at = left + width - _PAD - text_width(line, style)
+                _draw_line(
+                    figure, top=top - 0.035 - j * style.leading, left=at, text=line, style=style
+                )
             left += width
         thickness = 0.012 if self.heading else 0.005
-        _box(
+        _draw_box(
             figure,
             left=_SIDE,
             top=bottom + thickness,
@@ -255,14 +259,14 @@ class _Row:
         )
 
 
-def by_sheets(chart: Chart) -> Iterator[Chart]:
+def split_by_sheets(chart: Chart) -> Iterator[Chart]:
     """Yield charts that each fit a sheet below the heading of a section, in whole rows."""
     panels = chart.panels
     parts: list[tuple[Panel, ...]] = [()]
     for start in range(0, len(panels), chart.columns):
         row = panels[start : start + chart.columns]
         longer = replace(chart, panels=parts[-1] + row)
-        if parts[-1] and height_of_block(longer) > _ROOM:
+        if parts[-1] and block_height(longer) > _ROOM:
             parts.append(row)
         else:
             parts[-1] += row
@@ -271,15 +275,15 @@ def by_sheets(chart: Chart) -> Iterator[Chart]:
         yield replace(chart, title=more, panels=part)
 
 
-def height_of_block(block: Block) -> float:
+def block_height(block: Block) -> float:
     """Height that a block needs on one sheet [inch]; of a table or listing, that of its start."""
     if isinstance(block, Chart):
-        caption, title = wrapped(block.caption, LINE, INSIDE), wrapped(block.title, BOLD, INSIDE)
+        caption, title = wrap(block.caption, LINE, INSIDE), wrap(block.title, BOLD, INSIDE)
         words = len(caption) * LINE.leading + len(title) * BOLD.leading
-        return height_of(block, INSIDE) + words + 0.35
+        return chart_height(block, INSIDE) + words + 0.35
     if isinstance(block, Table | Listing):
         return 1.0
-    return len(wrapped(block.text, BODY, INSIDE)) * BODY.leading + 0.2
+    return len(wrap(block.text, BODY, INSIDE)) * BODY.leading + 0.2
 
 
 def column_widths(rows: list[tuple[Cell, ...]]) -> list[float]:
@@ -287,7 +291,7 @@ def column_widths(rows: list[tuple[Cell, ...]]) -> list[float]:
     bold = Style(size=LINE.size, weight="bold")
     count = max(len(row) for row in rows)
     natural = [
-        max(width_of(row[i].text, bold) for row in rows if len(row) == count) + 2 * _PAD + 0.02
+        max(text_width(row[i].text, bold) for row in rows if len(row) == count) + 2 * _PAD + 0.02
         for i in range(count)
     ]
     cap = INSIDE
@@ -296,7 +300,7 @@ def column_widths(rows: list[tuple[Cell, ...]]) -> list[float]:
     return [min(width, cap) for width in natural]
 
 
-def _text(figure: Any, x: float, y: float, text: str, style: Style) -> None:
+def _draw_text(figure: Any, x: float, y: float, text: str, style: Style) -> None:
     figure.text(
         x,
         y,
@@ -310,11 +314,13 @@ def _text(figure: Any, x: float, y: float, text: str, style: Style) -> None:
     )
 
 
-def _line(figure: Any, *, top: float, left: float, text: str, style: Style) -> None:
-    _text(figure, left, top - 0.8 * style.leading, text, style)
+def _draw_line(figure: Any, *, top: float, left: float, text: str, style: Style) -> None:
+    _draw_text(figure, left, top - 0.8 * style.leading, text, style)
 
 
-def _box(figure: Any, *, left: float, top: float, width: float, height: float, shade: str) -> None:
+def _draw_box(
+    figure: Any, *, left: float, top: float, width: float, height: float, shade: str
+) -> None:
     from matplotlib.patches import Rectangle
 
     figure.add_artist(

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from lbt_synth.report.figures.map_cells import cell_edges
+from lbt_synth.report.map_cells import cell_edges
 from lbt_synth.report.page.charts import Area, Axis, Bars, Curve, Map, Panel, Rule
 from lbt_synth.validation import FloatArray
 
@@ -15,7 +15,7 @@ _ROOM = 0.04  # around what is drawn, of its extent
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def ends_of(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
+def scale_ends(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the ends of both scales of a panel."""
     across, up = [], []
     tight = False
@@ -38,16 +38,20 @@ def ends_of(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
         elif isinstance(mark, Rule) and mark.axis == "y":
             up.append(np.array([mark.at]))
     # a shaded area stands on its end of the scale; equal scales stay equal
-    drawn = [] if tight or panel.equal or panel.of(Area) or panel.of(Bars) else panel.of(Curve)
-    x = _ends(
+    drawn = (
+        []
+        if tight or panel.equal or panel.select(Area) or panel.select(Bars)
+        else panel.select(Curve)
+    )
+    x = _axis_ends(
         panel.x,
         across,
-        0.0 if tight or _is_line(panel) else _ROOM,
+        0.0 if tight or _has_only_lines(panel) else _ROOM,
         [(curve.x, curve.marker is not None) for curve in drawn],
     )
     if panel.categories:
         return x, (len(panel.categories) - 0.4, -0.6)
-    return x, _ends(
+    return x, _axis_ends(
         panel.y,
         up,
         0.0 if tight else _ROOM,
@@ -55,14 +59,14 @@ def ends_of(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
     )
 
 
-def _is_line(panel: Panel) -> bool:
+def _has_only_lines(panel: Panel) -> bool:
     """Whether everything is a line, which may reach from end to end."""
     return not panel.categories and all(
-        mark.line and mark.marker is None for mark in panel.of(Curve)
+        mark.line and mark.marker is None for mark in panel.select(Curve)
     )
 
 
-def _ends(
+def _axis_ends(
     axis: Axis,
     values: Iterable[FloatArray],
     room: float,
@@ -138,7 +142,7 @@ def _power_text(value: float) -> str:
     return raised if factor == "1" else f"{factor}·{raised}"
 
 
-def shortened(text: str, most: int) -> str:
+def shorten(text: str, most: int) -> str:
     """Return a text of so many characters at most, its middle left out."""
     if len(text) <= most:
         return text

@@ -29,19 +29,22 @@ LINE = Style(8)
 MONO = Style(7, family="monospace")
 
 
-def width_of(text: str, style: Style) -> float:
+def text_width(text: str, style: Style) -> float:
     """Width of a text [inch]."""
-    return sum(_width(part, style.weight, style.family) for part in _parts(text)) * style.size
+    return (
+        sum(_word_width(part, style.weight, style.family) for part in _split_words(text))
+        * style.size
+    )
 
 
-def _parts(text: str) -> list[str]:
+def _split_words(text: str) -> list[str]:
     """Words and spaces, so that the widths of words are found again."""
     words = text.split(" ")
     return [part for word in words for part in (word, " ")][:-1]
 
 
 @lru_cache(maxsize=20_000)
-def _width(part: str, weight: str, family: str) -> float:
+def _word_width(part: str, weight: str, family: str) -> float:
     """Width of a word [inch] at one point."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
@@ -54,33 +57,33 @@ def _width(part: str, weight: str, family: str) -> float:
     return float(width) / size / _POINTS
 
 
-def wrapped(text: str, style: Style, width: float) -> list[str]:
+def wrap(text: str, style: Style, width: float) -> list[str]:
     """Lines of a text that are not wider than a width [inch]; words that are, are broken."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
         line = ""
         for word in paragraph.split():
             joined = f"{line} {word}" if line else word
-            if width_of(joined, style) <= width:
+            if text_width(joined, style) <= width:
                 line = joined
                 continue
             if line:
                 lines.append(line)
             line = word
-            while width_of(line, style) > width and len(line) > 1:
-                fits = _fitting(line, style, width)
+            while text_width(line, style) > width and len(line) > 1:
+                fits = _count_fitting(line, style, width)
                 lines.append(line[:fits])
                 line = line[fits:]
         lines.append(line)
     return lines
 
 
-def _fitting(word: str, style: Style, width: float) -> int:
+def _count_fitting(word: str, style: Style, width: float) -> int:
     """Return how many letters of a word fit, at least one."""
     low, high = 1, len(word)
     while low < high:
         middle = (low + high + 1) // 2
-        if width_of(word[:middle], style) <= width:
+        if text_width(word[:middle], style) <= width:
             low = middle
         else:
             high = middle - 1
@@ -89,7 +92,7 @@ def _fitting(word: str, style: Style, width: float) -> int:
 
 def mono_lines(text: str, width: float) -> list[str]:
     """Lines of a listing; those that are too long go on in the next line."""
-    letters = max(8, int(width / width_of("m", MONO)))
+    letters = max(8, int(width / text_width("m", MONO)))
     lines: list[str] = []
     for line in text.expandtabs(4).splitlines():
         rest = line

@@ -9,10 +9,10 @@ import numpy as np
 from lbt_synth.report.number_text import listing_text
 from lbt_synth.report.page.charts import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
 from lbt_synth.studies import StudyStatistics
-from lbt_synth.studies.study.binning import binned_map, cumulative, histogram, values_of
-from lbt_synth.studies.study.comparison import losses_of
-from lbt_synth.studies.study.conditional import ConditionalCurve
-from lbt_synth.studies.study.sample_status import Outcomes
+from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
+from lbt_synth.studies.study.comparison import sample_losses
+from lbt_synth.studies.study.conditional_curve import ConditionalCurve
+from lbt_synth.studies.study.controller_samples import ControllerSamples
 from lbt_synth.studies.study.summary import varying_parameters
 from lbt_synth.validation import FloatArray
 
@@ -20,7 +20,7 @@ _UNSTABLE_PANELS = 4
 _HIGH = 40.0  # Strehl ratio [%]; an axis of curves that are all above it does not start at 0
 
 
-def distribution_chart(found: Sequence[Outcomes]) -> Chart | None:
+def distribution_chart(found: Sequence[ControllerSamples]) -> Chart | None:
     """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
     curves = []
     most = 1.0
@@ -29,7 +29,7 @@ def distribution_chart(found: Sequence[Outcomes]) -> Chart | None:
         if not values.size:
             continue
         most = min(most, 1 / values.size)
-        level, part = cumulative(values)
+        level, part = cumulative_points(values)
         # from nothing just below the first value
         x, y = np.concatenate((level[:1], level)), np.concatenate(([0.0], part))
         curves.append((look, each.controller, 100 * x, 100 * y))
@@ -76,14 +76,14 @@ def distribution_chart(found: Sequence[Outcomes]) -> Chart | None:
     )
 
 
-def loss_chart(found: Sequence[Outcomes]) -> Chart | None:
+def loss_chart(found: Sequence[ControllerSamples]) -> Chart | None:
     """How much each controller loses against the best of each sample, and how often."""
-    losses = losses_of(found)
+    losses = sample_losses(found)
     if len(found) < 2 or not losses[0].size:
         return None
     curves = []
     for look, (each, loss) in enumerate(zip(found, losses, strict=True)):
-        level, part = cumulative(loss)
+        level, part = cumulative_points(loss)
         x, y = np.concatenate(([0.0], level)), np.concatenate(([1.0], 1 - part))
         curves.append(
             Curve(name=each.controller, x=100 * x, y=100 * y, look=look, step=True, width=1.8)
@@ -113,7 +113,7 @@ def parameter_chart(parameters: Mapping[str, FloatArray], names: Mapping[str, st
     for name, values in parameters.items():
         if np.ptp(values) == 0:
             continue
-        listed = values_of(values)
+        listed = value_shares(values)
         if listed is not None:
             places, part = listed
             x, y = np.repeat(places, 3), np.zeros(3 * len(places))
@@ -288,7 +288,7 @@ def _unstable_curve(name: str, curve: ConditionalCurve, look: int) -> Curve:
 
 def map_charts(
     statistics: StudyStatistics,
-    found: Sequence[Outcomes],
+    found: Sequence[ControllerSamples],
     parameters: Mapping[str, FloatArray],
     names: Mapping[str, str],
 ) -> tuple[Chart, ...]:
@@ -338,7 +338,7 @@ def map_charts(
     return tuple(charts)
 
 
-def _medians(each: Outcomes) -> str:
+def _medians(each: ControllerSamples) -> str:
     values = each.strehl[each.evaluated]
     if not values.size:
         return f"{each.controller} has none"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from lbt_synth.report.provenance import SourceFile, read_source, time_of_making, versions
+from lbt_synth.report.provenance import SourceFile, creation_time, program_versions, read_source
 from lbt_synth.storage.array_file import digest
 from lbt_synth.studies import Failure, Study
 
@@ -78,8 +78,8 @@ def study_info(
         failures=tuple(failures),
         files=tuple(files),
         texts=texts,
-        versions=versions(),
-        made=time_of_making(),
+        versions=program_versions(),
+        made=creation_time(),
         computing_s=computing_s,
         replay=shlex.join(["lbt-synth", "study", os.fspath(study.source)])
         + f" -o {shlex.quote(os.fspath(directory))} --row {{row}}",

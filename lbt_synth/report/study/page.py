@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
-from lbt_synth.report.provenance import creator, time_text
+from lbt_synth.report.provenance import creator_name, time_text
 from lbt_synth.report.study.charts import (
     conditional_chart,
     distribution_chart,
@@ -23,7 +23,11 @@ from lbt_synth.report.study.charts import (
 from lbt_synth.report.study.info import StudyInfo
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies import ControllerStatistics, StudyStatistics
-from lbt_synth.studies.study.sample_status import Outcomes, column, outcomes
+from lbt_synth.studies.study.controller_samples import (
+    ControllerSamples,
+    read_column,
+    read_controller_samples,
+)
 from lbt_synth.studies.study.summary import (
     comparison_table,
     percent,
@@ -44,13 +48,15 @@ _LISTED = 5  # parameters of a worst sample: with the row and the Strehl ratio, 
 
 def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, Any]) -> Page:
     """Page of a study's results. Shapes: columns (n,)."""
-    found = [outcomes(columns, each.controller) for each in statistics.controllers]
+    found = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
     if any(len(each.strehl) != statistics.samples for each in found):
         raise ProblemError(
             f"the columns must have the {statistics.samples} samples of the statistics; got "
             f"{len(found[0].strehl)}."
         )
-    values = {name: column(columns, name, statistics.samples) for name in statistics.parameters}
+    values = {
+        name: read_column(columns, name, statistics.samples) for name in statistics.parameters
+    }
     names = short_names(statistics.parameters)
     return Page(
         title=f"Robustness study {info.name}",
@@ -73,7 +79,7 @@ def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[st
             )
             if section.blocks
         ),
-        creator=creator(),
+        creator=creator_name(),
     )
 
 
@@ -98,7 +104,9 @@ def varying(values: Mapping[str, FloatArray]) -> tuple[str, ...]:
     return tuple(name for name, column in values.items() if column.size and np.ptp(column) > 0)
 
 
-def _summary(info: StudyInfo, statistics: StudyStatistics, found: Sequence[Outcomes]) -> Section:
+def _summary(
+    info: StudyInfo, statistics: StudyStatistics, found: Sequence[ControllerSamples]
+) -> Section:
     blocks: list[Block] = []
     if statistics.samples < info.samples:
         blocks.append(
@@ -244,7 +252,7 @@ def _count(count: int) -> Cell:
     return Cell(text=str(count), tone="bad" if count else "plain")
 
 
-def _comparison(statistics: StudyStatistics, found: Sequence[Outcomes]) -> Section:
+def _comparison(statistics: StudyStatistics, found: Sequence[ControllerSamples]) -> Section:
     chart = loss_chart(found)
     table = comparison_table(statistics)
     return Section(
@@ -260,7 +268,7 @@ def _comparison(statistics: StudyStatistics, found: Sequence[Outcomes]) -> Secti
 
 def _dependence(
     statistics: StudyStatistics,
-    found: Sequence[Outcomes],
+    found: Sequence[ControllerSamples],
     values: Mapping[str, FloatArray],
     names: Mapping[str, str],
 ) -> Section:

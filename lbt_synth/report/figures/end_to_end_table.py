@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.report.figures.style import COLOURS, MARKERS, house_style, new_figure
+from lbt_synth.report.figures.style import METHOD_LABELS, house_style, new_figure
+from lbt_synth.report.line_styles import COLOURS, MARKERS
 from lbt_synth.studies import EndToEndEntry
 
-_NAMES = {"kalman": "Kalman", "hinf": r"H$_\infty$"}
 
-
-def table_figure(entries: Sequence[EndToEndEntry]) -> Any:
+def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Any:
     """Table III end to end, beside the paper and the modal prediction."""
     rows = [e for e in entries if e.table == "III" and e.error_hz is not None]
     methods = list(dict.fromkeys(e.method for e in rows))
@@ -54,7 +53,7 @@ def table_figure(entries: Sequence[EndToEndEntry]) -> Any:
             )
             panel.set(
                 xlabel="frequency of the model less the true one [Hz]",
-                title=_NAMES.get(method, method),
+                title=METHOD_LABELS.get(method, method),
                 ylim=(0, 100),
             )
         axes[0].set_ylabel("Strehl ratio at 2.2 µm [%]")
