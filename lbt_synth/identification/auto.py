@@ -20,7 +20,7 @@ from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.validation import choice, instance, number
+from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
 _APART = 3.0  # standard errors
@@ -126,7 +126,7 @@ def design_from_record(
     >>> bool(table[made.name].replayed_nm < 0.5 * table["what ran"].replayed_nm)
     True
     """
-    instance(record, LoopRecord)
+    require_instance(record, LoopRecord)
     choice(method, "method", METHODS)
     number(
         gamma_ratio,

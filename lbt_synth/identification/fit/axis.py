@@ -1,4 +1,4 @@
-"""From recorded series to turbulence, lines, noise and sensor gain."""
+"""The model of one axis: turbulence, lines, noise and sensor gain from series or spectra."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.order_search import Rules, gain_ambiguity, search_model
+from lbt_synth.identification.fit.model_fitter import Rules
+from lbt_synth.identification.fit.order_search import gain_ambiguity, search_model
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -22,12 +23,12 @@ from lbt_synth.identification.fit.physical_parameters import (
     parameter_covariance,
 )
 from lbt_synth.identification.fit.whittle import GAIN
-from lbt_synth.validation import FloatArray, instance, integer, number, real_array
+from lbt_synth.validation import FloatArray, integer, number, real_array, require_instance
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
-GAIN_ERROR = 0.3  # relative; a gain that is known worse is not identifiable
-_POOR_GAIN = 0.1  # is said to be known poorly
+GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
+_POOR_GAIN = 0.1  # relative error from which a note says so
 _APART = 3.0  # standard errors
 _GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}
 _MOST_AVERAGES = 1000.0
@@ -247,10 +248,10 @@ def identify_spectrum(
 
 
 def estimate_averages(density: FloatArray) -> float | None:
-    """Shape of the gamma distribution that a density scatters with about a smooth curve.
+    """Return how many periodograms were averaged in a density, by its scatter about a curve.
 
-    None if it is above what anybody averages: whatever the model leaves would count as evidence
-    for one more line, and standard errors would vanish.
+    It is the shape of a gamma distribution; None above what anybody averages: whatever the model
+    leaves would count as evidence for one more line, and standard errors would vanish.
     """
     from scipy.optimize import brentq
     from scipy.special import polygamma
@@ -291,7 +292,7 @@ def identify_periodogram(
     given_error = number(sensor_gain_error, "sensor_gain_error", at_least=0)
     assumed = number(assumed_gain, "assumed_gain", **_GAINS)
     if start is not None:
-        instance(start, IdentifiedAxis)
+        require_instance(start, IdentifiedAxis)
     nyquist = data.frame_rate_hz / 2
     for frequency, error in announced:
         number(frequency, "an announced frequency", above=0, below=nyquist)
@@ -302,31 +303,31 @@ def identify_periodogram(
         most_lines=integer(most_lines, "most_lines", at_least=0),
         announced=tuple(announced),
     )
-    grown = search_model(data, rules, None if start is None else start.fitted_model)
+    model = search_model(data, rules, None if start is None else start.fitted_model)
     if sensor_gain is not None:
         relative = given_error / sensor_gain
         note = "given" if data.closed else "given: the series is divided by it"
         if data.duration_s is None:
             note = "1: of a spectrum it has no meaning"
-        return describe_axis(data, rules, grown, relative or None, note, known=relative)
+        return describe_axis(data, rules, model, relative or None, note, known=relative)
     if not data.closed:
         note = "1: of an open loop it has no meaning"
-        return describe_axis(data, rules, grown, None, note, known=0.0)
-    variance = float(parameter_covariance(grown)[GAIN, GAIN])
+        return describe_axis(data, rules, model, None, note, known=0.0)
+    variance = float(parameter_covariance(model)[GAIN, GAIN])
     error = float(np.sqrt(variance)) if variance > 0 else float("inf")
-    narrow = grown.drop_wide(WIDE_DAMPING)
-    if len(narrow.parts) < len(grown.parts) and error <= GAIN_ERROR:
+    narrow = model.drop_wide(WIDE_DAMPING)
+    if len(narrow.parts) < len(model.parts) and error <= GAIN_ERROR:
         # such a model may stand for another gain
-        away = gain_ambiguity(data, rules, grown)
+        away = gain_ambiguity(data, rules, model)
         if away > _APART * error:
             error = away
     if error <= GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
-        return describe_axis(data, rules, grown, error, f"found in the closed loop's data{poor}")
+        return describe_axis(data, rules, model, error, f"found in the closed loop's data{poor}")
     rules = replace(rules, gain=assumed)
     by = f" by {100 * error:.0f} %" if error < 1 else ""
     note = (
         f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
-    return describe_axis(data, rules, search_model(data, rules, grown), None, note, known=0.0)
+    return describe_axis(data, rules, search_model(data, rules, model), None, note, known=0.0)

@@ -1,4 +1,4 @@
-"""Both axes of a loop, with one sensor gain where the data agree on one."""
+"""The model of a loop from its record: both axes, with one sensor gain if they agree."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from lbt_synth.identification.fit.axis import (
     identify_axis,
     identify_spectrum,
 )
+from lbt_synth.identification.fit.delay import better_delay
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
 from lbt_synth.identification.fit.jumps import (
-    Jump,
-    better_delay,
-    cut_around,
+    MOST_JUMPS,
+    cut_at_jumps,
+    describe_jumps,
     find_correction_jumps,
     find_jumps,
 )
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
-from lbt_synth.validation import instance
+from lbt_synth.validation import require_instance
 
-_DELAY = 2.0  # frames, where nothing is said
-_MOST_JUMPS = 20
-_LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # that a sensor has
-_SAME_JUMP = 50  # frames
-_UNSEEN = 0.5
-_APART = 3.0  # standard errors between gains that are not the same
+_DELAY = 2.0  # frames, if neither the record nor the call has a delay
+_LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
+_UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
+_APART = 3.0  # standard errors between gains that differ
 
 
 def identify(
@@ -114,10 +113,10 @@ def identify(
     True
     """
     for line in announced:
-        instance(line, LinePrior)
+        require_instance(line, LinePrior)
     known = [(line.frequency_hz, line.frequency_error_hz) for line in announced]
     if start is not None:
-        instance(start, IdentifiedModel)
+        require_instance(start, IdentifiedModel)
     options: dict[str, Any] = {
         "announced": known,
         "lowest_line_hz": lowest_line_hz,
@@ -125,7 +124,7 @@ def identify(
     }
     if isinstance(record, SpectrumRecord):
         return _identify_spectra(record, frame_rate_hz, delay_frames, options)
-    instance(record, LoopRecord)
+    require_instance(record, LoopRecord)
     if frame_rate_hz is not None and frame_rate_hz != record.frame_rate_hz:
         raise ProblemError(
             f"the record has {record.frame_rate_hz:.9g} frames a second; got frame_rate_hz="
@@ -158,7 +157,7 @@ def identify(
         )
     total, done = 2 * count, 0
 
-    def one(
+    def fit(
         i: int, gain: float | None, begin: IdentifiedAxis | None, error: float = 0.0
     ) -> IdentifiedAxis:
         nonlocal done
@@ -180,28 +179,23 @@ def identify(
 
     notes: list[str] = []
     if corrections is not None:
-        early = merge_jumps(
-            [
-                jump
-                for i in range(count)
-                for jump in find_correction_jumps(corrections[:, i], pieces)
-            ]
-        )
+        early = find_correction_jumps(corrections, pieces)
         if early:
-            notes.append(_describe_jumps(early, "commands"))
-            pieces = _cut_at_jumps(pieces, early)
-    axes = [one(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
-    broken = _find_jumps(record, axes, pieces)
-    if broken:
-        notes.append(_describe_jumps(broken, "pseudo-open loop"))
-        if len(broken) <= _MOST_JUMPS:
-            pieces = _cut_at_jumps(pieces, broken)
-            axes = [one(i, gains[i], axes[i]) for i in range(count)]
-    told = [i for i in range(count) if axes[i].sensor_gain_error is not None]
-    if count > 1 and told and all(gain is None for gain in gains):
-        axes, note = _pool_gains(axes, told, one)
+            notes.append(describe_jumps(early, "commands"))
+            pieces = cut_at_jumps(pieces, early)
+    axes = [fit(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
+    series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
+    late = find_jumps(series, axes, pieces)
+    if late:
+        notes.append(describe_jumps(late, "pseudo-open loop"))
+        if len(late) <= MOST_JUMPS:
+            pieces = cut_at_jumps(pieces, late)
+            axes = [fit(i, gains[i], axes[i]) for i in range(count)]
+    found_gain = [i for i in range(count) if axes[i].sensor_gain_error is not None]
+    if count > 1 and found_gain and all(gain is None for gain in gains):
+        axes, note = _pool_gains(axes, found_gain, fit)
         notes.append(note)
-    notes += _find_doubts(record, axes, told, pieces)
+    notes += _find_doubts(record, axes, found_gain, pieces)
     notes += [
         f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and the "
         "rest of the model suffers"
@@ -271,56 +265,17 @@ def _check_stretches(
     return out
 
 
-def _find_jumps(
-    record: LoopRecord, axes: Sequence[IdentifiedAxis], pieces: Sequence[tuple[int, int]]
-) -> list[Jump]:
-    """Return the jumps of all axes, each place once."""
-    series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
-    return merge_jumps(
-        [jump for i, axis in enumerate(axes) for jump in find_jumps(series[:, i], axis, pieces)]
-    )
-
-
-def merge_jumps(found: Sequence[Jump]) -> list[Jump]:
-    """Return jumps by rising frame, each place once."""
-    out: list[Jump] = []
-    for jump in sorted(found, key=lambda jump: jump.frame):
-        if not out or jump.frame - out[-1].frame > _SAME_JUMP:
-            out.append(jump)
-    return out
-
-
-def _cut_at_jumps(pieces: list[tuple[int, int]], broken: Sequence[Jump]) -> list[tuple[int, int]]:
-    """Cut the stretches at jumps, if there are few."""
-    return (
-        cut_around(pieces, [jump.frame for jump in broken])
-        if len(broken) <= _MOST_JUMPS
-        else pieces
-    )
-
-
-def _describe_jumps(broken: Sequence[Jump], of: str) -> str:
-    """Return what is said of jumps."""
-    first = max(broken, key=lambda jump: jump.size)
-    text = (
-        f"warning: {len(broken)} jump{'s' if len(broken) > 1 else ''} of the {of}, the largest at "
-        f"frame {first.frame} with {first.size:.0f} standard deviations"
-    )
-    if len(broken) <= _MOST_JUMPS:
-        return f"{text}; the record was cut there"
-    return f"{text}; too many to cut the record there, and the model suffers"
-
-
 def _find_doubts(
     record: LoopRecord,
     axes: Sequence[IdentifiedAxis],
-    told: Sequence[int],
+    found_gain: Sequence[int],
     pieces: Sequence[tuple[int, int]],
 ) -> list[str]:
-    """Return warnings of a delay that does not fit, and of noise that is not seen."""
+    """Return warnings of a delay that fits badly, odd sensor gains, and hidden noise."""
     out = []
-    if told and record.commands is not None:
-        other = better_delay(record, told[0], axes[told[0]], pieces)
+    if found_gain and record.commands is not None:
+        first = found_gain[0]
+        other = better_delay(record, first, axes[first], pieces)
         if other is not None:
             out.append(
                 f"warning: a delay of {other[0]:g} frames fits better than {record.delay_frames:g} "
@@ -329,7 +284,7 @@ def _find_doubts(
     out += [
         f"warning: axis {i} has a sensor gain of {axes[i].sensor_gain:.3g}: are the units, signs "
         "and axes of the commands right?"
-        for i in told
+        for i in found_gain
         if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN
     ]
     out += [
@@ -341,7 +296,7 @@ def _find_doubts(
 
 
 def _gain_per_axis(given: Any, count: int) -> list[float | None]:
-    """One gain an axis, or None."""
+    """Return the given gain of each axis, None for one to be found."""
     if given is None:
         return [None] * count
     try:
@@ -355,12 +310,12 @@ def _gain_per_axis(given: Any, count: int) -> list[float | None]:
 
 def _pool_gains(
     axes: list[IdentifiedAxis],
-    told: list[int],
-    one: Callable[[int, float | None, IdentifiedAxis | None, float], IdentifiedAxis],
+    found_gain: list[int],
+    fit: Callable[[int, float | None, IdentifiedAxis | None, float], IdentifiedAxis],
 ) -> tuple[list[IdentifiedAxis], str]:
-    """Fit the axes again with the mean of the gains, where there is one."""
-    log = np.array([np.log(axes[i].sensor_gain) for i in told])
-    error = np.array([axes[i].sensor_gain_error or 0.0 for i in told]) / np.exp(log)
+    """Fit the axes again with the mean of the gains that were found, if they agree."""
+    log = np.array([np.log(axes[i].sensor_gain) for i in found_gain])
+    error = np.array([axes[i].sensor_gain_error or 0.0 for i in found_gain]) / np.exp(log)
     weight = 1 / error**2
     mean = float(np.sum(weight * log) / np.sum(weight))
     if np.any(np.abs(log - mean) > _APART * error):
@@ -370,17 +325,10 @@ def _pool_gains(
         return axes, f"warning: the axes have different sensor gains, {values}"
     gain = float(np.exp(mean))
     spread = gain / float(np.sqrt(np.sum(weight)))
-    out = [
-        replace(
-            one(i, gain, axis, spread),
-            sensor_gain_note=(
-                "mean of the axes"
-                if len(told) == len(axes)
-                else "found in the closed loop's data"
-                if i in told
-                else "that of the other axis"
-            ),
-        )
-        for i, axis in enumerate(axes)
-    ]
+    out = []
+    for i, axis in enumerate(axes):
+        note = "found in the closed loop's data" if i in found_gain else "that of the other axis"
+        if len(found_gain) == len(axes):
+            note = "mean of the axes"
+        out.append(replace(fit(i, gain, axis, spread), sensor_gain_note=note))
     return out, "one sensor gain for all axes"

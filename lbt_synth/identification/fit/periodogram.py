@@ -12,7 +12,7 @@ at both ends, and the power divided by that of the difference, ``|1 - z^-1|^2``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,17 +28,14 @@ SHORTEST_SEGMENT = 256
 class LoopPeriodogram:
     """One-sided densities over frequency, of the measurement and of the correction in it."""
 
-    frequency_hz: FloatArray  # (f,): frequencies, increasing
-    # measured, crossed, corrected (f,): ``|Y|^2``, ``Re(Y C*)`` and ``|C|^2`` [nm^2/Hz]; zeros
-    # without corrections
-    measured: FloatArray
-    crossed: FloatArray
-    corrected: FloatArray
-    count: FloatArray  # (f,): number of independent periodograms that each value is the mean of
-    frame_rate_hz: float  # Frame rate [Hz]
-    resolution_hz: float  # Width of a frequency bin of the transform [Hz]
-    # Duration of the tapered segments [s]; None if it is not known how the density was made
-    duration_s: float | None = None
+    frequency_hz: FloatArray  # (f,), increasing
+    measured: FloatArray  # (f,): |Y|^2 [nm^2/Hz]
+    crossed: FloatArray  # (f,): Re(Y C*) [nm^2/Hz]; zeros without corrections
+    corrected: FloatArray  # (f,): |C|^2 [nm^2/Hz]; zeros without corrections
+    count: FloatArray  # (f,): independent periodograms that each value is the mean of
+    frame_rate_hz: float
+    resolution_hz: float  # width of a frequency bin of the transform
+    duration_s: float | None = None  # of the tapered segments; None for a density from elsewhere
 
     @property
     def closed(self) -> bool:
@@ -46,30 +43,28 @@ class LoopPeriodogram:
         return bool(np.any(self.corrected > 0))
 
     def power(self, gain: float) -> FloatArray:
-        """Density of ``y + gain c`` [nm^2/Hz], (f,)."""
+        """Return the density of ``y + gain c`` [nm^2/Hz], (f,)."""
         return np.asarray(self.measured + gain * (2 * self.crossed + gain * self.corrected))
 
-    def merged(self, starts: IntArray) -> LoopPeriodogram:
-        """Means over groups of neighbours that begin at these indices."""
+    def merge(self, starts: IntArray) -> LoopPeriodogram:
+        """Return the means over groups of neighbours that begin at these indices."""
         size = np.diff(np.append(starts, len(self.frequency_hz)))
 
         def mean(values: FloatArray) -> FloatArray:
             return np.asarray(np.add.reduceat(values, starts) / size)
 
-        return LoopPeriodogram(
+        return replace(
+            self,
             frequency_hz=mean(self.frequency_hz),
             measured=mean(self.measured),
             crossed=mean(self.crossed),
             corrected=mean(self.corrected),
             count=np.add.reduceat(self.count, starts),
-            frame_rate_hz=self.frame_rate_hz,
-            resolution_hz=self.resolution_hz,
-            duration_s=self.duration_s,
         )
 
 
 def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:
-    """``4 sin^2(pi f / f_s)``, the power of the difference of two frames."""
+    """Return ``4 sin^2(pi f / f_s)``, the power of the difference of two frames."""
     return np.asarray(4 * np.sin(np.pi * frequency_hz / frame_rate_hz) ** 2)
 
 
@@ -80,11 +75,10 @@ def loop_periodogram(
     frame_rate_hz: float,
     stretches: Sequence[tuple[int, int]],
 ) -> LoopPeriodogram:
-    """Periodogram of one axis over its usable stretches.
+    """Return the periodogram of one axis, series (frames,), over its usable stretches.
 
-    Segments of one length are cut from all stretches; that length leaves most of the data in use,
-    and is the whole stretch where there is one of at most 2^16 frames. Shapes: measurement,
-    correction (frames,), stretches list of (start, stop).
+    Segments of one length are cut from all stretches. That length uses most of the data, and is
+    the whole stretch where there is one of at most 2^16 frames.
     """
     from scipy.fft import next_fast_len, rfft
 
@@ -125,7 +119,7 @@ def loop_periodogram(
 
 
 def _segment_length(lengths: list[int]) -> int:
-    """Length of segment that uses most frames; of equals the longest."""
+    """Return the length of segments that uses most frames, the longest of equal ones."""
     candidates = sorted(
         {length // part for length in lengths for part in range(1, 9)} | {LONGEST_SEGMENT}
     )

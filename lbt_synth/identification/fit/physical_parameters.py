@@ -1,4 +1,4 @@
-"""A fit in the units of the phase, with standard errors."""
+"""Physical parameters of a fitted model, with standard errors."""
 
 from __future__ import annotations
 
@@ -10,35 +10,39 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedTurbulence,
     Kind,
 )
-from lbt_synth.identification.fit.order_search import Rules
+from lbt_synth.identification.fit.model_fitter import Rules
 from lbt_synth.identification.fit.parameters import FittedModel, has_corner
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whiteness import whiteness
 from lbt_synth.identification.fit.whittle import (
     CORNER,
-    FIRST,
+    DAMPING,
+    FREQUENCY,
     GAIN,
     NOISE,
+    VARIANCE,
     Likelihood,
+    component,
+    component_slice,
     damping_ratio,
     damping_slope,
 )
 from lbt_synth.models import ARModel
-from lbt_synth.models.resonance_spectrum import PARAMETERS, coefficients
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.models.resonance_spectrum import coefficients
+from lbt_synth.validation import FloatArray, frozen_copy
 
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 WIDE_DAMPING = 0.1
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 
 
-def parameter_covariance(grown: FittedModel, known: float | None = None) -> FloatArray:
-    """Inverse of the information over the parameters that moved.
+def parameter_covariance(model: FittedModel, known: float | None = None) -> FloatArray:
+    """Return the inverse of the information over the parameters that moved.
 
-    With a gain that is known with a standard error of its logarithm, what that moves is added to
-    the covariance at that gain.
+    ``known`` is the standard error of the logarithm of a given gain: its effect is added to the
+    covariance at that gain.
     """
-    information = grown.fitted.information
+    information = model.minimum.information
     moved = np.diag(information) > 0
     if known is not None:
         moved[GAIN] = False
@@ -57,10 +61,10 @@ def parameter_covariance(grown: FittedModel, known: float | None = None) -> Floa
 
 def _turbulence(theta: FloatArray, rate: float) -> ARModel:
     """Return the first component as a process of the phase."""
-    w, damping = float(np.exp(theta[FIRST])), damping_ratio(theta[FIRST + 1], first=True)
-    a1, a2, drive = coefficients(w, damping)
+    frequency, damping, variance = component(theta, 0)
+    a1, a2, drive = coefficients(float(np.exp(frequency)), damping_ratio(damping, first=True))
     polynomial = np.array([1.0, -a1, -a2])
-    size = np.exp(theta[FIRST + 2] / 2 - theta[GAIN]) * np.sqrt(drive)
+    size = np.exp(variance / 2 - theta[GAIN]) * np.sqrt(drive)
     if has_corner(theta):
         pole = np.exp(-np.exp(theta[CORNER]))
         polynomial = np.convolve(polynomial, [1.0, -pole])
@@ -71,15 +75,19 @@ def _turbulence(theta: FloatArray, rate: float) -> ARModel:
 def describe_axis(
     data: LoopPeriodogram,
     rules: Rules,
-    grown: FittedModel,
+    model: FittedModel,
     gain_error: float | None,
     note: str,
     *,
     known: float | None = None,
 ) -> IdentifiedAxis:
-    """Return the fit in the units of the phase, with standard errors."""
-    theta, rate = grown.theta, data.frame_rate_hz
-    covariance = parameter_covariance(grown, known)
+    """Return a fitted model in the units of the phase.
+
+    ``gain_error`` is the standard error of the logarithm of the gain, None where the data do not
+    tell it; ``known`` as for :func:`parameter_covariance`.
+    """
+    theta, rate = model.theta, data.frame_rate_hz
+    covariance = parameter_covariance(model, known)
     error = np.sqrt(np.maximum(np.diag(covariance), 0))
     gain = float(np.exp(theta[GAIN]))
     to_hz = rate / (2 * np.pi)
@@ -87,20 +95,19 @@ def describe_axis(
     fitted = density.sum(axis=0)
     lines: list[IdentifiedLine] = []
     background = fitted.copy()
-    for i, part in enumerate(grown.parts):
-        if i == 0:
-            continue
-        at = FIRST + PARAMETERS * i
-        frequency = float(np.exp(theta[at])) * to_hz
-        damping = damping_ratio(theta[at + 1], first=False)
-        damping_error = damping * damping_slope(damping, first=False) * float(error[at + 1])
+    for i, part in enumerate(model.parts[1:], start=1):
+        log_frequency, odds, log_variance = component(theta, i)
+        log_error = component(error, i)
+        frequency = float(np.exp(log_frequency)) * to_hz
+        damping = damping_ratio(odds, first=False)
+        damping_error = damping * damping_slope(damping, first=False) * float(log_error[DAMPING])
         finest = 0.0 if data.duration_s is None else UNRESOLVED / data.duration_s / frequency
         resolved = damping >= finest
         if not resolved:
             damping = damping_error = finest
-        rms = float(np.exp(theta[at + 2] / 2 - theta[GAIN]))
+        rms = float(np.exp(log_variance / 2 - theta[GAIN]))
         along = np.zeros(theta.size)
-        along[at + 2], along[GAIN] = 0.5, -1.0
+        component(along, i)[VARIANCE], along[GAIN] = 0.5, -1.0
         own = float(np.interp(frequency, data.frequency_hz, density[1 + i]))
         rest = float(np.interp(frequency, data.frequency_hz, fitted)) - own
         narrow = damping < WIDE_DAMPING and own > rest
@@ -113,14 +120,14 @@ def describe_axis(
             IdentifiedLine(
                 kind=kind,
                 frequency_hz=frequency,
-                frequency_error_hz=frequency * float(error[at]),
+                frequency_error_hz=frequency * float(log_error[FREQUENCY]),
                 damping=damping,
                 damping_error=damping_error,
                 resolved=resolved,
                 rms_nm=rms,
                 rms_error_nm=rms * float(np.sqrt(along @ covariance @ along)),
                 prominence=own / rest if rest > 0 else float("inf"),
-                evidence=grown.evidence[i],
+                evidence=model.evidence[i],
                 announced=part.frequency is not None,
             )
         )
@@ -137,35 +144,36 @@ def describe_axis(
         sensor_gain_note=note,
         whiteness=whiteness(data, data.power(gain), fitted),
         frequency_hz=data.frequency_hz,
-        density_nm2_hz=frozen(data.power(gain) / gain**2),
-        fitted_nm2_hz=frozen(fitted / gain**2),
-        background_nm2_hz=frozen(background / gain**2),
+        density_nm2_hz=frozen_copy(data.power(gain) / gain**2),
+        fitted_nm2_hz=frozen_copy(fitted / gain**2),
+        background_nm2_hz=frozen_copy(background / gain**2),
         frame_rate_hz=rate,
         resolution_hz=data.resolution_hz,
-        fitted_model=grown,
+        fitted_model=model,
         data=data,
     )
 
 
 def _turbulence_fit(theta: FloatArray, covariance: FloatArray, rate: float) -> IdentifiedTurbulence:
-    """Parameters of the turbulence; the error of its rms by differences."""
+    """Return the parameters of the turbulence; the error of its rms is by differences."""
     error = np.sqrt(np.maximum(np.diag(covariance), 0))
     slope = np.zeros(theta.size)
-    for i in (GAIN, CORNER, FIRST, FIRST + 1, FIRST + 2):
+    for i in (GAIN, CORNER, *range(theta.size)[component_slice(0)]):
         step = np.zeros(theta.size)
         step[i] = 1e-4
         up, down = (np.log(_turbulence(theta + s * step, rate).rms_nm) for s in (1, -1))
         slope[i] = (up - down) / 2e-4
     rms = _turbulence(theta, rate).rms_nm
     to_hz = rate / (2 * np.pi)
-    frequency = float(np.exp(theta[FIRST])) * to_hz
-    damping = damping_ratio(theta[FIRST + 1], first=True)
+    log_error = component(error, 0)
+    frequency = float(np.exp(component(theta, 0)[FREQUENCY])) * to_hz
+    damping = damping_ratio(component(theta, 0)[DAMPING], first=True)
     corner = float(np.exp(theta[CORNER])) * to_hz if has_corner(theta) else None
     return IdentifiedTurbulence(
         frequency_hz=frequency,
-        frequency_error_hz=frequency * float(error[FIRST]),
+        frequency_error_hz=frequency * float(log_error[FREQUENCY]),
         damping=damping,
-        damping_error=damping * damping_slope(damping, first=True) * float(error[FIRST + 1]),
+        damping_error=damping * damping_slope(damping, first=True) * float(log_error[DAMPING]),
         corner_hz=corner,
         corner_error_hz=None if corner is None else corner * float(error[CORNER]),
         rms_nm=rms,

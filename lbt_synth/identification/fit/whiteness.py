@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
 LAGS = 100
 _LOWEST = 3  # bins, in which the ends of the taper show
@@ -78,9 +78,9 @@ def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Wh
     return Whiteness(
         deviation=deviation,
         p_value=float(kolmogorov(deviation * np.sqrt(effective))),
-        autocorrelation=frozen(correlation),
+        autocorrelation=frozen_copy(correlation),
         correlation_p_value=p_value,
         frequency_hz=data.frequency_hz,
-        cumulative=frozen(cumulative),
+        cumulative=frozen_copy(cumulative),
         effective=effective,
     )

@@ -26,8 +26,9 @@ from lbt_synth.identification.fit.taper import FAR, WIDE, log_smearing
 from lbt_synth.models.resonance_spectrum import PARAMETERS, log_density, log_roll_off
 from lbt_synth.validation import BoolArray, FloatArray
 
-GAIN, NOISE, CORNER, FIRST = 0, 1, 2, 3  # places in the vector of parameters
-LEAST = 0.05  # damping ratio of turbulence: what is narrower is a line
+GAIN, NOISE, CORNER, _FIRST = 0, 1, 2, 3  # places in the vector of parameters
+FREQUENCY, DAMPING, VARIANCE = 0, 1, 2  # places among the parameters of a component
+_LEAST = 0.05  # damping ratio of turbulence: what is narrower is a line
 _JUST_ABOVE = 1e-3
 _DIFFERENCE = 1e-4  # of a logarithm
 _FARTHEST = 60.0  # of a logarithm: exp stays finite
@@ -37,9 +38,8 @@ _FARTHEST = 60.0  # of a logarithm: exp stays finite
 class Priors:
     """Normal priors on the logarithms of the parameters; an infinite width is none."""
 
-    # centre, width (p,): mean and standard deviation
-    centre: FloatArray
-    width: FloatArray
+    centre: FloatArray  # (p,): means
+    width: FloatArray  # (p,): standard deviations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,40 +47,43 @@ class Minimum:
     """A minimum of the likelihood."""
 
     # (p,): logarithms of sensor gain, noise variance, corner of the first component's roll-off, and
-    # (frequency, damping, variance) of each component; frequencies as angles a frame. The damping
+    # (frequency, damping, variance) of each component; frequencies as angles per frame. The damping
     # of the first, the turbulence, is above 0.05: its parameter is ``log(zeta - 0.05)``; that of
     # all others is below 1: ``log(zeta / (1 - zeta))``.
     parameters: FloatArray
     contrast: float  # L without the priors
-    information: FloatArray  # (p, p): second derivatives of L, expected where the model's are
-    left: float  # What another step would still gain of L
+    information: FloatArray  # (p, p): second derivatives of L, expected ones for the model
+
+
+def component_slice(i: int) -> slice:
+    """Return where the frequency, damping and variance of a component stand."""
+    return slice(_FIRST + PARAMETERS * i, _FIRST + PARAMETERS * (i + 1))
+
+
+def component(values: FloatArray, i: int) -> FloatArray:
+    """Return a view of what belongs to a component, of parameters or rows by parameter."""
+    return values[component_slice(i)]
 
 
 def damping_ratio(parameter: float, *, first: bool) -> float:
-    """Damping ratio of a component from its parameter."""
-    return float(LEAST + np.exp(parameter)) if first else float(1 / (1 + np.exp(-parameter)))
+    """Return the damping ratio of a component from its parameter."""
+    return float(_LEAST + np.exp(parameter)) if first else float(1 / (1 + np.exp(-parameter)))
 
 
 def damping_slope(ratio: float, *, first: bool) -> float:
     """Return the derivative of the logarithm of a damping ratio by its parameter."""
-    return 1 - LEAST / ratio if first else 1 - ratio
+    return 1 - _LEAST / ratio if first else 1 - ratio
 
 
 def damping_parameter(ratio: float, *, first: bool) -> float:
-    """Parameter of a component from its damping ratio."""
+    """Return the parameter of a damping ratio."""
     if first:
-        return float(np.log(max(ratio - LEAST, _JUST_ABOVE)))
+        return float(np.log(max(ratio - _LEAST, _JUST_ABOVE)))
     return float(np.log(ratio / (1 - ratio)))
 
 
 class Likelihood:
-    """Value, gradient and information of L for one periodogram.
-
-    Parameters
-    ----------
-    data : LoopPeriodogram
-        The periodogram.
-    """
+    """Value, gradient and information of L for one periodogram."""
 
     def __init__(self, data: LoopPeriodogram) -> None:
         self.data = data
@@ -88,18 +91,18 @@ class Likelihood:
         self._white = 2 / data.frame_rate_hz
 
     def parts(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Density of the white noise and of each component, (1 + c, f), with log derivatives.
+        """Return the densities of noise and components, (1 + c, f), with log derivatives.
 
-        Those of component i by frequency and damping are slopes[i]; the last slope is that of
-        the first component by its corner.
+        The derivatives by frequency and damping are (c, 2, f), those of the first component by
+        its corner (f,).
         """
-        count = (theta.size - FIRST) // PARAMETERS
+        count = (theta.size - _FIRST) // PARAMETERS
         density = np.empty((1 + count, self._s.size))
         slopes = np.empty((count, 2, self._s.size))
         fall, by_corner = log_roll_off(float(np.exp(theta[CORNER])), self._s)
         density[0] = self._white * np.exp(theta[NOISE])
         for i in range(count):
-            f, damping, variance = theta[FIRST + PARAMETERS * i : FIRST + PARAMETERS * (i + 1)]
+            f, damping, variance = component(theta, i)
             ratio = damping_ratio(damping, first=i == 0)
             value, slopes[i, 0], slopes[i, 1] = log_density(np.exp(f), ratio, self._s)
             if i == 0:
@@ -128,17 +131,17 @@ class Likelihood:
         slopes[1, start:stop] += by_width
 
     def model(self, theta: FloatArray) -> FloatArray:
-        """Density of the whole spectrum, (f,)."""
+        """Return the density of the whole spectrum, (f,)."""
         return np.asarray(self.parts(theta)[0].sum(axis=0))
 
     def contrast(self, theta: FloatArray) -> float:
-        """L without the priors."""
+        """Return L without the priors."""
         model = self.model(theta)
         power = self.data.power(float(np.exp(theta[GAIN])))
         return float(np.sum(self.data.count * (np.log(model) + power / model)))
 
     def derivatives(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """L without the priors, its gradient and its information matrix."""
+        """Return L without the priors, its gradient and its information matrix."""
         data, count = self.data, self.data.count
         gain = float(np.exp(theta[GAIN]))
         density, slopes, by_corner = self.parts(theta)
@@ -150,10 +153,10 @@ class Likelihood:
         log_slopes[NOISE] = density[0] / model
         log_slopes[CORNER] = by_corner * density[1] / model
         for i in range(len(slopes)):
-            at = FIRST + PARAMETERS * i
             share = density[1 + i] / model
-            np.multiply(slopes[i], share, out=log_slopes[at : at + 2])
-            log_slopes[at + 2] = share
+            rows = component(log_slopes, i)
+            np.multiply(slopes[i], share, out=rows[:VARIANCE])
+            rows[VARIANCE] = share
         weighted = log_slopes * count
         gradient = weighted @ (1 - ratio)
         information = weighted @ log_slopes.T
@@ -175,10 +178,7 @@ def minimise(
     free: BoolArray,
     steps: int = 40,
 ) -> Minimum:
-    """Minimise L from a start, by scoring steps within a trust region.
-
-    Shapes: start (p,), free (p,).
-    """
+    """Minimise L from a start (p,) over the free parameters, by scoring in a trust region."""
     from scipy.optimize import minimize
 
     moves = np.flatnonzero(np.asarray(free))
@@ -225,23 +225,18 @@ def minimise(
         )
     information = np.zeros((start.size, start.size))
     information[np.ix_(moves, moves)] = reduced
-    return Minimum(
-        parameters=theta,
-        contrast=likelihood.contrast(theta),
-        information=information,
-        left=left,
-    )
+    return Minimum(parameters=theta, contrast=likelihood.contrast(theta), information=information)
 
 
 def add_observed_information(
-    likelihood: Likelihood, fitted: Minimum, priors: Priors, *, free: BoolArray
+    likelihood: Likelihood, minimum: Minimum, priors: Priors, *, free: BoolArray
 ) -> Minimum:
     """Return a minimum with the exact second derivatives of L, by differences of its gradient.
 
     Where they are not positive definite, the expected ones stay.
     """
     moves = np.flatnonzero(np.asarray(free))
-    theta = fitted.parameters
+    theta = minimum.parameters
     exact = np.zeros((theta.size, theta.size))
     for i in moves:
         step = np.zeros(theta.size)
@@ -251,7 +246,7 @@ def add_observed_information(
     exact = (exact + exact.T) / 2 + np.diag(1 / np.asarray(priors.width) ** 2)
     block = exact[np.ix_(moves, moves)]
     if np.any(np.diag(block) <= 0) or np.min(np.linalg.eigvalsh(block)) <= 0:
-        return fitted
+        return minimum
     exact = np.zeros_like(exact)
     exact[np.ix_(moves, moves)] = block
-    return replace(fitted, information=exact)
+    return replace(minimum, information=exact)

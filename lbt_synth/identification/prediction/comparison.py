@@ -33,7 +33,7 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.validation import FloatArray, frozen, instance, integer
+from lbt_synth.validation import FloatArray, frozen_copy, integer, require_instance
 
 RAN, INTEGRATOR, PREDICTOR, LIMIT = (
     "what ran",
@@ -125,9 +125,9 @@ def prediction_against_data(
     >>> bool(abs(table["Kalman"].deviations) < 4)
     True
     """
-    instance(plant, TipTiltPlant)
+    require_instance(plant, TipTiltPlant)
     if imaging is not None:
-        instance(imaging, Imaging)
+        require_instance(imaging, Imaging)
     hardware = plant.hardware
     n = hardware.modes
     series, usable = check_series(open_loop, n, stretches)
@@ -223,7 +223,7 @@ def _split_frames(
 def _as_controller(thing: Controller | Design) -> Controller:
     if isinstance(thing, Design):
         return thing.controller
-    instance(thing, Controller)
+    require_instance(thing, Controller)
     return thing
 
 
@@ -272,7 +272,7 @@ def _build_row(
     return PredictionRow(
         name=name,
         replayed=found,
-        model_nm2=None if promised is None else frozen(promised),
+        model_nm2=None if promised is None else frozen_copy(promised),
         strehl=strehl,
         model_strehl=promised_strehl,
     )

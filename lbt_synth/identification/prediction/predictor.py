@@ -21,7 +21,7 @@ from lbt_synth.identification.prediction.residual import check_series, inverse_s
 from lbt_synth.linear import Controller
 from lbt_synth.loop import youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, frozen, instance, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
 
 _MOST_TAPS = 1000
 _ROWS_A_TAP = 4  # frames to fit for each coefficient, at least
@@ -106,7 +106,7 @@ def least_squares_predictor(
     >>> bool(abs(fit.coefficients[0, 0, 0] - 0.81) < 0.02)
     True
     """
-    instance(hardware, LoopHardware)
+    require_instance(hardware, LoopHardware)
     count = integer(taps, "taps", at_least=1)
     if count > _MOST_TAPS:
         raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {count}.")
@@ -136,8 +136,8 @@ def least_squares_predictor(
         found, fitted[i] = _solve_least_squares(X[:, seen].reshape(len(X), -1), Z[:, i], share)
         coefficients[i, seen] = found.reshape(-1, count)
     return LeastSquaresPredictor(
-        coefficients=frozen(coefficients),
-        fitted_nm2=frozen(fitted),
+        coefficients=frozen_copy(coefficients),
+        fitted_nm2=frozen_copy(fitted),
         frames=len(X),
         controller=_build_controller(hardware, coefficients, back, gain),
     )

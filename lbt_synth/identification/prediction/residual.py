@@ -18,7 +18,14 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, close_loop, filter_series
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, float_array, instance, integer, number, real_array
+from lbt_synth.validation import (
+    FloatArray,
+    float_array,
+    integer,
+    number,
+    real_array,
+    require_instance,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,7 +108,7 @@ def replayed_residual(
     >>> bool(abs(would.rms_nm - exact.rms_nm) < 3 * would.rms_error_nm)
     True
     """
-    instance(hardware, LoopHardware)
+    require_instance(hardware, LoopHardware)
     deviation = _per_measurement(noise_nm, "noise_nm", hardware.n_measurements)
     data = prediction_data(
         open_loop,
@@ -135,7 +142,7 @@ def prediction_data(
     standard deviations are independent, and leave its correlations as they are: an error of one
     measurement is common to all modes that it is seen in.
     """
-    instance(hardware, LoopHardware)
+    require_instance(hardware, LoopHardware)
     gain = number(sensor_gain, "sensor_gain", above=0)
     series, parts = check_series(open_loop, hardware.modes, stretches)
     back = inverse_sensor(hardware) / gain

@@ -16,7 +16,7 @@ from scipy.fft import rfft
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.prediction.stretches import Stretches
 from lbt_synth.loop import Imaging, jitter_strehl
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
 _FEWEST = 100  # frames of which a mean square is worth a standard error
 _TOO_FAR = 4.0  # standard errors below zero that are no chance
@@ -53,12 +53,12 @@ class ResidualEstimate:
     @property
     def variance_nm2(self) -> FloatArray:
         """Residual variance of each axis, (n,) [nm^2]; may be negative within its error."""
-        return frozen(np.diag(self.covariance_nm2))
+        return frozen_copy(np.diag(self.covariance_nm2))
 
     @property
     def variance_error_nm2(self) -> FloatArray:
         """Standard error of each axis' variance, (n,) [nm^2]."""
-        return frozen(np.sqrt(np.diag(self.error_nm4)))
+        return frozen_copy(np.sqrt(np.diag(self.error_nm4)))
 
     @property
     def total_nm2(self) -> float:
@@ -73,13 +73,13 @@ class ResidualEstimate:
     @property
     def axis_rms_nm(self) -> FloatArray:
         """Residual of each axis, (n,) [nm rms]; nan where the variance is negative."""
-        return frozen(_roots(self.variance_nm2))
+        return frozen_copy(_roots(self.variance_nm2))
 
     @property
     def axis_rms_error_nm(self) -> FloatArray:
         """Standard error of each axis' rms, (n,) [nm]; nan where the variance is negative."""
         with np.errstate(divide="ignore"):
-            return frozen(self.variance_error_nm2 / (2 * self.axis_rms_nm))
+            return frozen_copy(self.variance_error_nm2 / (2 * self.axis_rms_nm))
 
     @property
     def rms_nm(self) -> float:
@@ -184,11 +184,11 @@ def estimate_residual(
         )
     error = _mean_covariance(measured, measured, stretches) + noise_error_nm4
     return ResidualEstimate(
-        measured_nm=frozen(measured),
+        measured_nm=frozen_copy(measured),
         stretches=stretches,
-        noise_nm2=frozen(noise_nm2),
-        covariance_nm2=frozen(measured.T @ measured / len(measured) - noise_nm2),
-        error_nm4=frozen(error),
+        noise_nm2=frozen_copy(noise_nm2),
+        covariance_nm2=frozen_copy(measured.T @ measured / len(measured) - noise_nm2),
+        error_nm4=frozen_copy(error),
     )
 
 

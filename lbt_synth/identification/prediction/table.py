@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.prediction.residual_estimate import ResidualEstimate
 from lbt_synth.identification.prediction.stretches import Stretches
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
 _AXES = ("tip", "tilt")
 
@@ -46,7 +46,7 @@ class PredictionRow:
     @property
     def model_axis_nm(self) -> FloatArray | None:
         """The same of each axis, (n,) [nm rms]."""
-        return None if self.model_nm2 is None else frozen(np.sqrt(np.diag(self.model_nm2)))
+        return None if self.model_nm2 is None else frozen_copy(np.sqrt(np.diag(self.model_nm2)))
 
     @property
     def replayed_nm(self) -> float:

@@ -34,7 +34,7 @@ class Clock:
     notes: tuple[str, ...] = field(default=())  # What was found
 
 
-def clock_of(
+def build_clock(
     rows: int,
     *,
     frame_rate_hz: float | None,

@@ -23,7 +23,7 @@ from lbt_synth.identification.records.columns import (
     recognise_fact,
 )
 from lbt_synth.identification.records.csv_file import read_csv
-from lbt_synth.storage.array_file import reason
+from lbt_synth.storage.array_file import error_reason
 from lbt_synth.validation import FloatArray
 
 FITS = (".fits", ".fit", ".fts")
@@ -92,7 +92,7 @@ def read_contents(path: Path, content: bytes) -> Contents:
         raise TelemetryError(f"{path}: {error}", path=path) from error
     except Exception as error:  # foreign bytes: the decoders raise whatever they like
         raise TelemetryError(
-            f"cannot read {path} as {ending}: {reason(error)}.", path=path
+            f"cannot read {path} as {ending}: {error_reason(error)}.", path=path
         ) from error
     return out
 

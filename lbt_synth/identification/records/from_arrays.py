@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.records.clock import clock_of, first_per_frame
+from lbt_synth.identification.records.clock import build_clock, first_per_frame
 from lbt_synth.identification.records.faults import (
     equal_runs,
     fill,
@@ -123,7 +123,7 @@ def loop_record(
         u = _series_in_nm(commands, "commands", command_scale)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
-    clock = clock_of(
+    clock = build_clock(
         len(y), frame_rate_hz=frame_rate_hz, times_s=times_s, frame_numbers=frame_numbers
     )
 

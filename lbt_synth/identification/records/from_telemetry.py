@@ -13,7 +13,7 @@ from lbt_synth.identification.records.from_arrays import loop_record
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.units import unit_name
 from lbt_synth.models import PositionLoop
-from lbt_synth.validation import FloatArray, instance, integer, number, sequence
+from lbt_synth.validation import FloatArray, integer, number, require_instance, sequence
 
 _FOREIGN = "timing"  # metadatum of telemetry of another program
 _CONDITION = 1e8
@@ -87,7 +87,7 @@ def record_from_telemetry(
     >>> bool(abs(error).max() < 1e-9)
     True
     """
-    instance(telemetry, Telemetry)
+    require_instance(telemetry, Telemetry)
     notes: list[str] = []
     if frame_rate_hz is not None:
         rate, own = number(frame_rate_hz, "frame_rate_hz", above=0), telemetry.frame_rate_hz

@@ -15,7 +15,7 @@ from lbt_synth.identification.records.columns import parse_column
 from lbt_synth.identification.records.contents import read_contents
 from lbt_synth.identification.records.csv_file import read_csv
 from lbt_synth.identification.records.units import hz_per
-from lbt_synth.validation import BoolArray, FloatArray, frozen, integer, number, real_array
+from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, integer, number, real_array
 
 _FEWEST_AVERAGES = 8
 _AVERAGES = 32  # that a segment is chosen for
@@ -193,7 +193,7 @@ def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
             f"{len(found)} of {sorted({values.size for values in found})} rows.",
             path=source,
         )
-    return frozen(np.stack(found, axis=1))
+    return frozen_copy(np.stack(found, axis=1))
 
 
 def accelerometer_lines(

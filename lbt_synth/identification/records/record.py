@@ -12,7 +12,7 @@ from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.health import Finding, RecordHealth, merge_notes
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
-from lbt_synth.validation import BoolArray, FloatArray, instance, integer, matrix, number
+from lbt_synth.validation import BoolArray, FloatArray, integer, matrix, number, require_instance
 
 _MOST_AXES = 2
 _BRIDGED_FRAMES = 3
@@ -92,7 +92,7 @@ class LoopRecord:
     commanded: BoolArray | None = None
 
     def __post_init__(self) -> None:
-        instance(self.health, RecordHealth)
+        require_instance(self.health, RecordHealth)
         y = matrix(self.measurements, "measurements")
         if not 1 <= y.shape[1] <= _MOST_AXES or len(y) == 0:
             raise DimensionError(
@@ -106,7 +106,7 @@ class LoopRecord:
         self._set("frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0))
         self._check_numbers()
         if self.mirror is not None:
-            instance(self.mirror, PositionLoop)
+            require_instance(self.mirror, PositionLoop)
         for name in ("usable", "measured", "commanded"):
             if (flags := getattr(self, name)) is not None:
                 self._set(name, _check_flags(flags, name, len(y)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import TabulatedSpectrum
-from lbt_synth.validation import FloatArray, frozen, integer, matrix, number, real_array
+from lbt_synth.validation import FloatArray, frozen_copy, integer, matrix, number, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,7 +94,7 @@ class SpectrumRecord:
     def rms_nm(self) -> FloatArray:
         """Root of the integral over the frequencies that are there, (axes,) [nm]."""
         middles = (self.density_nm2_hz[1:] + self.density_nm2_hz[:-1]) / 2
-        return frozen(np.sqrt(np.diff(self.frequency_hz) @ middles))
+        return frozen_copy(np.sqrt(np.diff(self.frequency_hz) @ middles))
 
     @property
     def spectra(self) -> tuple[TabulatedSpectrum, ...]:

@@ -8,7 +8,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.tracking.line_fit import LineFit, Search
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.plant.tip_tilt import require_no_memory, with_vibrations
-from lbt_synth.validation import FloatArray, instance, number
+from lbt_synth.validation import FloatArray, number, require_instance
 
 _LEAST_BINS = 8
 _ALIGNED = 0.9  # cosine between directions along which lines may be mistaken
@@ -55,7 +55,7 @@ class LineFollower:
     """
 
     def __init__(self, plant: TipTiltPlant, *, span_hz: float = 4.0) -> None:
-        instance(plant, TipTiltPlant)
+        require_instance(plant, TipTiltPlant)
         require_no_memory(plant)
         if not plant.vibrations:
             raise ProblemError("there must be a vibration to follow; got a plant without any.")
@@ -115,7 +115,7 @@ class LineFollower:
             if frequencies is None:
                 return None
             for i, frequency in zip(group, frequencies, strict=True):
-                found[i] = self._lines[i].moved(frequency)
+                found[i] = self._lines[i].at_frequency(frequency)
         self._lines = found
         return with_vibrations(self._plant, found)
 

@@ -11,7 +11,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.axis import identify_axis
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.validation import FloatArray, instance, integer
+from lbt_synth.validation import FloatArray, integer, require_instance
 
 
 class LoopIdentifier:
@@ -55,7 +55,7 @@ class LoopIdentifier:
     """
 
     def __init__(self, plant: TipTiltPlant, *, find_gain: bool = True, most_lines: int = 2) -> None:
-        instance(plant, TipTiltPlant)
+        require_instance(plant, TipTiltPlant)
         sensor = plant.hardware.sensor
         gains = np.diag(sensor)
         if not np.array_equal(sensor, np.diag(gains)) or np.any(gains <= 0):

@@ -17,7 +17,7 @@ from lbt_synth.identification.tracking.switching import SwitchedController, requ
 from lbt_synth.identification.tracking.trend import LineTrack, match_tracks
 from lbt_synth.models import LoopHardware, TipTiltPlant, Vibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
-from lbt_synth.validation import FloatArray, instance, number
+from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_SPOILT = 0.01  # of a window; fillers stand in for the measurements
 _LEAST_FRAMES = 16
@@ -154,7 +154,7 @@ class TrackingController:
         trend_s: float | None = None,
         design: Callable[[TipTiltPlant], FilterDesign] = kalman,
     ) -> None:
-        instance(plant, TipTiltPlant)
+        require_instance(plant, TipTiltPlant)
         if identifier is None:
             identifier = LoopIdentifier(plant)
         if not callable(identifier):
@@ -348,4 +348,4 @@ def _move_line(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vi
     lowest = line.damping * line.frequency_hz
     if line.damping > _NARROW:
         return line
-    return line.moved(frequency_hz) if lowest < frequency_hz < frame_rate_hz / 2 else line
+    return line.at_frequency(frequency_hz) if lowest < frequency_hz < frame_rate_hz / 2 else line
