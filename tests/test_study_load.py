@@ -118,7 +118,7 @@ def test_a_sample_is_a_configuration(tmp_path):
         "error.delay_frames: {uniform: [0, 0.5]}, error.noise_factor: {uniform: [1, 2]}}",
     )
     for values in study.values(0, 4):
-        named = study.named(values)
+        named = study.parameters_by_name(values)
         sample = make_sample(study, values)
         settings = sample.config.settings
         assert settings.atmosphere.seeing_arcsec == named["atmosphere.seeing_arcsec"]

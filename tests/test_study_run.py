@@ -148,7 +148,7 @@ def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
 def sizes_of(batches, seconds):
     out = []
     while batches.left:
-        start, stop = batches.next()
+        start, stop = batches.take()
         out.append((start, stop))
         batches.learn(stop - start, seconds(stop - start))
     assert all(start < stop for start, stop in out)
@@ -188,9 +188,9 @@ def test_slow_rows_come_one_by_one():
     long = BatchQueue([(0, 10**8)], 2)
     for rows in (100, 1000):
         long.learn(rows, 1e-3 * rows)
-    assert long.next() == (0, 4000)  # at most four times what was measured
+    assert long.take() == (0, 4000)  # at most four times what was measured
     long.learn(65_536, 65.536)
-    assert long.next()[1] - 4000 > 24_000  # a file every 25 s rather than a million files
+    assert long.take()[1] - 4000 > 24_000  # a file every 25 s rather than a million files
 
 
 def test_missing_rows(tmp_path):
@@ -519,7 +519,7 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
     real = lbt.load_config(folder / "row_2.yaml")
     assert real.hardware.delay_frames == 2 + again.parameters["error.delay_frames"]
     text = (folder / "row_2.yaml").read_text()
-    assert "designs were told 2 (error.delay_frames)" in text
+    assert "designs assume 2 (error.delay_frames)" in text
     assert "(error.noise_factor)" in text
     for name, path in (("a", folder / "a.fits"), ("told", folder / "row_2_told.fits")):
         design = lbt.load_gain(path)

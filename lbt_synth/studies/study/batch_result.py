@@ -1,4 +1,4 @@
-"""What comes of a batch of samples."""
+"""Results and failures of a batch of samples."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lbt_synth.validation import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """A controller of a sample that has no result.
+    """A controller without a result on a sample.
 
     Attributes
     ----------
@@ -21,8 +21,8 @@ class Failure:
     error : str
         What went wrong.
     retry : bool
-        Whether it is tried again when the study is started again: its process ended without
-        a word, which need not be the sample's doing.
+        Whether it is tried again when the study is started again: its process died, which need
+        not be the sample's fault.
     """
 
     row: int
@@ -33,16 +33,16 @@ class Failure:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BatchResult:
-    """Results of samples that follow each other.
+    """Results of consecutive samples.
 
     Attributes
     ----------
     start : int
-        Row of the first.
+        Row of the first sample.
     columns : mapping of str to (b,) ndarray
         Results by the names of their columns, ``Study.result_columns``; nan where there is none.
     failures : tuple of Failure
-        Those that failed, in the order of their rows.
+        In the order of their rows.
     """
 
     start: int

@@ -1,4 +1,4 @@
-"""Batches on any executor: a bounded number of them at once, and what to do when one dies."""
+"""Run the batches of a study on any executor, and recover when a process dies."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
 Evaluate = Callable[[Study, FloatArray, int], BatchResult]
-TimedBatch = tuple[BatchResult, float]  # and the seconds that it took
+TimedBatch = tuple[BatchResult, float]  # with its seconds
 
 DIED = "its process ended without a word: killed, or for want of memory"
-_MOST_DEATHS = 40  # one after the other, without a batch that comes back
-_SPARE = 2  # batches in flight for each worker, so that none waits
+_MOST_DEATHS = 40  # in a row, without a batch that comes back
+_IN_FLIGHT = 2  # batches per worker, so that none waits
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class _Task:
 
 
 class _InlineExecutor(Executor):
-    """Runs what it is given in this process, at once."""
+    """Executor that runs each call at once in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -55,7 +55,7 @@ class _InlineExecutor(Executor):
 
 
 class _Workers:
-    """Where batches run: an executor, and how to replace it when it breaks."""
+    """An executor, and how to replace it when it breaks."""
 
     def __init__(self, executor: Executor, pool: WorkerPool | None, jobs: int) -> None:
         self.executor = executor
@@ -63,7 +63,7 @@ class _Workers:
         self._jobs = jobs
 
     def renew(self, error: BaseException) -> None:
-        """Start anew after processes died."""
+        """Start new processes after some died."""
         if self._pool is None:
             raise NumericalError(
                 f"the executor broke: {error or type(error).__name__}. What is finished is kept: "
@@ -75,11 +75,10 @@ class _Workers:
 
     def end(self, *, at_once: bool) -> None:
         """End the processes, if they are ours."""
-        if self._pool is not None:
-            if at_once:
-                self._pool.kill()
-            else:
-                self._pool.close()
+        if self._pool is not None and at_once:
+            self._pool.kill()
+        elif self._pool is not None:
+            self._pool.close()
 
 
 @contextmanager
@@ -99,7 +98,7 @@ def _open_workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
 
 
 def evaluate_timed(evaluate: Evaluate, study: Study, values: FloatArray, start: int) -> TimedBatch:
-    """Evaluate a batch, and time it; this is what a worker runs."""
+    """Evaluate a batch and time it, in the worker."""
     before = time.perf_counter()
     batch = evaluate(study, values, start)
     return batch, time.perf_counter() - before
@@ -114,14 +113,14 @@ def run_batches(
     executor: Executor | None = None,
     workers: int | None = None,
 ) -> Generator[TimedBatch, None, None]:
-    """Yield the results of all rows of some ranges, in the order in which they come.
+    """Yield the results of all rows of some ranges, in the order in which they arrive.
 
-    Where a process dies, what was in flight is run again, each batch alone; one that kills its
-    process again is halved, down to single rows, which fail. Shapes: ranges list of (int, int).
+    When a process dies, all batches in flight run again, each alone. One that kills its process
+    again is halved, down to single rows, which fail.
     """
     count = workers or jobs
     batches = BatchQueue(ranges, count)
-    most = 1 if executor is None and jobs == 1 else _SPARE * count
+    most = 1 if executor is None and jobs == 1 else _IN_FLIGHT * count
     running: dict[Future[TimedBatch], _Task] = {}
     suspects: deque[RowRange] = deque()
     deaths = 0
@@ -133,7 +132,7 @@ def run_batches(
                     while (batches.left and not suspects and len(running) < most) or (
                         suspects and not running
                     ):
-                        rows = suspects[0] if suspects else batches.next()
+                        rows = suspects[0] if suspects else batches.take()
                         task = _Task(rows=rows, alone=bool(suspects))
                         values = study.values(*rows)
                         try:
@@ -142,7 +141,7 @@ def run_batches(
                             )
                         except BrokenExecutor:
                             if not suspects:
-                                suspects.append(rows)  # it was given out, and did not run
+                                suspects.append(rows)  # taken from the queue, but not run
                             raise
                         if suspects:
                             suspects.popleft()
@@ -201,34 +200,33 @@ def _future_error(future: Future[TimedBatch]) -> BaseException | None:
 
 
 def _error_to_raise(error: BaseException, rows: RowRange) -> BaseException:
-    """Return what to raise for an error of a batch that is none of a sample."""
+    """Return the error to raise where a batch as a whole failed."""
     if isinstance(error, LbtSynthError | MemoryError):
         return error
     if isinstance(error, CancelledError):
-        told = NumericalError(
+        raised = NumericalError(
             "the executor cancelled what was running: its scheduler is gone, perhaps. What is "
             "finished is kept: start again."
         )
     else:
         text = f"{type(error).__name__}: {error}".rstrip(".")
-        told = NumericalError(
+        raised = NumericalError(
             f"rows {rows[0]} to {rows[1] - 1} could not be computed ({text}). What is finished is "
             "kept. Every process needs the same lbt_synth as this one."
         )
-    told.__cause__ = error
-    return told
+    raised.__cause__ = error
+    return raised
 
 
 def _require_whole(batch: BatchResult, rows: RowRange, study: Study) -> None:
-    """Refuse what a worker returned if it is not what was asked for."""
+    """Refuse a batch that has not the requested rows and columns."""
     size = rows[1] - rows[0]
-    right = (
+    if not (
         isinstance(batch, BatchResult)
         and batch.start == rows[0]
         and tuple(batch.columns) == study.result_columns
         and all(np.shape(column) == (size,) for column in batch.columns.values())
-    )
-    if not right:
+    ):
         raise NumericalError(
             f"the evaluation must return a BatchResult of rows {rows[0]} to {rows[1] - 1} with the "
             "columns of the study, in their order; got something else."
@@ -236,7 +234,7 @@ def _require_whole(batch: BatchResult, rows: RowRange, study: Study) -> None:
 
 
 def _failed_row(study: Study, row: int) -> BatchResult:
-    """Return what is left of a row that ends its process."""
+    """Return the batch of a row that ends its process."""
     return BatchResult(
         start=row,
         columns={name: np.full(1, np.nan) for name in study.result_columns},

@@ -1,4 +1,4 @@
-"""What a study will cost, from a batch of it that is measured."""
+"""Estimate the time and disk space of a study from a measured batch."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Estimate:
     measured_s : float
         Time that it took in one process [s].
     seconds : float
-        Time of the whole study on the processes asked for [s].
+        Time of the whole study on the requested processes [s].
     disk_bytes : int
-        Largest size of its directory, when results and parts are both there.
+        Largest size of its directory, while it holds both results and parts.
     """
 
     measured_rows: int
@@ -42,7 +42,7 @@ class Estimate:
 def estimate_study(
     study: Study, *, workers: int = 1, local: bool = True, evaluate: Evaluate = evaluate_samples
 ) -> Estimate:
-    """Measure a batch in this process, and say what the whole study will cost.
+    """Measure a batch in this process, and estimate what the whole study will cost.
 
     Parameters
     ----------
@@ -51,9 +51,9 @@ def estimate_study(
     workers : int, optional
         Processes that it will run on.
     local : bool, optional
-        Whether they are of this machine, and so no more than its processors at once.
+        Whether they run on this machine, and so no more at once than it has processors.
     evaluate : callable, optional
-        As :func:`run_study` takes.
+        As for :func:`run_study`.
 
     Returns
     -------

@@ -1,9 +1,10 @@
-"""Results of a study as files: one row a sample, in order; what failed; and back."""
+"""Write and read the tables of a study: results, one row per sample in order, and failures."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -19,19 +20,18 @@ from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
 _BLOCK_ROWS = 65_536
-_PARAMETER, _RESULT = "%.12g", "%.9g"  # a row that is replayed is computed anew, with all digits
+_PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 
 
 def results_path(folder: Path, study: Study) -> Path:
-    """Return the name of the table of results."""
+    """Return the path of the table of results."""
     return folder / f"results.{study.settings.results}"
 
 
 def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
-    """Write the table of results, part after part, whole or not at all.
+    """Write the table of results part by part, completely or not at all.
 
-    Numbers of a CSV table have 12 digits for parameters and 9 for results; a Parquet table has
-    them all.
+    A CSV table has 12 digits for parameters and 9 for results; a Parquet table has all digits.
     """
     path = results_path(folder, study)
     with open_atomically(path) as stream:
@@ -39,13 +39,8 @@ def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
             write_parquet(stream, study.columns, _table_blocks(study, parts))
             return path
         stream.write((",".join(study.columns) + "\n").encode())
-        line = ",".join(
-            [
-                "%d",
-                *[_PARAMETER] * len(study.parameters),
-                *[_RESULT] * len(study.result_columns),
-            ]
-        )
+        formats = [_PARAMETER] * len(study.parameters) + [_RESULT] * len(study.result_columns)
+        line = ",".join(["%d", *formats])
         for start, values in _table_blocks(study, parts):
             rows = enumerate(values.tolist(), start)
             stream.write("".join([f"{line % (row, *cells)}\n" for row, cells in rows]).encode())
@@ -53,13 +48,13 @@ def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
 
 
 def _table_blocks(study: Study, parts: Sequence[Part]) -> Iterator[tuple[int, FloatArray]]:
-    """Yield parameters and results together."""
+    """Yield the first row, and parameters and results side by side."""
     for start, results in read_blocks(list(parts), study, _BLOCK_ROWS):
         yield start, np.hstack([study.values(start, start + len(results)), results])
 
 
 def write_failures(folder: Path, failures: Sequence[Failure]) -> Path:
-    """Write the table of what failed, in the order of the rows."""
+    """Write the table of failures, in the order of the rows."""
     rows = [
         (failure.row, failure.controller, failure.error)
         for failure in sorted(failures, key=lambda failure: failure.row)
@@ -68,16 +63,13 @@ def write_failures(folder: Path, failures: Sequence[Failure]) -> Path:
 
 
 def read_failures(folder: Path) -> list[tuple[int, str, str]]:
-    """Return row, controller and error of what failed, from the table of failures."""
+    """Return row, controller and error of each failure, from their table."""
     with (folder / FAILED).open(encoding="utf-8", newline="") as stream:
         return [(int(row), name, error) for row, name, error in list(csv.reader(stream))[1:]]
 
 
 def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict[str, FloatArray]:
-    """Return all columns: of the parts if there are some, else of the table of results.
-
-    Shapes: returns (n,).
-    """
+    """Return all columns (n,), from the parts if there are any, else from the table of results."""
     if parts:
         rows = np.concatenate([np.arange(part.start, part.stop) for part in parts])
         values = np.vstack([study.values(part.start, part.stop) for part in parts])
@@ -109,26 +101,21 @@ def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict
 
 
 def read_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dict[str, float]:
-    """Return the results of one row, as far as they are there."""
+    """Return the results of one row, none if it is not computed yet."""
     for part in parts:
         if part.start <= row < part.stop:
             found = read_part(part, study)[0][row - part.start]
             return dict(zip(study.result_columns, found.tolist(), strict=True))
-    if not results_path(folder, study).exists():
+    path = results_path(folder, study)
+    if not path.exists():
         return {}
     if study.settings.results == "parquet":
         table = read_results(folder, study)
         return {name: float(table[name][row]) for name in study.result_columns}
     cells: list[str] = []
-    with contextlib.suppress(OSError), results_path(folder, study).open(encoding="utf-8") as stream:
-        for number, line in enumerate(stream):
-            if number == row + 1:
-                cells = line.split(",")
-                break
+    with contextlib.suppress(OSError), path.open(encoding="utf-8") as stream:
+        cells = next(itertools.islice(stream, row + 1, None), "").split(",")
     if len(cells) != len(study.columns) or cells[0] != str(row):
-        raise OutputError(
-            f"{results_path(folder, study)} has no row {row} of this study.",
-            path=results_path(folder, study),
-        )
+        raise OutputError(f"{path} has no row {row} of this study.", path=path)
     first = 1 + len(study.parameters)
     return dict(zip(study.result_columns, map(float, cells[first:]), strict=True))

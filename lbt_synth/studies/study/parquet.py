@@ -1,4 +1,4 @@
-"""Parquet: the only module that knows pyarrow (extra ``parquet``)."""
+"""Parquet tables, in the only module that imports pyarrow."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lbt_synth.validation import FloatArray
 
 
 def require_parquet() -> None:
-    """Refuse to begin without pyarrow."""
+    """Refuse to go on without pyarrow."""
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError as error:
@@ -27,10 +27,7 @@ def require_parquet() -> None:
 def write_parquet(
     stream: BinaryIO, names: Sequence[str], blocks: Iterable[tuple[int, FloatArray]]
 ) -> None:
-    """Write blocks of rows; the first column, the row, as an integer, the others as doubles.
-
-    Shapes: blocks (n, columns - 1).
-    """
+    """Write blocks (n, columns - 1) of rows, with the number of the row as the first column."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -44,7 +41,7 @@ def write_parquet(
 
 
 def read_parquet(path: Path) -> dict[str, FloatArray]:
-    """Return all columns of a file."""
+    """Return all columns of a file, (n,) each."""
     require_parquet()
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -1,4 +1,4 @@
-"""Percentiles and shares of samples, with intervals of confidence that assume no distribution."""
+"""Percentiles and shares of samples, with distribution-free confidence intervals."""
 
 from __future__ import annotations
 
@@ -16,35 +16,29 @@ CONFIDENCE = 0.95
 class Percentile:
     """A percentile of a sample."""
 
-    percent: float  # Which one, in [0, 100]
-    value: float  # The percentile; nan where there is no sample
-    # low, high: Interval that holds the true percentile with a probability of 95 % at least; nan
-    # where the sample is too small for a limit on that side
-    low: float
-    high: float
+    percent: float  # in [0, 100]
+    value: float  # nan if there is no sample
+    low: float  # of the 95 % interval of the true percentile; nan if the sample is too small
+    high: float  # of the same interval, likewise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Share:
     """A part of the samples."""
 
-    # count, total: Samples that are meant, and all
     count: int
-    total: int
-    # low, high: Interval that holds the true probability with a probability of 95 % at least
-    low: float
-    high: float
+    total: int  # all samples
+    low: float  # of the 95 % interval of the true probability
+    high: float  # of the same interval
 
     @property
     def value(self) -> float:
-        """The part, in [0, 1]; nan where there is no sample."""
+        """The part, in [0, 1]; nan if there is no sample."""
         return self.count / self.total if self.total else np.nan
 
 
 def percentiles(values: FloatArray, percents: Sequence[float]) -> tuple[Percentile, ...]:
-    """Percentiles of a sample and their intervals from order statistics.
-
-    Shapes: values (n,).
+    """Return percentiles of a sample (n,), with intervals from order statistics.
 
     Examples
     --------
@@ -78,7 +72,7 @@ def percentiles(values: FloatArray, percents: Sequence[float]) -> tuple[Percenti
 
 
 def _interpolate(ordered: FloatArray, fraction: float) -> float:
-    """Quantile by linear interpolation between order statistics, some of which may be inf."""
+    """Return a quantile by linear interpolation between order statistics; some may be inf."""
     at = fraction * (len(ordered) - 1)
     below = int(at)
     low, weight = float(ordered[below]), at - below
@@ -88,7 +82,7 @@ def _interpolate(ordered: FloatArray, fraction: float) -> float:
 
 
 def share(count: int, total: int) -> Share:
-    """Part of the samples, with the interval of Clopper and Pearson.
+    """Return a part of the samples, with the interval of Clopper and Pearson.
 
     Examples
     --------

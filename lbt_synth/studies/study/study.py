@@ -156,6 +156,6 @@ class Study:
         names = self.parameter_names
         return float(values[names.index(name)]) if name in names else default
 
-    def named(self, values: Sequence[float] | FloatArray) -> dict[str, Any]:
+    def parameters_by_name(self, values: Sequence[float] | FloatArray) -> dict[str, Any]:
         """Return a row of :meth:`values` by the names of the parameters."""
         return dict(zip(self.parameter_names, np.asarray(values).tolist(), strict=True))
