@@ -12,7 +12,7 @@ from lbt_synth.cli.identification_files import (
     require_places,
 )
 from lbt_synth.cli.identification_tables import add_model, add_record, marked_note
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, format_fixed, tabulate
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.cli.record_arguments import identification_options, read_record
 from lbt_synth.errors import ProblemError
@@ -81,29 +81,16 @@ def _add_comparison(report: Report, found: RecordedDesign, record: LoopRecord) -
     """Add what the second half of the data says of a design from the first."""
     table = found.held_out
     report.tables.append(
-        TableText(
-            title="Residual on the second half of the record, by models of the first",
-            headings=(
-                "controller",
-                "data [nm]",
-                "+-",
-                "model [nm]",
-                "data/model",
-                "Strehl, data",
-                "Strehl, model",
-            ),
-            rows=[
-                (
-                    entry.name,
-                    format_fixed(entry.replayed_nm, 2),
-                    format_fixed(entry.replayed_error_nm, 2),
-                    format_fixed(entry.model_nm, 2),
-                    format_fixed(entry.ratio, 3),
-                    format_fixed(entry.strehl, 3),
-                    format_fixed(entry.model_strehl, 3),
-                )
-                for entry in table.entries
-            ],
+        tabulate(
+            "Residual on the second half of the record, by models of the first",
+            table.entries,
+            ("controller", lambda entry: entry.name),
+            ("data [nm]", lambda entry: format_fixed(entry.replayed_nm, 2)),
+            ("+-", lambda entry: format_fixed(entry.replayed_error_nm, 2)),
+            ("model [nm]", lambda entry: format_fixed(entry.model_nm, 2)),
+            ("data/model", lambda entry: format_fixed(entry.ratio, 3)),
+            ("Strehl, data", lambda entry: format_fixed(entry.strehl, 3)),
+            ("Strehl, model", lambda entry: format_fixed(entry.model_strehl, 3)),
         )
     )
     report.notes += [f"note: {note}" for note in table.notes]

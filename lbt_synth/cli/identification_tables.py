@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
 from lbt_synth.identification import (
     IdentifiedAxis,
+    IdentifiedLine,
     IdentifiedModel,
     LoopRecord,
     SpectrumRecord,
@@ -75,58 +76,46 @@ def _axis_names(count: int) -> list[str]:
 def add_model(report: Report, model: IdentifiedModel) -> None:
     """Add the tables of an identified model, its notes, and its numbers."""
     names = _axis_names(len(model.axes))
-    background: list[tuple[Any, ...]] = []
-    lines: list[tuple[Any, ...]] = []
-    for name, axis in zip(names, model.axes, strict=True):
-        background += _background_rows(name, axis)
-        lines += [
-            (
-                name,
-                format_fixed(line.frequency_hz, 3),
-                f"{line.frequency_error_hz:.2g}",
-                f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
-                f"{line.damping_error:.2g}" if line.resolved else None,
-                format_fixed(line.rms_nm, 2),
-                f"{line.rms_error_nm:.2g}",
-                f"{line.prominence:.3g}",
-                line.kind + (", announced" if line.announced else ""),
-            )
-            for line in axis.parts
-        ]
+    named_axes = list(zip(names, model.axes, strict=True))
     report.tables.append(
         TableText(
             title="Turbulence, noise and sensor",
             headings=("quantity", "axis", "value", "error", "unit"),
-            rows=background,
+            rows=[row for name, axis in named_axes for row in _background_rows(name, axis)],
         )
     )
+    lines = [(name, line) for name, axis in named_axes for line in axis.parts]
     if lines:
         report.tables.append(
-            TableText(
-                title="Vibrations",
-                headings=(
-                    "axis",
-                    "f [Hz]",
-                    "+-",
-                    "damping",
-                    "+-",
-                    "rms [nm]",
-                    "+-",
-                    "over the rest",
-                    "origin",
-                ),
-                rows=lines,
+            tabulate(
+                "Vibrations",
+                lines,
+                ("axis", lambda item: item[0]),
+                ("f [Hz]", lambda item: format_fixed(item[1].frequency_hz, 3)),
+                ("+-", lambda item: f"{item[1].frequency_error_hz:.2g}"),
+                ("damping", lambda item: _damping_texts(item[1])[0]),
+                ("+-", lambda item: _damping_texts(item[1])[1]),
+                ("rms [nm]", lambda item: format_fixed(item[1].rms_nm, 2)),
+                ("+-", lambda item: f"{item[1].rms_error_nm:.2g}"),
+                ("over the rest", lambda item: f"{item[1].prominence:.3g}"),
+                ("origin", lambda item: item[1].kind + ", announced" * item[1].announced),
             )
         )
     else:
         report.notes.append("no vibration stands out of the turbulence and the noise.")
     report.notes += [marked_note(note) for note in model.notes]
-    for name, axis in zip(names, model.axes, strict=True):
+    for name, axis in named_axes:
         where = "" if name == "-" else f"{name}: "
         report.notes.append(f"{where}sensor gain {axis.sensor_gain_note}.")
         report.notes.append(f"{where}{_whiteness_note(axis)}")
     report.data["axes"] = [_axis_record(axis) for axis in model.axes]
     report.data["model_notes"] = model.notes
+
+
+def _damping_texts(line: IdentifiedLine) -> tuple[str, str | None]:
+    if line.resolved:
+        return f"{line.damping:.3g}", f"{line.damping_error:.2g}"
+    return f"< {line.damping:.2g}", None
 
 
 def marked_note(note: str) -> str:

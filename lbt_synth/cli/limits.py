@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
 from lbt_synth import studies
 from lbt_synth.cli.loop_inputs import load_designs, loop_difference_notes
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
@@ -31,22 +32,13 @@ def run(arguments: Namespace) -> Report:
             config.imaging,
             errors_hz=config.settings.robustness.errors_hz,
         )
-    banded = study.band is not None
-    records = [_record(row, banded=banded) for row in map(asdict, study.rows)]
-    headings = ["design", "residual [nm]", "Strehl [%]", "above the limit [%]"]
-    if study.shift_hz.size:
-        headings.append("worst residual [nm]")
-    if banded:
-        headings.append("above the band limit [%]")
+    records = [asdict(row) for row in study.rows]
+    if study.band is None:
+        for record in records:
+            del record["above_band_limit_percent"]
     report = Report(
         data=_data(study, records),
-        tables=[
-            TableText(
-                title="Distance to the limits of any linear controller",
-                headings=headings,
-                rows=[_cells(record)[: len(headings)] for record in records],
-            )
-        ],
+        tables=[_limit_table(study)],
         notes=[*_limit_notes(study), *_design_notes(config, designs, study)],
     )
     write_outputs(report, arguments.output, records=records, figure=lambda: limits_figure(study))
@@ -61,19 +53,23 @@ def _config_designs(config: Config) -> dict[str, Design]:
     }
 
 
-def _record(row: dict[str, Any], *, banded: bool) -> dict[str, Any]:
-    return {k: v for k, v in row.items() if banded or k != "above_band_limit_percent"}
-
-
-def _cells(record: dict[str, Any]) -> list[str]:
-    return [
-        record["design"],
-        format_fixed(record["residual_nm"], 2) if record["stable"] else "unstable",
-        format_fixed(100 * record["strehl"], 2),
-        format_fixed(record["above_limit_percent"], 2),
-        format_fixed(record["worst_nm"], 2),
-        format_fixed(record.get("above_band_limit_percent", float("nan")), 2),
+def _limit_table(study: studies.LimitStudy) -> TableText:
+    columns: list[tuple[str, Callable[[studies.LimitRow], str]]] = [
+        ("design", lambda row: row.design),
+        (
+            "residual [nm]",
+            lambda row: format_fixed(row.residual_nm, 2) if row.stable else "unstable",
+        ),
+        ("Strehl [%]", lambda row: format_fixed(100 * row.strehl, 2)),
+        ("above the limit [%]", lambda row: format_fixed(row.above_limit_percent, 2)),
     ]
+    if study.shift_hz.size:
+        columns.append(("worst residual [nm]", lambda row: format_fixed(row.worst_nm, 2)))
+    if study.band is not None:
+        columns.append(
+            ("above the band limit [%]", lambda row: format_fixed(row.above_band_limit_percent, 2))
+        )
+    return tabulate("Distance to the limits of any linear controller", study.rows, *columns)
 
 
 def _data(study: studies.LimitStudy, records: list[dict[str, Any]]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from argparse import Namespace
 from dataclasses import asdict
 
 from lbt_synth import studies
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import load_config
@@ -69,23 +69,19 @@ def run(arguments: Namespace) -> Report:
                     ("one frame", 1e3 * hardware.dt_s, "ms"),
                 ],
             ),
-            TableText(
-                title="Designs on this mirror",
-                headings=(
-                    "design",
+            tabulate(
+                "Designs on this mirror",
+                rows,
+                ("design", lambda row: row.design),
+                (
                     "residual [nm]",
-                    "Strehl [%]",
-                    "settled less real position [nm]",
+                    lambda row: format_fixed(row.residual_nm, 2) if row.stable else "unstable",
                 ),
-                rows=[
-                    (
-                        row.design,
-                        format_fixed(row.residual_nm, 2) if row.stable else "unstable",
-                        format_fixed(100 * row.strehl, 2),
-                        format_fixed(row.unsettled_nm, 2),
-                    )
-                    for row in rows
-                ],
+                ("Strehl [%]", lambda row: format_fixed(100 * row.strehl, 2)),
+                (
+                    "settled less real position [nm]",
+                    lambda row: format_fixed(row.unsettled_nm, 2),
+                ),
             ),
         ],
         notes=[

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
@@ -67,7 +67,15 @@ def run(arguments: Namespace) -> Report:
             "residual_nm": whole,
             "turbulence_nm": _norm(air.rms_nm),
         },
-        tables=[_whole_table(whole, _norm(air.rms_nm)), _order_table(records)],
+        tables=[
+            tabulate(
+                "All modes",
+                [("none, turbulence alone", _norm(air.rms_nm)), *whole.items()],
+                ("controller", lambda total: total[0]),
+                ("residual [nm]", lambda total: format_fixed(total[1], 1)),
+            ),
+            _order_table(records),
+        ],
         notes=[
             "turbulence: AR1 models, von Karman variances, poles by radial order.",
             "vibrations: those of the model, on tip and tilt.",
@@ -181,32 +189,16 @@ def _order_records(
     return rows
 
 
-def _whole_table(whole: dict[str, float], turbulence: float) -> TableText:
-    rows = [["none, turbulence alone", format_fixed(turbulence, 1)]]
-    rows += [[name, format_fixed(value, 1)] for name, value in whole.items()]
-    return TableText(title="All modes", headings=["controller", "residual [nm]"], rows=rows)
-
-
 def _order_table(records: list[dict[str, Any]]) -> TableText:
-    digits = {"noise_nm": 2, "gain": 3}
-    rows = [
-        [
-            str(value) if isinstance(value, int) else format_fixed(value, digits.get(key, 1))
-            for key, value in record.items()
-        ]
-        for record in records
-    ]
-    return TableText(
-        title="By radial order, residuals over its modes",
-        headings=[
-            "radial order",
-            "modes",
-            "turbulence [nm]",
-            "noise a mode [nm]",
-            "mean gain",
-            "one gain [nm]",
-            "optimised gains [nm]",
-            "Kalman [nm]",
-        ],
-        rows=rows,
+    return tabulate(
+        "By radial order, residuals over its modes",
+        records,
+        ("radial order", lambda record: record["radial_order"]),
+        ("modes", lambda record: record["modes"]),
+        ("turbulence [nm]", lambda record: format_fixed(record["turbulence_nm"], 1)),
+        ("noise a mode [nm]", lambda record: format_fixed(record["noise_nm"], 2)),
+        ("mean gain", lambda record: format_fixed(record["gain"], 3)),
+        ("one gain [nm]", lambda record: format_fixed(record["uniform_nm"], 1)),
+        ("optimised gains [nm]", lambda record: format_fixed(record["optimised_nm"], 1)),
+        ("Kalman [nm]", lambda record: format_fixed(record["kalman_nm"], 1)),
     )

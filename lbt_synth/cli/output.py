@@ -6,7 +6,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +27,17 @@ class TableText:
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[Any]]
+
+
+def tabulate(
+    title: str, items: Iterable[Any], *columns: tuple[str, Callable[[Any], Any]]
+) -> TableText:
+    """Make a table of items from columns: a heading, and the cell of an item below it."""
+    return TableText(
+        title=title,
+        headings=[heading for heading, _ in columns],
+        rows=[[cell(item) for _, cell in columns] for item in items],
+    )
 
 
 @dataclass(kw_only=True)

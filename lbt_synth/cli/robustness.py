@@ -11,7 +11,7 @@ import numpy as np
 
 from lbt_synth import studies
 from lbt_synth.cli.loop_inputs import load_designs, truth_at_sensor_gain
-from lbt_synth.cli.output import Report, TableText, format_fixed
+from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import count_progress, track_progress
 from lbt_synth.config import Config, load_config
@@ -78,31 +78,17 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
     report = Report(
         data={"rows": records},
         tables=[
-            TableText(
-                title="Robustness to the vibration frequency",
-                headings=(
-                    "error [Hz]",
-                    "method",
-                    "Strehl [%]",
-                    "residual [nm]",
-                    "vibration [nm]",
-                    "turbulence [nm]",
-                    "noise [nm]",
-                    "stable",
-                ),
-                rows=[
-                    (
-                        f"{row.error_hz:+.2f}",
-                        row.method,
-                        format_fixed(100 * row.strehl, 2),
-                        format_fixed(row.residual_nm, 1),
-                        format_fixed(row.vibration_nm, 1),
-                        format_fixed(row.turbulence_nm, 1),
-                        format_fixed(row.noise_nm, 1),
-                        row.stable,
-                    )
-                    for row in rows
-                ],
+            tabulate(
+                "Robustness to the vibration frequency",
+                rows,
+                ("error [Hz]", lambda row: f"{row.error_hz:+.2f}"),
+                ("method", lambda row: row.method),
+                ("Strehl [%]", lambda row: format_fixed(100 * row.strehl, 2)),
+                ("residual [nm]", lambda row: format_fixed(row.residual_nm, 1)),
+                ("vibration [nm]", lambda row: format_fixed(row.vibration_nm, 1)),
+                ("turbulence [nm]", lambda row: format_fixed(row.turbulence_nm, 1)),
+                ("noise [nm]", lambda row: format_fixed(row.noise_nm, 1)),
+                ("stable", lambda row: row.stable),
             )
         ],
     )

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from argparse import Namespace
 from dataclasses import fields
-from typing import Any
 
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Report, tabulate
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import track_progress
 from lbt_synth.config import load_config
 from lbt_synth.report.figures import tradeoff_figure
-from lbt_synth.studies import TradeoffPoint, tradeoff
+from lbt_synth.studies import tradeoff
 from lbt_synth.studies.tradeoff import FAMILIES
 from lbt_synth.validation import integer
 
@@ -30,7 +29,8 @@ def run(arguments: Namespace) -> Report:
             quiet=arguments.json,
         )
     )
-    records = [_record(point) for point in points]
+    names = [field.name for field in fields(points[0]) if field.name != "design"]
+    records = [{name: getattr(point, name) for name in names} for point in points]
     least = points[0].design
     report = Report(
         data={
@@ -39,29 +39,16 @@ def run(arguments: Namespace) -> Report:
             "gamma_infeasible": least.gamma_infeasible,
         },
         tables=[
-            TableText(
-                title="Trade-off of variance, norm and sensor gain",
-                headings=(
-                    "filter",
-                    "norm [nm]",
-                    "norm / least",
-                    "rms [nm]",
-                    "gain from",
-                    "gain to",
-                    "modulus",
-                ),
-                rows=[
-                    (
-                        r["family"],
-                        f"{r['gamma']:.2f}",
-                        f"{r['gamma_ratio']:.4f}",
-                        f"{r['rms']:.2f}",
-                        f"{r['gain_low']:.3f}",
-                        f"{r['gain_high']:.3f}",
-                        f"{r['modulus']:.3f}",
-                    )
-                    for r in records
-                ],
+            tabulate(
+                "Trade-off of variance, norm and sensor gain",
+                points,
+                ("filter", lambda point: point.family),
+                ("norm [nm]", lambda point: f"{point.gamma:.2f}"),
+                ("norm / least", lambda point: f"{point.gamma_ratio:.4f}"),
+                ("rms [nm]", lambda point: f"{point.rms:.2f}"),
+                ("gain from", lambda point: f"{point.gain_low:.3f}"),
+                ("gain to", lambda point: f"{point.gain_high:.3f}"),
+                ("modulus", lambda point: f"{point.modulus:.3f}"),
             )
         ],
         notes=[
@@ -71,7 +58,3 @@ def run(arguments: Namespace) -> Report:
     )
     write_outputs(report, arguments.output, records=records, figure=lambda: tradeoff_figure(points))
     return report
-
-
-def _record(point: TradeoffPoint) -> dict[str, Any]:
-    return {f.name: getattr(point, f.name) for f in fields(point) if f.name != "design"}

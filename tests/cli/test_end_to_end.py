@@ -1,0 +1,196 @@
+"""The commands e2e and e2e-table."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.end_to_end import CONFIG, load_setup, make_run
+from support.small_telescope import needs_specula, small_config
+
+import lbt_synth as lbt
+from lbt_synth.cli import end_to_end as end_to_end_commands
+from lbt_synth.cli.main import main
+from lbt_synth.errors import ConfigError, MissingExtraError
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return load_setup()
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("outer_scale_m: 22.0", "outer_scale_m: null", "outer_scale_m must be a length"),
+        ("turbulence: frozen_flow", "turbulence: none", "truth.turbulence must be frozen_flow"),
+        ("mirror:\n  modes: 672 ", "mirror: {}\n# ", "mirror.modes is missing"),
+        ("subapertures_across: 30", "subapertures_across: 80", "pixels must be even"),
+        ("pixels: 60", "pixels: 61", "pixels must be even"),
+    ],
+)
+def test_configurations_that_cannot_be_simulated(tmp_path, capsys, old, new, match):
+    text = Path(CONFIG).read_text()
+    assert old in text
+    file = tmp_path / "c.yaml"
+    file.write_text(text.replace(old, new, 1))
+    config = lbt.load_config(file)
+    with pytest.raises(ConfigError, match=match):
+        _ = config.end_to_end
+    assert main(["end-to-end", str(file), "x.fits", "-o", str(tmp_path / "run")]) == 2
+    assert "lbt-synth: error:" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("found", [None, "1.0.3", "1.2.0"])
+def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path, capsys, found):
+    def version(name):
+        if name != "specula":
+            return real(name)
+        if found is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return found
+
+    real = importlib.metadata.version
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    gain = tmp_path / "i.fits"
+    lbt.save_gain(gain, lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5))
+    for arguments in (
+        ["end-to-end", CONFIG, str(gain), "-o", str(tmp_path / "run")],
+        ["end-to-end-table", CONFIG, "-o", str(tmp_path / "table"), "--tables", "II"],
+    ):
+        assert main(arguments) == 2
+        assert 'pip install "lbt-synth[e2e]"' in capsys.readouterr().err
+    with pytest.raises(MissingExtraError) as caught:
+        lbt.interop.calibrate(lbt.load_config(CONFIG).end_to_end.system, cache=tmp_path)
+    assert caught.value.extra == "e2e"
+
+
+def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
+    shell = lbt.models.PositionLoop.from_bandwidth(
+        natural_frequency_hz=20, damping=0.5, bandwidth_hz=150
+    )
+    slow = replace(setup.system.hardware, mirror=shell)
+    run = make_run(replace(setup.system, modes=3, hardware=slow), frames=20)
+    design = lbt.integrator(slow, gain=0.1)
+    gain = lbt.save_gain(tmp_path / "i.fits", design)
+    monkeypatch.setattr(end_to_end_commands, "specula_version", lambda: "1.1")
+    seen = end_to_end_commands._telemetry(
+        run, design, SimpleNamespace(key="k"), SimpleNamespace(gain=str(gain))
+    )
+    seen = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.fits", seen))
+    assert np.array_equal(seen.hardware.mirror_taps, slow.mirror_taps)
+    assert "with the mirror taps c" in seen.convention
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--seeds", "0"],
+        ["--jobs", "0"],
+        ["--frames", "1"],
+        ["--settle-frames", "10"],
+        ["--seed", "-1"],
+        ["--seed", "5000000000"],
+        ["--pixels", "7"],
+        ["nowhere.fits"],
+    ],
+)
+def test_bad_input_at_the_command_line(tmp_path, capsys, arguments):
+    out = tmp_path / "table"
+    assert main(["end-to-end-table", CONFIG, *arguments, "-o", str(out)]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("lbt-synth: error:")
+    assert captured.out == ""
+    assert not out.exists()
+
+
+@needs_specula
+def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
+    config, gain = small_config(tmp_path), tmp_path / "k.fits"
+    lbt.save_gain(gain, lbt.kalman(lbt.load_config(config).plant))
+    out = tmp_path / "run"
+    arguments = [
+        "end-to-end",
+        str(config),
+        str(gain),
+        "-o",
+        str(out),
+        "--cache",
+        str(cache),
+        "--json",
+    ]
+    assert main(arguments) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert sorted(p.name for p in out.iterdir()) == ["run.png", "summary.json", "telemetry.fits"]
+    assert json.loads((out / "summary.json").read_text())["strehl"] == data["strehl"]
+    telemetry = lbt.files.load_telemetry(out / "telemetry.fits")
+    assert telemetry.strehl == data["strehl"]
+    assert telemetry.commands.shape == (40, 20)
+    assert np.std(telemetry.residual_nm[:, 0]) <= data["tip_rms_nm"] * (1 + 1e-12)
+    # y(k+1) is the gain times the residual of frame k, plus noise
+    y, phase = telemetry.measurements[1:, :2], telemetry.residual_nm[:-1, :2]
+    assert np.sum(y * phase) / np.sum(phase**2) == pytest.approx(telemetry.sensor_gain)
+    assert main(arguments[:-1]) == 0
+    assert "Strehl ratio at 2.2 um" in capsys.readouterr().out
+
+
+@needs_specula
+def test_a_table_that_was_killed_goes_on(tmp_path, cache):
+    config, out = small_config(tmp_path), tmp_path / "table"
+    arguments = [
+        sys.executable,
+        "-m",
+        "lbt_synth.cli.main",
+        "end-to-end-table",
+        str(config),
+        "-o",
+        str(out),
+        "--cache",
+        str(cache),
+        "--seeds",
+        "1",
+        "--tables",
+        "II",
+        "--jobs",
+        "2",
+        "--json",
+    ]
+    first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
+    end = time.monotonic() + 120
+    while len(list(out.glob("cases/*.json"))) < 2:
+        assert first.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    os.kill(first.pid, signal.SIGKILL)
+    first.wait()
+    kept = {p.name: p.read_text() for p in out.glob("cases/*.json")}
+    assert 2 <= len(kept) < 6
+    second = subprocess.run(arguments, capture_output=True, text=True, check=True, timeout=300)
+    data = json.loads(second.stdout)
+    assert data["runs"] == 6
+    assert len(list(out.glob("cases/*.json"))) == 6
+    for name, text in kept.items():
+        assert (out / "cases" / name).read_text() == text
+    assert {(e["row"], e["method"]) for e in data["entries"]} == {
+        (row, method)
+        for row in ("no vibration", "vibration")
+        for method in ("classical", "kalman", "hinf")
+    }
+    lines = (out / "table_ii.csv").read_text().splitlines()
+    assert len(lines) == 7

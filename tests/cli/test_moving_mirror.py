@@ -1,0 +1,74 @@
+"""Commands for a mirror with dynamics."""
+
+from __future__ import annotations
+
+import pytest
+from support.plants import ROOT
+
+SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
+
+
+def run(capsys, *arguments):
+    import json
+
+    from lbt_synth.cli.main import main
+
+    status = main([*map(str, arguments), "--json"])
+    captured = capsys.readouterr()
+    return status, json.loads(captured.out), captured.err
+
+
+def test_commands(tmp_path, capsys):
+    gain = tmp_path / "lqg.fits"
+    status, data, _ = run(capsys, "design", SLOW_YAML, "--method", "lqg", "-o", gain)
+    assert status == 0
+    assert data["rms"] == pytest.approx(data["limit_nm"], rel=1e-6)
+    assert data["mirror"]["settling_s"] > 3e-3
+    assert run(capsys, "verify", gain)[0] == 0
+    assert run(capsys, "show", gain, "--matrices")[0] == 0
+    figure = tmp_path / "m.png"
+    table = tmp_path / "m.csv"
+    status, data, _ = run(capsys, "mirror", SLOW_YAML, "-o", figure, "-o", table)
+    assert status == 0
+    assert figure.stat().st_size > 10_000
+    assert table.read_text().count("\n") == 5
+    assert [row["stable"] for row in data["rows"]] == [True, False, True, True]
+    status, data, _ = run(capsys, "simulate", SLOW_YAML, gain, "--frames", 500, "--cases", 1)
+    assert status == 0
+    assert run(capsys, "sigma", gain, "-o", tmp_path / "s.png")[0] == 0
+
+
+def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
+    from lbt_synth.cli.main import main
+
+    gain = str(tmp_path / "kalman.npz")
+    assert main(["design", str(SLOW_YAML), "--method", "kalman", "-o", gain]) == 0
+    assert "as if the mirror settled at once" in capsys.readouterr().out
+
+
+def test_wrong_commands(tmp_path, capsys):
+    settled = ROOT / "examples" / "lbt.yaml"
+    gain = tmp_path / "kalman.fits"
+    assert run(capsys, "design", settled, "--method", "kalman", "-o", gain)[0] == 0
+    status, _, err = run(capsys, "simulate", SLOW_YAML, gain)
+    assert status == 1
+    assert "another mirror" in err
+    status, _, err = run(capsys, "mirror", settled)
+    assert status == 2
+    assert "mirror.local_loop is missing" in err
+    status, _, err = run(capsys, "mirror", SLOW_YAML, "--tolerance", "2")
+    assert status == 2
+    assert "tolerance" in err
+    for extra, text in (
+        (("--horizon", "2"), "takes no horizon"),
+        (("--gain", "1"), "--gain goes"),
+        (("--route", "sdp"), "takes no --route"),
+    ):
+        status, _, err = run(capsys, "design", SLOW_YAML, "--method", "lqg", *extra, "-o", gain)
+        assert status == 2
+        assert text in err
+    status, _, err = run(
+        capsys, "design", settled, "--method", "kalman", "--command-weight", "0.1", "-o", gain
+    )
+    assert status == 2
+    assert "--command-weight goes with --method lqg" in err
