@@ -1,7 +1,7 @@
 """Exceptions of the package.
 
-Every message says what was expected, what came, and what to try; the data
-behind the message is on the exception, so that a script need not parse text.
+Every message says what was expected, what came, and what to try. The data behind the
+message are on the exception, so that a script need not parse text.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ class LbtSynthError(Exception):
     """Base class of every error that this package raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle with the data, whatever the constructor asks for: other processes raise, too."""
-        return _rebuilt, (type(self), self.args, self.__dict__)
+        """Pickle with the data, whatever the constructor needs, for errors of other processes."""
+        return _rebuild, (type(self), self.args, self.__dict__)
 
 
-def _rebuilt(
+def _rebuild(
     kind: type[LbtSynthError], args: tuple[Any, ...], data: dict[str, Any]
 ) -> LbtSynthError:
     error = kind.__new__(kind)
@@ -87,11 +87,11 @@ class InfeasibleError(SynthesisError):
     Attributes
     ----------
     gamma : float or None
-        The level that was asked for.
+        The requested level.
     gamma_least : float or None
         The least level that can be met.
     conflict : tuple of str
-        Demands that cannot hold together, none of which can be spared.
+        Demands that cannot hold together; without any one of them the rest can.
     """
 
     def __init__(
@@ -114,9 +114,9 @@ class NumericalError(SynthesisError):
     Attributes
     ----------
     status : str
-        What the method said of itself.
+        Status that the method reported.
     residual : float or None
-        The residual that was reached.
+        The residual reached.
     """
 
     def __init__(self, message: str, *, status: str = "", residual: float | None = None) -> None:

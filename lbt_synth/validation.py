@@ -1,4 +1,4 @@
-"""Checks of arguments: the one place where arrays and numbers are let in.
+"""Check arguments: numbers, arrays and matrices enter the package through here.
 
 Each function returns the value in its canonical form (read-only float64
 arrays, Python floats) or raises a :class:`~lbt_synth.errors.ProblemError`
@@ -22,7 +22,7 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 
-def frozen(array: npt.ArrayLike) -> FloatArray:
+def frozen_copy(array: npt.ArrayLike) -> FloatArray:
     """Return a read-only float64 copy of an array."""
     out = np.array(array, dtype=np.float64)
     out.setflags(write=False)
@@ -30,7 +30,7 @@ def frozen(array: npt.ArrayLike) -> FloatArray:
 
 
 def float_array(value: Any, name: str) -> FloatArray:
-    """Return a float64 array of any shape: finite or not, and no copy where there need be none."""
+    """Return a float64 array of any shape, finite or not, without a copy if possible."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
@@ -48,7 +48,7 @@ def float_array(value: Any, name: str) -> FloatArray:
 
 def real_array(value: Any, name: str) -> FloatArray:
     """Return a finite, read-only float64 array of any shape."""
-    out = frozen(float_array(value, name))
+    out = frozen_copy(float_array(value, name))
     if not np.all(np.isfinite(out)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(out))[0])
         raise NonFiniteError(
@@ -70,17 +70,17 @@ def matrix(
 
     ``rows`` and ``cols`` are pairs ``(size, why)``; ``why`` ends the sentence
     of the error, for example ``"to match A (4, 4)"``. With ``stacked``, leading
-    dimensions are let in: a stack of matrices.
+    dimensions are allowed: a stack of matrices.
     """
     out = real_array(value, name)
     if out.ndim == 0:
-        out = frozen(out.reshape(1, 1))
+        out = frozen_copy(out.reshape(1, 1))
     if out.ndim < 2 or (out.ndim > 2 and not stacked):
         kind = "a matrix (2-D) or a stack of them" if stacked else "a matrix (2-D)"
         raise DimensionError(f"{name} must be {kind}; got {out.ndim}-D, shape {out.shape}.")
-    for axis, demand, word in ((-2, rows, "row"), (-1, cols, "column")):
-        if demand is not None and out.shape[axis] != demand[0]:
-            size, why = demand
+    for axis, required, word in ((-2, rows, "row"), (-1, cols, "column")):
+        if required is not None and out.shape[axis] != required[0]:
+            size, why = required
             plural = "" if size == 1 else "s"
             raise DimensionError(f"{name} must have {size} {word}{plural} {why}; got {out.shape}.")
     return out
@@ -97,21 +97,21 @@ def square(value: Any, name: str, *, stacked: bool = False) -> FloatArray:
 def symmetric(
     value: Any, name: str, *, size: tuple[int, str] | None = None, stacked: bool = False
 ) -> FloatArray:
-    """Return a finite symmetric matrix; asymmetry beyond rounding is refused."""
+    """Return a finite symmetric matrix; refuse asymmetry beyond rounding."""
     out = matrix(value, name, rows=size, cols=size, stacked=stacked)
     if out.shape[-2] != out.shape[-1]:
         raise DimensionError(f"{name} must be square; got {out.shape}.")
-    turned = np.swapaxes(out, -1, -2)
+    transposed = np.swapaxes(out, -1, -2)
     scale = np.max(np.abs(out), axis=(-2, -1), initial=0.0)
-    skew = np.max(np.abs(out - turned), axis=(-2, -1), initial=0.0)
-    crooked = skew > 1e-10 * scale
-    if np.any(crooked):
-        worst = tuple(np.argwhere(crooked)[0])
+    skew = np.max(np.abs(out - transposed), axis=(-2, -1), initial=0.0)
+    asymmetric = skew > 1e-10 * scale
+    if np.any(asymmetric):
+        worst = tuple(np.argwhere(asymmetric)[0])
         raise DefinitenessError(
             f"{name} must be symmetric; got an asymmetry of {skew[worst]:.3g} beside entries of "
             f"{scale[worst]:.3g}. Try {name} = ({name} + {name}.T) / 2 if it is rounding."
         )
-    return frozen((out + turned) / 2)
+    return frozen_copy((out + transposed) / 2)
 
 
 def semidefinite(
@@ -141,7 +141,7 @@ def definite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> F
 
 
 def _extreme_eigenvalues(symmetric_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least eigenvalue and largest modulus, of each matrix of a stack."""
+    """Least eigenvalue, and largest modulus of one, of each matrix of a stack."""
     values = np.atleast_2d(np.linalg.eigvalsh(symmetric_matrix))
     return values[..., 0], np.max(np.abs(values), axis=-1)
 
@@ -165,13 +165,13 @@ def number(
         raise ProblemError(f"{name} must be a number; got {value!r}.") from error
     if not math.isfinite(out):
         raise NonFiniteError(f"{name} must be finite; got {out}.")
-    demands = (
+    bounds = (
         (above, "above", above is not None and not out > above),
         (at_least, "at least", at_least is not None and not out >= at_least),
         (below, "below", below is not None and not out < below),
         (at_most, "at most", at_most is not None and not out <= at_most),
     )
-    for bound, word, broken in demands:
+    for bound, word, broken in bounds:
         if broken:
             raise ProblemError(
                 f"{name} must be {word} {bound:.12g}; got {out:.12g}. {hint}".strip()
@@ -196,14 +196,14 @@ def choice(value: Any, name: str, options: Sequence[str]) -> str:
 
 
 def sequence(value: Any, name: str) -> tuple[Any, ...]:
-    """Return a list or tuple as a tuple; anything else is refused."""
+    """Return a list or tuple as a tuple; refuse anything else."""
     if not isinstance(value, list | tuple):
         raise ProblemError(f"{name} must be a list; got {type(value).__name__}.")
     return tuple(value)
 
 
-def instance(value: object, kind: type[Any]) -> None:
-    """Refuse anything that is not of a kind."""
+def require_instance(value: object, kind: type[Any]) -> None:
+    """Refuse anything that is not an instance of a class."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise ProblemError(f"expected {article} {kind.__name__}; got {type(value).__name__}.")

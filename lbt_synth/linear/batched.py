@@ -1,4 +1,4 @@
-"""Stacks of matrices: arrays (N, n, m) that are worked on at once."""
+"""Linear algebra on stacks of matrices, arrays (N, n, m)."""
 
 from __future__ import annotations
 
@@ -12,26 +12,24 @@ from lbt_synth.validation import FloatArray
 Entry = TypeVar("Entry", bound=np.generic)
 
 
-def transposed(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
+def transpose(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
     """Transpose each matrix of a stack."""
     return np.swapaxes(stack, -1, -2)
 
 
-def symmetrised(stack: FloatArray) -> FloatArray:
+def symmetrise(stack: FloatArray) -> FloatArray:
     """Symmetric part of each matrix of a stack."""
-    return np.asarray((stack + transposed(stack)) / 2, dtype=np.float64)
+    return np.asarray((stack + transpose(stack)) / 2, dtype=np.float64)
 
 
-def norms(stack: FloatArray) -> FloatArray:
+def frobenius_norms(stack: FloatArray) -> FloatArray:
     """Frobenius norm of each matrix of a stack, (N,)."""
     squares = np.einsum("...ij,...ij->...", stack, stack)
     return np.asarray(np.sqrt(squares), dtype=np.float64)
 
 
 def solve_stack(matrices: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve each system of a stack; the answer of a singular one is nan.
-
-    Shapes: matrices (N, n, n), right (N, n, m) -> (N, n, m).
+    """Solve each system of a stack, (N, n, n) and (N, n, m); a singular one gives nan.
 
     Examples
     --------

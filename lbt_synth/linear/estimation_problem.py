@@ -1,4 +1,4 @@
-"""The estimation problem that every filter of this package solves."""
+"""The estimation problem that every filter in this package solves."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
 from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
-from lbt_synth.validation import FloatArray, definite, frozen, integer, matrix
+from lbt_synth.validation import FloatArray, definite, frozen_copy, integer, matrix
 
-LONGEST_HORIZON = 100  # frames of a horizon
+LONGEST_HORIZON = 100  # samples
 
 
 def require_problem(problem: object) -> None:
-    """Refuse anything that is not an estimation problem."""
+    """Refuse anything but an estimation problem."""
     if not isinstance(problem, EstimationProblem):
         raise ProblemError(
             "expected an EstimationProblem, such as a plant; got "
@@ -28,7 +28,7 @@ class EstimationProblem(LinearSystem):
 
     The filter is the strictly causal one-step predictor: the estimate of z(k)
     uses y up to k-1. For the Kalman filter w is white noise of unit variance,
-    for the H-infinity filter any signal of unit energy; B and D carry the
+    for the H-infinity filter any signal of unit energy; B and D hold the
     weights. B D' need not be zero.
 
     Parameters
@@ -81,17 +81,17 @@ class EstimationProblem(LinearSystem):
     @property
     def Q(self) -> FloatArray:
         """Covariance of the process noise, ``B B'`` (n, n)."""
-        return frozen(self.B @ self.B.T)
+        return frozen_copy(self.B @ self.B.T)
 
     @property
     def R(self) -> FloatArray:
         """Covariance of the measurement noise, ``D D'`` (q, q)."""
-        return frozen(self.D @ self.D.T)
+        return frozen_copy(self.D @ self.D.T)
 
     @property
     def S(self) -> FloatArray:
         """Cross-covariance of process and measurement noise, ``B D'`` (n, q)."""
-        return frozen(self.B @ self.D.T)
+        return frozen_copy(self.B @ self.D.T)
 
     def error_system(self, gain_predictor: FloatArray) -> StateSpace:
         """System from w to the estimation error ``z - z_hat`` of a predictor gain.
@@ -119,19 +119,14 @@ class EstimationProblem(LinearSystem):
         0.5
         """
         gain = self._checked_gain(gain_predictor)
-        return StateSpace(
-            A=self.A - gain @ self.C,
-            B=self.B - gain @ self.D,
-            C=self.L,
-            D=np.zeros((self.L.shape[0], self.B.shape[1])),
-            dt_s=self.dt_s,
-        )
+        A, B, D = self.A - gain @ self.C, self.B - gain @ self.D, np.zeros_like(self.L @ self.B)
+        return StateSpace(A=A, B=B, C=self.L, D=D, dt_s=self.dt_s)
 
     def with_unit_weights(self) -> EstimationProblem:
         """Return the problem with each disturbance scaled to unit size.
 
-        The columns of ``[B; D]`` are divided by their norms: the paper's own
-        generalised plant, whose disturbances act with identity weights.
+        The columns of ``[B; D]`` are divided by their norms, so that the disturbances of
+        the generalised plant act with identity weights.
 
         Returns
         -------
@@ -147,27 +142,26 @@ class EstimationProblem(LinearSystem):
         """
         size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
         size = np.where(size > 0, size, 1.0)
-        return EstimationProblem(
-            A=self.A, B=self.B / size, C=self.C, D=self.D / size, L=self.L, dt_s=self.dt_s
-        )
+        A, C, L = self.A, self.C, self.L
+        return EstimationProblem(A=A, B=self.B / size, C=C, D=self.D / size, L=L, dt_s=self.dt_s)
 
     def ahead(self, frames: int) -> EstimationProblem:
         """Problem whose one-step prediction is the estimate of ``z(k + frames)`` from y up to k.
 
-        1 is this problem. 0 is its filter (a-posteriori) form: the estimated signal gets
-        a state of its own, one frame late. Less than 0 smooths with a fixed lag.
-        For 2 and more the measurement gets states of its own, and the disturbances that
-        come in between count in the error, for which they are not delayed.
+        With 1 it is this problem. With 0 it is the filter (a-posteriori) form: the estimated
+        signal gets a state of its own, one sample late. Less than 0 smooths with a fixed lag.
+        With 2 or more the measurement gets states of its own, and the disturbances that
+        arrive in between count in the error, where they are not delayed.
 
         Parameters
         ----------
         frames : int
-            Frames from the newest measurement to the estimate.
+            Samples from the newest measurement to the estimate.
 
         Returns
         -------
         EstimationProblem
-            With some more states; the first ones are x(k + max(frames, 1) - 1).
+            The problem, with more states; the first ones are x(k + max(frames, 1) - 1).
 
         Raises
         ------
@@ -184,7 +178,7 @@ class EstimationProblem(LinearSystem):
         """
         steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
         if steps > LONGEST_HORIZON:
-            raise ProblemError(f"horizon must be at most {LONGEST_HORIZON} frames; got {steps}.")
+            raise ProblemError(f"horizon must be at most {LONGEST_HORIZON} samples; got {steps}.")
         if steps == 1:
             return self
         n, p, q = self.n_states, self.B.shape[1], self.C.shape[0]
@@ -192,7 +186,7 @@ class EstimationProblem(LinearSystem):
             size = np.linalg.norm(self.B, 2) * np.linalg.norm(self.D, 2)
             if np.linalg.norm(self.S, 2) > 1e-12 * size:
                 raise ProblemError(
-                    f"a prediction of {steps} frames needs process and measurement noise that are "
+                    f"a prediction of {steps} samples needs process and measurement noise that are "
                     "uncorrelated (B D' = 0); got B D' with a norm of "
                     f"{np.linalg.norm(self.S, 2):.3g}. Try horizon=1, or separate the noises."
                 )
@@ -216,10 +210,10 @@ class EstimationProblem(LinearSystem):
         )
 
     def with_memory(self, taps: FloatArray) -> EstimationProblem:
-        """Problem with the past innovations of a filter as states, for filters that weigh them.
+        """Add the past innovations of a filter as states, for filters that weight them.
 
-        The new states are zero in truth, so that z is the same signal; a filter that feeds its
-        innovations into them, with the gain 1, estimates ``L x + taps [nu(k); nu(k-1); ...]``.
+        The true values of the new states are zero, so z is the same signal. A filter that feeds
+        its innovations into them, with gain 1, estimates ``L x + taps [nu(k); nu(k-1); ...]``.
 
         Parameters
         ----------
@@ -229,7 +223,7 @@ class EstimationProblem(LinearSystem):
         Returns
         -------
         EstimationProblem
-            Of the same kind, with T q more states.
+            The same kind of problem, with T q more states.
 
         Raises
         ------
@@ -248,7 +242,7 @@ class EstimationProblem(LinearSystem):
         if size == 0 or size % q:
             raise DimensionError(
                 f"taps must have a multiple of {q} columns, one for each measurement of each past "
-                f"frame; got {weights.shape}."
+                f"sample; got {weights.shape}."
             )
         A = np.zeros((self.n_states + size, self.n_states + size))
         A[: self.n_states, : self.n_states] = self.A
@@ -262,7 +256,7 @@ class EstimationProblem(LinearSystem):
         )
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from what is known: here from y(k), as :meth:`controller`.
+        """Estimator of z from all known signals: here from y(k), as :meth:`controller`.
 
         Parameters
         ----------
@@ -302,13 +296,8 @@ class EstimationProblem(LinearSystem):
         0.4
         """
         gain = self._checked_gain(gain_predictor)
-        return Controller(
-            A=self.A - gain @ self.C,
-            B=gain,
-            C=self.L,
-            D=np.zeros((self.L.shape[0], self.C.shape[0])),
-            dt_s=self.dt_s,
-        )
+        A, D = self.A - gain @ self.C, np.zeros_like(self.L @ gain)
+        return Controller(A=A, B=gain, C=self.L, D=D, dt_s=self.dt_s)
 
     def _checked_gain(self, gain_predictor: FloatArray) -> FloatArray:
         return matrix(

@@ -1,4 +1,4 @@
-"""Disturbances that no filter can see: proof that a level of gamma cannot be reached.
+"""Prove that a level of gamma cannot be reached, by disturbances that no filter can see.
 
 A disturbance that makes every measurement zero leaves every filter with the estimate
 zero, so its estimation error is the signal z itself. A set of such disturbances is
@@ -8,8 +8,8 @@ second moments of the states. Then, whatever the filter,
 
     gamma^2 >= ||L (A states + B disturbances)||^2 / ||disturbances||^2      (Frobenius)
 
-by weak duality with the linear matrix inequality of the filter: the moments are a point of
-its dual. What rounding takes from "at least" is charged to the bound.
+by weak duality with the linear matrix inequality of the filter, of whose dual the moments are
+a point. If rounding breaks the "at least", the shortfall is subtracted from the bound.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.validation import FloatArray, matrix
 
 _RANK_TOLERANCE = 1e-13
-_STRAYED = 1e-9  # what of the successors may lie where a filter has no error
+_STRAYED = 1e-9  # share of the successors that may lie where no filter has an error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,7 +34,7 @@ class Witness:
     states : (n, r) ndarray
         States x of the problem.
     disturbances : (p, r) ndarray
-        Disturbances w that go with them.
+        The disturbance w of each state.
     """
 
     states: FloatArray
@@ -56,10 +56,10 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
     problem : EstimationProblem
         The problem.
     witness : Witness
-        The disturbances; what the measurements would show of them is taken out first.
+        The disturbances; the part that the measurements would show is removed first.
     covariance : (n, n) ndarray
         Least covariance of the prediction error (Kalman), which bounds the storage matrix
-        of every filter, ``P <= gamma^2 covariance^-1``; it prices what rounding took.
+        of every filter, ``P <= gamma^2 covariance^-1``; it weighs the shortfall by rounding.
 
     Returns
     -------
@@ -78,8 +78,8 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
     >>> infeasible_level(p, push, np.eye(1))
     1.0
     """
-    basis, inverse = identity_coordinates(covariance)
-    x = basis @ (inverse @ witness.states)  # the error of a filter stays in this space
+    basis, inverse = whitening_coordinates(covariance)
+    x = basis @ (inverse @ witness.states)  # the space of a filter's error
     w = witness.disturbances
     w = w - problem.D.T @ np.linalg.solve(problem.R, problem.C @ x + problem.D @ w)
     after = problem.A @ x + problem.B @ w
@@ -91,14 +91,14 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
         return 0.0
     growth = inverse @ (after @ after.T - x @ x.T) @ inverse.T
     values, vectors = np.linalg.eigh((growth + growth.T) / 2)
-    grown = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
-    lost = -float(values[values < 0].sum())
-    gained = float(np.sum((problem.L @ x) ** 2) + np.sum((problem.L @ grown) ** 2))
-    spent = float(np.sum(w**2)) + lost
+    gain = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+    shortfall = -float(values[values < 0].sum())
+    gained = float(np.sum((problem.L @ x) ** 2) + np.sum((problem.L @ gain) ** 2))
+    spent = float(np.sum(w**2)) + shortfall
     return float(np.sqrt(gained / spent)) if spent > 0 else 0.0
 
 
-def identity_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Basis T with ``covariance = T T'``, and its left inverse; null directions are dropped."""
     spread = np.sqrt(np.diag(covariance))
     spread = np.where(spread > 0, spread, 1.0)

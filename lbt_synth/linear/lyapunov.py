@@ -1,4 +1,4 @@
-"""Stationary covariances: the discrete Lyapunov (Stein) equation."""
+"""Stationary covariances, by the discrete Lyapunov (Stein) equation."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ import warnings
 import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 
-from lbt_synth.linear.batched import norms, symmetrised, transposed
+from lbt_synth.linear.batched import frobenius_norms, symmetrise, transpose
 from lbt_synth.validation import FloatArray
 
-_SOLVED = 1e-14  # relative residual of an equation that is solved to rounding
+_SOLVED = 1e-14  # relative residual of an equation solved to rounding
 
 
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Solve ``X = A X A' + Q`` for a stable A, with iterative refinement.
 
-    By squaring; where that leaves a residual, by a bilinear transformation if it leaves less. The
-    latter inverts ``A + I``, which is all but singular for states in very different units. Shapes:
-    A (n, n), Q (n, n) -> (n, n).
+    By squaring, or by a bilinear transformation if that leaves a smaller residual. The latter
+    inverts ``A + I``, which is all but singular for states in very different units.
 
     Examples
     --------
@@ -31,7 +30,7 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     if residuals[0] < _SOLVED:
         return np.asarray(squared[0])
     with warnings.catch_warnings():
-        # states of very different sizes; whoever uses X measures its residual
+        # from states of very different sizes; the residual is measured below
         warnings.simplefilter("ignore", LinAlgWarning)
         warnings.simplefilter("ignore", RuntimeWarning)
         X = solve_discrete_lyapunov(A, Q)
@@ -41,9 +40,9 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Solve ``X = A X A' + Q`` for a stack, by squaring with refinement.
+    """Solve ``X = A X A' + Q`` for a stack (N, n, n); return X and its residuals (N,).
 
-    Shapes: A, Q (N, n, n) -> X (N, n, n), residuals (N,).
+    By squaring with refinement.
 
     Examples
     --------
@@ -54,12 +53,12 @@ def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
     (100.0, True)
     """
     X = smith_sum(A, Q)
-    with np.errstate(all="ignore"):  # what is not finite is reported
+    with np.errstate(all="ignore"):  # the caller judges the residuals
         for _ in range(2):
-            X = symmetrised(X + smith_sum(A, symmetrised(A @ X @ transposed(A) - X + Q)))
-        AXA = A @ X @ transposed(A)
-        size = norms(X) + norms(AXA) + norms(Q)
-        residuals = norms(AXA - X + Q) / np.where(size > 0, size, 1.0)
+            X = symmetrise(X + smith_sum(A, symmetrise(A @ X @ transpose(A) - X + Q)))
+        AXA = A @ X @ transpose(A)
+        size = frobenius_norms(X) + frobenius_norms(AXA) + frobenius_norms(Q)
+        residuals = frobenius_norms(AXA - X + Q) / np.where(size > 0, size, 1.0)
     return X, residuals
 
 
@@ -73,9 +72,8 @@ def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:
 def smith_sum(A: FloatArray, Q: FloatArray, *, max_steps: int = 60) -> FloatArray:
     """Sum ``A^i Q A'^i`` over all i by squaring, for a stack of matrices.
 
-    R. A. Smith, SIAM J. Appl. Math. 16, 198 (1968), doi:10.1137/0116017. Not finite where A is not
-    stable. For corrections: it loses digits as A nears the unit circle. Shapes: A, Q (N, n, n) ->
-    (N, n, n).
+    R. A. Smith, SIAM J. Appl. Math. 16, 198 (1968), doi:10.1137/0116017. Not finite where A is
+    not stable. Good for corrections only: it loses digits as A nears the unit circle.
 
     Examples
     --------
@@ -87,9 +85,9 @@ def smith_sum(A: FloatArray, Q: FloatArray, *, max_steps: int = 60) -> FloatArra
     X = Q
     with np.errstate(all="ignore"):
         for _ in range(max_steps):
-            X = X + A @ X @ transposed(A)
+            X = X + A @ X @ transpose(A)
             A = A @ A
-            size = norms(A)
-            if not np.any(size > 1e-9):  # what remains is of its square
+            size = frobenius_norms(A)
+            if not np.any(size > 1e-9):  # the rest is of the size of its square
                 return np.where((size <= 1)[:, None, None], X, np.nan)
     return np.where((size <= 1e-9)[:, None, None], X, np.nan)

@@ -1,4 +1,4 @@
-"""H-infinity norm of a discrete-time system by level sets on its symplectic pencil.
+"""H-infinity norms of discrete-time systems, by level sets of a symplectic pencil.
 
 N. A. Bruinsma, M. Steinbuch, Syst. Control Lett. 14, 287 (1990),
 doi:10.1016/0167-6911(90)90049-Z, in its discrete form: sigma is a singular
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import eigvals
 
 from lbt_synth.errors import NumericalError, UnstableLoopError
-from lbt_synth.linear.state_space import StateSpace, pointwise_response, swept_response
+from lbt_synth.linear.state_space import StateSpace, pointwise_response, schur_response
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _TOLERANCE = 2e-11
@@ -27,17 +27,17 @@ _CAREFUL = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HinfNorm:
-    """Norm with its bracket; ``float(norm)`` gives the value.
+    """Norm with its bracket; ``float(norm)`` is the value.
 
     Attributes
     ----------
     value : float
         Largest singular value found, attained at ``peak_frequency_hz``.
     lower, upper : float
-        Two-sided bracket of the level sets. Next to a pole on the unit circle the evaluation
-        itself is only as good as the distance to it: with a pole at 1 - 1e-9, some 1e-7.
+        Two-sided bracket by the level sets. Near a pole on the unit circle the evaluation
+        itself is only as good as the distance to it: some 1e-7 with a pole at 1 - 1e-9.
     peak_frequency_hz : float
-        Frequency of the peak [Hz] (cycles a sample when the system has no period).
+        Frequency of the peak [Hz] (cycles per sample when the system has no period).
     """
 
     value: float
@@ -102,17 +102,17 @@ def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
     """
     low, high = (2 * np.pi * f * system.dt_s for f in (low_hz, high_hz))
     found = _peak(system.balanced(), low, high)
-    # an end of the band, there and back, must not fall outside it
+    # rounding must not move an end of the band outside the band
     return replace(found, peak_frequency_hz=min(max(found.peak_frequency_hz, low_hz), high_hz))
 
 
 def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
     """Largest singular value of a balanced system between two angles, by level sets."""
     seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
-    peak, angle = _climbed(
-        seeds=_folded(seeds, low, high),
+    peak, angle = _climb(
+        seeds=_fold(seeds, low, high),
         largest=lambda angles: _largest(G, angles),
-        proposed=lambda level: _folded(_level_angles(G, level), low, high),
+        propose=lambda level: _fold(_level_angles(G, level), low, high),
     )
     return HinfNorm(
         value=peak,
@@ -125,7 +125,7 @@ def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
 def largest_real_part(system: StateSpace) -> float:
     """Largest real part of a stable scalar system's response over all frequencies.
 
-    By the level sets of ``G(z) + G(1/z) = 2 level``, as the norm.
+    As the norm, by the level sets of ``G(z) + G(1/z) = 2 level``.
 
     Examples
     --------
@@ -145,31 +145,31 @@ def largest_real_part(system: StateSpace) -> float:
         best = int(np.argmax(values))
         return float(values[best]), float(angles[best])
 
-    peak, _ = _climbed(
-        seeds=_folded(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)]), 0.0, np.pi),
+    peak, _ = _climb(
+        seeds=_fold(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)]), 0.0, np.pi),
         largest=largest,
-        proposed=lambda level: _folded(_real_part_angles(moved, level), 0.0, np.pi),
+        propose=lambda level: _fold(_real_part_angles(moved, level), 0.0, np.pi),
     )
     return peak * (1 + 2 * _TOLERANCE) - 2 * size
 
 
-def _climbed(
+def _climb(
     *,
     seeds: FloatArray,
     largest: Callable[[FloatArray], tuple[float, float]],
-    proposed: Callable[[float], FloatArray],
+    propose: Callable[[float], FloatArray],
 ) -> tuple[float, float]:
-    """Peak over angles, and where: raise a level until nothing lies above it.
+    """Find the peak over angles, and its angle, by raising a level until nothing lies above it.
 
-    ``largest`` gives the largest value at some angles, at least 0, and its angle;
-    ``proposed`` the angles that delimit what may lie above a level.
+    ``largest`` returns the largest value at some angles, at least 0, and its angle. ``propose``
+    returns the angles between which values may lie above a level.
     """
     peak, angle = largest(seeds)
     if peak == 0:
         return peak, angle
     for _ in range(100):
         level = peak * (1 + _TOLERANCE)
-        candidates = proposed(level)
+        candidates = propose(level)
         tests = np.concatenate([candidates, (candidates[1:] + candidates[:-1]) / 2])
         new_peak, new_angle = largest(tests)
         if new_peak > peak:
@@ -216,7 +216,7 @@ def largest_singular_values(system: StateSpace, frequency_hz: Any) -> FloatArray
 def spectral_norms(matrices: ComplexArray) -> FloatArray:
     """Largest singular value of each matrix of a stack, (N,).
 
-    From the Gram matrix of the smaller side, which costs no accuracy for the largest one.
+    By the Gram matrix of the smaller side, which costs the largest one no accuracy.
     """
     if matrices.shape[-2] > matrices.shape[-1]:
         matrices = matrices.swapaxes(-1, -2)
@@ -236,16 +236,16 @@ def spectral_norms(matrices: ComplexArray) -> FloatArray:
     return np.asarray(scale * np.sqrt(np.maximum(largest, 0.0)), dtype=np.float64)
 
 
-def _folded(angles: FloatArray, low: float, high: float) -> FloatArray:
-    """Sorted distinct angles between two of [0, pi], these included."""
+def _fold(angles: FloatArray, low: float, high: float) -> FloatArray:
+    """Fold angles into [low, high] within [0, pi]; return them sorted, with both ends."""
     inside = np.abs(np.mod(angles + np.pi, 2 * np.pi) - np.pi)
     return np.unique(np.concatenate([np.clip(inside, low, high), [low, high]]))
 
 
 def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
-    """Largest singular value of a balanced system; the highest few are evaluated with care."""
+    """Largest singular value and its angle; the highest few are computed again with care."""
     z = np.exp(1j * angles)
-    high = np.argsort(spectral_norms(swept_response(G, z)))[-_CAREFUL:]
+    high = np.argsort(spectral_norms(schur_response(G, z)))[-_CAREFUL:]
     careful = spectral_norms(pointwise_response(G, z[high]))
     best = int(np.argmax(careful))
     return float(careful[best]), float(angles[high[best]])

@@ -1,4 +1,4 @@
-"""Composite Gauss-Legendre quadrature."""
+"""Gauss-Legendre quadrature on panels, fixed or adaptive."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import BoolArray, FloatArray
 
 
 def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights of a Gauss-Legendre rule on each of consecutive panels.
-
-    Shapes: edges (panels + 1,) -> nodes, weights (panels * order,).
+    """Nodes and weights (panels * order,) of a Gauss-Legendre rule on consecutive panels.
 
     Examples
     --------
@@ -35,6 +33,11 @@ def panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArra
     return middle + half * x, half * w
 
 
+def _stack(left: FloatArray, right: FloatArray, rows: BoolArray) -> FloatArray:
+    """Chosen rows of two arrays, one below the other."""
+    return np.concatenate([left[rows], right[rows]])
+
+
 def adaptive_integral(
     integrand: Callable[[FloatArray], FloatArray],
     edges: FloatArray,
@@ -42,9 +45,7 @@ def adaptive_integral(
     tolerance: float = 1e-7,
     order: int = 6,
 ) -> FloatArray:
-    """Integrate a matrix-valued function, halving panels until the integral stands still.
-
-    Shapes: edges (panels + 1,).
+    """Integrate a matrix-valued function, halving panels until the integral converges.
 
     Examples
     --------
@@ -74,47 +75,40 @@ def adaptive_integral(
         done = done + fine[~open_].sum(axis=0)
         if not open_.any():
             return np.asarray(done)
-        low, high = (
-            np.concatenate([low[open_], middle[open_]]),
-            np.concatenate([middle[open_], high[open_]]),
-        )
-        coarse = np.concatenate([left[open_], right[open_]])
+        low, high = _stack(low, middle, open_), _stack(middle, high, open_)
+        coarse = _stack(left, right, open_)
     raise NumericalError(
-        "the integral of a spectrum did not settle: it changes still after 40 halvings. "
+        "the integral of a spectrum did not settle: it still changes after 40 halvings. "
         "Check that the spectrum is finite and not a set of delta functions.",
         status="quadrature",
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SettledPanels:
-    """Panels on which a vector-valued integral stands still."""
+class RefinedPanels:
+    """Panels on which a vector-valued integral has converged, in increasing order."""
 
-    # low, high (panels,): ends, in increasing order
-    low: FloatArray
-    high: FloatArray
+    low: FloatArray  # (panels,)
+    high: FloatArray  # (panels,)
     integrals: FloatArray  # (panels, k): integral over each panel
-    # Sum over the panels of what their last halving changed, the worst of the k entries
-    change: float
+    change: float  # by the last halvings: summed over the panels, the largest of the k entries
 
 
-def settled_panels(
+def refine_panels(
     integrand: Callable[[FloatArray], FloatArray],
     edges: FloatArray,
     *,
     tolerance: float = 1e-10,
     floor: float = 0.0,
     order: int = 10,
-) -> SettledPanels:
-    """Halve panels until the integral of a vector of either sign stands still.
-
-    Shapes: edges (panels + 1,).
+) -> RefinedPanels:
+    """Halve panels until the integral of a vector of either sign converges.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.linear.quadrature import settled_panels
-    >>> found = settled_panels(lambda x: np.log(x)[:, None], np.array([0.0, 1.0]))
+    >>> from lbt_synth.linear.quadrature import refine_panels
+    >>> found = refine_panels(lambda x: np.log(x)[:, None], np.array([0.0, 1.0]))
     >>> round(float(found.integrals.sum()), 8)
     -1.0
     """
@@ -143,16 +137,13 @@ def settled_panels(
         if not open_.any():
             ends = [np.concatenate(parts) for parts in zip(*done, strict=True)]
             rank = np.argsort(ends[0])
-            return SettledPanels(
+            return RefinedPanels(
                 low=ends[0][rank], high=ends[1][rank], integrals=ends[2][rank], change=moved
             )
-        low, high = (
-            np.concatenate([low[open_], middle[open_]]),
-            np.concatenate([middle[open_], high[open_]]),
-        )
-        coarse = np.concatenate([left[open_], right[open_]])
+        low, high = _stack(low, middle, open_), _stack(middle, high, open_)
+        coarse = _stack(left, right, open_)
     raise NumericalError(
-        "the integral of a spectrum's logarithm did not settle: it changes still after 45 "
+        "the integral of a spectrum's logarithm did not settle: it still changes after 45 "
         "halvings. Check that the spectrum is finite and without jumps; give a table its own "
         "frequencies.",
         status="quadrature",

@@ -1,9 +1,8 @@
-"""Discrete-time linear systems, in the two output conventions of this field.
+"""Discrete-time linear systems in textbook form, and controllers in the form in which they run.
 
 :class:`StateSpace` is the textbook form ``y(k) = C x(k) + D u(k)``.
-:class:`Controller` is the form of real-time computers (and of SPECULA's
-state-space filter): the state is updated first and the output is read from
-the *new* state, ``u(k) = C x(k+1) + D y(k)``.
+:class:`Controller` is the form of real-time computers: the state is updated first, and the
+output is read from the *new* state, ``u(k) = C x(k+1) + D y(k)``.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from scipy.linalg import matrix_balance, schur
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import ComplexArray, FloatArray, matrix, number, real_array, square
 
-_CHUNK = 60_000  # complex numbers worked on at once by a frequency response: they fit a cache
+_CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LinearSystem:
-    """Four matrices that fit each other, and a sampling period."""
+    """Four matrices of matching sizes, and a sampling period."""
 
     A: FloatArray
     B: FloatArray
@@ -143,12 +142,13 @@ class StateSpace(LinearSystem):
         )
 
     def balanced(self) -> StateSpace:
-        """Return the same input-output map with states in units (powers of two) that balance it.
+        """Scale the states by powers of two so that the system is balanced.
 
         Returns
         -------
         StateSpace
-            Rows and columns of ``[[A, B], [C, 0]]`` are of similar size, state by state.
+            The same input-output map; rows and columns of ``[[A, B], [C, 0]]`` are of
+            similar size, state by state.
 
         Examples
         --------
@@ -160,11 +160,11 @@ class StateSpace(LinearSystem):
         n = self.n_states
         scale = max(float(np.abs(self.A).max()), 1e-300)
         entry, leaving = np.linalg.norm(self.B, axis=1), np.linalg.norm(self.C, axis=0)
-        scaling = bordered_scaling(self.A, _of_size(entry, scale), _of_size(leaving, scale))
+        scaling = balancing_scales(self.A, _rescale(entry, scale), _rescale(leaving, scale))
         units = np.asarray(scaling[:n] / scaling[n], dtype=np.float64)
         if not np.all(np.isfinite(units)):
             return self
-        # the sizes of B and C as a whole are shared between them, too
+        # B and C as a whole share their sizes, too
         large, small = entry / units, leaving * units
         both = float(np.sqrt(max(float(np.max(large)), 1e-300) / max(float(np.max(small)), 1e-300)))
         units = units * np.exp2(np.round(np.log2(both))) if 0 < both < np.inf else units
@@ -197,7 +197,7 @@ class StateSpace(LinearSystem):
         Returns
         -------
         (f, p, m) complex ndarray
-            One matrix a frequency.
+            One matrix per frequency.
 
         Raises
         ------
@@ -215,7 +215,7 @@ class StateSpace(LinearSystem):
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         # a few points are solved one by one, which is more accurate next to a pole
         few = z.size <= self.n_states
-        response = pointwise_response(self, z) if few else swept_response(self.balanced(), z)
+        response = pointwise_response(self, z) if few else schur_response(self.balanced(), z)
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -225,20 +225,20 @@ class StateSpace(LinearSystem):
         return response
 
 
-def bordered_scaling(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> FloatArray:
-    """Scaling, powers of two, that balances ``[[|A|, entry], [leaving', 0]]``, (n + 1,)."""
+def balancing_scales(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> FloatArray:
+    """Powers of two that balance ``[[|A|, entry], [leaving', 0]]``, (n + 1,)."""
     border = np.block([[np.abs(A), entry[:, None]], [leaving[None, :], np.zeros((1, 1))]])
     _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
     return np.asarray(scaling, dtype=np.float64)
 
 
-def _of_size(vector: FloatArray, size: float) -> FloatArray:
+def _rescale(vector: FloatArray, size: float) -> FloatArray:
     largest = float(np.max(vector, initial=0.0))
     return vector * (size / largest) if largest > 0 else vector
 
 
 def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
-    """Transfer matrices at points z, one linear system a point; inf at a pole."""
+    """Transfer matrices at points z, by one linear system per point; inf at a pole."""
     n, m = system.B.shape
     pencil = z[:, None, None] * np.eye(n) - system.A
     try:
@@ -251,22 +251,22 @@ def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     return np.asarray(system.C @ states + system.D, dtype=np.complex128)
 
 
-def swept_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
-    """Transfer matrices at points z, by one Schur form and a substitution a point.
+def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
+    """Transfer matrices at points z, by one Schur form and one substitution per point.
 
     ``A = U T U*`` is unitary, so nothing is lost when A is defective, as it is with
     every delay. The smaller of inputs and outputs is carried through the substitution.
-    The system should be balanced; not finite at a pole.
+    The system should be balanced. The result is not finite at a pole.
     """
     if len(system.C) > system.B.shape[1]:
         dual = StateSpace(A=system.A.T, B=system.C.T, C=system.B.T, D=system.D.T)
-        return np.swapaxes(swept_response(dual, z), 1, 2)
+        return np.swapaxes(schur_response(dual, z), 1, 2)
     T, U = schur(system.A.astype(np.complex128), output="complex")
     rows, B = system.C @ U, U.conj().T @ system.B
     p, n = rows.shape
     out = np.empty((z.size, p, B.shape[1]), dtype=np.complex128)
     step = max(1, _CHUNK // (n * p))
-    with np.errstate(all="ignore"):  # a pole among the points is the caller's to report
+    with np.errstate(all="ignore"):  # the caller reports a pole among the points
         for start in range(0, z.size, step):
             part = z[start : start + step]
             left = np.empty((n, p * part.size), dtype=np.complex128)  # C U (zI - T)^-1
@@ -318,13 +318,13 @@ class Controller(LinearSystem):
         )
 
     def start(self) -> RunningController:
-        """Return a running copy with a zero state, to be stepped frame by frame."""
+        """Return a running copy with a zero state, to be stepped sample by sample."""
         return RunningController(self)
 
 
 @dataclass(slots=True, eq=False)
 class RunningController:
-    """A controller with its state: ``step(y) -> u`` once a frame, and ``reset()``.
+    """A controller with its state: call ``step(y) -> u`` once per sample, or ``reset()``.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Arrays and one text of metadata in one file, FITS or NPZ, with a digest of both.
+"""Arrays with a text of metadata in one file, FITS or NPZ, and a digest of both.
 
-Each ``read_*`` raises ``ValueError``, ``KeyError`` or ``OSError`` on bytes that
-are not its format; the caller turns that into an error of its own.
+Each ``read_*`` raises ``ValueError``, ``KeyError`` or ``OSError`` on bytes of another format;
+the caller turns that into an error of its own.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def fits_bytes(
     primary: Cards,
     cards: Mapping[str, Cards] | None = None,
 ) -> bytes:
-    """Write a primary HDU without data, one image HDU an array in their order, then the text."""
+    """Write a primary HDU without data, one image HDU per array in their order, then the text."""
     everything: dict[str, Any] = {**arrays, TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
     return fitsfile.fits_bytes(primary, everything, headers=cards)
 
@@ -57,9 +57,9 @@ def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
                 io.BytesIO(content), memmap=False, lazy_load_hdus=False, checksum=True
             ) as units:
                 data = {unit.name: np.array(unit.data) for unit in units[1:]}
-        except Exception as error:  # astropy has no common class for what damage makes it raise
+        except Exception as error:  # astropy raises many kinds on damaged files
             raise ValueError("its FITS structure or a checksum is broken") from error
-    return _parted(data)
+    return _split_text(data)
 
 
 def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> bytes:
@@ -75,18 +75,18 @@ def read_npz(content: bytes) -> tuple[dict[str, FloatArray], str]:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             data = {name: np.array(archive[name]) for name in archive.files}
-    except Exception as error:  # zip, zlib and NumPy each raise their own
+    except Exception as error:  # zip, zlib and NumPy each raise their own kinds
         raise ValueError("it is not a NumPy archive") from error
-    return _parted(data)
+    return _split_text(data)
 
 
-def _parted(data: dict[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], str]:
+def _split_text(data: dict[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], str]:
     text = data.pop(TEXT).astype(np.uint8).tobytes().decode()
     return {name: array.astype(np.float64) for name, array in data.items()}, text
 
 
-def reason(error: Exception) -> str:
-    """Return what an error says, in one line without its full stop."""
+def error_reason(error: Exception) -> str:
+    """Return the message of an error, in one line without its full stop."""
     if isinstance(error, KeyError):
         return f"{error.args[0]} is missing".rstrip(".")
     return str(error).split("\n")[0].rstrip(".") or type(error).__name__

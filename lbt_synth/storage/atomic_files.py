@@ -1,4 +1,4 @@
-"""Files: read as a whole, written as a whole or not at all."""
+"""Write files whole or not at all, and never over an input."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ def require_writable(
         target = Path(path)
         if not target.parent.is_dir():
             raise OutputError(f"cannot write {target}: no directory {target.parent}.", path=target)
-        if target.is_dir():
-            raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+        _require_no_directory(target)
         try:
             with tempfile.TemporaryFile(dir=target.parent):
                 pass
@@ -46,7 +45,7 @@ def require_writable(
 def refuse_replacing(
     outputs: Iterable[str | os.PathLike[str]], inputs: Iterable[str | os.PathLike[str]]
 ) -> None:
-    """Refuse to write what is read: the same file by whatever name, symbolic or hard link.
+    """Refuse to write to an input, under whatever name, symbolic or hard link.
 
     Examples
     --------
@@ -66,12 +65,15 @@ def refuse_replacing(
                 )
 
 
+def _require_no_directory(target: Path) -> None:
+    if target.is_dir():
+        raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+
+
 def _is_same(one: Path, other: Path) -> bool:
     try:
-        if one.resolve() == other.resolve():
-            return True
-        return one.samefile(other)
-    except (OSError, ValueError, RuntimeError):  # one is not there, no name, or a ring of links
+        return one.resolve() == other.resolve() or one.samefile(other)
+    except (OSError, ValueError, RuntimeError):  # missing, no valid name, or a ring of links
         return False
 
 
@@ -105,8 +107,7 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
     """
     targets = {Path(path): content for path, content in contents.items()}
     for target in targets:
-        if target.is_dir():
-            raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+        _require_no_directory(target)
     staged: dict[Path, Path] = {}
     older: dict[Path, bytes | None] = {}
     target = next(iter(targets))
@@ -114,7 +115,7 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
         for target, content in targets.items():
             staged[target] = _stage(target, content)
         for target, temporary in staged.items():
-            # what a later failure has to put back; a single file is replaced in one step
+            # kept to undo the change if a later file fails; a single file needs no undoing
             older[target] = target.read_bytes() if len(targets) > 1 and target.exists() else None
             temporary.replace(target)
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
@@ -128,20 +129,20 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
                     done.unlink()
                 else:
                     _stage(done, content_before).replace(done)
-        raise _unwritten(target, error) from error
+        raise _output_error(target, error) from error
     return tuple(targets)
 
 
 def _stage(target: Path, content: bytes) -> Path:
-    """Write a whole file under a temporary name beside its target; none is left if that fails."""
-    with _staged(target) as (stream, temporary):
+    """Write a whole file under a temporary name beside its target; leave none if that fails."""
+    with _temporary_file(target) as (stream, temporary):
         stream.write(content)
     return temporary
 
 
 @contextlib.contextmanager
-def _staged(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
-    """Give a stream to a temporary file beside a target, and its name; gone if the block fails."""
+def _temporary_file(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
+    """Open a temporary file beside a target, which is deleted if the block fails."""
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     temporary = Path(name)
     try:
@@ -159,31 +160,30 @@ def _staged(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
 
 
 @contextlib.contextmanager
-def writing_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Give a stream whose content becomes a file when the block ends well, and not before.
+def open_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a stream whose content becomes a file only when the block ends without an error.
 
     Examples
     --------
     >>> import tempfile, pathlib
-    >>> from lbt_synth.storage.atomic_files import writing_atomically
+    >>> from lbt_synth.storage.atomic_files import open_atomically
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with writing_atomically(pathlib.Path(folder) / "a.txt") as stream:
+    ...     with open_atomically(pathlib.Path(folder) / "a.txt") as stream:
     ...         _ = stream.write(b"part by part")
     ...     (pathlib.Path(folder) / "a.txt").read_bytes()
     b'part by part'
     """
     target = Path(path)
-    if target.is_dir():
-        raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+    _require_no_directory(target)
     try:
-        with _staged(target) as (stream, temporary):
+        with _temporary_file(target) as (stream, temporary):
             yield stream
         temporary.replace(target)
     except OSError as error:
-        raise _unwritten(target, error) from error
+        raise _output_error(target, error) from error
 
 
-def _unwritten(target: Path, error: Exception) -> OutputError:
+def _output_error(target: Path, error: Exception) -> OutputError:
     reason = getattr(error, "strerror", None) or error
     return OutputError(
         f"cannot write {target}: {reason}. Check the directory and its free space.", path=target

@@ -1,4 +1,4 @@
-"""Arrays as FITS bytes."""
+"""Write arrays as the bytes of a FITS file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def fits_bytes(
     headers: Mapping[str, Mapping[str, Any]] | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
-    """Return a primary HDU of cards and one image HDU an array, each with its checksums.
+    """Return a primary HDU of cards and one image HDU per array, each with its checksums.
 
     The same content gives the same bytes: no date is written.
 
@@ -54,7 +54,9 @@ def fits_bytes(
             unit.header[key] = value
         for line in comments if unit is primary else ():
             unit.header.add_comment(line)
-        unit.add_checksum(when="of this unit")  # not the time: the same content is the same file
+        unit.add_checksum(
+            when="of this unit"
+        )  # instead of the time, so that equal contents give equal files
     buffer = io.BytesIO()
     fits.HDUList(units).writeto(buffer)
     return buffer.getvalue()

@@ -1,8 +1,8 @@
-"""Many independent cases, one file each: killed at any moment, a campaign goes on where it was.
+"""Run many independent cases, one file each, and resume where a killed run stopped.
 
-A case is a name and arguments that JSON can hold. Its result is written, whole or
-not at all, as soon as it is there, with a digest of what was asked; the process that
-started the campaign is the only one that writes.
+A case is a name and arguments that JSON can hold. Its result is written as soon as it is
+known, whole or not at all, with a digest of the case. Only the process that started the run
+writes.
 """
 
 from __future__ import annotations
@@ -13,19 +13,13 @@ import json
 import os
 import re
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from pathlib import Path
 from typing import Any
 
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.storage.atomic_files import write_atomically
-from lbt_synth.storage.worker_processes import WorkerPool, alone_in, one_thread_each
+from lbt_synth.storage.worker_processes import WorkerPool, exclusive_lock, limit_threads
 from lbt_synth.validation import integer
 
 Case = Mapping[str, Any]
@@ -41,15 +35,15 @@ def run_cases(
     executor: Executor | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Run what is missing of some cases, and return the results of all.
+    """Run the cases that have no result yet, and return the results of all.
 
     Parameters
     ----------
     function : callable
         Maps a case to its result, a mapping that JSON can hold; importable by name where
-        other processes run it. What it returns must depend on the case only.
+        other processes run it. Its result must depend on the case only.
     cases : mapping of str to mapping
-        Arguments of each case by its name, which is that of its file.
+        Arguments of each case, by its name, which is also that of its file.
     directory : path-like
         An existing directory; results go into ``NAME.json``.
     jobs : int, optional
@@ -68,7 +62,7 @@ def run_cases(
     ------
     OutputError
         If the directory holds results of other arguments under these names, is in use by
-        another campaign, or cannot be written.
+        another run, or cannot be written.
     ProblemError
         If a name is no file name, or a case or a result does not fit into JSON.
     NumericalError
@@ -91,7 +85,7 @@ def run_cases(
     folder = Path(directory)
     jobs = integer(jobs, "jobs", at_least=1)
     digests = {name: _digest(name, case) for name, case in cases.items()}
-    with alone_in(folder, "campaign"):
+    with exclusive_lock(folder, "computation"):
         results = {}
         for name, expected in digests.items():
             found = _read(folder / f"{name}.json", expected)
@@ -100,21 +94,21 @@ def run_cases(
         if progress is not None and results:
             progress(len(results))
         missing = {name: case for name, case in cases.items() if name not in results}
-        with contextlib.closing(_results(function, missing, jobs, executor)) as coming:
-            for name, result in coming:
+        with contextlib.closing(_run_cases(function, missing, jobs, executor)) as finished:
+            for name, result in finished:
                 results[name] = _write(folder, name, digests[name], cases[name], result)
                 if progress is not None:
                     progress(1)
     return {name: results[name] for name in cases}
 
 
-def _results(
+def _run_cases(
     function: Callable[[Case], Mapping[str, Any]],
     cases: Mapping[str, Case],
     jobs: int,
     executor: Executor | None,
 ) -> Generator[tuple[str, Mapping[str, Any]], None, None]:
-    """Yield results as they come; if a case fails, those that run are still waited for."""
+    """Yield results as they come; if a case fails, wait for those that are running."""
     if not cases:
         return
     if executor is None and (jobs == 1 or len(cases) == 1):
@@ -149,16 +143,16 @@ def _results(
 
 @contextlib.contextmanager
 def _pool(workers: int) -> Iterator[Executor]:
-    """Give processes that are waited for, unless this one is interrupted."""
-    with one_thread_each():
+    """Provide processes, which are waited for unless this one is interrupted."""
+    with limit_threads():
         pool = WorkerPool(workers)
         try:
             yield pool.executor
         except BrokenExecutor as error:
             pool.close()
             raise NumericalError(
-                "a process of the campaign ended without a word, for want of memory perhaps. "
-                "What is finished is kept: start again, with fewer jobs."
+                "a worker process ended without a word, perhaps for want of memory. "
+                "Finished results are kept: start again, with fewer jobs."
             ) from error
         except (KeyboardInterrupt, SystemExit, GeneratorExit):
             pool.kill()
@@ -191,13 +185,13 @@ def _read(path: Path, expected: str) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise OutputError(
-            f"{path} is no result of a campaign: {error}. Delete it, or name another directory.",
+            f"{path} is no result of a run: {error}. Delete it, or name another directory.",
             path=path,
         ) from error
     if asked != expected:
         raise OutputError(
-            f"{path} is of other settings than those asked for. Name another directory, or delete "
-            "the results of the old settings.",
+            f"{path} is the result of other settings. Name another directory, or delete the "
+            "results of the old settings.",
             path=path,
         )
     if digest != _hash(result):

@@ -1,4 +1,4 @@
-"""Tables of text, and tables as CSV files."""
+"""Tables of text cells, and tables as CSV files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ TONES = ("plain", "good", "bad", "note")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """A cell of a table that is not only a text."""
+    """A cell of a table with a tone beside its text."""
 
-    text: str  # The text
-    tone: str = "plain"  # "plain", "good", "bad" or "note"; the text has to say it, too
+    text: str
+    tone: str = "plain"  # one of TONES; the text must say the same
 
     def __post_init__(self) -> None:
         choice(self.tone, "tone", TONES)
@@ -29,12 +29,10 @@ class Cell:
 class Table:
     """A table; the first cell of each row is its heading."""
 
-    caption: str  # What it holds
-    headings: tuple[str, ...]  # One a column, the first over the headings of the rows
-    # One a row; a row of a single cell is a heading of the rows below
-    rows: tuple[tuple[str | Cell, ...], ...]
-    # Columns of words, which are set flush left; the first one always is
-    words: tuple[int, ...] = ()
+    caption: str
+    headings: tuple[str, ...]  # one per column, the first over the headings of the rows
+    rows: tuple[tuple[str | Cell, ...], ...]  # a single cell is a heading of the rows below
+    words: tuple[int, ...] = ()  # columns set flush left, besides the first
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "headings", tuple(self.headings))
@@ -52,7 +50,7 @@ class Table:
             yield tuple(Cell(text=c) if isinstance(c, str) else c for c in row)
 
     def by_columns(self, most: int) -> Iterator[Table]:
-        """Tables of so many columns at most after the first, which all of them repeat."""
+        """Split into tables of at most so many columns after the first, which each repeats."""
         columns = range(1, len(self.headings))
         for start in range(1, max(len(self.headings), 2), most):
             kept = [c for c in columns if start <= c < start + most]

@@ -1,4 +1,4 @@
-"""Processes that compute, with one thread of linear algebra each, and who may write where."""
+"""Worker processes with one thread each, and a lock on the directory they write to."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _ORPHAN_SECONDS = 1.0
 
 
 class WorkerPool:
-    """Fresh processes that are gone when their parent is, however it ends.
+    """Fresh processes that end with their parent, however it ends.
 
-    Start it within :func:`one_thread_each`, which the processes inherit.
+    Start it within :func:`limit_threads`, whose limit the processes inherit.
     """
 
     def __init__(self, workers: int) -> None:
@@ -44,15 +44,15 @@ class WorkerPool:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def kill(self) -> None:
-        """End at once: what is running is not waited for."""
+        """End at once, without waiting for what is running."""
         for worker in set(multiprocessing.active_children()) - self._others:
             worker.terminate()
         self.close()
 
 
 @contextlib.contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Let processes that are started in the block have one thread of linear algebra."""
+def limit_threads() -> Iterator[None]:
+    """Limit the processes that are started in the block to one thread of linear algebra."""
     before = {name: os.environ.get(name) for name in _THREADS}
     for name in _THREADS:
         os.environ.setdefault(name, "1")
@@ -65,7 +65,7 @@ def one_thread_each() -> Iterator[None]:
 
 
 def _watch_parent(parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and ends them
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it, and ends the workers
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -76,11 +76,11 @@ def _watch_parent(parent: int) -> None:
 
 
 @contextlib.contextmanager
-def alone_in(folder: Path, what: str) -> Iterator[None]:
-    """Hold a lock that the system lets go of when this process ends, however it ends."""
+def exclusive_lock(folder: Path, what: str) -> Iterator[None]:
+    """Hold a lock on a directory, which the system releases when this process ends in any way."""
     try:
         import fcntl
-    except ImportError:  # Windows: two of them in one directory are not noticed
+    except ImportError:  # on Windows a second one in the directory goes unnoticed
         yield
         return
     try:

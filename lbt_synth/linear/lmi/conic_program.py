@@ -1,13 +1,13 @@
-"""Conic programmes over the coefficients of a Youla parameter.
+"""Conic programmes that minimise functions of the coefficients of a Youla parameter.
 
-A function with denominators (a sensor gain other than one) is not convex. It is replaced by
-a convex one that lies above it and touches it at the present coefficients c0: with
-``b = 1 - steering c`` and b0 its value at c0::
+A function with denominators (at another gain of the loop than the nominal one) is not convex.
+It is replaced by a convex function that lies above it and touches it at the current
+coefficients c0. With ``b = 1 - steering c`` and its value b0 at c0::
 
     |b|^2 >= l(b) = 2 Re(conj(b0) b) - |b0|^2,    so    |a|^2 / |b|^2 <= |a|^2 / l(b)
 
 Minimising the right-hand side lowers the function, and its domain keeps b in the half-plane
-of b0 at every frequency of the programme: the loop does not leave its stable set (the
+of b0 at every frequency of the programme, so the loop does not leave its stable set (the
 convex-concave procedure; A. L. Yuille, A. Rangarajan, Neural Comput. 15, 915 (2003),
 doi:10.1162/08997660360581958).
 """
@@ -21,12 +21,12 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.convex_functions import (
-    Bounded,
-    Combined,
+    CombinedFunction,
     Constraint,
     Discs,
     Fractions,
     Function,
+    FunctionBound,
     HalfPlanes,
 )
 from lbt_synth.linear.lmi.solver import USABLE, solve
@@ -34,53 +34,52 @@ from lbt_synth.validation import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ShapingSolution:
+class ConicSolution:
     """Answer of a programme."""
 
-    # (n,): the coefficients; None if the constraints cannot hold together
-    coefficients: FloatArray | None
-    status: str  # The solver's word
+    coefficients: FloatArray | None  # (n,); None if the constraints cannot hold together
+    status: str  # as reported by the solver
 
 
-def least(
+def minimize(
     function: Function,
     constraints: tuple[Constraint, ...],
     *,
     size: int,
     scale: float,
     start: FloatArray | None = None,
-) -> ShapingSolution:
-    """Minimise a function, or what touches it from above at a start. Shapes: start (size,)."""
+) -> ConicSolution:
+    """Minimise a function; one with denominators by its convex majorant at ``start``, (size,)."""
     c = cp.Variable(size)
     held: list[cp.Constraint] = []
     objective = _expression(function, c, held, scale, start)
     for constraint in constraints:
-        held += _held(constraint, c, 0.0)
+        held += _as_constraints(constraint, c, 0.0)
     status, _ = solve(cp.Minimize(objective), held)
     if status not in USABLE or c.value is None:
-        return ShapingSolution(coefficients=None, status=status)
-    return ShapingSolution(coefficients=np.asarray(c.value, dtype=np.float64), status=status)
+        return ConicSolution(coefficients=None, status=status)
+    return ConicSolution(coefficients=np.asarray(c.value, dtype=np.float64), status=status)
 
 
-def least_relaxation(
+def minimize_relaxation(
     groups: tuple[tuple[Constraint, ...], ...], *, size: int, rigid: tuple[bool, ...]
 ) -> FloatArray:
-    """Least factors by which groups of constraints have to be relaxed to hold together.
+    """Find by how much groups of constraints must be relaxed to hold together, (groups,).
 
-    Shapes: returns (groups,).
+    Each bound is multiplied by 1 plus the number of its group, which is 0 for ``rigid`` groups.
     """
     c, slack = cp.Variable(size), cp.Variable(len(groups), nonneg=True)
     held: list[cp.Constraint] = []
     for i, group in enumerate(groups):
         for constraint in group:
-            held += _held(constraint, c, 0.0 if rigid[i] else slack[i])
+            held += _as_constraints(constraint, c, 0.0 if rigid[i] else slack[i])
     status, _ = solve(cp.Minimize(cp.sum(slack)), held)
     if "infeasible" in status:
         return np.full(len(groups), np.inf)
     if status not in USABLE or slack.value is None:
         raise NumericalError(
-            f"the search for demands that clash ended as {status!r}. The demands may be close to "
-            "what can be met, or very far from it; relax them, or try another number of functions.",
+            f"the search for constraints that clash ended as {status!r}. They may be close to what "
+            "can be met, or very far from it; relax them, or try another number of functions.",
             status=status,
         )
     return np.asarray(np.where(rigid, 0.0, slack.value), dtype=np.float64)
@@ -93,8 +92,8 @@ def _expression(
     scale: float,
     start: FloatArray | None,
 ) -> cp.Expression:
-    """Convex expression of a function over its scale; what it needs is added to ``held``."""
-    if isinstance(function, Combined):
+    """Convex expression of a function over its scale; it adds its own constraints to ``held``."""
+    if isinstance(function, CombinedFunction):
         parts = [
             weight * _expression(part, c, held, scale, start)
             for weight, part in zip(function.weights, function.parts, strict=True)
@@ -106,9 +105,9 @@ def _expression(
     unit = 1 / np.sqrt(scale)
     if function.worst:
         level = cp.Variable(nonneg=True)
-        held.append(_cones(level, function.centres * unit, function.rows * unit, c))
+        held.append(_norm_bounds(level, function.centres * unit, function.rows * unit, c))
         return cp.square(level)
-    root, target = _triangle(function)
+    root, target = _least_squares_form(function)
     return cp.sum_squares(unit * root @ c - unit * target)
 
 
@@ -131,7 +130,7 @@ def _majorant(
     sizes = np.maximum(values, max(1e-9 * largest, 1e-12 * scale))
     largest = float(np.max(sizes))
     unit = np.sqrt(sizes) * np.abs(b0)
-    stacked = _stacked(function.centres / unit[:, None], function.rows / unit[:, None, None], c)
+    stacked = _real_parts(function.centres / unit[:, None], function.rows / unit[:, None, None], c)
     if function.worst:
         level: cp.Expression = cp.Variable(nonneg=True)
         # in units of the largest value
@@ -147,37 +146,37 @@ def _majorant(
     return total
 
 
-def _held(
+def _as_constraints(
     constraint: Constraint, c: cp.Variable, slack: float | cp.Expression
 ) -> list[cp.Constraint]:
-    """Constraint of the programme, its bound times ``1 + slack``."""
+    """Constraints of the programme, with the bound times ``1 + slack``."""
     if isinstance(constraint, HalfPlanes):
         unit = 1 / constraint.bounds
         return [cp.multiply(unit, constraint.rows @ c) <= 1 + slack]
     if isinstance(constraint, Discs):
         unit = 1 / constraint.radii
         return [
-            _cones(
+            _norm_bounds(
                 1 + slack,
                 constraint.centres[:, None] * unit[:, None],
                 constraint.rows[:, None, :] * unit[:, None, None],
                 c,
             )
         ]
-    assert isinstance(constraint, Bounded)
-    root, target = _triangle(constraint.function)
+    assert isinstance(constraint, FunctionBound)
+    root, target = _least_squares_form(constraint.function)
     unit = 1 / np.sqrt(constraint.limit)
     return [cp.norm(unit * root @ c - unit * target) <= 1 + slack]
 
 
-def _cones(
+def _norm_bounds(
     level: float | cp.Expression, centres: ComplexArray, rows: ComplexArray, c: cp.Variable
 ) -> cp.Constraint:
     """``sqrt(sum over r |centres + rows c|^2) <= level`` at each frequency."""
-    return cp.SOC(level * np.ones(len(centres)), _stacked(centres, rows, c))
+    return cp.SOC(level * np.ones(len(centres)), _real_parts(centres, rows, c))
 
 
-def _stacked(centres: ComplexArray, rows: ComplexArray, c: cp.Variable) -> cp.Expression:
+def _real_parts(centres: ComplexArray, rows: ComplexArray, c: cp.Variable) -> cp.Expression:
     """Real and imaginary parts of the responses, (2 r, F)."""
     parts = []
     for i in range(centres.shape[1]):
@@ -188,7 +187,7 @@ def _stacked(centres: ComplexArray, rows: ComplexArray, c: cp.Variable) -> cp.Ex
     return cp.vstack(parts)
 
 
-def _triangle(function: Fractions) -> tuple[FloatArray, FloatArray]:
+def _least_squares_form(function: Fractions) -> tuple[FloatArray, FloatArray]:
     """Root and target with ``sum |centres + rows c|^2 = ||root c - target||^2``."""
     size = function.rows.shape[-1]
     rows = function.rows.reshape(-1, size)

@@ -1,4 +1,4 @@
-"""The H-infinity predictor as a linear matrix inequality.
+"""Solve for the H-infinity predictor by a linear matrix inequality.
 
 The gain is eliminated: with N a basis of the null space of ``[C D]``, a filter
 with error norm below gamma exists if and only if some P satisfies::
@@ -23,20 +23,20 @@ from scipy.linalg import null_space
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lmi.balanced_coordinates import BalancedProblem, balanced
-from lbt_synth.linear.lmi.solver import USABLE, LmiSolution, solve, symmetrised
+from lbt_synth.linear.lmi.balanced_coordinates import BalancedProblem, balance
+from lbt_synth.linear.lmi.solver import USABLE, LmiSolution, solve, symmetrise
 from lbt_synth.validation import FloatArray
 
 
 def least_gamma_lmi(
     problem: EstimationProblem, *, coordinates: FloatArray, scale: float
 ) -> LmiSolution:
-    """Least gamma and a filter at it. Shapes: coordinates (n, n)."""
-    frame = balanced(problem, coordinates, scale)
-    P = cp.Variable(frame.problem.A.shape, symmetric=True)
+    """Find the least gamma, and a filter that reaches it."""
+    scaled = balance(problem, coordinates, scale)
+    P = cp.Variable(scaled.problem.A.shape, symmetric=True)
     gamma_squared = cp.Variable(nonneg=True)
-    basis = null_space(np.hstack([frame.problem.C, frame.problem.D]))
-    inequalities = _inequalities(frame.problem, basis, P, gamma_squared, 1.0)
+    basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
+    inequalities = _inequalities(scaled.problem, basis, P, gamma_squared, 1.0)
     status, iterations = solve(cp.Minimize(gamma_squared), inequalities)
     if status not in USABLE or P.value is None or gamma_squared.value is None:
         raise NumericalError(
@@ -45,19 +45,19 @@ def least_gamma_lmi(
             status=status,
         )
     level = float(gamma_squared.value)
-    witness = frame.witness(inequalities[0].dual_value, basis)
-    return _unpacked(frame, P.value / level, level, status, iterations, witness)
+    witness = scaled.witness(inequalities[0].dual_value, basis)
+    return _unpack(scaled, P.value / level, level, status, iterations, witness)
 
 
 def hinf_lmi(
     problem: EstimationProblem, gamma: float, *, coordinates: FloatArray, scale: float
 ) -> LmiSolution:
-    """Central filter of a given gamma: the greatest storage matrix. Shapes: coordinates (n, n)."""
-    frame = balanced(problem, coordinates, scale)
+    """Find the central filter of a given gamma, which has the greatest storage matrix."""
+    scaled = balance(problem, coordinates, scale)
     level = (gamma / scale) ** 2
-    P = cp.Variable(frame.problem.A.shape, symmetric=True)
-    basis = null_space(np.hstack([frame.problem.C, frame.problem.D]))
-    inequalities = _inequalities(frame.problem, basis, P, 1.0, 1 / level)
+    P = cp.Variable(scaled.problem.A.shape, symmetric=True)
+    basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
+    inequalities = _inequalities(scaled.problem, basis, P, 1.0, 1 / level)
     status, iterations = solve(cp.Maximize(cp.trace(P)), inequalities)
     if "infeasible" in status:
         raise InfeasibleError(
@@ -71,7 +71,7 @@ def hinf_lmi(
             'an optimum. Try route="riccati".',
             status=status,
         )
-    return _unpacked(frame, P.value, level, status, iterations)
+    return _unpack(scaled, P.value, level, status, iterations)
 
 
 def _inequalities(
@@ -88,11 +88,11 @@ def _inequalities(
         - step.T @ P @ step
         - output_weight * (seen.T @ seen)
     )
-    return [symmetrised(dissipation) >> 0, P - output_weight * (L.T @ L) >> 0]
+    return [symmetrise(dissipation) >> 0, P - output_weight * (L.T @ L) >> 0]
 
 
-def _unpacked(
-    frame: BalancedProblem,
+def _unpack(
+    scaled: BalancedProblem,
     P: FloatArray,
     gamma_squared: float,
     status: str,
@@ -101,11 +101,11 @@ def _unpacked(
 ) -> LmiSolution:
     """Turn ``P / gamma^2`` into gains and a covariance in the problem's coordinates."""
     storage = (P + P.T) / 2
-    information = storage - frame.problem.L.T @ frame.problem.L / gamma_squared
-    predictor, filtering = frame.gains(information)
+    information = storage - scaled.problem.L.T @ scaled.problem.L / gamma_squared
+    predictor, filtering = scaled.gains(information)
     return LmiSolution(
-        gamma=float(np.sqrt(gamma_squared) * frame.output_scale),
-        P=frame.covariance(np.asarray(np.linalg.inv(storage), dtype=np.float64)),
+        gamma=float(np.sqrt(gamma_squared) * scaled.output_scale),
+        P=scaled.covariance(np.asarray(np.linalg.inv(storage), dtype=np.float64)),
         gain_predictor=predictor,
         gain_filter=filtering,
         status=status,

@@ -1,10 +1,10 @@
-"""Least variance under a bound on the norm, and the reverse, over filters of the innovations.
+"""Minimise the variance of a filter under a bound on its norm, or the reverse.
 
 With any stable predictor gain as a base, every stable filter is the base plus a stable
 system Q driven by the base's innovations (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE
 Trans. Autom. Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223). The estimation error is
-affine in Q, so variance and norm are convex in it. Q is a finite impulse response here, and
-the norm is bounded at given frequencies; whoever calls looks between them.
+affine in Q, so variance and norm are convex in it. Here Q is a finite impulse response, and
+the norm is bounded at given frequencies; the caller checks between them.
 """
 
 from __future__ import annotations
@@ -31,23 +31,21 @@ class InnovationProgramme:
     innovations nu, scaled to unit variance.
     """
 
-    # error, innovation: From w to ``L e``, and to the scaled innovations
-    error: StateSpace
-    innovation: StateSpace
-    whitening: FloatArray  # (q, q): what scales the innovations
-    # root, target: Square root of the Gram matrix of the past innovations, (T q, T q), and what the
-    # taps should make of it, (l, T q): ``variance = floor + ||c root - target||^2``
-    root: FloatArray
-    target: FloatArray
-    floor: float  # Least variance that these taps reach
-    scale: float  # Size of the error; levels are divided by it
-    taps: int  # Taps T
+    error: StateSpace  # from w to ``L e``
+    innovation: StateSpace  # from w to the scaled innovations
+    whitening: FloatArray  # (q, q): scales the innovations
+    # ``variance = floor + ||c root - target||^2``
+    root: FloatArray  # (T q, T q): square root of the Gram matrix of the past innovations
+    target: FloatArray  # (l, T q)
+    floor: float  # least variance that these taps reach
+    scale: float  # size of the error, by which levels are divided
+    taps: int  # T
 
     @classmethod
-    def of(
+    def from_predictor(
         cls, problem: EstimationProblem, gain_predictor: FloatArray, *, taps: int
     ) -> InnovationProgramme:
-        """Set the programme up. Shapes: gain_predictor (n, q)."""
+        """Set up the programme for a base with this predictor gain."""
         error = problem.error_system(gain_predictor)
         covariance = stationary_covariance(error.A, error.B @ error.B.T)
         whitening = np.linalg.inv(
@@ -77,34 +75,34 @@ class InnovationProgramme:
             taps=taps,
         )
 
-    def least_variance(
+    def minimize_variance(
         self, gamma: float, frequency_hz: FloatArray
     ) -> tuple[FloatArray, float, str]:
         """Minimise the variance with the error below gamma at the frequencies.
 
-        Shapes: returns taps (l, T q).
+        Returns the taps (l, T q), gamma and the status of the solver.
         """
         taps = cp.Variable(self.target.shape)
         bounds = self._bounds(taps, gamma / self.scale, frequency_hz)
-        found, status = self._solved(taps, cp.Minimize(self._distance(taps)), bounds)
+        found, status = self._solve(taps, cp.Minimize(self._distance(taps)), bounds)
         return found, gamma, status
 
-    def least_level(
+    def minimize_level(
         self, variance: float, frequency_hz: FloatArray
     ) -> tuple[FloatArray, float, str]:
-        """Minimise the level at the frequencies with a bound on the variance."""
+        """Minimise the level at the frequencies with a bound on the variance; likewise."""
         taps, level = cp.Variable(self.target.shape), cp.Variable(nonneg=True)
-        room = float(np.sqrt(max(variance - self.floor, 0.0))) / self.scale
+        slack = float(np.sqrt(max(variance - self.floor, 0.0))) / self.scale
         bounds = self._bounds(taps, level, frequency_hz)
-        found, status = self._solved(
-            taps, cp.Minimize(level), [*bounds, self._distance(taps) <= room]
+        found, status = self._solve(
+            taps, cp.Minimize(level), [*bounds, self._distance(taps) <= slack]
         )
         return found, float(level.value) * self.scale, status
 
     def _distance(self, taps: cp.Variable) -> cp.Expression:
         return cp.norm(taps @ self.root - self.target / self.scale, "fro")
 
-    def _solved(
+    def _solve(
         self, taps: cp.Variable, objective: cp.Minimize, constraints: list[cp.Constraint]
     ) -> tuple[FloatArray, str]:
         status, _ = solve(objective, constraints)
@@ -120,7 +118,7 @@ class InnovationProgramme:
     def _bounds(
         self, taps: cp.Variable, level: float | cp.Variable, frequency_hz: FloatArray
     ) -> list[cp.Constraint]:
-        """Spectral norm of the error below a level, frequency by frequency.
+        """Constrain the spectral norm of the error below a level, frequency by frequency.
 
         With ``[N; E] = [[N1, 0], [E1, E2]] U`` and U orthonormal, ``E - Q N`` has the
         singular values of ``[E1 - Q N1, E2]``, of l rows and q + l columns.
@@ -145,15 +143,15 @@ class InnovationProgramme:
                 rows.append(cp.hstack([real[0], imaginary[0]]))
                 continue
             block = cp.bmat([[real, -imaginary], [imaginary, real]])
-            constraints.append(_below(block, level, 2 * outputs, 2 * columns))
+            constraints.append(_norm_below(block, level, 2 * outputs, 2 * columns))
         if rows:
             levels = cp.multiply(level, np.ones(len(rows)))
             constraints.append(cp.SOC(levels, cp.vstack(rows), axis=1))
         return constraints
 
 
-def _below(
+def _norm_below(
     block: cp.Expression, level: float | cp.Variable, rows: int, columns: int
 ) -> cp.Constraint:
-    """Spectral norm of a matrix below a level, as a semidefinite constraint."""
+    """Constrain the spectral norm of a matrix below a level."""
     return cp.bmat([[level * np.eye(rows), block], [block.T, level * np.eye(columns)]]) >> 0

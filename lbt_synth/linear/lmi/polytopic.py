@@ -1,4 +1,4 @@
-"""One filter for a segment of plants, with parameter-dependent Lyapunov and slack matrices.
+"""Find one filter for a segment of plants, by parameter-dependent Lyapunov and slack matrices.
 
 For the plants ``A = (1 - t) A_0 + t A_1`` with t in [0, 1], the filter ``xf+ = Af xf + Bf y``,
 ``zf = Cf xf`` and, in the coordinates (x, e) with ``e = x - xf``, slack matrices::
@@ -14,8 +14,8 @@ the error has a norm below gamma on the whole segment if for some P(t), quadrati
 
 which is linear in P, Z, U, K and the products ``K Af``, ``K Bf`` and Cf. Z and U multiply
 nothing of the filter, so they may follow the parameter; K may not. The entries are
-polynomials of degree two in t, and their three Bernstein coefficients are asked to be
-positive definite. For the variance the third row and column become an inequality of their own.
+polynomials of degree two in t, and their three Bernstein coefficients must be positive
+definite. For the variance the third row and column become an inequality of their own.
 """
 
 from __future__ import annotations
@@ -28,26 +28,27 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.infeasibility_proof import identity_coordinates
-from lbt_synth.linear.lmi.solver import USABLE, solve, symmetrised
+from lbt_synth.linear.infeasibility_proof import whitening_coordinates
+from lbt_synth.linear.lmi.solver import USABLE, solve, symmetrise
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
-_RANK = 1e-11  # share of a covariance that is added to it, so that no direction is lost
+_RANK = 1e-11  # share of its trace added to a covariance, so that no direction is lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SegmentFilter:
-    """A filter for a segment of plants, as the solver left it."""
+    """A filter ``xf+ = A xf + B y``, ``zf = C xf`` for a segment of plants, as solved.
 
-    # A, B, C: ``xf+ = A xf + B y``, ``zf = C xf``; of the order of the plant, less the states that
-    # are sums of others
+    Its order is that of the plant, less the states that are sums of others.
+    """
+
     A: FloatArray
     B: FloatArray
     C: FloatArray
-    bound: float  # Norm, or standard deviation, that the programme claims for the whole segment
-    status: str  # The solver's word; no evidence
-    iterations: int  # Iterations of the solver
+    bound: float  # norm, or standard deviation, that the programme claims for the whole segment
+    status: str  # as reported by the solver, which is no evidence
+    iterations: int
 
 
 def segment_filter(
@@ -58,12 +59,9 @@ def segment_filter(
     coordinates: FloatArray,
     scale: float,
 ) -> SegmentFilter:
-    """Filter of the least bound over a segment of plants.
-
-    Shapes: ends list of (n, n), coordinates (n, n).
-    """
-    frame = _Frame.of(problem, ends, coordinates, scale)
-    programme = _Programme(frame)
+    """Filter of the least bound over a segment of plants, given the state matrices at its ends."""
+    segment = _ScaledSegment.from_problem(problem, ends, coordinates, scale)
+    programme = _Programme(segment)
     level = cp.Variable(nonneg=True)
     constraints = [
         inequality >> 0 for k in range(3) for inequality in programme.inequalities(k, norm, level)
@@ -81,11 +79,11 @@ def segment_filter(
         raise NumericalError(
             "the slack matrix of the filter is singular. Try a narrower interval.", status=status
         ) from error
-    back = frame.basis @ inverse
+    back = segment.basis @ inverse
     return SegmentFilter(
-        A=frozen(back @ programme.KA.value @ frame.inverse),
-        B=frozen(-back @ programme.KB.value @ frame.sensor_scale),
-        C=frozen(programme.output.value @ frame.inverse * scale),
+        A=frozen_copy(back @ programme.KA.value @ segment.inverse),
+        B=frozen_copy(-back @ programme.KB.value @ segment.measurement_scale),
+        C=frozen_copy(programme.output.value @ segment.inverse * scale),
         bound=float(np.sqrt(level.value)) * scale,
         status=status,
         iterations=iterations,
@@ -93,8 +91,8 @@ def segment_filter(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Frame:
-    """The segment in states that are of size one and independent, without those that are none.
+class _ScaledSegment:
+    """The segment in independent states of size one; states that never move are dropped.
 
     The errors of these states are ``basis`` times errors of size one.
     """
@@ -106,41 +104,41 @@ class _Frame:
     L: FloatArray
     basis: FloatArray
     inverse: FloatArray
-    sensor_scale: FloatArray
+    measurement_scale: FloatArray
 
     @classmethod
-    def of(
+    def from_problem(
         cls,
         problem: EstimationProblem,
         ends: tuple[FloatArray, FloatArray],
         coordinates: FloatArray,
         scale: float,
-    ) -> _Frame:
+    ) -> _ScaledSegment:
         states = stationary_covariance((ends[0] + ends[1]) / 2, problem.Q)
-        wide, narrow = identity_coordinates(states)
+        wide, narrow = whitening_coordinates(states)
         errors = narrow @ coordinates @ narrow.T
-        basis, inverse = identity_coordinates(
+        basis, inverse = whitening_coordinates(
             errors + _RANK * np.trace(errors) * np.eye(len(errors))
         )
-        sensor_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
+        measurement_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
         return cls(
             ends=(narrow @ ends[0] @ wide, narrow @ ends[1] @ wide),
             B=narrow @ problem.B,
-            C=sensor_scale @ problem.C @ wide,
-            D=sensor_scale @ problem.D,
+            C=measurement_scale @ problem.C @ wide,
+            D=measurement_scale @ problem.D,
             L=problem.L @ wide / scale,
             basis=basis,
             inverse=inverse,
-            sensor_scale=np.asarray(sensor_scale, dtype=np.float64),
+            measurement_scale=np.asarray(measurement_scale, dtype=np.float64),
         )
 
 
 class _Programme:
     """Variables of the programme, and its inequalities."""
 
-    def __init__(self, frame: _Frame) -> None:
-        n, (outputs, q) = len(frame.basis), (len(frame.L), len(frame.C))
-        self.frame = frame
+    def __init__(self, segment: _ScaledSegment) -> None:
+        n, (outputs, q) = len(segment.basis), (len(segment.L), len(segment.C))
+        self.segment = segment
         self.Z = [cp.Variable((n, n)) for _ in range(2)]
         self.U = [cp.Variable((n, n)) for _ in range(2)]
         self.K = cp.Variable((n, n))
@@ -149,8 +147,8 @@ class _Programme:
         self.output = cp.Variable((outputs, n))
 
     def inequalities(self, k: int, norm: str, level: Any) -> list[Any]:
-        """Matrices that are to be positive: the Bernstein coefficients of index k."""
-        f, n = self.frame, len(self.frame.basis)
+        """Bernstein coefficients of index k, the matrices that must be positive."""
+        f, n = self.segment, len(self.segment.basis)
         p, outputs = f.B.shape[1], len(f.L)
         Z, U = _coefficient(self.Z, k), _coefficient(self.U, k)
         zero = np.zeros((n, n))
@@ -175,19 +173,19 @@ class _Programme:
                 [GB.T, across.T, level * np.eye(p), np.zeros((p, outputs))],
                 [none.T, C, np.zeros((outputs, p)), np.eye(outputs)],
             ]
-            return [symmetrised(cp.bmat(whole))]
+            return [symmetrise(cp.bmat(whole))]
         W = cp.Variable((p, p), symmetric=True)
         decay = [[slack, GA, none], [GA.T, P, C.T], [none.T, C, np.eye(outputs)]]
         entry = [[slack, GB], [GB.T, W]]
         return [
-            symmetrised(cp.bmat(decay)),
-            symmetrised(cp.bmat(entry)),
+            symmetrise(cp.bmat(decay)),
+            symmetrise(cp.bmat(entry)),
             cp.reshape(level - cp.trace(W), (1, 1), order="C"),
         ]
 
 
 def _coefficient(ends: Any, k: int) -> Any:
-    """Bernstein coefficient k, of degree two, of what is affine between two ends."""
+    """Bernstein coefficient k, of degree two, of an affine function with these ends."""
     return (1 - k / 2) * ends[0] + (k / 2) * ends[1]
 
 

@@ -1,1 +1,1 @@
-"""Discrete algebraic Riccati equations, those of filtering and of H-infinity included."""
+"""Discrete algebraic Riccati equations, including those of Kalman and H-infinity filters."""

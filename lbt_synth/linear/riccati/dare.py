@@ -1,4 +1,4 @@
-"""The discrete algebraic Riccati equation, one or many at once, with its evidence."""
+"""Solve discrete algebraic Riccati equations, one or many at once, and verify each solution."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     IntArray,
-    frozen,
+    frozen_copy,
     matrix,
     square,
     symmetric,
 )
 
-RESIDUAL_LIMIT = 1e-12  # a solution beyond these limits is not returned
+RESIDUAL_LIMIT = 1e-12  # a solution beyond one of these limits is refused
 ERROR_LIMIT = 1e-3
-_SATISFIED = 1e-8  # beyond this estimate of its error the next route is tried
-_DOUBTFUL = 1e-6  # a pole this close to the unit circle makes the conditions be checked
-_NEAR = 1e-2  # from here to the unit circle, a pole may be one on it that rounding has moved:
-_CLEAR = 1e-5  # part of its distance that the error of X may be
+_SATISFIED = 1e-8  # if the estimated error of X is larger, the next route is tried
+_DOUBTFUL = 1e-6  # if a pole is this close to the unit circle, existence is checked
+# Rounding may have moved a pole this close to the unit circle off the circle itself; the pole
+# counts as stable only if the error of X is at most this part of its distance to the circle.
+_NEAR = 1e-2
+_CLEAR = 1e-5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,13 +37,13 @@ class Attempt:
 
     Attributes
     ----------
-    method : str
+    route : str
         "doubling", "shifted doubling" or "schur".
     tried, solved : int
-        Equations it was given, and those it solved.
+        Numbers of equations that it was given, and that it solved.
     """
 
-    method: str
+    route: str
     tried: int
     solved: int
 
@@ -94,17 +96,17 @@ class DareSolution:
         return float(np.max(self.errors, initial=0.0))
 
     @property
-    def method(self) -> str:
+    def route(self) -> str:
         """Routes that solved something, in the order they were tried."""
-        solvers = [attempt.method for attempt in self.attempts if attempt.solved]
-        return ", ".join(solvers or [attempt.method for attempt in self.attempts])
+        solvers = [attempt.route for attempt in self.attempts if attempt.solved]
+        return ", ".join(solvers or [attempt.route for attempt in self.attempts])
 
 
 def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     """Solve ``X = A'XA + Q - (A'XB + S)(R + B'XB)^-1 (B'XA + S')`` for its stabilising X.
 
-    Structured doubling in balanced units; if that fails, doubling from some steps of
-    the Riccati recursion, which a singular R needs; if that fails, the ordered Schur
+    Three routes are tried in turn: structured doubling in balanced units; doubling from
+    some steps of the Riccati recursion, which a singular R needs; and the ordered Schur
     form of the extended pencil. Each answer is refined by Newton steps on a residual in
     extended precision, and verified: a stable closed loop and a small residual make it
     the stabilising solution, of which there is only one. For the filter equation pass
@@ -157,24 +159,24 @@ def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
     >>> lbt.solve_dare(1, 1, [[[1]], [[2]], [[6]]], 1).X.ravel().round(6).tolist()
     [1.618034, 2.732051, 6.872983]
     """
-    equations, lead = _stacked(A, B, Q, R, S)
-    with np.errstate(all="ignore"):  # what is not finite is refused
-        return _solved(equations, lead)
+    equations, lead = _stack_arguments(A, B, Q, R, S)
+    with np.errstate(all="ignore"):  # anything not finite is refused
+        return _solve_stack(equations, lead)
 
 
-def _solved(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
+def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     """Solve a stack, verify each answer, and put the leading dimensions back."""
     factors = equations.normalising_factors()
     units = equations.balancing_units()
-    balanced = equations.divided(factors).in_units(units)
-    best = _attempted(balanced)
+    balanced = equations.divide_weights(factors).change_units(units)
+    best = _try_routes(balanced)
     radius = np.abs(best.poles).max(axis=-1)
 
     solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
     solved &= (1 - radius > _NEAR) | (best.errors <= _CLEAR * (1 - radius))
     for i in np.flatnonzero(~solved | (radius > 1 - _DOUBTFUL)):
         try:
-            require_stabilising(balanced, int(i), _name(int(i), lead), zeros=not solved[i])
+            require_stabilising(balanced, int(i), _prefix(int(i), lead), zeros=not solved[i])
         except ProblemError:
             raise
         except ValueError:  # numbers out of range (LinAlgError): refused without a reason
@@ -189,11 +191,11 @@ def _solved(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     column, row = units[:, None, :], units[:, :, None]
     n, m = equations.B.shape[-2:]
     return DareSolution(
-        X=frozen((X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
-        gain_feedback=frozen((best.gains / column).reshape(*lead, m, n)),
+        X=frozen_copy((X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
+        gain_feedback=frozen_copy((best.gains / column).reshape(*lead, m, n)),
         poles=_read_only(best.poles.reshape(*lead, n)),
-        residuals=frozen(best.residuals.reshape(lead)),
-        errors=frozen(best.errors.reshape(lead)),
+        residuals=frozen_copy(best.residuals.reshape(lead)),
+        errors=frozen_copy(best.errors.reshape(lead)),
         negative=_read_only(negative.reshape(lead)),
         iterations=int(np.max(best.steps, initial=0)),
         attempts=tuple(best.attempts),
@@ -205,7 +207,7 @@ def _read_only(array: Any) -> Any:
     return array
 
 
-def _stacked(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[int, ...]]:
+def _stack_arguments(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[int, ...]]:
     """Check the arguments; return them as one stack, and its leading dimensions."""
     A = square(A, "A", stacked=True)
     n, why = A.shape[-1], f"to match A {A.shape}"
@@ -234,7 +236,7 @@ def _stacked(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[i
 
 
 class _Best:
-    """The best answer to each equation so far, and what was tried."""
+    """The best answer to each equation so far, and the routes that were tried."""
 
     def __init__(self, equations: Equations) -> None:
         count, n, m = equations.B.shape
@@ -246,16 +248,16 @@ class _Best:
         self.attempts: list[Attempt] = []
 
 
-def _attempted(equations: Equations) -> _Best:
-    """Try the routes in order, each on what the ones before have not solved."""
+def _try_routes(equations: Equations) -> _Best:
+    """Try the routes in order, each on the equations that are still unsolved."""
     best = _Best(equations)
     pending = np.arange(len(best.X))
-    for method, route in ROUTES:
+    for route, solve in ROUTES:
         if pending.size == 0:
             break
         part = equations.take(pending)
-        found, steps = route(part)
-        refined = part.refined(found)
+        found, steps = solve(part)
+        refined = part.refine(found)
         poles = part.poles(refined.gains)
         size = np.where(np.abs(poles).max(axis=-1) < 1, refined.residuals, np.inf)
         better = size < best.residuals[pending]
@@ -265,14 +267,14 @@ def _attempted(equations: Equations) -> _Best:
         best.poles[chosen], best.steps[chosen] = poles[better], steps[better]
         satisfied = (size <= RESIDUAL_LIMIT) & (refined.errors <= _SATISFIED)
         best.attempts.append(
-            Attempt(method=method, tried=int(pending.size), solved=int(satisfied.sum()))
+            Attempt(route=route, tried=int(pending.size), solved=int(satisfied.sum()))
         )
         pending = pending[~satisfied]
     return best
 
 
-def _name(index: int, lead: tuple[int, ...]) -> str:
-    """Begin of a message about one equation of many; empty for a single one."""
+def _prefix(index: int, lead: tuple[int, ...]) -> str:
+    """Prefix of a message that names one equation of a stack; empty for a single equation."""
     if not lead:
         return ""
     where = tuple(int(i) for i in np.unravel_index(index, lead))
@@ -290,8 +292,8 @@ def _refuse(index: int, lead: tuple[int, ...], best: _Best) -> None:
         else "no stable closed loop"
     )
     raise NumericalError(
-        f"{_name(index, lead)}the Riccati equation was not solved: "
-        f"{', '.join(attempt.method for attempt in best.attempts)} gave {found}; expected a stable "
+        f"{_prefix(index, lead)}the Riccati equation was not solved: "
+        f"{', '.join(attempt.route for attempt in best.attempts)} gave {found}; expected a stable "
         f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
         f"{ERROR_LIMIT:g} (of a pole near the unit circle, below {_CLEAR:g} of its distance). "
         "There may be no stabilising solution; look for modes near the unit circle that are barely "
@@ -304,20 +306,20 @@ def _refuse(index: int, lead: tuple[int, ...], best: _Best) -> None:
 def _require_saddle(
     R: FloatArray, X: FloatArray, negative: IntArray, lead: tuple[int, ...]
 ) -> None:
-    """Existence conditions of the H-infinity problem, wherever R has negative eigenvalues."""
+    """Check the existence conditions of the H-infinity problem where R is indefinite."""
     values = np.linalg.eigvalsh(R)
     expected = np.sum(values < -1e-12 * np.abs(values).max(axis=-1, keepdims=True), axis=-1)
     for i in np.flatnonzero(expected > 0):
         spectrum = np.linalg.eigvalsh(X[i])
         if negative[i] != expected[i]:
             raise InfeasibleError(
-                f"{_name(int(i), lead)}R + B'XB must have as many negative eigenvalues as R, "
+                f"{_prefix(int(i), lead)}R + B'XB must have as many negative eigenvalues as R, "
                 f"{expected[i]}; got {negative[i]}. The level that R holds cannot be met: "
                 "try a larger one."
             )
         if spectrum[0] < -1e-9 * max(abs(spectrum[-1]), abs(spectrum[0])):
             raise InfeasibleError(
-                f"{_name(int(i), lead)}X must be positive semidefinite, as R is indefinite; got an "
-                f"eigenvalue of {spectrum[0]:.3g}. The level that R holds cannot be met: "
+                f"{_prefix(int(i), lead)}X must be positive semidefinite, as R is indefinite; got "
+                f"an eigenvalue of {spectrum[0]:.3g}. The level that R holds cannot be met: "
                 "try a larger one."
             )

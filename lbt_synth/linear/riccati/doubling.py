@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.linear.batched import norms, solve_stack, symmetrised, transposed
+from lbt_synth.linear.batched import frobenius_norms, solve_stack, symmetrise, transpose
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 MAX_DOUBLINGS = 60
@@ -19,21 +19,20 @@ _ROUNDING = 4 * np.finfo(float).eps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Doubled:
-    """Where a stack of iterations ended."""
+class DoublingResult:
+    """The last iterates of a stack of N equations."""
 
-    X: FloatArray  # (N, n, n): the last iterates; not finite where the recursion escaped
-    steps: IntArray  # (N,): doublings made
+    X: FloatArray  # (N, n, n): not finite where the recursion diverged
+    steps: IntArray  # (N,): doublings
     converged: BoolArray  # (N,): whether the last step changed X by no more than rounding
 
 
 def doubling(
     A: FloatArray, G: FloatArray, H: FloatArray, *, max_steps: int = MAX_DOUBLINGS
-) -> Doubled:
-    """Iterate to the stabilising X of ``X = A' X (I + G X)^-1 A + H``.
+) -> DoublingResult:
+    """Iterate to the stabilising X of ``X = A' X (I + G X)^-1 A + H``; all are (N, n, n).
 
-    An equation leaves the stack as soon as it has converged or escaped. Shapes: A (N, n, n), G, H
-    (N, n, n).
+    An equation leaves the stack as soon as it has converged or diverged.
 
     Examples
     --------
@@ -55,12 +54,12 @@ def doubling(
         for step in range(1, max_steps + 1):
             solved = solve_stack(identity + G @ X, np.concatenate([A, G], axis=-1))
             WA, WG = solved[..., :n], solved[..., n:]
-            increment = symmetrised(transposed(A) @ X @ WA)
-            G = symmetrised(G + A @ WG @ transposed(A))
+            increment = symmetrise(transpose(A) @ X @ WA)
+            G = symmetrise(G + A @ WG @ transpose(A))
             X = X + increment
             A = A @ WA
-            size = norms(X)
-            still = norms(increment) <= _ROUNDING * size
+            size = frobenius_norms(X)
+            still = frobenius_norms(increment) <= _ROUNDING * size
             left = still | ~np.isfinite(size)
             if left.any() or step == max_steps:
                 steps[going], X_out[going] = step, X
@@ -70,4 +69,4 @@ def doubling(
                 if going.size == 0:
                     break
                 A, G, X = A[keep], G[keep], X[keep]
-    return Doubled(X=X_out, steps=steps, converged=converged)
+    return DoublingResult(X=X_out, steps=steps, converged=converged)

@@ -1,4 +1,4 @@
-"""The Riccati equation of the Kalman predictor."""
+"""Solve the Riccati equation of the Kalman predictor."""
 
 from __future__ import annotations
 
@@ -8,29 +8,26 @@ import numpy as np
 
 from lbt_synth.errors import DetectabilityError
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.filter_gains import decorrelated
+from lbt_synth.linear.filter_gains import decorrelate
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterRiccati:
-    """A solved filter equation."""
+    """A solved filter equation, with its gains (n, q)."""
 
-    # (n, n): covariance of the prediction error (Kalman), or its H-infinity counterpart
-    P: FloatArray
-    # gain_predictor, gain_filter (n, q): gains of the time-and-measurement update, and of the
-    # measurement update alone
-    gain_predictor: FloatArray
-    gain_filter: FloatArray
-    residual: float  # Relative residual of the equation
-    iterations: int  # Doublings made
-    status: str  # Method that gave P
+    P: FloatArray  # (n, n): error covariance (Kalman), or its H-infinity counterpart
+    gain_predictor: FloatArray  # of the measurement and the time update together
+    gain_filter: FloatArray  # of the measurement update alone
+    residual: float  # relative
+    iterations: int  # doublings
+    status: str  # the route that gave P
 
 
 def require_detectable(problem: EstimationProblem) -> None:
-    """Raise where no stable filter exists."""
+    """Raise if no stable filter exists."""
     hidden = unstable_hidden_mode(problem.A, problem.C, drive=problem.B)
     if hidden is not None:
         raise DetectabilityError(
@@ -38,7 +35,7 @@ def require_detectable(problem: EstimationProblem) -> None:
             "measurement sees it. Measure it, or take it out of the model.",
             eigenvalue=hidden,
         )
-    A_s, B_s, _ = decorrelated(problem)
+    A_s, B_s, _ = decorrelate(problem)
     hidden = unstable_hidden_mode(A_s.T, B_s.T, drive=problem.C.T, only_unit_circle=True)
     if hidden is not None:
         raise DetectabilityError(
@@ -65,9 +62,9 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     gain_filter = np.linalg.solve(innovation, problem.C @ dare.X).T
     return FilterRiccati(
         P=dare.X,
-        gain_predictor=frozen(dare.gain_feedback.T),
-        gain_filter=frozen(gain_filter),
+        gain_predictor=frozen_copy(dare.gain_feedback.T),
+        gain_filter=frozen_copy(gain_filter),
         residual=dare.residual,
         iterations=dare.iterations,
-        status=dare.method,
+        status=dare.route,
     )

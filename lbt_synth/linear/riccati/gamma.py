@@ -13,11 +13,11 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.filter_gains import decorrelated
+from lbt_synth.linear.filter_gains import decorrelate
 from lbt_synth.linear.riccati.doubling import doubling
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
-from lbt_synth.validation import FloatArray, frozen
+from lbt_synth.validation import FloatArray, frozen_copy
 
 _RESIDUAL_LIMIT = 1e-9
 _GAMMA_TOLERANCE = 4e-12
@@ -25,12 +25,11 @@ _GAMMA_TOLERANCE = 4e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LevelTrial:
-    """What the equation says of one level."""
+    """Whether one level can be met, and the solution of its equation if so."""
 
-    # Least eigenvalue of ``I - L P L' / gamma^2``; negative where the level cannot be met
-    slack: float
-    P: FloatArray | None = None  # (n, n): the stabilising solution, if the level can be met
-    iterations: int = 0  # Doublings made
+    slack: float  # least eigenvalue of ``I - L P L' / gamma^2``; negative if it cannot be met
+    P: FloatArray | None = None  # (n, n)
+    iterations: int = 0  # doublings
 
 
 class GammaEquation:
@@ -39,7 +38,7 @@ class GammaEquation:
     A predictor with an error norm below gamma exists if and only if the
     stabilising P is positive semidefinite and ``gamma^2 I - L P L' > 0``; the gain
     is ``A Pt C'(R + C Pt C')^-1`` with ``Pt = P + P L'(gamma^2 I - L P L')^-1 L P``.
-    Correlated noise is taken out first.
+    Noise is decorrelated first.
 
     The equation is solved for the excess over the Kalman filter's P0. With the
     filtered covariance M, F = I - gain_filter C and
@@ -61,7 +60,7 @@ class GammaEquation:
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
         self.problem, self.start = problem, start
-        self.A, self.B, self.injection = decorrelated(problem)
+        self.A, self.B, self.injection = decorrelate(problem)
         self.identity = np.eye(len(self.A))
         self.keep = self.identity - start.gain_filter @ problem.C
         filtered = self.keep @ start.P
@@ -109,7 +108,7 @@ class GammaEquation:
             R=weight[None],
             S=np.zeros((1, *outputs.T.shape)),
         )
-        refined = equation.refined(trial.P[None])
+        refined = equation.refine(trial.P[None])
         P, residual = refined.X[0], float(refined.residuals[0])
         if residual > _RESIDUAL_LIMIT:
             raise NumericalError(
@@ -127,9 +126,9 @@ class GammaEquation:
         if not _stable(problem.A - gain @ problem.C):
             return None
         return FilterRiccati(
-            P=frozen(P),
-            gain_predictor=frozen(gain),
-            gain_filter=frozen(gain_filter),
+            P=frozen_copy(P),
+            gain_predictor=frozen_copy(gain),
+            gain_filter=frozen_copy(gain_filter),
             residual=residual,
             iterations=trial.iterations,
             status="doubling",
@@ -156,7 +155,9 @@ def gamma_riccati(
 def least_gamma(
     problem: EstimationProblem, *, lower: float, upper: float, start: FilterRiccati | None = None
 ) -> tuple[float, float, FilterRiccati]:
-    """Bracket the least gamma: where ``gamma^2 I - L P L'`` stops being positive.
+    """Bracket the least gamma, at which ``gamma^2 I - L P L'`` stops being positive.
+
+    Returns the ends of the bracket, and the filter at the upper one.
 
     Examples
     --------
@@ -192,7 +193,7 @@ def least_gamma(
     if lower < upper and slack(lower) <= 0:
         root = brentq(slack, lower, upper, xtol=_GAMMA_TOLERANCE * upper, rtol=_GAMMA_TOLERANCE)
     upper, width = min(met), _GAMMA_TOLERANCE
-    for _ in range(100):  # the search ends with one end of its bracket far away: close it
+    for _ in range(100):  # the search leaves one end of its bracket far away: bring it in
         if upper - lower <= 2.5 * _GAMMA_TOLERANCE * upper:
             break
         above, below = root * (1 + width), root * (1 - width)
@@ -201,7 +202,7 @@ def least_gamma(
         else:
             slack(below if below > lower and width < 1e-3 else (lower + upper) / 2)
         upper, width = min(met), 4 * width
-    for gamma in sorted(met):  # one that is too close to the edge may not give a filter
+    for gamma in sorted(met):  # a level too close to the edge may give no filter
         solution = equation.solution(gamma, met[gamma])
         if solution is not None:
             return lower, gamma, solution

@@ -1,7 +1,7 @@
-"""Routes to the stabilising solution of a Riccati equation, in the order they are tried.
+"""The three routes to the stabilising solution of a Riccati equation.
 
-A route takes a stack of equations and returns an approximate X for each, not finite
-where it failed. What it returns is refined and verified by the caller.
+A route takes a stack of equations and returns an approximate X and a count of steps for each;
+X is not finite where the route failed. The caller refines and verifies it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from lbt_synth.linear.batched import solve_stack, symmetrised, transposed
+from lbt_synth.linear.batched import solve_stack, symmetrise, transpose
 from lbt_synth.linear.riccati.doubling import doubling
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
@@ -22,14 +22,14 @@ _WELL_CONDITIONED = 1e-8  # least ratio of R's eigenvalues at which R is inverte
 Route: TypeAlias = Callable[[Equations], tuple[FloatArray, IntArray]]
 
 
-def by_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
-    """Structured doubling; needs an R that can be inverted."""
+def solve_by_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
+    """Solve by structured doubling, which needs an R that can be inverted."""
     nothing = np.zeros_like(equations.Q)
-    return _doubled_from(equations, nothing, _invertible(equations.R))
+    return _double_from(equations, nothing, _invertible(equations.R))
 
 
-def by_shifted_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
-    """Structured doubling for the excess over some steps of the Riccati recursion.
+def solve_by_shifted_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
+    """Solve by doubling for the excess over some steps of the Riccati recursion.
 
     With ``X = P + Y`` the equation of Y has the weight ``R + B'PB``, which can be
     inverted although R cannot, and for a positive semidefinite problem its constant
@@ -41,58 +41,51 @@ def by_shifted_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
         if np.all(ready):
             break
         weights = equations.weights(P)
-        cross = transposed(equations.B) @ P @ equations.A + transposed(equations.S)
+        cross = transpose(equations.B) @ P @ equations.A + transpose(equations.S)
         inverse = np.linalg.pinv(
             np.where(np.isfinite(weights), weights, 0.0), rcond=1e-10, hermitian=True
         )
-        step = symmetrised(
+        step = symmetrise(
             equations.Q
-            + transposed(equations.A) @ P @ equations.A
-            - transposed(cross) @ inverse @ cross
+            + transpose(equations.A) @ P @ equations.A
+            - transpose(cross) @ inverse @ cross
         )
         P = np.where(ready[:, None, None], P, step)
         ready = ready | _invertible(equations.weights(P))
-    return _doubled_from(equations, P, ready)
+    return _double_from(equations, P, ready)
 
 
-def by_schur(equations: Equations) -> tuple[FloatArray, IntArray]:
-    """Ordered generalised Schur form of the extended pencil (scipy), one by one."""
+def solve_by_schur(equations: Equations) -> tuple[FloatArray, IntArray]:
+    """Solve one by one by the ordered generalised Schur form of the extended pencil (scipy)."""
     X = np.full_like(equations.Q, np.nan)
     for i in range(len(X)):
         try:
-            X[i] = symmetrised(
-                solve_discrete_are(
-                    equations.A[i],
-                    equations.B[i],
-                    equations.Q[i],
-                    equations.R[i],
-                    s=equations.S[i],
-                )
-            )
+            A, B, Q, R, S = (getattr(equations, name)[i] for name in "ABQRS")
+            X[i] = symmetrise(solve_discrete_are(A, B, Q, R, s=S))
         except (np.linalg.LinAlgError, ValueError):
             continue
     return X, np.zeros(len(X), dtype=np.int64)
 
 
 ROUTES: tuple[tuple[str, Route], ...] = (
-    ("doubling", by_doubling),
-    ("shifted doubling", by_shifted_doubling),
-    ("schur", by_schur),
+    ("doubling", solve_by_doubling),
+    ("shifted doubling", solve_by_shifted_doubling),
+    ("schur", solve_by_schur),
 )
 
 
 def _invertible(R: FloatArray) -> BoolArray:
-    """Whether each weight has a condition number that inverting it may have, (N,)."""
+    """Whether each weight is well enough conditioned to be inverted, (N,)."""
     finite = np.asarray(np.all(np.isfinite(R), axis=(-2, -1)))
     size = np.abs(np.linalg.eigvalsh(np.where(finite[:, None, None], R, 0.0)))
     least, largest = size.min(axis=-1), size.max(axis=-1)
     return np.asarray(finite & (least > _WELL_CONDITIONED * largest), dtype=np.bool_)
 
 
-def _doubled_from(
+def _double_from(
     equations: Equations, P: FloatArray, usable: BoolArray
 ) -> tuple[FloatArray, IntArray]:
-    """Doubling for ``X - P`` of the usable equations; nan for the others."""
+    """Solve the usable equations for ``X - P`` by doubling; nan for the others."""
     X = np.full_like(equations.Q, np.nan)
     steps = np.zeros(len(X), dtype=np.int64)
     which = np.flatnonzero(usable)
@@ -101,14 +94,14 @@ def _doubled_from(
     part, P = equations.take(which), P[which]
     A, B = part.A, part.B
     PA = P @ A
-    R, S = part.weights(P), part.S + transposed(PA) @ B
-    Q = symmetrised(part.Q + transposed(A) @ PA - P)
-    feedback = solve_stack(R, np.concatenate([transposed(S), transposed(B)], axis=-1))
+    R, S = part.weights(P), part.S + transpose(PA) @ B
+    Q = symmetrise(part.Q + transpose(A) @ PA - P)
+    feedback = solve_stack(R, np.concatenate([transpose(S), transpose(B)], axis=-1))
     n = A.shape[-1]
     done = doubling(
         A - B @ feedback[..., :n],
-        symmetrised(B @ feedback[..., n:]),
-        symmetrised(Q - S @ feedback[..., :n]),
+        symmetrise(B @ feedback[..., n:]),
+        symmetrise(Q - S @ feedback[..., :n]),
     )
     X[which] = np.where(done.converged[:, None, None], P + done.X, np.nan)
     steps[which] = done.steps

@@ -1,4 +1,4 @@
-"""Why a Riccati equation has no stabilising solution: the mode, and what it lacks."""
+"""Find out why a Riccati equation has no stabilising solution, and which mode is to blame."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from scipy.linalg import eigvals
 
 from lbt_synth.errors import DefinitenessError, DetectabilityError
 from lbt_synth.linear.riccati.equations import Equations
-from lbt_synth.linear.state_space import bordered_scaling
+from lbt_synth.linear.state_space import balancing_scales
 from lbt_synth.validation import FloatArray
 
 _RANK = 1e-10
-_CIRCLE = 1e-3  # a multiple root on the circle is found this far from it
-_SINGULAR = 1e-11  # ratio of singular values of a pencil that is taken for a zero
-_LARGE = 1e6  # beyond, the ratio of singular values says little
-_ELSEWHERE = 0.37 + 0.61j  # a point like any other
-_CLUSTER = 1e-4  # and one of several, of a defective matrix, this far
-_CLUSTER_RANK = 1e-13  # which is then tested at the circle, where a mode that decays passes
+_CIRCLE = 1e-3  # a multiple root on the circle is computed up to this far from it
+_SINGULAR = 1e-11  # a ratio of singular values of a pencil that counts as zero
+_LARGE = 1e6  # above this norm the ratio of singular values says little
+_ELSEWHERE = 0.37 + 0.61j  # an arbitrary point
+# An eigenvalue of a defective matrix is computed up to this far from the circle. It is tested on
+# the circle as well, with a tolerance at which a mode that decays passes.
+_CLUSTER = 1e-4
+_CLUSTER_RANK = 1e-13
 
 
 def unstable_hidden_mode(
@@ -25,12 +27,12 @@ def unstable_hidden_mode(
     """Eigenvalue of A that does not decay and that C does not see, or None.
 
     The Popov-Belevitch-Hautus test on the eigenvalues with modulus 1 or more
-    (or about 1, with ``only_unit_circle``). ``drive`` (n, p) enters the states: with
-    it their units are chosen, on which the answer must not depend.
+    (or about 1, with ``only_unit_circle``). ``drive`` (n, p), which enters the states,
+    serves to scale them, because the answer must not depend on their units.
     """
     n = A.shape[0]
     entry, leaving = np.linalg.norm(drive, axis=1), np.linalg.norm(C, axis=0)
-    units = bordered_scaling(A, entry, leaving)[:n]
+    units = balancing_scales(A, entry, leaving)[:n]
     A, C = A * units / units[:, None], C * units
     scale_A = max(float(np.linalg.norm(A, 2)), 1e-300)
     scale_C = max(float(np.linalg.norm(C, 2)), 1e-300)
