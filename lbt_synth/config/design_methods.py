@@ -87,22 +87,8 @@ def design_by_method(config: Config, request: DesignRequest) -> Design:
             norm=options.get("norm", "hinf"),
             horizon=horizon,
         )
-    gamma, ratio, rms = (options.get(name) for name in ("gamma", "gamma_ratio", "rms"))
-    if gamma is None and ratio is None and rms is None:
-        ratio = defaults.gamma_ratio
+    bounds = {name: options[name] for name in ("gamma", "gamma_ratio", "rms") if name in options}
+    bounds = bounds or {"gamma_ratio": defaults.gamma_ratio}
     if method == "mixed":
-        return mixed(
-            config.plant,
-            gamma=gamma,
-            gamma_ratio=ratio,
-            rms=rms,
-            taps=options.get("taps", 16),
-            horizon=horizon,
-        )
-    return hinf(
-        config.plant,
-        gamma=gamma,
-        gamma_ratio=ratio,
-        horizon=horizon,
-        route=options.get("route"),
-    )
+        return mixed(config.plant, **bounds, taps=options.get("taps", 16), horizon=horizon)
+    return hinf(config.plant, **bounds, horizon=horizon, route=options.get("route"))

@@ -12,6 +12,8 @@ from lbt_synth.interop import EndToEndSetup, EndToEndSystem
 from lbt_synth.models import LoopHardware, Truth
 
 _HINT = "an end-to-end simulation needs it"
+# keys of the section that belong to the system, not to the set-up
+_OF_SYSTEM = {"pixels", "actuators_across", "wind_direction_deg", "calibration_nm"}
 
 
 def build_end_to_end_setup(
@@ -55,31 +57,17 @@ def build_end_to_end_setup(
     with name_key("end_to_end"):
         system = EndToEndSystem(
             hardware=modal,
-            diameter_m=telescope.diameter_m,
-            obstruction=telescope.obstruction,
-            seeing_arcsec=air.seeing_arcsec,
-            seeing_wavelength_um=air.seeing_wavelength_um,
-            outer_scale_m=air.outer_scale_m,
-            wind_speed_m_s=air.wind_speed_m_s,
-            wind_direction_deg=section.wind_direction_deg,
             sensing_wavelength_um=pyramid.wavelength_um,
-            modulation_lambda_over_d=pyramid.modulation_lambda_over_d,
-            subapertures_across=pyramid.subapertures_across,
-            photons=pyramid.photons,
-            read_noise_electrons=pyramid.read_noise_electrons,
-            modes=settings.mirror.modes,
-            actuators_across=section.actuators_across,
             imaging_wavelength_um=settings.imaging.wavelength_um,
-            pixels=section.pixels,
-            calibration_nm=section.calibration_nm,
+            modes=settings.mirror.modes,
+            **telescope.model_dump(),
+            **air.model_dump(),
+            **pyramid.model_dump(exclude={"wavelength_um"}),
+            **section.model_dump(include=_OF_SYSTEM),
         )
         return EndToEndSetup(
             system=system,
             vibrations=truth.vibrations,
-            frames=section.frames,
-            settle_frames=section.settle_frames,
             seed=settings.simulation.seed,
-            gain=section.gain,
-            leak=section.leak,
-            leak_from_mode=section.leak_from_mode,
+            **section.model_dump(exclude=_OF_SYSTEM),
         )

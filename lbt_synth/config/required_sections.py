@@ -36,10 +36,4 @@ def build_atmosphere(settings: FileSection) -> Atmosphere | None:
     telescope = require_telescope(
         settings, "the turbulence of atmosphere is that over its diameter"
     )
-    return Atmosphere(
-        seeing_arcsec=air.seeing_arcsec,
-        seeing_wavelength_um=air.seeing_wavelength_um,
-        outer_scale_m=air.outer_scale_m,
-        wind_speed_m_s=air.wind_speed_m_s,
-        diameter_m=telescope.diameter_m,
-    )
+    return Atmosphere(diameter_m=telescope.diameter_m, **air.model_dump())

@@ -48,11 +48,11 @@ def lbt_designs():
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
         "integrator": lbt.design.optimal_integrator(config.hardware, config.truth),
         "prior": prior(15),
-        "turned": turned(prior(3)),
+        "turned": turn_states(prior(3)),
     }
 
 
-def turned(design):
+def turn_states(design):
     """The same controller in other coordinates, without a zero: loops over whole matrices."""
     own = design.controller
     T, _ = np.linalg.qr(np.random.default_rng(8).standard_normal(own.A.shape))

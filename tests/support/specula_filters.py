@@ -3,7 +3,7 @@
 The precision of SPECULA is one for a process and is chosen before its classes are imported,
 so each precision is a process of its own::
 
-    python tests/specula_filters.py PRECISION OUTPUT.npz CONFIG CLASS:FILE ...
+    python tests/support/specula_filters.py PRECISION OUTPUT.npz CONFIG CLASS:FILE ...
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ def commands(precision, config, named):
         data = data_class.restore(file)
         assert data.dtype == (np.float64, np.float32)[precision]
         theirs = Triggered(lambda f=filter_class, d=data: f(d), data.nfilter)
-        loop = simulated(theirs, config)
+        loop = simulate_commands(theirs, config)
         theirs.reset()
         results.append((loop, [theirs.step(y) for y in noise_series(data.nfilter)]))
     return results
 
 
-def simulated(controller, config):
+def simulate_commands(controller, config):
     """Commands in the loop of a configuration, from the first frame on."""
     loaded = lbt.load_config(config)
     return lbt.simulate(

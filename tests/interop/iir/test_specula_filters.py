@@ -1,23 +1,25 @@
-"""Our files in SPECULA's own filters: the commands are those of the controller."""
+"""Gain files and transfer-function files in SPECULA's own filters: same commands."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.exports import relative
 from support.plants import LBT_YAML, ROOT
-from support.specula_filters import noise_series, simulated
+from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
 
 pytestmark = pytest.mark.e2e
 
+
 DOUBLE, SINGLE = 0, 1
-SCRIPT = Path(__file__).parent / "support" / "specula_filters.py"
+
+
+SCRIPT = ROOT / "tests" / "support" / "specula_filters.py"
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,7 @@ LIMITS = {
 def test_the_closed_loop_is_that_of_our_simulator(designs, run, key):
     """Same disturbance and noise: SPECULA's filter in the loop, and our simulator."""
     precision, series = run
-    expected = simulated(designs[key[0]].controller, LBT_YAML)
+    expected = simulate_commands(designs[key[0]].controller, LBT_YAML)
     assert np.max(np.abs(expected)) > 100  # nm: there is something to correct
     assert relative(series[key][0], expected) < LIMITS[key][precision]
 

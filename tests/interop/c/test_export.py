@@ -12,23 +12,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.compiled import STRICT, Compiled, compiler
-from support.exports import bare_design, lbt_config, lbt_designs, relative
+from support.exports import bare_design, relative
 
 import lbt_synth as lbt
 from lbt_synth.interop.export_checks import WrittenTerms, rehearsal_error
 
 FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
-
-
-@pytest.fixture
-def loaded():
-    return lbt_config()
-
-
-@pytest.fixture
-def designs():
-    return lbt_designs()
 
 
 @pytest.mark.parametrize("precision", LIMITS)
@@ -112,12 +102,6 @@ def test_any_stable_controller(tmp_path, controller, precision):
     states = max(1.0, float(np.max(np.abs(ours.state))))
     size = max(float(np.max(np.abs(expected))), states)
     assert np.max(np.abs(found - expected)) < LIMITS[precision] * size
-
-
-def test_both_forms_are_met(designs):
-    for name in ("kalman", "hinf", "integrator", "prior"):
-        assert lbt.interop.frame_cost(designs[name]).form == "straight line"
-    assert lbt.interop.frame_cost(designs["turned"]).form == "loops"
 
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])

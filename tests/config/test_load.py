@@ -2,41 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-
-import numpy as np
 import pytest
-from ruamel.yaml import YAML
-from support.plants import LBT_YAML
+from support.configs import AR, GOOD, change_key, minimal_config, write_config
+from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.config.robust import design_robust
-
-GOOD = YAML(typ="safe", pure=True).load(LBT_YAML.read_text())
-
-
-def write(tmp_path, content):
-    path = tmp_path / "c.yaml"
-    if isinstance(content, str):
-        path.write_text(content)
-    else:
-        with path.open("w") as stream:
-            YAML(typ="safe", pure=True).dump(content, stream)
-    return path
-
-
-def changed(path, value):
-    """A copy of the good file with one key set (or taken away, with ``...``)."""
-    out = copy.deepcopy(GOOD)
-    here = out
-    *steps, last = path
-    for step in steps:
-        here = here[step]
-    if value is ...:
-        del here[last]
-    else:
-        here[last] = value
-    return out
 
 
 def test_the_example_is_the_papers_table_i(config):
@@ -124,7 +94,7 @@ def test_the_example_is_the_papers_table_i(config):
 )
 def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
     with pytest.raises(lbt.errors.ConfigError) as caught:
-        lbt.load_config(write(tmp_path, changed(path, value)))
+        lbt.load_config(write_config(tmp_path, change_key(path, value)))
     message = str(caught.value)
     assert text in message
     assert caught.value.path == key
@@ -150,7 +120,7 @@ def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
 )
 def test_other_texts_are_refused(tmp_path, content, text):
     with pytest.raises(lbt.errors.ConfigError, match=text) as caught:
-        lbt.load_config(write(tmp_path, content))
+        lbt.load_config(write_config(tmp_path, content))
     assert "\n" not in str(caught.value)
 
 
@@ -163,71 +133,6 @@ def test_unreadable_files(tmp_path):
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(lbt.errors.ConfigError, match="not a text file"):
         lbt.load_config(binary)
-
-
-def test_every_kind_of_turbulence_and_noise(tmp_path):
-    ar2 = lbt.load_config(write(tmp_path, changed(("model", "turbulence"), {"kind": "ar2"})))
-    assert ar2.plant.turbulence[0].coefficients == pytest.approx([1.99747, -0.99755], abs=1e-4)
-    given = {"kind": "ar", "coefficients": [0.9, 0.05], "driving_rms_nm": 3.0}
-    ar = lbt.load_config(write(tmp_path, changed(("model", "turbulence"), given)))
-    assert ar.plant.turbulence[0].coefficients.tolist() == [0.9, 0.05]
-    mas = lbt.load_config(write(tmp_path, changed(("sensor",), {"noise_mas": 2.0})))
-    assert mas.noise_nm == pytest.approx(2 * lbt.models.nm_per_mas(8.22))
-
-
-def test_directions(tmp_path):
-    line = {"direction_deg": 30.0, "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 5.0}
-    config = lbt.load_config(write(tmp_path, changed(("model", "vibrations"), [line])))
-    assert config.plant.vibrations[0].direction == pytest.approx(
-        (np.cos(np.pi / 6), np.sin(np.pi / 6))
-    )
-    both = lbt.load_config(LBT_YAML).plant.vibrations
-    assert [v.direction for v in both] == [(1.0, 0.0), (0.0, 1.0)]
-
-
-def test_sensor_gain_of_model_and_truth_are_relative(tmp_path):
-    content = changed(("truth", "sensor_gain"), 0.5)
-    content["model"]["sensor_gain"] = 0.5
-    config = lbt.load_config(write(tmp_path, content))
-    assert config.truth.sensor_gain == 1.0  # relative to what the design assumes
-    assert np.array_equal(config.hardware.sensor, 0.5 * np.eye(2))
-
-
-def test_a_plant_without_vibrations(tmp_path):
-    config = lbt.load_config(write(tmp_path, changed(("model", "vibrations"), ...)))
-    assert config.plant.vibrations == ()
-
-
-# --- what an identified system leaves out, and what differs between its axes
-
-AR = {"kind": "ar", "coefficients": [0.99], "driving_rms_nm": 40.0}
-OTHER = {"kind": "ar", "coefficients": [1.6, -0.65], "driving_rms_nm": 25.0}
-SMALL = {
-    "version": 1,
-    "sensor": {"noise_nm": 15.5},
-    "loop": {"frame_rate_hz": 800.0},
-    "model": {
-        "turbulence": AR,
-        "vibrations": [{"axis": "tip", "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 300.0}],
-    },
-}
-
-
-def small(**sections):
-    """The smallest configuration, some of its sections with other keys."""
-    out = copy.deepcopy(SMALL)
-    for name, keys in sections.items():
-        out[name] = {**out.get(name, {}), **keys}
-    return out
-
-
-def test_no_telescope_and_no_atmosphere(tmp_path):
-    config = lbt.load_config(write(tmp_path, SMALL))
-    assert config.atmosphere is None
-    assert config.truth.turbulence is config.plant.turbulence[0]  # the model, without an atmosphere
-    assert config.imaging.diameter_m is None
-    assert config.settings.true_turbulence == "model"
-    assert lbt.load_config(LBT_YAML).settings.true_turbulence == "frozen_flow"
 
 
 @pytest.mark.parametrize(
@@ -282,11 +187,11 @@ def test_no_telescope_and_no_atmosphere(tmp_path):
         ),
         ({"atmosphere": GOOD["atmosphere"]}, "telescope", "telescope is missing: the turbulence"),
         # lists of another length, or of other things
-        ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one a measurement \(2\); got 1"),
+        ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one per measurement \(2\); got 1"),
         ({"sensor": {"noise_nm": []}}, "sensor.noise_nm", "at least 1 item"),
         ({"sensor": {"noise_nm": [1.0, -1.0]}}, "sensor.noise_nm[1]", "greater than 0"),
         ({"sensor": {"noise_nm": "15"}}, "sensor.noise_nm", "valid number"),
-        ({"model": {"turbulence": [AR]}}, "model.turbulence", r"one an axis \(2\); got 1"),
+        ({"model": {"turbulence": [AR]}}, "model.turbulence", r"one per axis \(2\); got 1"),
         ({"model": {"turbulence": []}}, "model.turbulence", "at least 1 item"),
         (
             {"model": {"turbulence": [AR, {**AR, "coefficients": [1.2]}]}},
@@ -354,80 +259,20 @@ def test_no_telescope_and_no_atmosphere(tmp_path):
     ],
 )
 def test_what_is_missing_or_does_not_fit_is_said(tmp_path, sections, key, text):
-    content = small(**sections)
+    content = minimal_config(**sections)
     if content["sensor"]["noise_nm"] is None:
         del content["sensor"]["noise_nm"]
     with pytest.raises(lbt.errors.ConfigError, match=text) as caught:
-        lbt.load_config(write(tmp_path, content))
+        lbt.load_config(write_config(tmp_path, content))
     assert caught.value.path == key
     assert "c.yaml" in str(caught.value)
 
 
-def test_axes_that_differ(tmp_path):
-    content = small(
-        sensor={"noise_nm": [15.5, 6.0]},
-        model={"turbulence": [AR, OTHER], "sensor_gain": [0.9, 0.7]},
-        truth={"vibrations": "model", "sensor_gain": [0.45, 0.35]},
-    )
-    config = lbt.load_config(write(tmp_path, content))
-    assert [m.order for m in config.plant.turbulence] == [1, 2]
-    assert config.truth.turbulence == config.plant.turbulence
-    assert config.truth.vibrations == config.plant.vibrations
-    assert config.truth.noise_per_measurement(2).tolist() == config.noise_nm.tolist() == [15.5, 6.0]
-    assert config.truth.sensor_gain == pytest.approx(0.5)
-    assert config.sensor_gain == pytest.approx(0.8)
-    np.testing.assert_array_equal(config.hardware.sensor, np.diag([0.9, 0.7]))
-    # a single real gain is the mean over the axes, which keep their proportion
-    content["truth"]["sensor_gain"] = 0.4
-    assert lbt.load_config(write(tmp_path, content)).truth.sensor_gain == pytest.approx(0.5)
-
-
-def test_ar2_is_fitted_above_the_noise_of_its_axis(tmp_path, air):
-    content = changed(("sensor",), {"noise_nm": [15.5, 60.0]})
-    content["model"]["turbulence"] = {"kind": "ar2"}
-    models = lbt.load_config(write(tmp_path, content)).plant.turbulence
-    for model, noise in zip(models, (15.5, 60.0), strict=True):
-        alone = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise)
-        np.testing.assert_array_equal(model.coefficients, alone.coefficients)
-    content["model"]["turbulence"] = [{"kind": "ar1"}, AR]
-    first, second = lbt.load_config(write(tmp_path, content)).plant.turbulence
-    assert first.coefficients[0] == pytest.approx(0.98860, abs=5e-6)
-    assert second.coefficients.tolist() == [0.99]
-
-
-@pytest.mark.parametrize("direction", [{}, {"axis": "tip"}])
-def test_one_axis(tmp_path, direction):
-    line = {"frequency_hz": 20.0, "damping": 0.01, "rms_nm": 300.0, **direction}
-    content = small(loop={"axes": 1}, model={"vibrations": [line]})
-    config = lbt.load_config(write(tmp_path, content))
-    assert config.hardware.modes == 1
-    assert config.plant.vibrations[0].direction == (1.0,)
-    both = lbt.load_config(write(tmp_path, small(loop={"axes": 2})))
-    # tip of the two
-    truth = lbt.Truth(
-        turbulence=both.plant.turbulence, vibrations=both.plant.vibrations, noise_nm=15.5
-    )
-    limit = lbt.loop.least_residual(both.hardware, truth)
-    assert lbt.kalman(config.plant).rms ** 2 == pytest.approx(limit.variance_nm2[0], rel=1e-6)
-
-
-def test_the_robust_design_of_an_identified_system(tmp_path):
-    band = {"low_hz": 18.0, "high_hz": 22.0, "rms_nm": 100.0}
-    robust = {"bands": [band], "functions": 8, "states": None, "modulus_margin": 0.3}
-    content = small(design={"robust": robust})
-    config = lbt.load_config(write(tmp_path, content))
-    design_robust(config)  # with the model's turbulence, as there is no atmosphere
-    for change, text in (
-        ({"turbulence": "frozen_flow"}, "atmosphere is missing: design.robust.turbulence"),
-        (
-            {"bands": [{"low_hz": 18.0, "high_hz": 22.0, "rms_mas": 9.0}]},
-            r"telescope is missing: design.robust.bands\[0\].rms_mas",
-        ),
-    ):
-        content["design"] = {"robust": {**robust, **change}}
-        with pytest.raises(lbt.errors.ConfigError, match=text):
-            design_robust(lbt.load_config(write(tmp_path, content)))
-    content["design"] = {"robust": {**robust, "command_step_nm": 500.0}}
-    content["model"]["turbulence"] = [AR, OTHER]
-    with pytest.raises(lbt.errors.ConfigError, match="hold under one turbulence for all axes"):
-        design_robust(lbt.load_config(write(tmp_path, content)))
+def test_the_smallest_file_of_the_documentation(tmp_path):
+    page = (ROOT / "docs" / "configuration.md").read_text()
+    path = tmp_path / "page.yaml"
+    path.write_text(page.split("```yaml\n")[1].split("```")[0])
+    config = lbt.load_config(path)
+    design = lbt.kalman(config.plant)
+    loop = lbt.close_loop(config.hardware, design.controller)
+    assert lbt.residual_budget(loop, config.truth).rms_nm == pytest.approx(design.rms, rel=1e-8)

@@ -1,143 +1,16 @@
-"""Costs, MATLAB files and transfer functions, and what no export takes."""
+"""Transfer-function files, stepped and refused."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from math import comb
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.io import loadmat
-from support.exports import bare_design, lbt_config, lbt_designs, relative, transfer_functions
+from support.exports import bare_design, relative, transfer_functions
 
 import lbt_synth as lbt
-from lbt_synth.interop.iir.polynomials import axis_polynomials
-
-
-@pytest.fixture
-def loaded():
-    return lbt_config()
-
-
-@pytest.fixture
-def designs():
-    return lbt_designs()
-
-
-EXPORTS = {
-    "k.c": lbt.interop.export_c,
-    "k.mat": lbt.interop.export_mat,
-    "k.fits": lbt.interop.export_iir,
-}
-
-
-@pytest.mark.parametrize("file", EXPORTS)
-def test_what_no_format_takes(tmp_path, designs, file):
-    export, target = EXPORTS[file], tmp_path / file
-    with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got int"):
-        export(target, 3)
-    failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, computed_by="guess")
-    with pytest.raises(lbt.errors.CertificateError, match="this one failed: rms") as caught:
-        export(
-            target,
-            replace(
-                designs["integrator"],
-                certificate=lbt.design.Certificate(
-                    checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0)
-                ),
-            ),
-        )
-    assert caught.value.failed == ("rms",)
-    for digest in ("abc", "AB" * 32, 3, "ab" * 32 + "\n"):
-        with pytest.raises(lbt.errors.ProblemError, match="64 hexadecimal digits"):
-            export(target, designs["integrator"], gain_digest=digest)
-    with pytest.raises(lbt.errors.OutputError, match="must end in"):
-        export(tmp_path / "k.txt", designs["integrator"])
-    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
-        export(tmp_path / "nowhere" / file, designs["integrator"])
-    assert not list(tmp_path.iterdir())
-
-
-def test_costs_by_hand():
-    controller = lbt.Controller(
-        A=[[1.0, 0.5], [0.0, -1.0]], B=[[2.0], [0.0]], C=[[1.0, 1.0], [0.0, 0.0]], D=[[0.0], [3.0]]
-    )
-    cost = lbt.interop.frame_cost(controller)
-    # x0 + .5 x1 + 2 y; -x1; n0 + n1; 3 y
-    assert (cost.multiplications, cost.additions, cost.coefficients, cost.states) == (3, 3, 3, 2)
-    assert (cost.dense_multiplications, cost.dense_additions, cost.dense_coefficients) == (
-        12,
-        8,
-        12,
-    )
-    assert (cost.coefficient_bytes_double, cost.coefficient_bytes_single) == (24, 12)
-    assert (cost.state_bytes_double, cost.state_bytes_single) == (16, 8)
-
-
-@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
-def test_costs_are_those_of_the_source(tmp_path, designs, name):
-    text = lbt.interop.export_c(tmp_path / "k.c", designs[name]).files[0].read_text()
-    body = text.split("k_step(k_state", 1)[1].split("{", 1)[1]
-    cost = lbt.interop.frame_cost(designs[name])
-    assert body.count(" * ") == cost.multiplications
-    assert body.count(" + ") + body.count(" - ") == cost.additions
-
-
-def test_costs_of_whole_matrices(tmp_path, designs):
-    cost = lbt.interop.frame_cost(designs["turned"])
-    n = designs["turned"].controller.n_states
-    assert cost.multiplications == cost.dense_multiplications == (n + 2) ** 2
-    text = lbt.interop.export_c(tmp_path / "k.c", designs["turned"]).files[0].read_text()
-    assert len(re.findall(r"/\* \[\d+\]\[\d+\] = ", text)) == cost.coefficients
-
-
-def test_costs_need_a_controller():
-    with pytest.raises(lbt.errors.ProblemError, match="expected a Design or a Controller; got int"):
-        lbt.interop.frame_cost(3)
-
-
-@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
-def test_matlab_round_trip(tmp_path, designs, name):
-    design = designs[name]
-    written = lbt.interop.export_mat(tmp_path / "k.mat", design, gain_digest="cd" * 32)
-    data = loadmat(written.files[0], simplify_cells=True)
-    for key in "ABCD":
-        assert np.array_equal(data["new_state"][key], getattr(design.controller, key))
-    form = data["textbook"]
-    A, B, C, D = (getattr(design.controller, key) for key in "ABCD")
-    assert np.array_equal(form["C"], C @ A)
-    assert np.array_equal(form["D"], C @ B + D)
-    assert data["dt_s"] == design.controller.dt_s
-    assert (data["frame_rate_hz"], data["delay_frames"]) == (800, 2)
-    assert "ss(textbook.A, textbook.B, textbook.C, textbook.D, dt_s)" in data["convention"]
-    assert "cd" * 32 in data["provenance"]
-    assert written.error < 1e-13
-    run, x = design.controller.start(), np.zeros(len(A))
-    series = np.random.default_rng(6).standard_normal((300, 2))
-    expected = np.array([run.step(y) for y in series])
-    found = []
-    for y in series:  # as ss(...) is stepped
-        found.append(form["C"] @ x + form["D"] @ y)
-        x = form["A"] @ x + form["B"] @ y
-    assert relative(found, expected) < 1e-12
-
-
-def test_the_same_design_is_the_same_matlab_file(tmp_path, designs):
-    files = [
-        lbt.interop.export_mat(tmp_path / n, designs["kalman"]).files[0] for n in ("a.mat", "b.mat")
-    ]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    assert files[0].read_bytes().startswith(b"MATLAB 5.0 MAT-file")
-
-
-def test_matlab_file_of_a_bare_problem(tmp_path):
-    odd = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0, 3.0]], C=[[1.0], [4.0]], D=np.zeros((2, 3)))
-    data = loadmat(lbt.interop.export_mat(tmp_path / "k.mat", bare_design(odd)).files[0])
-    assert data["textbook"]["D"][0, 0].tolist() == [[1, 2, 3], [4, 8, 12]]
-    assert "frame_rate_hz" not in data
 
 
 @pytest.mark.parametrize(("name", "limit"), [("kalman", 1e-12), ("hinf", 1e-9), ("integrator", 0)])
@@ -201,19 +74,6 @@ def test_axes_of_any_order(tmp_path, seed, orders):
         past = slice(t - k + 1, t + 1)
         u[t] = np.sum(num.T * y[past], axis=0) - np.sum(den.T[:-1] * u[past][:-1], axis=0)
     assert np.max(np.abs(u[k:] - expected)) < 1e-9 * max(1.0, np.max(np.abs(expected)))
-
-
-def test_exact_coefficients_of_close_poles():
-    """(z - r)^8 with r = 1 - 2^-10: binomials, where floating-point routes lose half the digits."""
-    r, n = 1 - 2.0**-10, 8
-    A = r * np.eye(n) + np.eye(n, k=1)
-    C, B = np.eye(n)[:1], np.eye(n)[:, -1:]
-    ((num, den),) = axis_polynomials(lbt.Controller(A=A, B=B, C=C, D=[[0.0]]))
-    exact = [
-        comb(n, k) * (-1) ** (n - k) * (1023 ** (n - k)) / 1024 ** (n - k) for k in range(n + 1)
-    ]
-    assert den.tolist() == exact
-    assert num.tolist() == [0, 1] + [0] * (n - 1)
 
 
 def test_transfer_functions_that_do_not_hold(tmp_path, loaded, designs):

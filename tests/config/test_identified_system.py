@@ -1,0 +1,116 @@
+"""Configurations of identified systems, read again."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+from support.identified_models import ONE_AXIS, SHELL, TILT, TIP, TWO, Line, Model, save_identified
+
+import lbt_synth as lbt
+
+
+@pytest.mark.parametrize(
+    "model", [TWO, ONE_AXIS, replace(TWO, mirror=SHELL), replace(TWO, delay_frames=2.4)]
+)
+def test_what_was_identified_is_what_is_read(tmp_path, model):
+    config = lbt.load_config(save_identified(tmp_path, model))
+    plant = config.plant
+    assert config.atmosphere is None
+    assert config.imaging.diameter_m is None
+    assert plant.hardware.modes == len(model.axes)
+    assert plant.hardware.delay_frames == model.delay_frames
+    if model.mirror is None:
+        assert plant.hardware.mirror is None
+    else:
+        assert astuple(plant.hardware.mirror) == astuple(model.mirror)
+    gains = [axis.sensor_gain for axis in model.axes]
+    np.testing.assert_array_equal(plant.hardware.sensor, np.diag(gains))
+    for own, axis in zip(plant.turbulence, model.axes, strict=True):
+        np.testing.assert_array_equal(own.coefficients, axis.turbulence.coefficients)  # all digits
+        assert own.driving_rms_nm == axis.turbulence.driving_rms_nm
+    noise = [axis.noise_nm for axis in model.axes]
+    np.testing.assert_allclose(np.sqrt(np.diag(plant.R)), noise, rtol=1e-14)
+    lines = [(i, line) for i, axis in enumerate(model.axes) for line in axis.parts]
+    assert len(plant.vibrations) == len(lines)
+    for made, (i, line) in zip(plant.vibrations, lines, strict=True):
+        assert made.direction == tuple(np.eye(len(model.axes))[i])
+        assert (made.frequency_hz, made.damping, made.rms_nm) == (
+            line.frequency_hz,
+            line.damping,
+            line.rms_nm,
+        )
+    truth = config.truth
+    assert truth.turbulence_per_mode(len(model.axes)) == plant.turbulence
+    assert truth.vibrations == plant.vibrations
+    assert truth.noise_per_measurement(len(noise)).tolist() == noise
+    assert truth.sensor_gain == 1.0
+
+
+def test_the_residual_of_the_kalman_filter_is_the_estimation_error(tmp_path):
+    """The truth is the model: an exact check of the whole chain."""
+    config = lbt.load_config(save_identified(tmp_path, TWO))
+    design = lbt.kalman(config.plant)
+    loop = lbt.close_loop(config.hardware, design.controller)
+    assert lbt.residual_budget(loop, config.truth).rms_nm == pytest.approx(design.rms, rel=1e-8)
+    assert lbt.loop.least_residual(config.hardware, config.truth).rms_nm == pytest.approx(
+        design.rms, rel=1e-6
+    )
+
+
+def test_standard_errors_stand_beside_their_numbers(tmp_path):
+    text = save_identified(tmp_path, TWO, title="Night of tests.\nSecond line.").read_text()
+    assert text.startswith("# Night of tests.\n# Second line.\nversion: 1\n")
+    rows = {
+        row.split(":")[0].strip(): row for row in text.splitlines() if "#" in row and ":" in row
+    }
+    assert "[15.5, 9.25]" in rows["noise_nm"]
+    assert rows["noise_nm"].endswith("# standard error 0.12, 0.12 nm")
+    assert rows["sensor_gain"].endswith("# standard error 0.011, not known")
+    assert "20.123456789 " in text
+    assert "# standard error 0.01 Hz" in text
+    assert "# standard error 0.0004" in text
+    assert "# standard error 1.5 nm" in text
+    assert "# tip, rms" in text
+    # a gain of 1 that was not estimated is not worth a key
+    assert "sensor_gain" not in save_identified(tmp_path, ONE_AXIS).read_text()
+
+
+def test_a_telescope_is_written_where_it_is_known(tmp_path):
+    camera = {"diameter_m": 8.22, "obstruction": 0.11, "wavelength_um": 1.65}
+    config = lbt.load_config(save_identified(tmp_path, TWO, **camera, other_modes_strehl=0.8))
+    for name, value in camera.items():
+        assert getattr(config.imaging, name) == value
+    assert config.imaging.other_modes == 0.8
+
+
+def test_quiet_axes_have_no_vibrations(tmp_path):
+    calm = Model(axes=(replace(TIP, parts=()), replace(TILT, parts=())))
+    config = lbt.load_config(save_identified(tmp_path, calm))
+    assert config.plant.vibrations == ()
+    assert config.truth.vibrations == ()
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "text"),
+    [
+        (Model(axes=()), {}, "one or two axes; got a model of 0"),
+        (Model(axes=(TIP, TILT, TIP)), {}, "one or two axes; got a model of 3"),
+        (TWO, {"obstruction": 0.1}, "diameter_m, which is missing"),
+        (TWO, {"diameter_m": -1.0}, "telescope.diameter_m"),
+        (TWO, {"wavelength_um": float("nan")}, "imaging.wavelength_um"),
+        (replace(TWO, delay_frames=float("nan")), {}, "delay_frames"),
+        (replace(TWO, delay_frames=None), {}, "delay_frames"),
+        (Model(axes=(replace(TIP, noise_nm=0.0),)), {}, "sensor.noise_nm"),
+        (Model(axes=(replace(TIP, sensor_gain=-1.0),)), {}, "model.sensor_gain"),
+        (
+            Model(axes=(replace(TIP, parts=(Line(frequency_hz=3, damping=1.0, rms_nm=1),)),)),
+            {},
+            r"model.vibrations\[0\].damping",
+        ),
+    ],
+)
+def test_models_that_no_configuration_can_hold(model, options, text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.config.identified_config(model, **options)

@@ -1,0 +1,43 @@
+"""What no export accepts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+
+EXPORTS = {
+    "k.c": lbt.interop.export_c,
+    "k.mat": lbt.interop.export_mat,
+    "k.fits": lbt.interop.export_iir,
+}
+
+
+@pytest.mark.parametrize("file", EXPORTS)
+def test_what_no_format_takes(tmp_path, designs, file):
+    export, target = EXPORTS[file], tmp_path / file
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got int"):
+        export(target, 3)
+    failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, computed_by="guess")
+    with pytest.raises(lbt.errors.CertificateError, match="this one failed: rms") as caught:
+        export(
+            target,
+            replace(
+                designs["integrator"],
+                certificate=lbt.design.Certificate(
+                    checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0)
+                ),
+            ),
+        )
+    assert caught.value.failed == ("rms",)
+    for digest in ("abc", "AB" * 32, 3, "ab" * 32 + "\n"):
+        with pytest.raises(lbt.errors.ProblemError, match="64 hexadecimal digits"):
+            export(target, designs["integrator"], gain_digest=digest)
+    with pytest.raises(lbt.errors.OutputError, match="must end in"):
+        export(tmp_path / "k.txt", designs["integrator"])
+    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
+        export(tmp_path / "nowhere" / file, designs["integrator"])
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,105 @@
+"""The tables of the paper, end to end: plans and entries."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.end_to_end import fake_results, load_setup, make_table, plan_rows
+
+import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.studies.paper.end_to_end import (
+    all_cases,
+    make_entries,
+    plan_tables,
+    rms_modal_difference,
+)
+from lbt_synth.studies.paper.published import TABLE_III
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return load_setup()
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return plan_rows()
+
+
+def test_the_tables_as_planned(rows):
+    second = [row for row in rows if row.table == "II"]
+    third = [row for row in rows if row.table == "III"]
+    assert [(r.label, r.method, r.paper) for r in second[:3]] == [
+        ("no vibration", "classical", 84.1),
+        ("no vibration", "kalman", 80.7),
+        ("no vibration", "hinf", 80.4),
+    ]
+    assert len(second) == 8
+    assert len(third) == 3 * 15
+    cases = all_cases(rows)
+    # the 20 Hz row of Table III is the row with vibration of Table II
+    assert len(cases) == 8 * 2 + 3 * 14
+    moved = [
+        c["vibrations"][0]["frequency_hz"]
+        for n, c in cases.items()
+        if n.startswith("slow-v") and "none" not in n
+    ]
+    assert sorted(set(moved)) == sorted(40 - row.model_hz for row in TABLE_III)
+    still = {
+        c["vibrations"][0]["frequency_hz"]
+        for n, c in cases.items()
+        if n.startswith("kal") and "none" not in n
+    }
+    assert still == {20.0}
+
+
+def test_seeds_are_shared_by_the_controllers(rows):
+    for row in rows:
+        seeds = [case["setup"]["seed"] for case in row.cases.values()]
+        expected = [0, 1] if row.table == "II" or row.error_hz == 0 else [0]
+        assert seeds == expected
+
+
+@pytest.fixture(scope="module")
+def table():
+    return make_table()
+
+
+def test_entries_are_means_over_seeds_beside_the_modal_analysis(table):
+    first = table[0]
+    assert first.strehl == pytest.approx(70.5)
+    assert first.scatter == pytest.approx(100 * 0.01 / np.sqrt(2))
+    # the modal analysis by hand
+    path = lbt.LoopHardware(frame_rate_hz=800)
+    air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
+    truth = lbt.Truth(turbulence=air, noise_nm=15.5, sensor_gain=0.6)
+    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller, sensor_gain=0.6)
+    camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11, wavelength_um=2.2, other_modes=0.85)
+    expected = 100 * lbt.strehl(lbt.residual_budget(loop, truth), camera)
+    assert first.modal == pytest.approx(expected, abs=1e-9)
+    assert rms_modal_difference(table, "kalman") > 0
+    # a filter for 20 Hz meets a line that moved: as bad as the model that moved
+    slow = {e.error_hz: e.modal for e in table if e.method == "slow" and e.table == "III"}
+    assert slow[-3.5] < slow[3.5]  # an integrator rejects 23.5 Hz less than 16.5 Hz
+
+
+@pytest.mark.parametrize("gain", [-0.1, 0.0, 5.0])
+def test_a_loop_that_is_unstable_at_the_measured_gain_predicts_nothing(setup, rows, gain):
+    table = make_entries(rows, fake_results(rows, gain=gain), setup)
+    assert {e.modal for e in table} == {0.0}
+
+
+def test_tables_of_another_loop_are_refused(setup):
+    hardware = lbt.LoopHardware(frame_rate_hz=1000)
+    other = replace(setup, system=replace(setup.system, hardware=hardware))
+    with pytest.raises(ProblemError, match="800 Hz with a delay of 2 frames"):
+        plan_tables(other)
+
+
+def test_a_design_cannot_take_the_name_of_the_papers(setup):
+    design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
+    with pytest.raises(ProblemError, match="the name kalman is taken"):
+        plan_tables(setup, {"kalman": design})
