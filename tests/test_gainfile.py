@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.files.gain_file import store
+from lbt_synth.storage.array_file import digest
 
 ENDINGS = ("fits", "npz", "json")
 
@@ -166,7 +166,7 @@ def edited(tmp_path, change, *, resign=True):
     change(document)
     if resign:
         arrays = {k: np.array(v, dtype=float) for k, v in document["arrays"].items()}
-        document["meta"]["digest"] = store._digest(arrays, document["meta"])
+        document["meta"]["digest"] = digest(arrays, document["meta"])
     path.write_text(json.dumps(document))
     return path
 

@@ -16,14 +16,14 @@ from support.plants import lbt_axis_plant
 import lbt_synth as lbt
 from lbt_synth.files.telemetry import native_layout
 from lbt_synth.files.telemetry.aot import lost_fields
+from lbt_synth.files.telemetry.conventions import CONVENTION
 from lbt_synth.files.telemetry.native_layout import LAYERS
-from lbt_synth.files.telemetry.telemetry import CONVENTION
 from lbt_synth.storage import array_file as archive
 
 ENDINGS = ("fits", "npz")
 
 
-SHELL = lbt.models.PositionLoop.of_bandwidth(
+SHELL = lbt.models.PositionLoop.from_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=150, sampling_hz=24_000, ramp_samples=3
 )
 
@@ -157,7 +157,9 @@ def test_float32_rounds_series_and_nothing_else(tmp_path, ending):
     seen = full(frames=5000)
     path = lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen, precision="float32")
     back = lbt.files.load_telemetry(path)
-    series = [layer.field for layer in LAYERS.values() if layer.series and layer.field != "times_s"]
+    series = [
+        layer.field for layer in LAYERS.values() if layer.is_series and layer.field != "times_s"
+    ]
     assert same(seen, back, but=series)
     for name in series:
         assert np.array_equal(getattr(back, name), getattr(seen, name).astype(np.float32))

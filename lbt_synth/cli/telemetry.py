@@ -61,7 +61,9 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         for layer in LAYERS.values()
         if getattr(telemetry, layer.field) is not None
     ]
-    rms = {name: _rms(array) for name, array, layer in arrays if layer.is_series and name != "times_s"}
+    rms = {
+        name: _rms(array) for name, array, layer in arrays if layer.is_series and name != "times_s"
+    }
     rows = [
         (
             name,

@@ -1,4 +1,4 @@
-"""A design as named arrays and plain metadata, and back."""
+"""What a gain file holds: a design as named arrays and plain metadata, and back."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ from lbt_synth.models import (
     TipTiltPlant,
     Vibration,
 )
-from lbt_synth.validation import FloatArray, choice, frozen, number
+from lbt_synth.validation import FloatArray, choice, frozen_copy, number
 
+SCHEMA = "lbt_synth gain file"
+SCHEMA_VERSION = 1
 CONVENTION = (
     "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
     "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1), or the "
@@ -44,6 +46,7 @@ CONVENTION = (
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
+_REQUESTS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
 _SIZES = ("bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme")
 _PROBLEMS: dict[str, type[EstimationProblem]] = {
     "problem": EstimationProblem,
@@ -60,11 +63,7 @@ def pack_design(design: Design) -> tuple[Arrays, Meta]:
         "method": design.method,
         "convention": CONVENTION,
         "dt_s": design.controller.dt_s,
-        "solver": {
-            "route": design.solver.route,
-            "status": design.solver.status,
-            "iterations": design.solver.iterations,
-        },
+        "solver": {n: getattr(design.solver, n) for n in ("route", "status", "iterations")},
         "certificate": _pack_certificate(design.certificate),
         "units": {"commands": "1", "measurements": "1", "phase": "1"},
     }
@@ -92,15 +91,10 @@ def pack_design(design: Design) -> tuple[Arrays, Meta]:
         }
     if isinstance(design, FilterDesign):
         arrays |= {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
-        meta["gamma_requested"] = design.gamma_requested
-        meta["gamma_least"] = design.gamma_least
-        meta["gamma_infeasible"] = design.gamma_infeasible
-        meta["rms_requested"] = design.rms_requested
+        meta |= {name: getattr(design, name) for name in _REQUESTS}
         if design.witness is not None:
-            arrays |= {
-                "WITNESS_X": design.witness.states,
-                "WITNESS_W": design.witness.disturbances,
-            }
+            arrays["WITNESS_X"] = design.witness.states
+            arrays["WITNESS_W"] = design.witness.disturbances
     if isinstance(design, PolytopicDesign):
         arrays |= {f"PREDICTOR_{name}": getattr(design.predictor, name) for name in "ABC"}
         meta["interval"] = {
@@ -110,10 +104,7 @@ def pack_design(design: Design) -> tuple[Arrays, Meta]:
         arrays |= {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_STATE": design.gain_state}
         if design.gain_mirror.size:
             arrays["GAIN_MIRROR"] = design.gain_mirror[None]
-        meta["lqg"] = {
-            "command_weight": design.command_weight,
-            "objective_nm": design.objective_nm,
-        }
+        meta["lqg"] = {name: getattr(design, name) for name in ("command_weight", "objective_nm")}
     if isinstance(design, EstimatorDesign):
         _pack_problem(design.problem, arrays, meta)
     return arrays, meta
@@ -226,7 +217,7 @@ def _unpack_lqg(
         problem=problem,
         gain_predictor=arrays["GAIN_PREDICTOR"],
         gain_state=arrays["GAIN_STATE"],
-        gain_mirror=frozen(np.ravel(arrays.get("GAIN_MIRROR", []))),
+        gain_mirror=frozen_copy(np.ravel(arrays.get("GAIN_MIRROR", []))),
         command_weight=number(lqg["command_weight"], "command_weight", at_least=0),
         objective_nm=number(lqg["objective_nm"], "objective_nm", at_least=0),
     )
@@ -250,20 +241,11 @@ def _pack_problem(problem: EstimationProblem, arrays: Arrays, meta: Meta) -> Non
         arrays |= {"KNOWN_B": problem.B_known, "KNOWN_D": problem.D_known}
     if isinstance(problem, TipTiltPlant):
         meta["turbulence"] = [
-            {
-                "coefficients": model.coefficients.tolist(),
-                "driving_rms_nm": model.driving_rms_nm,
-            }
-            for model in problem.turbulence
+            {"coefficients": ar.coefficients.tolist(), "driving_rms_nm": ar.driving_rms_nm}
+            for ar in problem.turbulence
         ]
         meta["vibrations"] = [
-            {
-                "frequency_hz": line.frequency_hz,
-                "damping": line.damping,
-                "rms_nm": line.rms_nm,
-                "direction": list(line.direction),
-            }
-            for line in problem.vibrations
+            {**asdict(line), "direction": list(line.direction)} for line in problem.vibrations
         ]
 
 
@@ -311,7 +293,7 @@ def _unpack_certificate(meta: Meta) -> Certificate:
     return Certificate(
         checks=tuple(_unpack_check(check) for check in meta["checks"]),
         gamma=np.nan if meta["gamma"] is None else float(meta["gamma"]),
-        rms_per_output=frozen(np.array(meta["rms_per_output"], dtype=np.float64)),
+        rms_per_output=frozen_copy(np.array(meta["rms_per_output"], dtype=np.float64)),
     )
 
 

@@ -2,8 +2,8 @@
 
 Standard: T. Gomes et al., A&A (2024), DOI 10.1051/0004-6361/202348486; version 2.0.0.
 It wants commands in metres, has no field for the true phase, and describes a controller by a
-control matrix and one transfer function a mode, not by a state space. What of a telemetry
-is lost, :func:`lost_fields` tells.
+control matrix and one transfer function per mode instead of a state space. :func:`lost_fields`
+returns what of a telemetry is lost.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lbt_synth.files.telemetry.native_layout import check_taps
 from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.array_file import reason
+from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.fits import has_card
 from lbt_synth.validation import FloatArray
 
@@ -31,8 +31,8 @@ _CARD_OF_OURS = "LBTSYNTH"  # one card with what the standard has no field for, 
 _IN_OURS = ("seed", "name", "controller_name", "controller_digest", "metadata")
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
 _RAD_PER_MAS = np.pi / 180 / 3600e3
-_FOREIGN = "that of another program: which exposure a row is of, the AOT standard does not say"
-_UNSAFE = "'&/"  # signs that a FITS text over several cards does not keep in every place
+_FOREIGN = "that of another program: the AOT standard does not say which exposure a row is of"
+_UNSAFE = "'&/"  # characters that a FITS text over several cards does not always keep
 _INSTALL = 'it needs aotpy: pip install "lbt-synth[aot]"'
 
 
@@ -42,10 +42,10 @@ def is_aot(content: bytes) -> bool:
 
 
 def lost_fields(telemetry: Telemetry) -> tuple[str, ...]:
-    """Fields that are set in a telemetry, and that the standard does not hold."""
+    """Return the fields of a telemetry that are set and that the standard does not hold."""
     without = ["residual_nm", "total_nm", "controller"]
     if telemetry.diameter_m is None:
-        without.append("obstruction")  # it is a diameter there
+        without.append("obstruction")  # the standard has it as a diameter
     return tuple(name for name in without if getattr(telemetry, name) is not None)
 
 
@@ -64,7 +64,7 @@ def require_aotpy(target: Path) -> Any:
 
 
 def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
-    """Return the file."""
+    """Return the content of an AOT file."""
     from astropy.io import fits
 
     aotpy = require_aotpy(target)
@@ -79,16 +79,15 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
 
 
 def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
-    """Describe telemetry as a system of aotpy."""
+    """Describe telemetry as an ``AOSystem`` of aotpy."""
+    obstruction = None
+    if seen.diameter_m is not None and seen.obstruction is not None:
+        obstruction = seen.diameter_m * seen.obstruction
     telescope = aotpy.MainTelescope(
         "Telescope",
         enclosing_diameter=seen.diameter_m,
         inscribed_diameter=seen.diameter_m,
-        obstruction_diameter=(
-            None
-            if seen.diameter_m is None or seen.obstruction is None
-            else seen.diameter_m * seen.obstruction
-        ),
+        obstruction_diameter=obstruction,
     )
     star = aotpy.NaturalGuideStar("Guide star")
     clock = aotpy.Time("Frames", frame_numbers=list(map(float, range(seen.frames))))
@@ -106,21 +105,16 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     axes, subapertures = seen.subaperture_axes, seen.sensed.shape[1] // seen.subaperture_axes
     slopes = seen.slopes is not None
     sensed_unit = seen.slope_unit if slopes else seen.measurement_unit
+    measured = seen.sensed.reshape(seen.frames, axes, subapertures)
+    gain = None if seen.sensor_gain is None else np.array([seen.sensor_gain])
     sensor = aotpy.Pyramid(
         "Pyramid",
         source=star,
         dimensions=axes,
         n_valid_subapertures=subapertures,
         n_sides=4,
-        measurements=image(
-            "MEASUREMENTS",
-            seen.sensed.reshape(seen.frames, axes, subapertures),
-            sensed_unit,
-            timed=True,
-        ),
-        optical_gain=image(
-            "OPTICAL GAIN", None if seen.sensor_gain is None else np.array([seen.sensor_gain])
-        ),
+        measurements=image("MEASUREMENTS", measured, sensed_unit, timed=True),
+        optical_gain=image("OPTICAL GAIN", gain),
     )
     m = seen.commands.shape[1]
     if m == 2:
@@ -132,7 +126,15 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     matrix = None if filters is None else filters.matrix
     if matrix is not None and slopes:
         matrix = None if seen.reconstructor is None else matrix @ seen.reconstructor
-    response = seen.interaction_matrix  # (s, n) to (s_v, d, n)
+    response = seen.interaction_matrix
+    if response is not None:  # (s, n) to (s_v, d, n)
+        response = response.reshape(axes, subapertures, -1).transpose(1, 0, 2)
+    modal = seen.measurements if slopes else None
+    numerators, denominators, residual = None, None, None
+    if filters is not None:
+        numerators, denominators = filters.numerators, filters.denominators
+        residual = metres * seen.measurements @ filters.matrix.T
+    back = _split_by_subaperture(seen.reconstructor, axes)
     loop = aotpy.ControlLoop(
         "Control loop",
         input_sensor=sensor,
@@ -141,31 +143,14 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         commands=image("COMMANDS", metres * seen.commands, command_unit, timed=True),
         framerate=seen.frame_rate_hz,
         delay=seen.delay_frames,
-        time_filter_num=image("TIME FILTER NUM", None if filters is None else filters.numerators),
-        time_filter_den=image("TIME FILTER DEN", None if filters is None else filters.denominators),
+        time_filter_num=image("TIME FILTER NUM", numerators),
+        time_filter_den=image("TIME FILTER DEN", denominators),
         modes=image("MODES", seen.mode_maps),
-        modal_coefficients=image(
-            "MODAL COEFFICIENTS",
-            seen.measurements if slopes else None,
-            seen.measurement_unit,
-            timed=True,
-        ),
-        control_matrix=image("CONTROL MATRIX", _by_subaperture(matrix, axes)),
-        residual_commands=image(
-            "RESIDUAL COMMANDS",
-            None if filters is None else metres * seen.measurements @ filters.matrix.T,
-            command_unit,
-            timed=True,
-        ),
-        measurements_to_modes=image(
-            "MEASUREMENTS TO MODES", _by_subaperture(seen.reconstructor, axes)
-        ),
-        modes_to_measurements=image(
-            "MODES TO MEASUREMENTS",
-            None
-            if response is None
-            else response.reshape(axes, subapertures, -1).transpose(1, 0, 2),
-        ),
+        modal_coefficients=image("MODAL COEFFICIENTS", modal, seen.measurement_unit, timed=True),
+        control_matrix=image("CONTROL MATRIX", _split_by_subaperture(matrix, axes)),
+        residual_commands=image("RESIDUAL COMMANDS", residual, command_unit, timed=True),
+        measurements_to_modes=image("MEASUREMENTS TO MODES", back),
+        modes_to_measurements=image("MODES TO MEASUREMENTS", response),
         commands_to_modes=image("COMMANDS TO MODES", seen.influence_matrix),
     )
     cameras = []
@@ -196,19 +181,19 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
 
 
 def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
-    """Cards of the primary header that the tables have no place for."""
+    """Cards of the primary header, for what the tables have no place for."""
     ours = {name: getattr(seen, name) for name in _IN_OURS} | {"metadata": dict(seen.metadata)}
     gains = seen.integrator_gains
     ours["integrator_gains"] = None if gains is None else gains.tolist()
     ours["psf_pixel_mas"] = seen.psf_pixel_mas if seen.psf is None else None
     if seen.mirror is not None and seen.mirror_taps is not None:
-        # the standard's TFZ_NUM and TFZ_DEN of a corrector: of what, and with which delay, it
-        # does not say
+        # the standard does not say what its TFZ_NUM and TFZ_DEN of a corrector act on, nor with
+        # which delay
         ours["mirror"], ours["mirror_taps"] = asdict(seen.mirror), seen.mirror_taps.tolist()
     if seen.controller is not None:
         ours["controller_states"] = seen.controller.n_states
     text = json.dumps(ours, allow_nan=False)
-    for sign in _UNSAFE:  # they are in texts only, where JSON may write them by their number
+    for sign in _UNSAFE:  # they stand only in texts, where JSON may write them by their number
         text = text.replace(sign, f"\\u{ord(sign):04x}")
     cards = [aotpy.Metadatum(_CARD_OF_OURS, text)]
     if (wavelength := _wavelength_m(seen)) is not None:
@@ -230,8 +215,8 @@ def _filters(seen: Telemetry) -> TimeFilters | None:
     )
 
 
-def _by_subaperture(matrix: FloatArray | None, axes: int) -> FloatArray | None:
-    """Reshape (rows, s) to (rows, d, s_v)."""
+def _split_by_subaperture(matrix: FloatArray | None, axes: int) -> FloatArray | None:
+    """Reshape (rows, s) to (rows, d, s_v), d values from each of s_v subapertures."""
     return None if matrix is None else matrix.reshape(len(matrix), axes, -1)
 
 
@@ -246,7 +231,7 @@ def _to_ascii(text: str) -> str:
 
 
 def from_bytes(content: bytes, source: Path) -> Telemetry:
-    """Read what the standard carries of a telemetry: the first control loop that has series."""
+    """Read the first control loop that has series, and what describes it."""
     try:
         aotpy = _aotpy()
     except ImportError as error:
@@ -254,7 +239,7 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # foreign files deviate in many small ways
         try:
-            # files and addresses that a file refers to are not opened
+            # other files and addresses that this one refers to are not opened
             warnings.filterwarnings("error", message=".*verification failed")  # of a checksum
             reader = aotpy.AOTFITSReader(
                 io.BytesIO(content), externals="disallow", memmap=False, checksum=True
@@ -262,7 +247,8 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
             system = reader.get_system()
         except Exception as error:  # damage and deviations, in whatever way they show
             raise TelemetryError(
-                f"{source} is no file of the AOT standard, or it is damaged: {reason(error)}.",
+                f"{source} is no file of the AOT standard, or it is damaged: "
+                f"{error_reason(error)}.",
                 path=source,
             ) from error
     loops = [
@@ -351,7 +337,7 @@ def _series_fields(loop: Any) -> dict[str, Any]:
         pair = (np.atleast_2d(_image_data(f)) for f in (loop.time_filter_num, loop.time_filter_den))
         gains = integrator_gains(*pair)
         m = commands.shape[-1]
-        if gains is not None and len(gains) in (1, m):  # one row is for all
+        if gains is not None and len(gains) in (1, m):  # one row serves all
             fields["integrator_gains"] = np.broadcast_to(gains, (m,))
     return fields
 
@@ -372,6 +358,6 @@ def _image_data(image: Any) -> Any:
 
 
 def _to_nm(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
-    """Return lengths in nm; other units stay."""
+    """Return lengths in nm, and other values in their own unit."""
     factor = _NM.get(unit)
     return (values, unit) if factor is None else (factor * values, "nm")

@@ -1,4 +1,4 @@
-"""Telemetry of a simulated loop."""
+"""Makes telemetry of one case of a simulation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files.telemetry.telemetry import Scalar, Telemetry
 from lbt_synth.loop import Imaging, Simulation, series_strehl
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import instance, integer
+from lbt_synth.validation import integer, require_instance
 
 
 def telemetry_from_simulation(
@@ -74,8 +74,8 @@ def telemetry_from_simulation(
     >>> bool(abs(seen.measurements[1:] - seen.residual_nm[:-1]).max() < 1e-9)  # no noise
     True
     """
-    instance(simulation, Simulation)
-    instance(hardware, LoopHardware)
+    require_instance(simulation, Simulation)
+    require_instance(hardware, LoopHardware)
     case = integer(case, "case", at_least=0)
     cases = len(simulation.commands)
     if case >= cases:
@@ -86,7 +86,7 @@ def telemetry_from_simulation(
             f"one at {hardware.frame_rate_hz:g} Hz."
         )
     if design is not None:
-        instance(design, Design)
+        require_instance(design, Design)
     gains = None
     if isinstance(design, IntegratorDesign):
         gains = np.full(hardware.n_commands, design.gain)

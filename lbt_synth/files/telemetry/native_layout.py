@@ -1,9 +1,9 @@
-"""Our own layout: telemetry as named arrays and plain metadata, and back."""
+"""The package's own layout of a telemetry file: named arrays, metadata and FITS cards."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,59 +23,45 @@ Arrays = dict[str, npt.NDArray[Any]]
 Meta = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layer:
-    """One array of the file: its field, its axes in numpy's order, and its unit.
+class Layer(NamedTuple):
+    """One array of the file: its field, its axes in numpy's order, its unit and its meaning.
 
     A unit that begins with an underscore is read from the field of that name.
     """
 
     field: str
     axes: str
-    unit: str = ""
-    meaning: str = ""
+    unit: str
+    meaning: str
 
     @property
-    def series(self) -> bool:
-        """Whether it has one row a frame."""
+    def is_series(self) -> bool:
+        """Whether it has one row per frame."""
         return self.axes.startswith("frame")
 
     def unit_in(self, telemetry: Telemetry) -> str:
-        """Return the unit, in this telemetry."""
+        """Return the unit that it has in a telemetry."""
         return str(getattr(telemetry, self.unit[1:])) if self.unit[:1] == "_" else self.unit
 
 
+_TAPS = "c: phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...)"
+_MEASURED = "y(k), of the exposure of frame k-1"
 LAYERS = {
-    "COMMANDS": Layer(
-        field="commands", axes="frame, command", unit="_command_unit", meaning="u(k)"
-    ),
-    "MEASURE": Layer(
-        field="measurements",
-        axes="frame, measurement",
-        unit="_measurement_unit",
-        meaning="y(k), of the exposure of frame k-1",
-    ),
-    "RESIDUAL": Layer(
-        field="residual_nm", axes="frame, mode", unit="nm", meaning="phi_res(k), corrected phase"
-    ),
-    "TOTAL": Layer(
-        field="total_nm", axes="frame, mode", unit="nm", meaning="phi_tot(k), before correction"
-    ),
-    "SLOPES": Layer(
-        field="slopes", axes="frame, slope", unit="_slope_unit", meaning="what the sensor gave"
-    ),
-    "TIMES": Layer(field="times_s", axes="frame", unit="s", meaning="time of each frame"),
-    "INTERACT": Layer(field="interaction_matrix", axes="sensed, mode", meaning="S"),
-    "RECONST": Layer(field="reconstructor", axes="mode, slope", meaning="slopes to modes"),
-    "INFLUENC": Layer(field="influence_matrix", axes="mode, command", meaning="N"),
-    "MODES": Layer(field="mode_maps", axes="mode, row, column", meaning="modes, of rms 1"),
-    "PSF": Layer(field="psf", axes="row, column", meaning="image of the camera"),
-    "INTGAINS": Layer(field="integrator_gains", axes="command", meaning="integrator gains"),
-    "MIRROR_TAPS": Layer(
-        field="mirror_taps", axes="age", meaning="c: phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...)"
-    ),
+    "COMMANDS": Layer("commands", "frame, command", "_command_unit", "u(k)"),
+    "MEASURE": Layer("measurements", "frame, measurement", "_measurement_unit", _MEASURED),
+    "RESIDUAL": Layer("residual_nm", "frame, mode", "nm", "phi_res(k), corrected phase"),
+    "TOTAL": Layer("total_nm", "frame, mode", "nm", "phi_tot(k), before correction"),
+    "SLOPES": Layer("slopes", "frame, slope", "_slope_unit", "what the sensor gave"),
+    "TIMES": Layer("times_s", "frame", "s", "time of each frame"),
+    "INTERACT": Layer("interaction_matrix", "sensed, mode", "", "S"),
+    "RECONST": Layer("reconstructor", "mode, slope", "", "slopes to modes"),
+    "INFLUENC": Layer("influence_matrix", "mode, command", "", "N"),
+    "MODES": Layer("mode_maps", "mode, row, column", "", "modes, of rms 1"),
+    "PSF": Layer("psf", "row, column", "", "image of the camera"),
+    "INTGAINS": Layer("integrator_gains", "command", "", "integrator gains"),
+    "MIRROR_TAPS": Layer("mirror_taps", "age", "", _TAPS),
 }
-_SAME_TAPS = 1e-9  # what is read beside what the mirror of the file has
+_SAME_TAPS = 1e-9  # largest difference between the taps of a file and those of its mirror
 _FACTS = (
     "frame_rate_hz",
     "delay_frames",
@@ -114,7 +100,7 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
     for name, layer in LAYERS.items():
         if (value := getattr(telemetry, layer.field)) is None:
             continue
-        exact = not layer.series or layer.field == "times_s"  # times need their digits
+        exact = not layer.is_series or layer.field == "times_s"  # times need their digits
         arrays[name] = value if exact else _round_series(value, precision, layer.field)
     meta: Meta = {
         "schema": SCHEMA,
@@ -149,7 +135,7 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
         layer.field: left.pop(name) for name, layer in LAYERS.items() if name in left
     }
     for name in ("COMMANDS", "MEASURE"):
-        if LAYERS[name].field not in fields:
+        if name not in arrays:
             raise KeyError(name)
     if "controller_dt_s" in meta:
         fields["controller"] = Controller(
@@ -158,18 +144,14 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
     if left:
         raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(left))}")
     taps = fields.pop("mirror_taps", None)
-    if "mirror" in meta:  # files of a mirror that settles at once have none
+    if "mirror" in meta:  # a mirror that settles at once is not in the file
         fields["mirror"] = PositionLoop(**meta["mirror"])
-    return check_taps(
-        Telemetry(
-            **fields, **{name: meta[name] for name in _FACTS}, metadata=dict(meta["metadata"])
-        ),
-        taps,
-    )
+    fields |= {name: meta[name] for name in _FACTS}
+    return check_taps(Telemetry(**fields, metadata=dict(meta["metadata"])), taps)
 
 
 def check_taps(telemetry: Telemetry, taps: npt.ArrayLike | None) -> Telemetry:
-    """Return telemetry whose mirror has the taps that stand in its file."""
+    """Return telemetry, or refuse it if its mirror does not have the taps of its file."""
     own = telemetry.mirror_taps
     if (own is None) != (taps is None):
         raise ValueError("a mirror and its taps go together; it has one of them")

@@ -1,13 +1,13 @@
-"""Save and load telemetry; what is loaded has been checked."""
+"""Saves telemetry to files, and loads and checks it."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 
-from lbt_synth.errors import OutputError, ProblemError, TelemetryError
+from lbt_synth.errors import OutputError, TelemetryError
+from lbt_synth.files.file_checks import FileKind
 from lbt_synth.files.telemetry import aot
 from lbt_synth.files.telemetry.native_layout import (
     PRECISIONS,
@@ -19,12 +19,19 @@ from lbt_synth.files.telemetry.native_layout import (
     unpack,
 )
 from lbt_synth.files.telemetry.telemetry import Telemetry
-from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz, reason
+from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import choice
 
 FORMATS = ("fits", "npz", "aot")
 _ENDINGS = ".fits, .npz or .aot.fits"
+_KIND = FileKind(
+    name="telemetry file",
+    schema=SCHEMA,
+    version=SCHEMA_VERSION,
+    error=TelemetryError,
+    version_error=TelemetryError,
+)
 
 
 def require_telemetry_name(path: str | os.PathLike[str], format: str | None = None) -> str:  # noqa: A002
@@ -69,7 +76,7 @@ def save_telemetry(
     telemetry : Telemetry
         The telemetry.
     format : {"fits", "npz", "aot"}, optional
-        The format, where the ending does not say it.
+        The format, where the ending does not give it.
     precision : {"float64", "float32"}, optional
         Of the series; matrices, images and times are float64.
 
@@ -121,7 +128,7 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     ----------
     path : path-like
         File in the layout of this package (``.fits``, ``.npz``) or of the Adaptive Optics
-        Telemetry standard (``.fits``); which of the two a FITS file is, its header tells.
+        Telemetry standard (``.fits``); the header of a FITS file says which of the two it is.
 
     Returns
     -------
@@ -145,49 +152,9 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     source = Path(path)
     if source.suffix.lower() not in (".fits", ".npz"):
         raise TelemetryError(f"telemetry must end in {_ENDINGS}; got {source.name!r}.", path=source)
-    try:
-        content = source.read_bytes()
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise TelemetryError(f"cannot read {source}: {why}.", path=source) from error
-    if source.suffix.lower() == ".fits" and aot.is_aot(content):
-        return _rebuild(lambda: aot.from_bytes(content, source), source)
-    read = read_npz if source.suffix.lower() == ".npz" else read_fits
-    try:
-        arrays, text = read(content)
-        meta = json.loads(text)
-        found = digest(arrays, meta) if isinstance(meta, dict) else ""
-    except Exception as error:  # foreign bytes: the decoders raise whatever they like
-        raise TelemetryError(
-            f"{source} is no telemetry file, or it is damaged: {reason(error)}.", path=source
-        ) from error
-    if not isinstance(meta, dict) or meta.get("schema") != SCHEMA:
-        raise TelemetryError(f"{source} is not a telemetry file of lbt_synth.", path=source)
-    if meta.get("schema_version") != SCHEMA_VERSION:
-        raise TelemetryError(
-            f"{source} has layout version {meta.get('schema_version')!r}; this lbt_synth reads "
-            f"{SCHEMA_VERSION}. Read it with the version that wrote it.",
-            path=source,
-        )
-    if meta.get("digest") != found:
-        raise TelemetryError(
-            f"{source} is damaged: its content does not match its digest.", path=source
-        )
-    return _rebuild(lambda: unpack(arrays, meta), source)
-
-
-def _rebuild(rebuild: Callable[[], Telemetry], source: Path) -> Telemetry:
-    """Rebuild telemetry from what was read; what does not fit is the file's fault."""
-    try:
-        return rebuild()
-    except TelemetryError:
-        raise
-    except (
-        ProblemError,
-        KeyError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-    ) as error:
-        raise TelemetryError(f"{source} is inconsistent: {reason(error)}.", path=source) from error
+    content = _KIND.read_bytes(source)
+    is_fits = source.suffix.lower() == ".fits"
+    if is_fits and aot.is_aot(content):
+        return _KIND.rebuild(lambda: aot.from_bytes(content, source), source)
+    arrays, meta = _KIND.decode(content, read_fits if is_fits else read_npz, source)
+    return _KIND.rebuild(lambda: unpack(arrays, meta), source)

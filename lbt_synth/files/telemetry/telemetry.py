@@ -1,4 +1,4 @@
-"""What a loop recorded, with the facts that make it readable later."""
+"""Telemetry: the series of a loop, with the facts that make them readable later."""
 
 from __future__ import annotations
 
@@ -11,32 +11,21 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.files.telemetry.conventions import CONVENTION, MOVING_CONVENTION
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
-from lbt_synth.validation import FloatArray, frozen, instance, integer, matrix, number, real_array
+from lbt_synth.validation import (
+    FloatArray,
+    frozen_copy,
+    integer,
+    matrix,
+    number,
+    real_array,
+    require_instance,
+)
 
 Scalar: TypeAlias = str | float | int | bool
 
-_CONVENTION = (
-    "Row k of every series is frame k of 1/frame_rate_hz. "
-    "y(k) = sensor_gain S phi_res(k-1) + noise(k): the measurement of frame k is of the exposure "
-    "of frame k-1. u(k) is the command computed from y up to y(k). "
-    "phi_res(k) = phi_tot(k) - phi_cor(k), {correction}. S is the interaction matrix, N the "
-    "influence matrix, each the identity where it is not given. Where slopes are recorded, "
-    "slopes(k) = sensor_gain S phi_res(k-1) + noise(k), y(k) = reconstructor slopes(k). "
-    "Units: nm rms of wavefront, unless a unit is given."
-)
-CONVENTION = _CONVENTION.format(
-    correction="phi_cor(k) = N u(k-d+1), d = delay_frames from the "
-    "middle of an exposure to the middle of the command computed from it; for d = j+1+f, "
-    "phi_cor(k) = N ((1-f) u(k-j) + f u(k-j-1))"
-)
-MOVING_CONVENTION = _CONVENTION.format(
-    correction="phi_cor(k) = N (c0 u(k) + c1 u(k-1) + c2 u(k-2) + ...) with the mirror taps c "
-    "recorded here: the weights of the commands in the position of a mirror that does not settle "
-    "at once, averaged over exposure k. They hold the whole delay: d = delay_frames as it would be "
-    "with a mirror that settles at once, and the mirror's lag after it"
-)
 _BOUNDED: dict[str, dict[str, Any]] = {
     "delay_frames": {"at_least": 0, "at_most": 1000},
     "psf_pixel_mas": {"above": 0},
@@ -104,7 +93,7 @@ class Telemetry:
         Time of each frame [s], rising; Unix time where it is of the sky.
     subaperture_axes : int, optional
         Values that a subaperture of the sensor gives: the slopes (the measurements, where
-        there are no slopes) are that many blocks of one value a subaperture.
+        there are no slopes) are that many blocks of one value per subaperture.
     command_unit, measurement_unit, slope_unit : str, optional
         Units; "nm" is rms of wavefront, and the only unit of length of the first two.
     sensor_gain : float, optional
@@ -186,7 +175,7 @@ class Telemetry:
         if self.seed is not None:
             self._set("seed", integer(self.seed, "seed", at_least=0))
         if self.mirror is not None:
-            instance(self.mirror, PositionLoop)
+            require_instance(self.mirror, PositionLoop)
             if self.delay_frames is None:
                 raise ProblemError("telemetry of a mirror with dynamics needs delay_frames.")
             _ = self.mirror_taps  # what does not fit is refused
@@ -259,7 +248,7 @@ class Telemetry:
             raise DimensionError("there must be one mode at least; got none.")
 
     def _counts(self) -> dict[str, int | None]:
-        """Return the number of modes in each thing that tells it."""
+        """Return the number of modes according to each field that has it."""
 
         def along(array: FloatArray | None, axis: int) -> int | None:
             return None if array is None else int(array.shape[axis])
@@ -336,7 +325,7 @@ class Telemetry:
 
     @property
     def modes(self) -> int:
-        """Number of modes n; that of the measurements, where nothing tells it."""
+        """Number of modes n; that of the measurements, where no field gives it."""
         known = [count for count in self._counts().values() if count is not None]
         return known[0] if known else int(self.measurements.shape[1])
 
@@ -356,12 +345,12 @@ class Telemetry:
 
     @property
     def convention(self) -> str:
-        """What the rows are, in sentences that files carry."""
+        """Meaning of the rows, in sentences that are stored in files."""
         return CONVENTION if self.mirror is None else MOVING_CONVENTION
 
     @property
     def hardware(self) -> LoopHardware:
-        """The loop as the records tell it, at sensor gain 1.
+        """The loop according to the telemetry, at sensor gain 1.
 
         Raises
         ------
@@ -373,7 +362,9 @@ class Telemetry:
         n, q, m = self.modes, self.measurements.shape[1], self.commands.shape[1]
         sensor, influence = self.interaction_matrix, self.influence_matrix
         if self.slopes is not None and sensor is not None:
-            sensor = None if self.reconstructor is None else frozen(self.reconstructor @ sensor)
+            sensor = (
+                None if self.reconstructor is None else frozen_copy(self.reconstructor @ sensor)
+            )
         for what, name, missing, size in (
             ("measurements", "interaction", sensor is None, q),
             ("commands", "influence", influence is None, m),

@@ -1,7 +1,7 @@
-"""A controller as a matrix and one transfer function a command, where it is one.
+"""Controllers as a constant matrix and one transfer function per command, where possible.
 
-The Adaptive Optics Telemetry standard has no state space; it has a control matrix and
-time filters. A controller ``u(z) = H(z) y(z)`` is that when each row of H is a scalar
+The Adaptive Optics Telemetry standard has no state space, but a control matrix and
+time filters. A controller ``u(z) = H(z) y(z)`` can be written so when each row of H is a scalar
 filter times a constant row: ``H_i(z) = f_i(z) k_i``.
 """
 
@@ -14,28 +14,24 @@ import numpy as np
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
 
-_POINTS = 64
-_SAME = 1e-8  # relative to the response, at every point
-_NOTHING = 1e-14  # relative to the largest entry: no link between states
+_POINTS = 64  # frequencies of the comparison
+_SAME = 1e-8  # largest difference, relative to the response at each frequency
+_NOTHING = 1e-14  # entries smaller than this part of the largest count as zero
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TimeFilters:
     """Scalar filters after a constant matrix."""
 
-    # (m, q): from measurements to what is filtered; its largest entry in each row is 1
-    matrix: FloatArray
-    # numerators, denominators (m, order + 1): coefficients of ``sum b_i z^i / sum a_i z^i``, from i
-    # = 0
-    numerators: FloatArray
-    denominators: FloatArray
+    matrix: FloatArray  # from measurements to filter inputs, (m, q); 1 is each row's largest entry
+    numerators: FloatArray  # b_i of ``sum b_i z^i / sum a_i z^i``, (m, order + 1)
+    denominators: FloatArray  # a_i
 
 
 def time_filters(controller: Controller) -> TimeFilters | None:
-    """Take a controller apart; None if it is no matrix followed by scalar filters.
+    """Return a controller's matrix and filters; None if it is not a matrix and scalar filters.
 
-    What is returned has been compared with the controller's response at 64 frequencies,
-    to 1e-8 of it.
+    They agree with the controller's response at 64 frequencies, to 1e-8 of it.
     """
     system = controller.to_statespace()
     frequency = np.geomspace(1e-4, 0.497, _POINTS) / system.dt_s
@@ -62,7 +58,7 @@ def time_filters(controller: Controller) -> TimeFilters | None:
 
 
 def integrator_gains(numerators: FloatArray, denominators: FloatArray) -> FloatArray | None:
-    """Gains g of filters that are all ``g z / (z - 1)``; None if one is not."""
+    """Gains g of filters that are all ``g z / (z - 1)``, else None."""
     powers = [np.flatnonzero(np.any(part != 0, axis=0)) for part in (numerators, denominators)]
     if not (np.array_equal(powers[0], [1]) and np.array_equal(powers[1], [0, 1])):
         return None
@@ -73,7 +69,7 @@ def integrator_gains(numerators: FloatArray, denominators: FloatArray) -> FloatA
 
 
 def _constant_row(response: ComplexArray) -> FloatArray | None:
-    """Row k of a response ``f(z) k`` over frequencies, (f, q); None if it turns."""
+    """Row k of a response (f, q) that is ``f(z) k`` at all frequencies, else None."""
     size = np.linalg.norm(response, axis=1)
     if not np.any(size):
         return np.asarray(np.eye(1, response.shape[1])[0])
@@ -89,7 +85,7 @@ def _constant_row(response: ComplexArray) -> FloatArray | None:
 def _transfer_function(
     system: StateSpace, output: int, row: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Polynomials, highest power first, of the scalar filter behind an output."""
+    """Numerator and denominator, highest power first, of the scalar filter of one output."""
     b, c = system.B @ row / (row @ row), system.C[output]
     d = float(system.D[output] @ row / (row @ row))
     linked = np.abs(system.A) > _NOTHING * np.max(np.abs(system.A), initial=0.0)
@@ -110,7 +106,7 @@ def _significant(vector: FloatArray) -> BoolArray:
 
 
 def _reachable_states(linked: BoolArray, start: BoolArray) -> BoolArray:
-    """States that the starting ones drive, themselves included."""
+    """States that the starting ones drive, and the starting ones."""
     inside = start
     for _ in range(len(linked)):
         inside = inside | (linked[:, inside].any(axis=1))

@@ -1,0 +1,78 @@
+"""Checks of a gain or telemetry file that is read: its bytes, layout version and digest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from lbt_synth.errors import FileError
+from lbt_synth.storage.array_file import digest, error_reason
+from lbt_synth.validation import FloatArray
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileKind:
+    """A kind of file, with the errors that are raised where one cannot be read."""
+
+    name: str
+    schema: str  # the mark of the kind in its metadata
+    version: int  # of the layout
+    error: type[FileError]
+    version_error: type[FileError]
+    advice: str = ""  # what to do about a damaged file
+
+    def read_bytes(self, source: Path) -> bytes:
+        """Return the content of a file."""
+        try:
+            return source.read_bytes()
+        except OSError as error:
+            why = error.strerror or error
+            raise self.error(f"cannot read {source}: {why}.", path=source) from error
+        except ValueError as error:
+            raise self.error(f"cannot read {str(source)!r}: {error}.", path=source) from error
+
+    def decode(
+        self,
+        content: bytes,
+        read: Callable[[bytes], tuple[dict[str, FloatArray], str]],
+        source: Path,
+    ) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+        """Return the arrays and the metadata, of a layout that is known and with their digest."""
+        try:
+            arrays, text = read(content)
+            meta = json.loads(text)
+            found = digest(arrays, meta) if isinstance(meta, dict) else ""
+        except Exception as error:  # foreign bytes: the decoders raise whatever they like
+            why = f"{source} is no {self.name}, or it is damaged: {error_reason(error)}."
+            raise self.error(why + self.advice, path=source) from error
+        if not isinstance(meta, dict) or meta.get("schema") != self.schema:
+            raise self.error(f"{source} is not a {self.name} of lbt_synth.", path=source)
+        version = meta.get("schema_version")
+        if version != self.version:
+            raise self.version_error(
+                f"{source} has layout version {version!r}; this lbt_synth reads {self.version}. "
+                "Read it with the version that wrote it.",
+                path=source,
+            )
+        if meta.get("digest") != found:
+            raise self.error(
+                f"{source} is damaged: its content does not match its digest.{self.advice}",
+                path=source,
+            )
+        return arrays, meta
+
+    def rebuild(self, build: Callable[[], T], source: Path) -> T:
+        """Build what a file holds; what does not fit together is the file's fault."""
+        try:
+            return build()
+        except FileError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
+            raise self.error(
+                f"{source} is inconsistent: {error_reason(error)}.{self.advice}", path=source
+            ) from error
