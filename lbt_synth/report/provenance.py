@@ -14,6 +14,7 @@ from pathlib import Path
 
 import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
+from lbt_synth.storage.tables import Table
 
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
 _WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
@@ -86,3 +87,18 @@ def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
         except PackageNotFoundError:
             found.append((name, "not installed"))
     return tuple(found)
+
+
+def files_table(files: Sequence[SourceFile]) -> Table:
+    """Digests of what was read."""
+    return Table(
+        caption="Files that were read",
+        headings=("file", "what it is", "SHA-256"),
+        rows=tuple((file.name, file.role, file.sha256) for file in files),
+        words=(1, 2),
+    )
+
+
+def versions_table(found: tuple[tuple[str, str], ...]) -> Table:
+    """Programs and libraries that made a page."""
+    return Table(caption="Made with", headings=("program", "version"), rows=found, words=(1,))

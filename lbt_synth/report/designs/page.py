@@ -12,18 +12,19 @@ from lbt_synth.report.designs.pole_and_step_charts import pole_and_step_charts
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.robustness_charts import robustness_charts
 from lbt_synth.report.designs.simulation_charts import simulation_charts
-from lbt_synth.report.designs.tables import (
-    certificate_table,
-    files_table,
-    summary_table,
-    versions_table,
-)
+from lbt_synth.report.designs.tables import certificate_table, summary_table
 from lbt_synth.report.designs.transfer_charts import transfer_charts
 from lbt_synth.report.designs.verdict import verdict
 from lbt_synth.report.number_text import listing_text, number_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
-from lbt_synth.report.provenance import creator_name, require_letters, time_text
+from lbt_synth.report.provenance import (
+    creator_name,
+    files_table,
+    require_letters,
+    time_text,
+    versions_table,
+)
 
 
 def write_report(
@@ -96,8 +97,8 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
             key="sources",
             title="Configuration and versions",
             blocks=(
-                files_table(report),
-                versions_table(report),
+                files_table(report.files),
+                versions_table(report.versions),
                 Listing(caption=source, text=report.config_text),
             ),
         ),

@@ -105,26 +105,6 @@ def certificate_table(one: DesignAssessment) -> Table:
     )
 
 
-def files_table(report: DesignReport) -> Table:
-    """Digests of what was read."""
-    return Table(
-        caption="Files that were read",
-        headings=("file", "what it is", "SHA-256"),
-        rows=tuple((file.name, file.role, file.sha256) for file in report.files),
-        words=(1, 2),
-    )
-
-
-def versions_table(report: DesignReport) -> Table:
-    """Programs that made the page."""
-    return Table(
-        caption="Made with",
-        headings=("program", "version"),
-        rows=report.versions,
-        words=(1,),
-    )
-
-
 def _measured(value: float) -> str:
     """Return six digits of a number, three of one that is all but 0."""
     return number_text(value, 6 if abs(value) >= 1e-4 else 3)

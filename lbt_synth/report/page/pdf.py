@@ -28,7 +28,7 @@ _SIDE, _TOP, _BOTTOM = 0.635, 0.6, 0.65
 INSIDE = WIDTH - 2 * _SIDE
 _COLUMNS = 6  # of a table, after the first one
 _ROOM = HEIGHT - _TOP - _BOTTOM - 0.5  # of a sheet below the heading of a section [inch]
-_TOGETHER = 12  # lines of a paragraph or rows of a table that are not torn apart
+_TOGETHER = 12  # lines of a paragraph or rows of a table that stay on one sheet
 _PAD = 0.05  # around the text of a cell
 _INKS = {"bad": "#a40e26", "good": "#116329", "note": "#6a4b00", "plain": "#1b1f24"}
 _TINTS = {"bad": "#fdecee", "good": "#e9f5ec", "note": "#fff6dc"}
@@ -45,10 +45,10 @@ def page_pdf(page: Page) -> bytes:
 
     with chart_style():
         sheets = _Sheets()
-        sheets.words(page.title, Style(size=19, weight="bold"), after=0.08)
-        sheets.words(page.subtitle, Style(size=9, ink="#4a5560"), after=0.25)
+        sheets.add_words(page.title, Style(size=19, weight="bold"), after=0.08)
+        sheets.add_words(page.subtitle, Style(size=9, ink="#4a5560"), after=0.25)
         for number, section in enumerate(page.sections):
-            sheets.section(section, first=number == 0)
+            sheets.add_section(section, first=number == 0)
         buffer = io.BytesIO()
         facts = {
             "Title": page.title,
@@ -70,7 +70,7 @@ def page_pdf(page: Page) -> bytes:
 
 
 class _Sheets:
-    """Sheets that are filled from the top; what is drawn on each is remembered."""
+    """Sheets that are filled from the top, and the drawings on each of them."""
 
     def __init__(self) -> None:
         self.pages: list[list[Draw]] = [[]]
@@ -85,10 +85,20 @@ class _Sheets:
         self.y -= height
         return top
 
+    def make_room(self, height: float) -> bool:
+        """Go on to a new sheet if there is no such height left, and return whether it is so."""
+        missing = self.y - height < _BOTTOM
+        if missing:
+            self.y = 0.0
+        return missing
+
     def draw(self, what: Draw) -> None:
         self.pages[-1].append(what)
 
-    def section(self, section: Section, *, first: bool) -> None:
+    def draw_line(self, text: str, style: Style, *, top: float, left: float = _SIDE) -> None:
+        self.draw(partial(_draw_line, top=top, left=left, text=text, style=style))
+
+    def add_section(self, section: Section, *, first: bool) -> None:
         """Set a section; its heading is not left alone at the foot of a sheet."""
         head = Style(size=14, weight="bold")
         opening = 0.0
@@ -97,39 +107,37 @@ class _Sheets:
             opening += block_height(first_part)
             if not isinstance(block, Paragraph | Notice):
                 break
-        room = 0.45 + min(opening, _ROOM)
-        if not first and self.y - room < _BOTTOM:
-            self.y = 0.0
-        self.words(section.title, head, after=0.1)
+        if not first:
+            self.make_room(0.45 + min(opening, _ROOM))
+        self.add_words(section.title, head, after=0.1)
         for block in section.blocks:
-            self.block(block)
+            self.add_block(block)
         self.y -= 0.15
 
-    def block(self, block: Block) -> None:
+    def add_block(self, block: Block) -> None:
         if isinstance(block, Paragraph):
-            self.words(block.text, BODY, after=0.1)
+            self.add_words(block.text, BODY, after=0.1)
         elif isinstance(block, Notice):
-            self.notice(block)
+            self.add_notice(block)
         elif isinstance(block, Listing):
-            self.listing(block)
+            self.add_listing(block)
         elif isinstance(block, Table):
             for part in block.by_columns(_COLUMNS):
-                self.table(part)
+                self.add_table(part)
         else:
             for chart in split_by_sheets(block):
-                self.chart(chart)
+                self.add_chart(chart)
 
-    def words(self, text: str, style: Style, *, after: float) -> None:
-        """Lines of a text; a short one is kept together."""
+    def add_words(self, text: str, style: Style, *, after: float) -> None:
+        """Set a text; a short one is kept together."""
         lines = wrap(text, style, INSIDE)
-        if len(lines) <= _TOGETHER and self.y - len(lines) * style.leading < _BOTTOM:
-            self.y = 0.0
+        if len(lines) <= _TOGETHER:
+            self.make_room(len(lines) * style.leading)
         for line in lines:
-            top = self.take(style.leading)
-            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=style))
+            self.draw_line(line, style, top=self.take(style.leading))
         self.y -= after
 
-    def notice(self, notice: Notice) -> None:
+    def add_notice(self, notice: Notice) -> None:
         style = Style(
             size=9, weight="bold" if notice.tone == "bad" else "normal", ink=_INKS[notice.tone]
         )
@@ -145,33 +153,32 @@ class _Sheets:
         )
         for i, line in enumerate(lines):
             at = top - 0.08 - i * style.leading
-            self.draw(partial(_draw_line, top=at, left=_SIDE + 0.18, text=line, style=style))
+            self.draw_line(line, style, top=at, left=_SIDE + 0.18)
 
-    def listing(self, listing: Listing) -> None:
+    def add_listing(self, listing: Listing) -> None:
         lines = mono_lines(listing.text, INSIDE)
         self.take(BOLD.leading + 4 * MONO.leading)  # not the heading alone
         self.y += BOLD.leading + 4 * MONO.leading
-        self.words(listing.caption, BOLD, after=0.05)
+        self.add_words(listing.caption, BOLD, after=0.05)
         for line in lines:
-            top = self.take(MONO.leading)
-            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=MONO))
+            self.draw_line(line, MONO, top=self.take(MONO.leading))
         self.y -= 0.1
 
-    def chart(self, chart: Chart) -> None:
+    def add_chart(self, chart: Chart) -> None:
         caption = wrap(chart.caption, LINE, INSIDE)
         title = wrap(chart.title, BOLD, INSIDE)
         top = self.take(block_height(chart))
         for line in title:
-            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=BOLD))
+            self.draw_line(line, BOLD, top=top)
             top -= BOLD.leading
         top -= 0.05
         self.draw(partial(draw_chart, chart=chart, left=_SIDE, top=top, width=INSIDE))
         top -= chart_height(chart, INSIDE) + 0.05
         for line in caption:
-            self.draw(partial(_draw_line, top=top, left=_SIDE, text=line, style=LINE))
+            self.draw_line(line, LINE, top=top)
             top -= LINE.leading
 
-    def table(self, table: Table) -> None:
+    def add_table(self, table: Table) -> None:
         """Set a table, its headings repeated on each sheet."""
         rows = list(table.cells())
         head = tuple(Cell(text=text) for text in table.headings)
@@ -180,18 +187,16 @@ class _Sheets:
         body = [_Row(cells, widths, table.words) for cells in rows]
         kept = body if len(body) <= _TOGETHER else body[:1]
         start = top_row.height + sum(row.height for row in kept)
-        if self.y - start - BOLD.leading - 0.1 < _BOTTOM:
-            self.y = 0.0
-        self.words(table.caption, BOLD, after=0.03)
-        self.row(top_row)
+        self.make_room(start + BOLD.leading + 0.1)
+        self.add_words(table.caption, BOLD, after=0.03)
+        self.add_row(top_row)
         for row in body:
-            if self.y - row.height < _BOTTOM:
-                self.y = 0.0
-                self.row(top_row)
-            self.row(row)
+            if self.make_room(row.height):
+                self.add_row(top_row)
+            self.add_row(row)
         self.y -= 0.2
 
-    def row(self, row: _Row) -> None:
+    def add_row(self, row: _Row) -> None:
         self.draw(partial(row.draw, top=self.take(row.height)))
 
 
@@ -276,7 +281,7 @@ def split_by_sheets(chart: Chart) -> Iterator[Chart]:
 
 
 def block_height(block: Block) -> float:
-    """Height that a block needs on one sheet [inch]; of a table or listing, that of its start."""
+    """Height that a block needs on one sheet [inch]; that of its start for a table or listing."""
     if isinstance(block, Chart):
         caption, title = wrap(block.caption, LINE, INSIDE), wrap(block.title, BOLD, INSIDE)
         words = len(caption) * LINE.leading + len(title) * BOLD.leading
@@ -287,7 +292,7 @@ def block_height(block: Block) -> float:
 
 
 def column_widths(rows: list[tuple[Cell, ...]]) -> list[float]:
-    """Widths of columns [inch] that fit the sheet: the widest are narrowed, and wrap."""
+    """Widths of columns [inch] that fit the sheet; the widest are narrowed and their text wraps."""
     bold = Style(size=LINE.size, weight="bold")
     count = max(len(row) for row in rows)
     natural = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -37,13 +37,13 @@ def distribution_chart(found: Sequence[ControllerSamples]) -> Chart | None:
         return None
     top = max(float(x[-1]) for _, _, x, _ in curves)
     low = min(10.0, 10.0 ** np.floor(np.log10(100 * most)))
-    plain = [
-        Curve(name=name, x=x, y=y, look=look, step=True, width=1.8) for look, name, x, y in curves
-    ]
-    tail = [
-        Curve(name=name, x=x[1:], y=y[1:], look=look, step=True, width=1.8)
-        for look, name, x, y in curves
-    ]
+    plain, tail = (
+        [
+            Curve(name=name, x=x[first:], y=y[first:], look=look, step=True, width=1.8)
+            for look, name, x, y in curves
+        ]
+        for first in (0, 1)
+    )
     across = Axis(label="Strehl ratio", unit="%", low=0, high=min(100.0, max(1.02 * top, 1.0)))
     part_label = "samples at or below"
     return Chart(
@@ -56,7 +56,7 @@ def distribution_chart(found: Sequence[ControllerSamples]) -> Chart | None:
             "rare bad nights."
         ),
         alt="Cumulative distributions of the Strehl ratio: "
-        + "; ".join(_medians(each) for each in found)
+        + "; ".join(_median_text(each) for each in found)
         + ".",
         panels=(
             Panel(
@@ -155,7 +155,7 @@ def _histogram_panel(name: str, *marks: Area | Curve) -> Panel:
 
 
 def sensitivity_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Chart | None:
-    """First-order indices as bars, one series a controller."""
+    """First-order indices as bars, one series per controller."""
     varying = varying_parameters(statistics)
     if not varying:
         return None
@@ -180,7 +180,7 @@ def sensitivity_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> 
             "Part of the variance of the Strehl ratio that each parameter explains by itself, with "
             "two standard errors. What is missing to 100 % is due to parameters that act together."
         ),
-        alt="Bars: " + "; ".join(_most(statistics, i) for i in range(len(bars))) + ".",
+        alt="Bars: " + "; ".join(_strongest_text(statistics, i) for i in range(len(bars))) + ".",
         panels=(
             Panel(
                 x=Axis(label="variance explained by itself", unit="%", low=0),
@@ -198,11 +198,9 @@ def conditional_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> 
     for name in varying_parameters(statistics):
         marks: list[Curve] = []
         least = 100.0
-        for look, one in enumerate(statistics.sensitivities):
-            curve = next(each.curve for each in one.parameters if each.parameter == name)
-            if curve is not None:
-                marks += _curve_marks(one.controller, curve, look)
-                least = min(least, 100 * float(np.min(curve.low)))
+        for look, controller, curve in _conditional_curves(statistics, name):
+            marks += _mean_and_low(controller, curve, look)
+            least = min(least, 100 * float(np.min(curve.low)))
         panels.append(
             Panel(
                 x=Axis(label=names[name]),
@@ -227,25 +225,21 @@ def conditional_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> 
     )
 
 
-def _curve_marks(name: str, curve: ConditionalCurve, look: int) -> list[Curve]:
+def _conditional_curves(
+    statistics: StudyStatistics, parameter: str
+) -> Iterator[tuple[int, str, ConditionalCurve]]:
+    """Yield look, controller and curve of all controllers that have one over a parameter."""
+    for look, one in enumerate(statistics.sensitivities):
+        curve = next(each.curve for each in one.parameters if each.parameter == parameter)
+        if curve is not None:
+            yield look, one.controller, curve
+
+
+def _mean_and_low(name: str, curve: ConditionalCurve, look: int) -> list[Curve]:
+    x = curve.parameter
     return [
-        Curve(
-            name=name,
-            x=curve.parameter,
-            y=100 * curve.mean,
-            look=look,
-            marker="own",
-            width=1.8,
-        ),
-        Curve(
-            name="",
-            x=curve.parameter,
-            y=100 * curve.low,
-            look=look,
-            line=True,
-            width=0.9,
-            hover=False,
-        ),
+        Curve(name=name, x=x, y=100 * curve.mean, look=look, marker="own", width=1.8),
+        Curve(name="", x=x, y=100 * curve.low, look=look, width=0.9, hover=False),
     ]
 
 
@@ -254,10 +248,10 @@ def unstable_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Cha
     panels = []
     for name in varying_parameters(statistics):
         marks, span = [], 0.0
-        for look, one in enumerate(statistics.sensitivities):
-            curve = next(each.curve for each in one.parameters if each.parameter == name)
-            if curve is not None and curve.unstable.any():
-                marks.append(_unstable_curve(one.controller, curve, look))
+        for look, controller, curve in _conditional_curves(statistics, name):
+            if curve.unstable.any():
+                x, y = curve.parameter, 100 * curve.unstable
+                marks.append(Curve(name=controller, x=x, y=y, look=look, marker="own", width=1.8))
                 span = max(span, float(np.ptp(curve.unstable)))
         axis = Axis(label="unstable", unit="%", low=0)
         panels.append((span, Panel(x=Axis(label=names[name]), y=axis, marks=tuple(marks))))
@@ -280,19 +274,13 @@ def unstable_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Cha
     )
 
 
-def _unstable_curve(name: str, curve: ConditionalCurve, look: int) -> Curve:
-    return Curve(
-        name=name, x=curve.parameter, y=100 * curve.unstable, look=look, marker="own", width=1.8
-    )
-
-
 def map_charts(
     statistics: StudyStatistics,
     found: Sequence[ControllerSamples],
     parameters: Mapping[str, FloatArray],
     names: Mapping[str, str],
 ) -> tuple[Chart, ...]:
-    """Mean Strehl ratio over the two most influential parameters, one chart a controller."""
+    """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
     charts = []
     for place, (one, each) in enumerate(zip(statistics.sensitivities, found, strict=True)):
         if len(one.ranked) < 2:
@@ -338,14 +326,14 @@ def map_charts(
     return tuple(charts)
 
 
-def _medians(each: ControllerSamples) -> str:
+def _median_text(each: ControllerSamples) -> str:
     values = each.strehl[each.evaluated]
     if not values.size:
         return f"{each.controller} has none"
     return f"{each.controller} has a median of {100 * np.median(values):.1f} %"
 
 
-def _most(statistics: StudyStatistics, place: int) -> str:
+def _strongest_text(statistics: StudyStatistics, place: int) -> str:
     one = statistics.sensitivities[place]
     if not one.ranked:
         return f"{one.controller} has none"

@@ -26,20 +26,19 @@ _EVALUATION = {
 class StudyInfo:
     """What the page of a study says besides its results."""
 
-    name: str  # Name of the study
-    samples: int  # Samples asked for
-    # sampling, evaluation: How they were drawn, and evaluated
-    sampling: str
-    evaluation: str
+    name: str  # Name of the study's file
+    samples: int  # How many samples it is to have
+    sampling: str  # How they are drawn
+    evaluation: str  # How they are evaluated
     parameters: dict[str, str]  # Distribution of each parameter, in words
     controllers: dict[str, str]  # Origin of each controller, in words
     # SHA-256 of the matrices of each controller that is the same for all samples
     digests: dict[str, str]
-    digest: str  # That of the study
-    failures: tuple[Failure, ...]  # What failed
+    digest: str  # Digest of the study
+    failures: tuple[Failure, ...]  # Evaluations that failed
     files: tuple[SourceFile, ...]  # Files that it was read from
     texts: dict[str, str]  # The study file and the configuration, by their names
-    versions: tuple[tuple[str, str], ...]  # list of (str, str): programs and their versions
+    versions: tuple[tuple[str, str], ...]  # Programs and their versions
     made: datetime  # When the page was made
     computing_s: float | None  # Time of all its batches, of all processes together [s]
     replay: str  # Command that replays a sample, with ``{row}`` for its number

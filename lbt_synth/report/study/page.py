@@ -1,53 +1,105 @@
-"""The page of a study: which controller to take, by how much, and what it depends on."""
+"""The page of a robustness study, and the files that it becomes."""
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.number_text import NO_BREAK
+from lbt_synth.report.page.blocks import Block, Page
+from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import creator_name, time_text
-from lbt_synth.report.study.charts import (
-    conditional_chart,
-    distribution_chart,
-    loss_chart,
-    map_charts,
-    parameter_chart,
-    sensitivity_chart,
-    unstable_chart,
+from lbt_synth.report.study.info import StudyInfo, study_info
+from lbt_synth.report.study.sections import (
+    comparison_section,
+    controllers_section,
+    dependence_section,
+    origin_section,
+    reading_section,
+    samples_section,
+    summary_section,
+    worst_section,
 )
-from lbt_synth.report.study.info import StudyInfo
-from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.studies import ControllerStatistics, StudyStatistics
-from lbt_synth.studies.study.controller_samples import (
-    ControllerSamples,
-    read_column,
-    read_controller_samples,
-)
-from lbt_synth.studies.study.summary import (
-    comparison_table,
-    percent,
-    residual_table,
-    sensitivity_table,
-    strehl_table,
-    swing_table,
-    varying_parameters,
-    worst_table,
-)
+from lbt_synth.storage.tables import Table
+from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
+from lbt_synth.studies.study.controller_samples import read_column, read_controller_samples
 from lbt_synth.studies.study.table_names import short_names
-from lbt_synth.validation import FloatArray
 
-_FAILURES = 10  # that are listed
-_TO = "\u00a0to\u00a0"
-_LISTED = 5  # parameters of a worst sample: with the row and the Strehl ratio, a sheet is full
+
+def write_study_page(
+    study: Study,
+    columns: Mapping[str, Any],
+    path: str | os.PathLike[str],
+    *,
+    statistics: StudyStatistics | None = None,
+    failures: Sequence[Failure] = (),
+    computing_s: float | None = None,
+    pdf: str | os.PathLike[str] | None = None,
+) -> tuple[Path, ...]:
+    """Write the page of a study as one HTML file that opens offline, and as a PDF if wanted.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    columns : mapping of str to (n,) array_like
+        Its results, all or those that there are so far.
+    path : path-like
+        File to write, that ends in .html, in the directory of the results.
+    statistics : StudyStatistics, optional
+        Those of the columns, if they are known already.
+    failures : sequence of Failure, optional
+        What failed.
+    computing_s : float, optional
+        Time of all its batches, of all processes together [s].
+    pdf : path-like, optional
+        File to write, that ends in .pdf.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The files; all of them are written, or none.
+
+    Raises
+    ------
+    ProblemError
+        If the columns are not those of the study.
+    OutputError
+        If a name ends in something else, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> values = study.values(0, 2)
+    >>> columns = dict(zip(study.parameter_names, values.T))
+    >>> columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = lbt.report.write_study_page(
+    ...         study, columns, pathlib.Path(folder) / "summary.html"
+    ...     )
+    >>> files[0].name
+    'summary.html'
+    """
+    require_page_names(path, pdf, inputs=study.inputs)
+    if statistics is None:
+        names = [each.name for each in study.controllers]
+        statistics = study_statistics(columns, study.parameter_names, names)
+    info = study_info(
+        study, directory=Path(path).parent, failures=failures, computing_s=computing_s
+    )
+    return write_page(study_page(info, statistics, columns), path, pdf)
 
 
 def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, Any]) -> Page:
-    """Page of a study's results. Shapes: columns (n,)."""
+    """Return the page of a study's results; columns (n,) have one value per sample."""
     found = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
     if any(len(each.strehl) != statistics.samples for each in found):
         raise ProblemError(
@@ -58,24 +110,25 @@ def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[st
         name: read_column(columns, name, statistics.samples) for name in statistics.parameters
     }
     names = short_names(statistics.parameters)
+    varying = sum(np.ptp(column) > 0 for column in values.values())
     return Page(
         title=f"Robustness study {info.name}",
         subtitle=(
-            f"{statistics.samples} samples of {len(varying(values))} parameters, "
+            f"{statistics.samples} samples of {varying} parameters, "
             f"{len(found)} {'controllers' if len(found) > 1 else 'controller'}. "
             f"Made {time_text(info.made)}."
         ),
         sections=tuple(
-            replace(section, blocks=tuple(_unbroken(block) for block in section.blocks))
+            replace(section, blocks=tuple(_keep_together(block) for block in section.blocks))
             for section in (
-                _summary(info, statistics, found),
-                _sampled(info, values, names),
-                _controllers(info, statistics),
-                _comparison(statistics, found),
-                _dependence(statistics, found, values, names),
-                _worst(info, statistics, names),
-                _reading(),
-                _provenance(info, statistics),
+                summary_section(info, statistics, found),
+                samples_section(info, values, names),
+                controllers_section(info, statistics),
+                comparison_section(statistics, found),
+                dependence_section(statistics, found, values, names),
+                worst_section(info, statistics, names),
+                reading_section(),
+                origin_section(info, statistics),
             )
             if section.blocks
         ),
@@ -83,301 +136,17 @@ def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[st
     )
 
 
-def _unbroken(block: Block) -> Block:
+def _keep_together(block: Block) -> Block:
     """Keep a number and its error, and the two ends of an interval, in one line of a table."""
     if not isinstance(block, Table):
         return block
     rows = tuple(
         tuple(
-            replace(cell, text=cell.text.replace(" ± ", "\u00a0±\u00a0").replace(" to ", _TO))
-            if place and place not in block.words
-            else cell
+            cell
+            if place == 0 or place in block.words
+            else replace(cell, text=re.sub(" (±|to) ", rf"{NO_BREAK}\1{NO_BREAK}", cell.text))
             for place, cell in enumerate(row)
         )
         for row in block.cells()
     )
     return replace(block, rows=rows)
-
-
-def varying(values: Mapping[str, FloatArray]) -> tuple[str, ...]:
-    """Names of the parameters that are not the same in every sample."""
-    return tuple(name for name, column in values.items() if column.size and np.ptp(column) > 0)
-
-
-def _summary(
-    info: StudyInfo, statistics: StudyStatistics, found: Sequence[ControllerSamples]
-) -> Section:
-    blocks: list[Block] = []
-    if statistics.samples < info.samples:
-        blocks.append(
-            Notice(
-                text=(
-                    f"The study is not complete: {statistics.samples} of {info.samples} samples "
-                    "have results. What follows is of these alone."
-                ),
-                tone="bad",
-            )
-        )
-    unstable = [each for each in statistics.controllers if each.unstable.count]
-    if unstable:
-        parts = ", ".join(
-            f"{each.controller} in {each.unstable.count} of {each.samples} "
-            f"({percent(each.unstable.value, 2)} %)"
-            for each in unstable
-        )
-        blocks.append(Notice(text=f"Unstable loops: {parts}.", tone="bad"))
-    failed = [each for each in statistics.controllers if each.failed]
-    if failed:
-        parts = ", ".join(f"{each.controller} {each.failed}" for each in failed)
-        blocks.append(
-            Notice(
-                text=f"Evaluations that failed, and are in none of the figures: {parts}.",
-                tone="bad",
-            )
-        )
-    if not unstable and not failed and statistics.samples:
-        blocks.append(
-            Notice(text="Every controller is stable in every sample, and none failed.", tone="good")
-        )
-    blocks.append(Paragraph(text=_verdict(statistics.controllers)))
-    blocks.append(strehl_table(statistics))
-    chart = distribution_chart(found)
-    if chart is not None:
-        blocks.append(chart)
-    return Section(key="summary", title="Summary", blocks=tuple(blocks))
-
-
-def _verdict(controllers: Sequence[ControllerStatistics]) -> str:
-    """Which controller leads by what measure; the reader decides which measure counts."""
-    with_data = [each for each in controllers if each.samples]
-    if not with_data:
-        return "No controller was evaluated on any sample."
-    mean = max(with_data, key=lambda each: each.mean)
-    low = max(with_data, key=lambda each: each.strehl[1].value)
-    half = max(with_data, key=lambda each: each.strehl[3].value)
-    text = (
-        f"Highest mean Strehl ratio: {mean.controller}, {percent(mean.mean)} %. "
-        f"Highest median: {half.controller}, {percent(half.strehl[3].value)} %. "
-        f"Highest 5th percentile, which 19 of 20 samples exceed: {low.controller}, "
-        f"{percent(low.strehl[1].value)} %."
-    )
-    if len(with_data) > 1:
-        loss = min(with_data, key=lambda each: each.loss.loss[1].value)
-        if np.isfinite(loss.loss.loss[1].value):
-            text += (
-                f" Least regret: {loss.controller} is within "
-                f"{percent(loss.loss.loss[1].value)} points of the best controller of the sample "
-                "in 95 % of the samples."
-            )
-    return text
-
-
-def _sampled(
-    info: StudyInfo, values: Mapping[str, FloatArray], names: Mapping[str, str]
-) -> Section:
-    rows = []
-    for name, column_ in values.items():
-        if not column_.size:
-            continue
-        rows.append(
-            (
-                names[name],
-                name,
-                info.parameters.get(name, ""),
-                *_rounded(np.percentile(column_, (0, 50, 100))),
-            )
-        )
-    table = Table(
-        caption="Parameters",
-        headings=("parameter", "its place", "distribution", "least", "median", "greatest"),
-        rows=tuple(rows),
-        words=(1, 2),
-    )
-    chart = parameter_chart(values, names) if rows else None
-    return Section(
-        key="samples",
-        title="What was sampled",
-        blocks=(
-            Paragraph(text=f"{info.samples} samples, {info.sampling}; {info.evaluation}."),
-            table,
-            *([chart] if chart is not None else []),
-        ),
-    )
-
-
-def _rounded(values: FloatArray) -> list[str]:
-    """Return numbers with four digits of their range, or of themselves if they are the same."""
-    span = float(np.ptp(values)) or float(np.max(np.abs(values))) or 1.0
-    digits = 3 - int(np.floor(np.log10(span)))
-    return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
-
-
-def _controllers(info: StudyInfo, statistics: StudyStatistics) -> Section:
-    blocks: list[Block] = [
-        Table(
-            caption="Controllers",
-            headings=("controller", "origin", "digest", "evaluated", "unstable", "failed"),
-            rows=tuple(
-                (
-                    each.controller,
-                    info.controllers.get(each.controller, ""),
-                    info.digests.get(each.controller, "-")[:16],
-                    str(each.samples),
-                    _count(each.unstable.count),
-                    _count(each.failed),
-                )
-                for each in statistics.controllers
-            ),
-            words=(1, 2),
-        )
-    ]
-    if info.failures:
-        more = len(info.failures) - _FAILURES
-        blocks.append(
-            Table(
-                caption="Evaluations that failed"
-                + (f": the first {_FAILURES}, and {more} more" if more > 0 else ""),
-                headings=("row", "controller", "error"),
-                rows=tuple(
-                    (str(each.row), each.controller, each.error)
-                    for each in info.failures[:_FAILURES]
-                ),
-                words=(1, 2),
-            )
-        )
-    return Section(key="controllers", title="Controllers", blocks=tuple(blocks))
-
-
-def _count(count: int) -> Cell:
-    return Cell(text=str(count), tone="bad" if count else "plain")
-
-
-def _comparison(statistics: StudyStatistics, found: Sequence[ControllerSamples]) -> Section:
-    chart = loss_chart(found)
-    table = comparison_table(statistics)
-    return Section(
-        key="comparison",
-        title="Comparison on the same samples",
-        blocks=(
-            *([table] if table.rows else []),
-            *([chart] if chart is not None else []),
-            residual_table(statistics),
-        ),
-    )
-
-
-def _dependence(
-    statistics: StudyStatistics,
-    found: Sequence[ControllerSamples],
-    values: Mapping[str, FloatArray],
-    names: Mapping[str, str],
-) -> Section:
-    if not varying_parameters(statistics):
-        words = (
-            "No index: no parameter varies, the Strehl ratio is the same everywhere, or there are "
-            "fewer than 20 samples."
-        )
-        return Section(key="dependence", title="Dependence", blocks=(Notice(text=words),))
-    blocks = (
-        sensitivity_chart(statistics, names),
-        sensitivity_table(statistics, names=names),
-        swing_table(statistics, names=names),
-        conditional_chart(statistics, names),
-        unstable_chart(statistics, names),
-        *map_charts(statistics, found, values, names),
-    )
-    return Section(
-        key="dependence",
-        title="What the Strehl ratio depends on",
-        blocks=tuple(block for block in blocks if block is not None),
-    )
-
-
-def _worst(info: StudyInfo, statistics: StudyStatistics, names: Mapping[str, str]) -> Section:
-    blocks: list[Block] = []
-    commands = []
-    most = 0
-    for each, one in zip(statistics.controllers, statistics.sensitivities, strict=True):
-        if each.worst:
-            ranked = tuple(p.parameter for p in one.ranked)
-            others = tuple(name for name in statistics.parameters if name not in ranked)
-            shown = (ranked or others)[:_LISTED]
-            most = max(most, len(ranked) - len(shown))
-            blocks.append(worst_table(each, shown, names=names))
-            commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
-    if most:
-        text = (
-            f"Unstable loops first, then by the Strehl ratio; of the parameters, the {_LISTED} "
-            "with the greatest indices of the controller."
-        )
-        blocks.insert(0, Paragraph(text=text))
-    if commands:
-        caption = "Commands that replay the first of each table; any other row likewise"
-        blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
-    return Section(key="worst", title="Worst samples", blocks=tuple(blocks))
-
-
-def _reading() -> Section:
-    return Section(
-        key="reading",
-        title="How to read the figures",
-        blocks=(
-            Paragraph(
-                text=(
-                    "An unstable loop counts as a Strehl ratio of 0 and an infinite residual. "
-                    "Evaluations that failed are left out and counted. Intervals hold the true "
-                    "value with a probability of 95 % for independent samples; for samples of a "
-                    "Sobol sequence or a Latin hypercube, which are more even, they are too wide. "
-                    "They tell how far the sampling is trusted, not how far the model is: if the "
-                    "parameters are distributed otherwise, so are the results."
-                )
-            ),
-            Paragraph(
-                text=(
-                    "The index of a parameter is the variance of the mean Strehl ratio given that "
-                    "parameter, over the whole variance. It does not say which way the Strehl "
-                    "ratio moves (the curves and the rank correlation do), and it leaves out what "
-                    "parameters do only together: what the indices lack to 100 %. An index near 0 "
-                    "with a large remainder does not make a parameter harmless. The sum means "
-                    "that only if the parameters were drawn independently of each other."
-                )
-            ),
-        ),
-    )
-
-
-def _provenance(info: StudyInfo, statistics: StudyStatistics) -> Section:
-    rows: list[tuple[str, str]] = [
-        ("samples with results", f"{statistics.samples} of {info.samples}"),
-        ("digest of the study", info.digest),
-    ]
-    if info.computing_s is not None:
-        rows.append(("computing time, of all processes together", _duration(info.computing_s)))
-    return Section(
-        key="origin",
-        title="Files and versions",
-        blocks=(
-            Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,)),
-            Table(
-                caption="Files that were read",
-                headings=("file", "what it is", "SHA-256"),
-                rows=tuple((file.name, file.role, file.sha256) for file in info.files),
-                words=(1, 2),
-            ),
-            Table(
-                caption="Made with",
-                headings=("program", "version"),
-                rows=info.versions,
-                words=(1,),
-            ),
-            *(Listing(caption=caption, text=text) for caption, text in info.texts.items()),
-        ),
-    )
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    if seconds < 7200:
-        return f"{seconds / 60:.1f} min"
-    return f"{seconds / 3600:.1f} h"

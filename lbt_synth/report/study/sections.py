@@ -1,0 +1,313 @@
+"""The sections of a study's page: verdict, samples, comparison, dependence, worst samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Section
+from lbt_synth.report.provenance import files_table, versions_table
+from lbt_synth.report.study.charts import (
+    conditional_chart,
+    distribution_chart,
+    loss_chart,
+    map_charts,
+    parameter_chart,
+    sensitivity_chart,
+    unstable_chart,
+)
+from lbt_synth.report.study.info import StudyInfo
+from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.studies import ControllerStatistics, StudyStatistics
+from lbt_synth.studies.study.controller_samples import ControllerSamples
+from lbt_synth.studies.study.summary import (
+    comparison_table,
+    percent,
+    residual_table,
+    sensitivity_table,
+    strehl_table,
+    swing_table,
+    varying_parameters,
+    worst_table,
+)
+from lbt_synth.validation import FloatArray
+
+_FAILURES = 10  # that are listed
+_LISTED = 5  # parameters of a worst sample: with the row and the Strehl ratio, a sheet is full
+
+
+def summary_section(
+    info: StudyInfo, statistics: StudyStatistics, found: Sequence[ControllerSamples]
+) -> Section:
+    """Open with what is wrong, the verdict, and the Strehl ratios."""
+    blocks: list[Block] = []
+    if statistics.samples < info.samples:
+        blocks.append(
+            Notice(
+                text=(
+                    f"The study is not complete: {statistics.samples} of {info.samples} samples "
+                    "have results. What follows is of these alone."
+                ),
+                tone="bad",
+            )
+        )
+    unstable = [each for each in statistics.controllers if each.unstable.count]
+    if unstable:
+        parts = ", ".join(
+            f"{each.controller} in {each.unstable.count} of {each.samples} "
+            f"({percent(each.unstable.value, 2)} %)"
+            for each in unstable
+        )
+        blocks.append(Notice(text=f"Unstable loops: {parts}.", tone="bad"))
+    failed = [each for each in statistics.controllers if each.failed]
+    if failed:
+        parts = ", ".join(f"{each.controller} {each.failed}" for each in failed)
+        blocks.append(
+            Notice(
+                text=f"Evaluations that failed, and are in none of the figures: {parts}.",
+                tone="bad",
+            )
+        )
+    if not unstable and not failed and statistics.samples:
+        blocks.append(
+            Notice(text="Every controller is stable in every sample, and none failed.", tone="good")
+        )
+    blocks.append(Paragraph(text=_verdict(statistics.controllers)))
+    blocks.append(strehl_table(statistics))
+    chart = distribution_chart(found)
+    blocks += [chart] if chart is not None else []
+    return Section(key="summary", title="Summary", blocks=tuple(blocks))
+
+
+def _verdict(controllers: Sequence[ControllerStatistics]) -> str:
+    """Which controller leads by what measure; the reader decides which measure counts."""
+    with_data = [each for each in controllers if each.samples]
+    if not with_data:
+        return "No controller was evaluated on any sample."
+    mean = max(with_data, key=lambda each: each.mean)
+    low = max(with_data, key=lambda each: each.strehl[1].value)
+    half = max(with_data, key=lambda each: each.strehl[3].value)
+    text = (
+        f"Highest mean Strehl ratio: {mean.controller}, {percent(mean.mean)} %. "
+        f"Highest median: {half.controller}, {percent(half.strehl[3].value)} %. "
+        f"Highest 5th percentile, which 19 of 20 samples exceed: {low.controller}, "
+        f"{percent(low.strehl[1].value)} %."
+    )
+    if len(with_data) > 1:
+        loss = min(with_data, key=lambda each: each.loss.loss[1].value)
+        if np.isfinite(loss.loss.loss[1].value):
+            text += (
+                f" Least regret: {loss.controller} is within "
+                f"{percent(loss.loss.loss[1].value)} points of the best controller of the sample "
+                "in 95 % of the samples."
+            )
+    return text
+
+
+def samples_section(
+    info: StudyInfo, values: Mapping[str, FloatArray], names: Mapping[str, str]
+) -> Section:
+    """Show the parameters and their histograms."""
+    rows = tuple(
+        (
+            names[name],
+            name,
+            info.parameters.get(name, ""),
+            *_rounded_texts(np.percentile(column, (0, 50, 100))),
+        )
+        for name, column in values.items()
+        if column.size
+    )
+    table = Table(
+        caption="Parameters",
+        headings=("parameter", "its place", "distribution", "least", "median", "greatest"),
+        rows=rows,
+        words=(1, 2),
+    )
+    chart = parameter_chart(values, names) if rows else None
+    return Section(
+        key="samples",
+        title="What was sampled",
+        blocks=(
+            Paragraph(text=f"{info.samples} samples, {info.sampling}; {info.evaluation}."),
+            table,
+            *([chart] if chart is not None else []),
+        ),
+    )
+
+
+def _rounded_texts(values: FloatArray) -> list[str]:
+    """Return numbers with four digits of their range, or of themselves if they are the same."""
+    span = float(np.ptp(values)) or float(np.max(np.abs(values))) or 1.0
+    digits = 3 - int(np.floor(np.log10(span)))
+    return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
+
+
+def controllers_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
+    """List the controllers, and evaluations that failed."""
+    blocks: list[Block] = [
+        Table(
+            caption="Controllers",
+            headings=("controller", "origin", "digest", "evaluated", "unstable", "failed"),
+            rows=tuple(
+                (
+                    each.controller,
+                    info.controllers.get(each.controller, ""),
+                    info.digests.get(each.controller, "-")[:16],
+                    str(each.samples),
+                    _count_cell(each.unstable.count),
+                    _count_cell(each.failed),
+                )
+                for each in statistics.controllers
+            ),
+            words=(1, 2),
+        )
+    ]
+    if info.failures:
+        more = len(info.failures) - _FAILURES
+        blocks.append(
+            Table(
+                caption="Evaluations that failed"
+                + (f": the first {_FAILURES}, and {more} more" if more > 0 else ""),
+                headings=("row", "controller", "error"),
+                rows=tuple(
+                    (str(each.row), each.controller, each.error)
+                    for each in info.failures[:_FAILURES]
+                ),
+                words=(1, 2),
+            )
+        )
+    return Section(key="controllers", title="Controllers", blocks=tuple(blocks))
+
+
+def _count_cell(count: int) -> Cell:
+    return Cell(text=str(count), tone="bad" if count else "plain")
+
+
+def comparison_section(statistics: StudyStatistics, found: Sequence[ControllerSamples]) -> Section:
+    """Compare the controllers on the same samples."""
+    chart = loss_chart(found)
+    table = comparison_table(statistics)
+    return Section(
+        key="comparison",
+        title="Comparison on the same samples",
+        blocks=(
+            *([table] if table.rows else []),
+            *([chart] if chart is not None else []),
+            residual_table(statistics),
+        ),
+    )
+
+
+def dependence_section(
+    statistics: StudyStatistics,
+    found: Sequence[ControllerSamples],
+    values: Mapping[str, FloatArray],
+    names: Mapping[str, str],
+) -> Section:
+    """Show what the Strehl ratio depends on."""
+    if not varying_parameters(statistics):
+        words = (
+            "No index: no parameter varies, the Strehl ratio is the same everywhere, or there are "
+            "fewer than 20 samples."
+        )
+        return Section(key="dependence", title="Dependence", blocks=(Notice(text=words),))
+    blocks = (
+        sensitivity_chart(statistics, names),
+        sensitivity_table(statistics, names=names),
+        swing_table(statistics, names=names),
+        conditional_chart(statistics, names),
+        unstable_chart(statistics, names),
+        *map_charts(statistics, found, values, names),
+    )
+    return Section(
+        key="dependence",
+        title="What the Strehl ratio depends on",
+        blocks=tuple(block for block in blocks if block is not None),
+    )
+
+
+def worst_section(
+    info: StudyInfo, statistics: StudyStatistics, names: Mapping[str, str]
+) -> Section:
+    """List the worst samples, and the commands that replay them."""
+    blocks: list[Block] = []
+    commands = []
+    most = 0
+    for each, one in zip(statistics.controllers, statistics.sensitivities, strict=True):
+        if each.worst:
+            ranked = tuple(p.parameter for p in one.ranked)
+            others = tuple(name for name in statistics.parameters if name not in ranked)
+            shown = (ranked or others)[:_LISTED]
+            most = max(most, len(ranked) - len(shown))
+            blocks.append(worst_table(each, shown, names=names))
+            commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
+    if most:
+        text = (
+            f"Unstable loops first, then by the Strehl ratio; of the parameters, the {_LISTED} "
+            "with the greatest indices of the controller."
+        )
+        blocks.insert(0, Paragraph(text=text))
+    if commands:
+        caption = "Commands that replay the first of each table; any other row likewise"
+        blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
+    return Section(key="worst", title="Worst samples", blocks=tuple(blocks))
+
+
+def reading_section() -> Section:
+    """Explain how the figures are to be read."""
+    return Section(
+        key="reading",
+        title="How to read the figures",
+        blocks=(
+            Paragraph(
+                text=(
+                    "An unstable loop counts as a Strehl ratio of 0 and an infinite residual. "
+                    "Evaluations that failed are left out and counted. Intervals hold the true "
+                    "value with a probability of 95 % for independent samples; for samples of a "
+                    "Sobol sequence or a Latin hypercube, which are more even, they are too wide. "
+                    "They tell how far the sampling is trusted, not how far the model is: if the "
+                    "parameters are distributed otherwise, so are the results."
+                )
+            ),
+            Paragraph(
+                text=(
+                    "The index of a parameter is the variance of the mean Strehl ratio given that "
+                    "parameter, over the whole variance. It does not say which way the Strehl "
+                    "ratio moves (the curves and the rank correlation do), and it leaves out what "
+                    "parameters do only together: what the indices lack to 100 %. An index near 0 "
+                    "with a large remainder does not make a parameter harmless. The sum means "
+                    "that only if the parameters were drawn independently of each other."
+                )
+            ),
+        ),
+    )
+
+
+def origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
+    """Name the files and programs that the page was made from."""
+    rows: list[tuple[str, str]] = [
+        ("samples with results", f"{statistics.samples} of {info.samples}"),
+        ("digest of the study", info.digest),
+    ]
+    if info.computing_s is not None:
+        rows.append(("computing time, of all processes together", _duration_text(info.computing_s)))
+    return Section(
+        key="origin",
+        title="Files and versions",
+        blocks=(
+            Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,)),
+            files_table(info.files),
+            versions_table(info.versions),
+            *(Listing(caption=caption, text=text) for caption, text in info.texts.items()),
+        ),
+    )
+
+
+def _duration_text(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    if seconds < 7200:
+        return f"{seconds / 60:.1f} min"
+    return f"{seconds / 3600:.1f} h"
