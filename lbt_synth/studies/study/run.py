@@ -53,11 +53,11 @@ _MOST_JOBS = 64
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FinishedStudy:
-    """All results of a study."""
+    """All results of a finished study."""
 
-    columns: dict[str, FloatArray]  # (n,): all columns by their names
-    computing_s: float  # Time of all batches, of all processes together [s]
-    new: bool  # Whether some were computed now; else they are those of the table
+    columns: dict[str, FloatArray]  # by name, (n,) each
+    computing_s: float  # time of all batches, summed over processes [s]
+    new: bool  # whether some were computed now; else all were read from the table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +77,7 @@ class StudyRun:
     retry : int
         How many of these are tried again when the study is started again.
     computing_s, seconds : float
-        Time of this run until the last row was there, and as a whole [s].
+        Time of this run until the last row was computed, and to its end [s].
     """
 
     directory: Path
@@ -104,10 +104,10 @@ def run_study(
 ) -> StudyRun:
     """Run what is missing of a study, and write its results.
 
-    Every finished batch is a file in ``parts``, whole or not at all: killed at any moment, a
-    study goes on where it was. When all rows are there, ``results.csv`` or ``results.parquet``
-    is written with one row a sample in order, ``failed.csv`` with what failed, and the parts are
-    removed.
+    Every finished batch is a file in ``parts``, written completely or not at all: a study that
+    is killed at any moment resumes where it was. When all rows are computed, ``results.csv`` or
+    ``results.parquet`` is written with one row per sample in order, and ``failed.csv`` with the
+    failures; then the parts are removed.
 
     Parameters
     ----------
@@ -116,38 +116,39 @@ def run_study(
     directory : path-like
         An existing directory.
     executor : concurrent.futures.Executor, optional
-        Runs the batches: any, a Dask ``Client.get_executor()`` too. It is left open.
+        Runs the batches; any executor, also a Dask ``Client.get_executor()``. It is left open.
     jobs : int, optional
-        Processes, if there is no executor, at most eight times those that the machine has at once
-        (or 64); 1 runs in this one.
+        Processes, if there is no executor: at most eight per processor of the machine, or 64.
+        With 1 the study runs in this process.
     workers : int, optional
-        How many batches the executor runs at once, as far as it does not tell; twice as many are
-        in flight.
+        How many batches the executor runs at once, if it does not say so itself; twice as many
+        are in flight.
     evaluate : callable, optional
         ``evaluate(study, values, start)`` returns the :class:`BatchResult` of rows of
-        ``study.values``; importable by name where other processes run it.
+        ``study.values``. Other processes must be able to import it by name.
     progress : callable, optional
         Called with the number of rows that were found or finished since its last call.
     whole : callable, optional
-        Called with all results when all rows are there: before the manifest says so, so that
-        what it does is done again if it fails. A study that was finished before calls it, too.
+        Called with all results when all rows are computed. The manifest records the end of the
+        study only after it, so that a call that fails is repeated. A study that was finished
+        before calls it, too.
 
     Returns
     -------
     StudyRun
-        What was done. A study that is finished is not run again.
+        What was done. A finished study is not run again.
 
     Raises
     ------
     ProblemError
         If there are too many or too few jobs.
     OutputError
-        If the directory is of another study, is in use or cannot be written, files in it would be
-        replaced, or its results were changed.
+        If the directory belongs to another study, is in use or cannot be written, files in it
+        would be replaced, or its results were changed.
     NumericalError
-        If processes die without end, or an executor breaks; what is finished is kept.
+        If processes keep dying, or an executor breaks; what is finished is kept.
     MissingExtraError
-        If the results shall be Parquet and pyarrow is not installed.
+        If the results are to be Parquet and pyarrow is not installed.
 
     Examples
     --------
@@ -184,11 +185,11 @@ def run_study(
             require_unchanged(folder, manifest)
         parts = _usable_parts(folder, study)
         if finished and not manifest["retry"]:
-            remove_parts(folder)  # killed while it removed them
+            remove_parts(folder)  # a run was killed while it removed them
             parts = []
         computed, computing_s = 0, 0.0
         if not finished or manifest["retry"]:
-            if manifest["finished"]:  # until its tables are those of all parts again
+            if manifest["finished"]:  # not until its tables are written again
                 manifest = manifest | {"finished": False, "tables": {}}
                 write_manifest(folder, manifest)
             computed = _compute_missing(
@@ -207,9 +208,8 @@ def run_study(
             if progress is not None:
                 progress(study.samples)
             if whole is not None:
-                columns = read_results(folder, study)
-                spent = manifest["computing_seconds"]
-                whole(FinishedStudy(columns=columns, computing_s=spent, new=False))
+                found, spent = read_results(folder, study), manifest["computing_seconds"]
+                whole(FinishedStudy(columns=found, computing_s=spent, new=False))
     return StudyRun(
         directory=folder,
         results=results_path(folder, study),
@@ -224,15 +224,14 @@ def run_study(
 
 
 def output_paths(folder: Path, study: Study) -> list[Path]:
-    """Return the files that a study writes into its directory, but for its parts."""
-    made = [c.name for c in study.controllers if c.request is not None and c.design is not None]
+    """Return the files that a study writes into its directory, without its parts."""
+    designs = [f"{c.name}.fits" for c in study.controllers if c.is_designed]
     tables = [results_path(folder, study).name, FAILED, PAGE, PRINT]
-    names = [MANIFEST, *tables, *(f"{name}.fits" for name in made)]
-    return [folder / name for name in names]
+    return [folder / name for name in (MANIFEST, *tables, *designs)]
 
 
 def _begin(folder: Path, study: Study) -> dict[str, Any]:
-    """Return the manifest of a directory, of a new study if there is none."""
+    """Return the manifest of a directory; begin the study if there is none."""
     manifest = read_manifest(folder)
     if manifest is not None:
         require_same_study(manifest, study.digest, folder)
@@ -270,19 +269,19 @@ def _begin(folder: Path, study: Study) -> dict[str, Any]:
             "computing_seconds": 0.0,
         }
         write_manifest(folder, manifest)
-    wanted = {c.name for c in study.controllers if c.request is not None and not c.for_sample}
-    if set(manifest["designs"]) != wanted:  # begun now, or killed before they were written
+    designs = {c.name for c in study.controllers if c.is_designed}
+    if set(manifest["designs"]) != designs:  # begun now, or killed before they were written
         manifest = manifest | {"designs": write_designs(folder, study)}
         write_manifest(folder, manifest)
     return manifest
 
 
 def _usable_parts(folder: Path, study: Study) -> list[Part]:
-    """Return the parts that need not be computed again; those that are to be are removed."""
+    """Return the parts to keep, and remove those to compute again."""
     usable = []
     for part in list_parts(folder):
         failures = read_part(part, study)[1]
-        if any(failure.retry for failure in failures):  # a single row, see the engine
+        if any(failure.retry for failure in failures):  # a part of one row, see the engine
             part.path.unlink()
         else:
             usable.append(part)
@@ -295,25 +294,25 @@ def _compute_missing(
     parts: Sequence[Part],
     *,
     progress: Callable[[int], None] | None,
-    **how: Any,
+    **options: Any,
 ) -> int:
-    """Compute the rows that are missing, and return how many they were."""
+    """Compute the missing rows, and return their number."""
     missing = missing_rows(list(parts), study.samples)
-    wanted = sum(stop - start for start, stop in missing)
+    count = sum(stop - start for start, stop in missing)
     try:
         (folder / PARTS).mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(
             f"cannot make the directory {folder / PARTS}: {error.strerror}.", path=folder
         ) from error
-    if progress is not None and wanted < study.samples:
-        progress(study.samples - wanted)
-    with contextlib.closing(run_batches(study, missing, **how)) as coming:
-        for batch, seconds in coming:
+    if progress is not None and count < study.samples:
+        progress(study.samples - count)
+    with contextlib.closing(run_batches(study, missing, **options)) as batches:
+        for batch, seconds in batches:
             part = write_part(folder, study, batch, seconds)
             if progress is not None:
                 progress(part.stop - part.start)
-    return wanted
+    return count
 
 
 def _write_tables(
@@ -326,14 +325,13 @@ def _write_tables(
 ) -> dict[str, Any]:
     """Write the results of all parts, then the manifest, then remove the parts."""
     parts = list_parts(folder)
-    recorded = [read_part(part, study)[1:] for part in parts]
-    failures = [failure for failed, _ in recorded for failure in failed]
-    spent = sum(seconds for _, seconds in recorded)
+    logs = [read_part(part, study)[1:] for part in parts]
+    failures = [failure for failed, _ in logs for failure in failed]
+    spent = sum(seconds for _, seconds in logs)
     tables = (write_results(folder, study, parts), write_failures(folder, failures))
     if whole is not None:
-        whole(
-            FinishedStudy(columns=read_results(folder, study, parts), computing_s=spent, new=True)
-        )
+        found = read_results(folder, study, parts)
+        whole(FinishedStudy(columns=found, computing_s=spent, new=True))
     retry = sum(failure.retry for failure in failures)
     manifest = manifest | {
         "finished": True,
@@ -346,6 +344,6 @@ def _write_tables(
         "computing_seconds": spent,
     }
     write_manifest(folder, manifest)
-    if not retry:  # else what is tried again finds the rest
+    if not retry:  # else the parts are needed to try again
         remove_parts(folder)
     return manifest

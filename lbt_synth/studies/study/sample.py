@@ -1,4 +1,4 @@
-"""A sample: the configuration with its numbers put in, and the loop that it really meets."""
+"""One sample of a study: its configuration, its real loop and its real disturbances."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from lbt_synth.validation import FloatArray
 class Sample:
     """One sample of a study."""
 
-    config: Config  # What designs are told
-    hardware: LoopHardware  # The real loop: that of ``config`` with the delay error
-    truth: Truth  # What it really meets: that of ``config`` with the real noise
-    delay_error_frames: float  # Real delay less that of ``config`` [frames]
-    noise_factor: float  # Real noise over that of ``config``
+    config: Config  # what designs assume
+    hardware: LoopHardware  # the real loop: that of ``config`` with the delay error
+    truth: Truth  # what it really meets: that of ``config`` with the real noise
+    delay_error_frames: float  # real delay less that of ``config`` [frames]
+    noise_factor: float  # real noise over that of ``config``
 
 
 def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
-    """Return the sample of a row of ``Study.values``."""
+    """Make the sample of a row of ``Study.values``."""
     base = study.config
     full = base.settings.model_dump()
     content = nested_copy(base.settings.model_dump(exclude_unset=True))
@@ -35,8 +35,9 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
         for keys in parameter.places:
             set_number(content, keys, float(value), full=full)
     config = build_config(validate_sections(FileSection, content, base.source), base.source)
-    delay_error = study.parameter_value(DELAY_ERROR, values, 0.0)
-    factor = study.parameter_value(NOISE_FACTOR, values, 1.0)
+    parameters = study.parameters_by_name(values)
+    delay_error = parameters.get(DELAY_ERROR, 0.0)
+    factor = parameters.get(NOISE_FACTOR, 1.0)
     hardware, truth = config.hardware, config.truth
     try:
         if delay_error != 0:

@@ -1,6 +1,6 @@
-"""Points of the unit cube: Sobol's, scrambled, or a Latin hypercube (``scipy.stats.qmc``).
+"""Points in the unit cube: a scrambled Sobol sequence or a Latin hypercube.
 
-The same seed gives the same points, whoever asks for which of them.
+A seed fixes every point, whichever are requested with it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from lbt_synth.validation import FloatArray
 def unit_points(
     sampling: str, *, samples: int, dimensions: int, seed: int, start: int, stop: int
 ) -> FloatArray:
-    """Return points ``start`` to ``stop`` of so many, (stop - start, dimensions) in [0, 1).
+    """Return points ``start`` to ``stop`` of ``samples``, (stop - start, dimensions) in [0, 1).
 
-    Sobol's sequence does not depend on ``samples``: more of them begin with the same. Each of
-    its blocks of 2^k points is balanced, so that a power of two is the best number of samples;
-    any other is allowed. A Latin hypercube is made as a whole, once a process.
+    Sobol's sequence does not depend on ``samples``: a longer one begins with the same points.
+    Each of its blocks of 2^k points is balanced, so a power of two is the best number of samples;
+    any other is allowed. A Latin hypercube is made as a whole, once per process.
 
     Examples
     --------
@@ -40,7 +40,7 @@ def unit_points(
     if start > 0:
         engine.fast_forward(start)
         return np.asarray(engine.random(stop - start))
-    first = engine.random(1)  # asked for at once, any number but a power of two is warned of
+    first = engine.random(1)  # taken apart, as SciPy warns of a number that is no power of two
     return np.vstack([first, engine.random(stop - 1)]) if stop > 1 else np.asarray(first)
 
 
@@ -54,7 +54,7 @@ def _hypercube(samples: int, dimensions: int, seed: int) -> FloatArray:
 
 
 def _generator(seed: int) -> dict[str, Any]:
-    """Return a generator under the name that the installed SciPy knows it by."""
+    """Return a generator under the argument name of the installed SciPy."""
     from scipy.stats import qmc
 
     name = "rng" if "rng" in inspect.signature(qmc.Sobol.__init__).parameters else "seed"

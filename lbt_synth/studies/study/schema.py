@@ -1,4 +1,4 @@
-"""Schema of a study file; unknown keys are refused."""
+"""Schema of a study file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CONTROLLER_NAME = r"^[A-Za-z][A-Za-z0-9_-]*$"
 
 
 class NormalSection(Section):
-    """A normal distribution, cut at low and high where they are given."""
+    """A normal distribution, cut at low and high if they are given."""
 
     mean: float
     deviation: Positive
@@ -79,7 +79,7 @@ class ControllerSection(Section):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Options of the design that are given."""
+        """The options of the design that are given."""
         named = {name: getattr(self, name) for name in ("route", "horizon", *OPTION_METHODS)}
         return {name: value for name, value in named.items() if value is not None}
 

@@ -1,4 +1,4 @@
-"""Which parameters a controller's Strehl ratio depends on."""
+"""Sensitivity of each controller's Strehl ratio to each parameter."""
 
 from __future__ import annotations
 
@@ -23,61 +23,56 @@ from lbt_synth.validation import FloatArray, IntArray
 class ParameterSensitivity:
     """How a controller's Strehl ratio depends on one parameter."""
 
-    parameter: str  # Its name
-    index: VarianceIndex  # Part of the variance that the parameter explains by itself
-    # Rank correlation, in [-1, 1]: the sign of the dependence, and how monotonic it is; nan where
-    # the parameter or the Strehl ratio is constant
-    spearman: float
-    # swing, swing_error: Greatest less least mean of the Strehl ratio over the middle 90 % of the
-    # parameter, and its standard error; nan for a constant
-    swing: float
-    swing_error: float
-    curve: ConditionalCurve | None  # The Strehl ratio over the parameter; None for a constant
+    parameter: str  # its name
+    index: VarianceIndex  # part of the variance that it explains by itself
+    spearman: float  # rank correlation, in [-1, 1]; nan if either is constant
+    swing: float  # see ConditionalCurve.swing; nan for a constant
+    swing_error: float  # its standard error
+    curve: ConditionalCurve | None  # None for a constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerSensitivity:
-    """Dependence of one controller's Strehl ratio on all parameters."""
+    """How one controller's Strehl ratio depends on all parameters."""
 
-    controller: str  # Its name
-    samples: int  # Samples on which it did not fail
-    parameters: tuple[ParameterSensitivity, ...]  # In the order of the study
+    controller: str  # its name
+    samples: int  # samples on which it did not fail
+    parameters: tuple[ParameterSensitivity, ...]  # in the order of the study
 
     @property
     def ranked(self) -> tuple[ParameterSensitivity, ...]:
-        """Those that vary, in order of falling index."""
+        """The parameters that vary, by falling index."""
         varying = [each for each in self.parameters if np.isfinite(each.index.value)]
         return tuple(sorted(varying, key=lambda each: -each.index.value))
 
     @property
     def sum(self) -> float:
-        """Sum of the indices; nan where there is none."""
+        """Sum of the indices; nan if there is none."""
         values = [each.index.value for each in self.ranked]
         return float(np.sum(values)) if values else np.nan
 
     @property
     def sum_error(self) -> float:
-        """Root of the sum of squares of their errors; nan where there is none."""
+        """Root of the sum of squares of their errors; nan if there is none."""
         errors = [each.index.error for each in self.ranked]
         return float(np.linalg.norm(errors)) if errors else np.nan
 
     @property
     def interactions(self) -> float:
-        """1 less the sum: what only parameters together explain, if they are independent."""
+        """1 less the sum: the part that only several independent parameters explain together."""
         return 1 - self.sum
 
 
 def sensitivities(
     controllers: Sequence[ControllerSamples], parameters: Mapping[str, FloatArray]
 ) -> tuple[ControllerSensitivity, ...]:
-    """Dependence of each controller's Strehl ratio on each parameter. Shapes: parameters (n,)."""
+    """Return the sensitivity of each controller's Strehl ratio to each parameter, (n,) each."""
     ranks = [_ranks(each) for each in controllers]
     found: list[list[ParameterSensitivity]] = [[] for _ in controllers]
     for name, values in parameters.items():
         order = np.argsort(values, kind="stable")  # ties in the order of the samples
         for place, each in enumerate(controllers):
-            kept = order if each.evaluated.all() else order[each.evaluated[order]]
-            found[place].append(_sensitivity(name, values[kept], each, kept, ranks[place]))
+            found[place].append(_sensitivity(name, values, each, order, ranks[place]))
     return tuple(
         ControllerSensitivity(
             controller=each.controller,
@@ -90,12 +85,15 @@ def sensitivities(
 
 def _sensitivity(
     name: str,
-    ordered: FloatArray,
+    values: FloatArray,
     controller: ControllerSamples,
     order: IntArray,
     ranks: FloatArray,
 ) -> ParameterSensitivity:
-    """One parameter, the samples in order of it."""
+    """Return the sensitivity to one parameter, given the order of its values."""
+    if not controller.evaluated.all():
+        order = order[controller.evaluated[order]]
+    ordered = values[order]
     index, curve = NO_INDEX, None
     spearman = swing = error = np.nan
     if len(ordered) >= FEWEST and ordered[0] < ordered[-1]:
@@ -115,7 +113,7 @@ def _sensitivity(
 
 
 def _ranks(controller: ControllerSamples) -> FloatArray:
-    """Ranks of the Strehl ratio, the mean one for ties; nan where the evaluation failed."""
+    """Return the ranks of the Strehl ratio, their mean for ties; nan where it failed."""
     from scipy.stats import rankdata
 
     ranks = np.full(len(controller.strehl), np.nan)
@@ -124,7 +122,7 @@ def _ranks(controller: ControllerSamples) -> FloatArray:
 
 
 def _ranks_in_order(ordered: FloatArray) -> FloatArray:
-    """Rank samples that are in order already."""
+    """Return the ranks of values that are in order."""
     starts = value_starts(ordered)
     counts = np.diff(np.append(starts, len(ordered)))
     ranks: FloatArray = np.repeat(starts + (counts + 1) / 2, counts)
@@ -132,7 +130,7 @@ def _ranks_in_order(ordered: FloatArray) -> FloatArray:
 
 
 def _correlation(first: FloatArray, second: FloatArray) -> float:
-    """Pearson's correlation; of ranks, Spearman's."""
+    """Return Spearman's correlation, given ranks."""
     middle = (len(first) + 1) / 2  # the mean of ranks
     first, second = first - middle, second - middle
     size = float(first @ first) * float(second @ second)

@@ -1,11 +1,10 @@
-"""A study: samples of a configuration, and the controllers that are tried on each."""
+"""A Monte Carlo study: samples of a configuration, and the controllers evaluated on each."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,26 +27,31 @@ SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parameter:
-    """A number that is not the same in every sample."""
+    """A number that varies over the samples."""
 
-    name: str  # Path in the configuration, ``error.delay_frames`` or ``error.noise_factor``
-    places: tuple[Keys, ...]  # Keys of every place that it is put to; none for the two errors
-    distribution: Distribution  # What it may be
+    name: str  # path in the configuration, ``error.delay_frames`` or ``error.noise_factor``
+    places: tuple[Keys, ...]  # keys of every place that it sets; none for the two errors
+    distribution: Distribution
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StudyController:
-    """A controller that is tried on each sample."""
+    """A controller that is evaluated on each sample."""
 
-    name: str  # Its name in the columns
-    request: DesignRequest | None  # What to design; None for a gain file
-    design: Design | None  # The controller for all samples; None where each sample has its own
-    origin: str  # Where it comes from, for people
+    name: str  # in the columns
+    request: DesignRequest | None  # what to design; None for a gain file
+    design: Design | None  # for all samples; None if each sample has its own
+    origin: str  # gain file or design, in words
 
     @property
     def for_sample(self) -> bool:
         """Whether each sample has its own design."""
         return self.design is None
+
+    @property
+    def is_designed(self) -> bool:
+        """Whether the study designs it once, for all samples."""
+        return self.request is not None and self.design is not None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,11 +65,11 @@ class Study:
     settings : StudySection
         Its values, checked.
     config : Config
-        The configuration as it stands.
+        The configuration, unchanged.
     parameters : tuple of Parameter
         What varies, in the order of the file.
     controllers : tuple of StudyController
-        What is tried, in the order of the file.
+        What is evaluated, in the order of the file.
     digest : str
         SHA-256 of all that decides the results: settings, configuration, gain files, version of
         the package.
@@ -93,7 +97,7 @@ class Study:
 
     @property
     def result_columns(self) -> tuple[str, ...]:
-        """Names of the results, those of each controller together."""
+        """Names of the results, controller by controller."""
         exact = self.settings.evaluation == "exact"
         return tuple(
             f"{controller.name}.{name}"
@@ -112,12 +116,12 @@ class Study:
         Parameters
         ----------
         start, stop : int, optional
-            Rows, the last not included; all by default.
+            Rows, the last not included; default all.
 
         Returns
         -------
         (stop - start, parameters) ndarray
-            The same for the same file, whoever asks for which rows.
+            A row is the same whichever rows are requested with it.
 
         Raises
         ------
@@ -149,13 +153,6 @@ class Study:
         drawn = np.random.SeedSequence(self.settings.seed, spawn_key=(row,)).generate_state(1)
         return int(drawn[0])
 
-    def parameter_value(
-        self, name: str, values: Sequence[float] | FloatArray, default: float
-    ) -> float:
-        """Return one parameter of a row of :meth:`values`, a default if it is none of them."""
-        names = self.parameter_names
-        return float(values[names.index(name)]) if name in names else default
-
-    def parameters_by_name(self, values: Sequence[float] | FloatArray) -> dict[str, Any]:
-        """Return a row of :meth:`values` by the names of the parameters."""
+    def parameters_by_name(self, values: Sequence[float] | FloatArray) -> dict[str, float]:
+        """Return a row of :meth:`values` as a dictionary."""
         return dict(zip(self.parameter_names, np.asarray(values).tolist(), strict=True))
