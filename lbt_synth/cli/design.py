@@ -47,7 +47,7 @@ def _refuse_unused_options(arguments: Namespace) -> None:
     method = arguments.method
     routes = METHOD_ROUTES[method]
     if arguments.route is not None and arguments.route not in routes:
-        expected = " or ".join(routes) if routes else "no --route"
+        expected = f"--route {' or '.join(routes)}" if routes else "no --route"
         raise ProblemError(f"--method {method} takes {expected}; got --route {arguments.route}.")
     for option, owners in OPTION_METHODS.items():
         if getattr(arguments, option) is not None and method not in owners:

@@ -72,7 +72,7 @@ def run(arguments: Namespace) -> Report:
                 rows=[
                     *_figure_rows(loop_run, figures),
                     ("condition of the reconstructor", f"{inverse.condition_number:.1f}", ""),
-                    ("time a frame", f"{data['milliseconds_a_frame']:.1f}", "ms"),
+                    ("time per frame", f"{data['milliseconds_a_frame']:.1f}", "ms"),
                 ],
             )
         ],

@@ -11,9 +11,9 @@ from lbt_synth.interop import FrameCost
 def cost_facts(cost: FrameCost) -> list[tuple[str, Any, str]]:
     """Return rows of a table: what a frame costs, and what it would cost with whole matrices."""
     return [
-        ("multiplications a frame", cost.multiplications, f"({cost.form})"),
+        ("multiplications per frame", cost.multiplications, f"({cost.form})"),
         ("  with whole matrices", cost.dense_multiplications, ""),
-        ("additions a frame", cost.additions, ""),
+        ("additions per frame", cost.additions, ""),
         ("  with whole matrices", cost.dense_additions, ""),
         ("coefficients, double", cost.coefficient_bytes_double, "bytes"),
         ("coefficients, single", cost.coefficient_bytes_single, "bytes"),

@@ -147,7 +147,13 @@ def _background_rows(name: str, axis: IdentifiedAxis) -> list[tuple[Any, ...]]:
             )
         )
     rows += [
-        ("noise a frame", name, format_fixed(axis.noise_nm, 3), f"{axis.noise_error_nm:.2g}", "nm"),
+        (
+            "noise per frame",
+            name,
+            format_fixed(axis.noise_nm, 3),
+            f"{axis.noise_error_nm:.2g}",
+            "nm",
+        ),
         (
             "sensor gain",
             name,

@@ -42,35 +42,35 @@ def run(arguments: Namespace) -> Report:
         gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **known)
         filters = modal_filters(air, **known)
 
-        def integrators(one: float) -> FloatArray:
-            control = MixedController.integrators(np.full(count, one))
+        def integrator_rms(gain: float) -> FloatArray:
+            control = MixedController.integrators(np.full(count, gain))
             loop = modal_loop(control, frame_rate_hz=air.frame_rate_hz, **path)
             return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
 
         best = minimize_scalar(
-            lambda one: _norm(integrators(one)),
+            lambda gain: _total_rms(integrator_rms(gain)),
             bounds=(1e-3 * gains.limit.min(), gains.limit.min()),
             method="bounded",
         )
     residuals = {
-        f"integrators, gain {best.x:.2f}": integrators(float(best.x)),
+        f"integrators, gain {best.x:.2f}": integrator_rms(float(best.x)),
         "integrators, optimised gains": gains.rms_nm,
         "Kalman filters": filters.rms_nm,
     }
     records = _order_records(count, air.rms_nm, noise, gains.gains, list(residuals.values()))
-    whole = {name: _norm(rms) for name, rms in residuals.items()}
+    whole = {name: _total_rms(rms) for name, rms in residuals.items()}
     report = Report(
         data={
             "modes": count,
             "uniform_gain": float(best.x),
             "rows": records,
             "residual_nm": whole,
-            "turbulence_nm": _norm(air.rms_nm),
+            "turbulence_nm": _total_rms(air.rms_nm),
         },
         tables=[
             tabulate(
                 "All modes",
-                [("none, turbulence alone", _norm(air.rms_nm)), *whole.items()],
+                [("none, turbulence alone", _total_rms(air.rms_nm)), *whole.items()],
                 ("controller", lambda total: total[0]),
                 ("residual [nm]", lambda total: format_fixed(total[1], 1)),
             ),
@@ -157,7 +157,7 @@ def _mirror_notes(config: Config) -> list[str]:
     ]
 
 
-def _norm(rms: FloatArray) -> float:
+def _total_rms(rms: FloatArray) -> float:
     return float(np.sqrt(np.sum(rms**2)))
 
 
@@ -173,12 +173,12 @@ def _order_records(
     rows = []
     for order in range(1, int(radial[-1]) + 1):
         which = radial == order
-        uniform, optimised, filtered = (_norm(rms[which]) for rms in residuals)
+        uniform, optimised, filtered = (_total_rms(rms[which]) for rms in residuals)
         rows.append(
             {
                 "radial_order": order,
                 "modes": int(which.sum()),
-                "turbulence_nm": _norm(turbulence[which]),
+                "turbulence_nm": _total_rms(turbulence[which]),
                 "noise_nm": float(noise[which][0]),
                 "gain": float(gains[which].mean()),
                 "uniform_nm": uniform,
@@ -196,7 +196,7 @@ def _order_table(records: list[dict[str, Any]]) -> TableText:
         ("radial order", lambda record: record["radial_order"]),
         ("modes", lambda record: record["modes"]),
         ("turbulence [nm]", lambda record: format_fixed(record["turbulence_nm"], 1)),
-        ("noise a mode [nm]", lambda record: format_fixed(record["noise_nm"], 2)),
+        ("noise per mode [nm]", lambda record: format_fixed(record["noise_nm"], 2)),
         ("mean gain", lambda record: format_fixed(record["gain"], 3)),
         ("one gain [nm]", lambda record: format_fixed(record["uniform_nm"], 1)),
         ("optimised gains [nm]", lambda record: format_fixed(record["optimised_nm"], 1)),

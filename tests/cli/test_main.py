@@ -34,7 +34,7 @@ BAD = [
     (
         ("design", CONFIG, "--method", "kalman", "--route", "lmi", "-o", "OUT.fits"),
         2,
-        "takes riccati or sdp",
+        "takes --route riccati or sdp",
     ),
     (
         ("design", CONFIG, "--method", "kalman", "--gain", "0.5", "-o", "OUT.fits"),

@@ -58,14 +58,14 @@ def add_design(parser: ArgumentParser) -> None:
         "loop with a delay of loop.delay_frames + horizon - 1, at least 1 frame",
     )
     parser.add_argument(
-        "--gain", type=float, help="integrator gain (default: the best for the truth)"
+        "--gain", type=float, help="integrator: its gain (default: the best for the truth)"
     )
     add_output(parser, GAIN_FILE)
 
 
 def _add_bound(parser: ArgumentParser) -> None:
     bound = parser.add_mutually_exclusive_group()
-    bound.add_argument("--gamma", type=float, help="bound of the H-infinity norm [nm]")
+    bound.add_argument("--gamma", type=float, help="hinf, mixed: bound of the H-infinity norm [nm]")
     bound.add_argument(
         "--gamma-ratio",
         type=float,

@@ -43,7 +43,7 @@ def _add_record(parser: ArgumentParser) -> None:
         "--wavelength-um", type=float, default=2.2, help="of Strehl ratios (default 2.2)"
     )
     parser.add_argument("--figure", help="figure to write (default: the output's name, .png)")
-    parser.add_argument("--no-figure", action="store_true", help="write none")
+    parser.add_argument("--no-figure", action="store_true", help="write no figure")
 
 
 def _add_missing_facts(parser: ArgumentParser) -> None:
