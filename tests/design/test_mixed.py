@@ -1,4 +1,4 @@
-"""Mixed filters and the trade-off: bounds that hold, and nothing better to be found."""
+"""Mixed filters: bounds that hold, and nothing better to be found."""
 
 from __future__ import annotations
 
@@ -146,119 +146,6 @@ def test_memory_that_does_not_fit(plant):
         lbt_axis_plant(modes=2).with_memory(np.ones((2, 3)))
 
 
-def test_the_front_of_the_lbt(plant):
-    """A norm close to its least costs sensor-gain robustness, whichever filter has it."""
-    points = list(lbt.studies.tradeoff(plant, points=5, taps=8))
-    for family in ("mixed", "central"):
-        own = [point for point in points if point.family == family]
-        gamma, rms, low = ([getattr(p, key) for p in own] for key in ("gamma", "rms", "gain_low"))
-        assert gamma == sorted(gamma)
-        assert rms == sorted(rms, reverse=True)
-        assert low == sorted(low, reverse=True)
-        assert low[0] > 0.7 > 0.1 > low[-1]
-    for mixed, central in zip(points[2:-2:2], points[3:-2:2], strict=True):
-        assert mixed.rms < central.rms
-        assert mixed.gain_low < central.gain_low  # it tolerates more, too
-    figure = lbt.report.figures.tradeoff_figure(points)
-    assert len(figure.axes) == 2
-    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert labels[0] == "least variance at this norm"
-    assert figure.axes[1].get_xlabel() == r"H$_\infty$ norm of the estimation error [nm]"
-
-
-def test_a_front_without_a_loop():
-    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    points = list(lbt.studies.tradeoff(walk, points=2, families=["central"]))
-    assert np.isnan(points[0].gain_low)
-    assert len(lbt.report.figures.tradeoff_figure(points).axes) == 1
-    with pytest.raises(lbt.errors.ProblemError, match="families must be"):
-        next(lbt.studies.tradeoff(walk, families=["best"]))
-    with pytest.raises(lbt.errors.ProblemError, match="points must be at least 2"):
-        next(lbt.studies.tradeoff(walk, points=1))
-    with pytest.raises(lbt.errors.ProblemError, match="at least one point"):
-        lbt.report.figures.tradeoff_figure([])
-
-
-def test_two_axes_on_the_command_line(tmp_path, capsys):
-    from lbt_synth.cli.main import main
-
-    assert (
-        main(
-            [
-                "tradeoff",
-                str(LBT_YAML),
-                "--points",
-                "2",
-                "-o",
-                str(tmp_path / "f.png"),
-                "-o",
-                str(tmp_path / "f.csv"),
-            ]
-        )
-        == 0
-    )
-    out = capsys.readouterr().out
-    assert "the least norm of any filter lies between 155.803" in out
-    assert (tmp_path / "f.csv").read_text().splitlines()[
-        0
-    ] == "family,gamma,gamma_ratio,rms,gain_low,gain_high,modulus"
-    assert (tmp_path / "f.png").stat().st_size > 10_000
-    for wrong, text in (
-        (["tradeoff", str(LBT_YAML), "-o", "f.txt"], "must end in .csv"),
-        (["tradeoff", str(LBT_YAML), "--points", "1"], "--points must be at least 2"),
-        (["tradeoff", "nowhere.yaml"], "nowhere.yaml"),
-        (
-            [
-                "design",
-                str(LBT_YAML),
-                "--method",
-                "kalman",
-                "--rms",
-                "200",
-                "-o",
-                str(tmp_path / "k.fits"),
-            ],
-            "--rms goes with --method mixed",
-        ),
-        (
-            [
-                "design",
-                str(LBT_YAML),
-                "--method",
-                "integrator",
-                "--horizon",
-                "2",
-                "-o",
-                str(tmp_path / "k.fits"),
-            ],
-            "no horizon",
-        ),
-        (
-            [
-                "design",
-                str(LBT_YAML),
-                "--method",
-                "kalman",
-                "--horizon",
-                "-3",
-                "-o",
-                str(tmp_path / "k.fits"),
-            ],
-            "horizon must leave the loop a delay",
-        ),
-    ):
-        assert main(wrong) == 2
-        assert text in capsys.readouterr().err
-    target = str(tmp_path / "m.fits")
-    assert main(["design", str(LBT_YAML), "--method", "mixed", "--rms", "100", "-o", target]) == 1
-    assert "rms must be at least 192.6" in capsys.readouterr().err
-    assert (
-        main(["design", str(LBT_YAML), "--method", "kalman", "--horizon", "2", "-o", target]) == 0
-    )
-    assert main(["verify", target]) == 0
-    assert lbt.load_gain(target).hardware.delay_frames == 3
-
-
 def test_a_plant_with_its_commands_as_states(plant):
     design = lbt.mixed(plant.full(), gamma_ratio=1.1, taps=4)
     same = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
@@ -274,19 +161,6 @@ def test_a_plant_with_memory_is_not_assembled_anew(plant):
     ):
         with pytest.raises(lbt.errors.ProblemError, match="holds the memory of a mixed filter"):
             again()
-
-
-def test_bounds_without_a_limit(plant, ends, tmp_path, capsys):
-    from lbt_synth.cli.main import main
-
-    assert lbt.mixed(plant, gamma_ratio=1e300 / ends[0].gamma_least).rms == ends[1].rms
-    assert lbt.mixed(plant, rms=1e200).gamma == ends[0].gamma
-    target = str(tmp_path / "m.npz")
-    for size in ("1e30", "1e200"):
-        assert (
-            main(["design", str(LBT_YAML), "--method", "mixed", "--rms", size, "-o", target]) == 0
-        )
-    capsys.readouterr()
 
 
 def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
@@ -322,24 +196,3 @@ def test_the_demand_is_kept_and_checked(tmp_path, plant):
     forged = dataclasses.replace(loaded, rms_requested=139.0)
     failed = [check.name for check in forged.recertify().checks if not check.passed]
     assert failed == ["standard deviation of the estimation error"]
-
-
-def test_what_the_command_line_says_of_mixed_filters(tmp_path, capsys, monkeypatch):
-    from lbt_synth.cli.main import main
-
-    target = str(tmp_path / "m.fits")
-    config = str(LBT_YAML)
-    assert main(["design", config, "--method", "mixed", "--gamma", "1e6", "-o", target]) == 0
-    assert "no better choice than the Kalman filter" in capsys.readouterr().out
-    assert main(["design", config, "--method", "kalman", "--horizon", "2", "-o", target]) == 0
-    assert main(["simulate", config, target]) == 1
-    assert "designed for a delay of 3 frames. Set loop.delay_frames to 3" in capsys.readouterr().err
-    assert main(["tradeoff", config, "--points", "201"]) == 2
-    assert "points must be at most 200" in capsys.readouterr().err
-
-    def full(**options):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("tempfile.TemporaryFile", full)
-    assert main(["tradeoff", config, "-o", str(tmp_path / "f.png")]) == 2
-    assert "takes no new files (No space left on device)" in capsys.readouterr().err

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.replays import a_plant, a_truth
 
 import lbt_synth as lbt
 
@@ -69,3 +70,13 @@ def test_an_undisturbed_loop_has_no_best_gain():
         lbt.design.optimal_integrator(
             lbt.LoopHardware(frame_rate_hz=800), lbt.Truth(turbulence=None)
         )
+
+
+def test_the_integrator_of_a_plant_is_that_of_its_truth():
+    plant = a_plant()
+    own, other = (
+        lbt.design.model_integrator(plant),
+        lbt.design.optimal_integrator(plant.hardware, a_truth()),
+    )
+    assert own.gain == pytest.approx(other.gain, rel=1e-5)
+    assert own.certificate.passed

@@ -93,7 +93,7 @@ def test_correlated_noise_is_refused_beyond_one_frame():
     p = random_problem(np.random.default_rng(0), 3)
     assert lbt.kalman(p, horizon=0).certificate.passed
     with pytest.raises(
-        lbt.errors.ProblemError, match="prediction of 2 frames needs .* uncorrelated"
+        lbt.errors.ProblemError, match="prediction of 2 samples needs .* uncorrelated"
     ):
         lbt.kalman(p, horizon=2)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,35 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
-from support.plants import ROOT, lbt_axis_plant
+from support.lqg import shell, slow_plant
+from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.lqg_design import estimation_plant, loop_variances
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
-
-SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
-
-
-def shell(bandwidth_hz=100.0, **changes):
-    return lbt.models.PositionLoop.from_bandwidth(
-        **{"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": bandwidth_hz, **changes}
-    )
-
-
-def slow_plant(delay=2.0, mirror=None, modes=1, **changes):
-    base = lbt_axis_plant(modes=modes)
-    return lbt.tip_tilt_plant(
-        **{
-            "frame_rate_hz": 800,
-            "delay_frames": delay,
-            "turbulence": base.turbulence,
-            "vibrations": base.vibrations,
-            "noise_nm": 15.5,
-            "modes": modes,
-            "mirror": mirror,
-            **changes,
-        }
-    )
 
 
 def model_rms(plant, controller):
@@ -157,24 +134,6 @@ def test_coupled_matrices_and_redundant_commands():
     assert design.rms == pytest.approx(model_rms(plant, design.controller), rel=1e-9)
 
 
-def test_other_disturbances_meet_the_same_loop():
-    plant = slow_plant(2.25, shell())
-    design = lbt.lqg(plant)
-    moved = lbt.models.retuned_plant(plant, 2.0)
-    assert astuple(moved.hardware.mirror) == astuple(plant.hardware.mirror)
-    error = design.error_system(moved)
-    from lbt_synth.linear.lyapunov import stationary_covariance
-
-    X = stationary_covariance(error.A, error.B @ error.B.T)
-    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5, vibrations=moved.vibrations)
-    budget = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
-    assert np.sqrt(error.C @ X @ error.C.T)[0, 0] == pytest.approx(budget.rms_nm, rel=1e-8)
-    with pytest.raises(lbt.errors.ProblemError, match="must come in a TipTiltPlant"):
-        design.error_system(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
-    with pytest.raises(lbt.errors.ProblemError, match="must have 4 states"):
-        design.error_system(slow_plant(2.25, shell(), vibrations=None))
-
-
 def test_what_is_left_of_the_settled_mirror():
     """Against the difference of two series of positions, tap by tap."""
     plant = slow_plant(2.0, shell(), vibrations=None)
@@ -210,57 +169,6 @@ def test_a_settled_mirror_leaves_nothing():
     loop = lbt.close_loop(plant.hardware, lbt.lqg(plant).controller)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
     assert lbt.loop.settling_error(loop, truth).rms_nm == 0
-
-
-@pytest.mark.parametrize("ending", ["fits", "npz", "json"])
-@pytest.mark.parametrize("mirror", [None, "slow"])
-def test_gain_files(tmp_path, ending, mirror):
-    plant = slow_plant(2.0, shell() if mirror else None, modes=2)
-    design = lbt.lqg(plant, command_weight=0.01)
-    loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"x.{ending}", design))
-    assert isinstance(loaded, lbt.design.LqgDesign)
-    assert loaded.recertify().passed
-    np.testing.assert_array_equal(loaded.controller.A, design.controller.A)
-    np.testing.assert_array_equal(loaded.gain_mirror, design.gain_mirror)
-    assert loaded.command_weight == 0.01
-    assert loaded.objective_nm == design.objective_nm
-    if mirror:
-        assert astuple(loaded.hardware.mirror) == astuple(plant.hardware.mirror)
-    else:
-        assert loaded.hardware.mirror is None
-    other = lbt.load_gain(lbt.save_gain(tmp_path / f"k.{ending}", lbt.kalman(plant)))
-    assert other.recertify().passed
-    np.testing.assert_array_equal(other.hardware.mirror_taps, plant.hardware.mirror_taps)
-
-
-def test_a_gain_file_that_does_not_fit_its_mirror_is_refused(tmp_path):
-    design = lbt.lqg(slow_plant(2.0, shell()))
-    broken = replace(design, gain_mirror=design.gain_mirror[:-1])
-    path = lbt.save_gain(tmp_path / "x.json", broken)
-    with pytest.raises(lbt.errors.GainFileError, match="GAIN_MIRROR must be"):
-        lbt.load_gain(path)
-
-
-@pytest.mark.parametrize("field", ["gain_predictor", "gain_state", "gain_mirror", "objective_nm"])
-def test_changed_gains_fail_the_certificate(field):
-    design = lbt.lqg(slow_plant(2.0, shell()))
-    assert design.recertify().passed
-    value = getattr(design, field)
-    changed = replace(design, **{field: value * (1 + 1e-4)})
-    certificate = changed.recertify()
-    assert not certificate.passed
-    with pytest.raises(lbt.errors.CertificateError):
-        certificate.require()
-
-
-def test_a_changed_controller_fails_the_certificate():
-    design = lbt.lqg(slow_plant(2.0, shell()))
-    K = design.controller
-    changed = lbt.Controller(A=K.A, B=K.B * 1.0001, C=K.C, D=K.D, dt_s=K.dt_s)
-    failed = [
-        c.name for c in replace(design, controller=changed).recertify().checks if not c.passed
-    ]
-    assert "controller against its gains" in failed
 
 
 def test_the_other_designs_and_analyses_take_a_moving_mirror():
@@ -351,120 +259,3 @@ def test_complex_zeros_outside_the_circle_have_no_limit():
             with pytest.raises(lbt.errors.ProblemError, match="real zeros outside the unit circle"):
                 lbt.loop.least_residual(path, truth)
     assert refused > 0
-
-
-# --------------------------------------------------------------------------
-# Configuration and command line
-# --------------------------------------------------------------------------
-def test_the_example_has_a_mirror_for_design_and_loop():
-    config = lbt.load_config(SLOW_YAML)
-    assert config.hardware.mirror is config.plant.hardware.mirror
-    step = config.hardware.mirror.step_response()
-    assert 3e-3 < step.settling_s < 6e-3
-    rows = lbt.studies.mirror(config.plant, config.truth, config.imaging)
-    by_name = {row.design: row for row in rows}
-    assert not by_name["kalman, settled mirror"].stable
-    assert by_name["lqg"].strehl > 0.8
-    assert by_name["lqg"].residual_nm < 0.3 * by_name["kalman, real positions"].residual_nm
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("bandwidth_hz: 100.0", "bandwith_hz: 100.0", "did you mean bandwidth_hz"),
-        ("bandwidth_hz: 100.0", "proportional_per_s2: 4.0e5", "expected either bandwidth_hz"),
-        (
-            "    bandwidth_hz: 100.0",
-            "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0",
-            "bandwidth_damping goes with bandwidth_hz",
-        ),
-        ("bandwidth_hz: 100.0", "bandwidth_hz: 10.0", "mirror.local_loop: bandwidth_hz must be"),
-        ("frame_rate_hz: 800.0", "frame_rate_hz: 990.0", "986.30137 and 1000 Hz"),
-        ("delay_samples: 1", "delay_samples: 1.5", "mirror.local_loop.delay_samples"),
-    ],
-)
-def test_wrong_sections_are_refused(tmp_path, old, new, message):
-    text = SLOW_YAML.read_text()
-    assert old in text
-    path = tmp_path / "a.yaml"
-    path.write_text(text.replace(old, new))
-    with pytest.raises(lbt.errors.ConfigError, match=message):
-        lbt.load_config(path)
-
-
-def test_gains_of_a_configuration(tmp_path):
-    text = SLOW_YAML.read_text()
-    start = text.index("    bandwidth_hz: 100.0")
-    end = text.index("    sampling_hz")
-    path = tmp_path / "a.yaml"
-    path.write_text(
-        text[:start] + "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0\n" + text[end:]
-    )
-    mirror = lbt.load_config(path).hardware.mirror
-    assert (mirror.proportional_per_s2, mirror.derivative_per_s) == (4.0e5, 800.0)
-
-
-def run(capsys, *arguments):
-    import json
-
-    from lbt_synth.cli.main import main
-
-    status = main([*map(str, arguments), "--json"])
-    captured = capsys.readouterr()
-    return status, json.loads(captured.out), captured.err
-
-
-def test_commands(tmp_path, capsys):
-    gain = tmp_path / "lqg.fits"
-    status, data, _ = run(capsys, "design", SLOW_YAML, "--method", "lqg", "-o", gain)
-    assert status == 0
-    assert data["rms"] == pytest.approx(data["limit_nm"], rel=1e-6)
-    assert data["mirror"]["settling_s"] > 3e-3
-    assert run(capsys, "verify", gain)[0] == 0
-    assert run(capsys, "show", gain, "--matrices")[0] == 0
-    figure = tmp_path / "m.png"
-    table = tmp_path / "m.csv"
-    status, data, _ = run(capsys, "mirror", SLOW_YAML, "-o", figure, "-o", table)
-    assert status == 0
-    assert figure.stat().st_size > 10_000
-    assert table.read_text().count("\n") == 5
-    assert [row["stable"] for row in data["rows"]] == [True, False, True, True]
-    status, data, _ = run(capsys, "simulate", SLOW_YAML, gain, "--frames", 500, "--cases", 1)
-    assert status == 0
-    assert run(capsys, "sigma", gain, "-o", tmp_path / "s.png")[0] == 0
-
-
-def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
-    from lbt_synth.cli.main import main
-
-    gain = str(tmp_path / "kalman.npz")
-    assert main(["design", str(SLOW_YAML), "--method", "kalman", "-o", gain]) == 0
-    assert "as if the mirror settled at once" in capsys.readouterr().out
-
-
-def test_wrong_commands(tmp_path, capsys):
-    settled = ROOT / "examples" / "lbt.yaml"
-    gain = tmp_path / "kalman.fits"
-    assert run(capsys, "design", settled, "--method", "kalman", "-o", gain)[0] == 0
-    status, _, err = run(capsys, "simulate", SLOW_YAML, gain)
-    assert status == 1
-    assert "another mirror" in err
-    status, _, err = run(capsys, "mirror", settled)
-    assert status == 2
-    assert "mirror.local_loop is missing" in err
-    status, _, err = run(capsys, "mirror", SLOW_YAML, "--tolerance", "2")
-    assert status == 2
-    assert "tolerance" in err
-    for extra, text in (
-        (("--horizon", "2"), "takes no horizon"),
-        (("--gain", "1"), "--gain goes"),
-        (("--route", "sdp"), "takes no --route"),
-    ):
-        status, _, err = run(capsys, "design", SLOW_YAML, "--method", "lqg", *extra, "-o", gain)
-        assert status == 2
-        assert text in err
-    status, _, err = run(
-        capsys, "design", settled, "--method", "kalman", "--command-weight", "0.1", "-o", gain
-    )
-    assert status == 2
-    assert "--command-weight goes with --method lqg" in err

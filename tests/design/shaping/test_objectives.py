@@ -1,0 +1,59 @@
+"""Terms of an objective, against the residual of the real loop."""
+
+from dataclasses import replace
+
+import pytest
+from support.shaping import (
+    AIR,
+    BASIC,
+    NOISE,
+    ONE,
+    channel,
+    random_coefficients,
+    spec,
+)
+
+import lbt_synth as lbt
+from lbt_synth.design.shaping.single_mode_loop import mode_loop
+
+TERMS = [
+    BASIC,
+    replace(BASIC, sensor_gain=0.5),
+    lbt.design.shaping.ResidualVariance(turbulence=AIR, noise_nm=15.5, sensor_gain=1.2),
+    lbt.design.shaping.ResidualVariance(turbulence=None, noise_nm=15.5),
+    lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797),
+    lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797, sensor_gain=0.6),
+    lbt.design.shaping.Total(
+        terms=(BASIC, lbt.design.shaping.VibrationBand(low_hz=5, high_hz=9, rms_nm=30)),
+        weights=(1, 2),
+    ),
+    lbt.design.shaping.Worst(
+        terms=(BASIC, lbt.design.shaping.VibrationBand(low_hz=5, high_hz=9, rms_nm=30)),
+        weights=(0.1, 2),
+    ),
+]
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.5, 3.0])
+@pytest.mark.parametrize("term", TERMS, ids=lambda t: getattr(t, "label", type(t).__name__))
+def test_a_term_over_the_grid_is_the_residual_of_the_real_loop(term, delay):
+    mode = channel(delay=delay)
+    c = random_coefficients(12) * 0.5
+    found = term.function(mode, spec(objective=term).grid(mode, fineness=2)).value(c)
+    exact = term.measured_nm2(mode_loop(mode.hardware, mode.basis.parameter(c)))
+    assert found == pytest.approx(exact, rel=2e-3)
+
+
+def test_a_narrow_line_of_a_tabulated_spectrum_is_not_missed():
+    f0, w = 53.0, 1e-3  # 100 nm rms
+    line = lbt.models.TabulatedSpectrum(
+        frequency_hz=[1, f0 - w, f0, f0 + w, 300], density_nm2_hz=[1e-3, 1e-3, 1e4 / w, 1e-3, 1e-3]
+    )
+    bound = lbt.design.shaping.CommandRms(at_most_nm=10, turbulence=line, noise_nm=1e-3)
+    design = lbt.design.shape(ONE, spec(bound), functions=20, states=None)
+    loop = lbt.close_loop(ONE, design.controller)
+    assert 100 * abs(loop.commanding().frequency_response([f0])[0, 0, 1]) < 10
+    seen = lbt.design.shaping.ResidualVariance(turbulence=line, noise_nm=NOISE)
+    rejecting = lbt.design.shape(ONE, spec(objective=seen), functions=30, states=None)
+    left = 100 * abs(lbt.close_loop(ONE, rejecting.controller).sensitivity([f0])[0, 0, 0])
+    assert left < rejecting.objective_nm[0]

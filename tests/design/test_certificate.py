@@ -1,0 +1,52 @@
+"""Certificates refuse what is not so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+
+
+def test_certificate_checks_are_independent(axis_plant):
+    design = lbt.hinf(axis_plant, gamma_ratio=1.2)
+    names = [check.name for check in design.certificate.checks]
+    assert "spectral radius of the filter" in names
+    assert "norm of the estimation error" in names
+    assert "spectral radius of the closed loop" in names
+    assert design.recertify().passed
+    tighter = lbt.design.certify_filter(
+        axis_plant, design.gain_predictor, gamma=0.99 * design.gamma
+    )
+    assert not tighter.passed
+    with pytest.raises(lbt.errors.CertificateError, match="norm of the estimation error"):
+        tighter.require()
+    assert not lbt.design.certify_filter(axis_plant, np.full((4, 1), 9.0)).passed
+
+
+def test_a_variance_that_rounding_has_spoilt_is_not_certified():
+    """Two Lyapunov equations that sum it in different orders have to agree."""
+    rng = np.random.default_rng(0)
+    spoilt = 0
+    for _ in range(40):
+        turn = (
+            rng.standard_normal((4, 4))
+            @ np.diag([1, 1e-3, 1e-6, 1e-9])
+            @ rng.standard_normal((4, 4))
+        )
+        A = turn @ np.diag([0.5, 0.4, 0.3, 0.2]) @ np.linalg.inv(turn)
+        problem = lbt.EstimationProblem(
+            A=A,
+            B=rng.standard_normal((4, 5)),
+            C=rng.standard_normal((1, 4)),
+            D=rng.standard_normal((1, 5)),
+            L=rng.standard_normal((1, 4)),
+        )
+        try:
+            design = lbt.kalman(problem)
+        except lbt.LbtSynthError:
+            spoilt += 1
+            continue
+        check = next(c for c in design.certificate.checks if "adjoint" in c.name)
+        assert check.value < 1e-6
+    assert 0 < spoilt

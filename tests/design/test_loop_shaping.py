@@ -1,0 +1,290 @@
+"""Loop shaping: designs against closed forms, other means and refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.shaping import (
+    BASIC,
+    NOISE,
+    ONE,
+    RATE,
+    SLOW,
+    shaped_design,
+    spec,
+)
+
+import lbt_synth as lbt
+
+OTHER_RATE = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=100)
+
+
+def test_nothing_to_reject_leaves_nothing():
+    idle = lbt.design.shaping.ResidualVariance(turbulence=None, noise_nm=10, sensor_gain=0.5)
+    design = lbt.design.shape(
+        ONE,
+        spec(lbt.design.shaping.ModulusMargin(at_least=0.5), objective=idle),
+        functions=8,
+        states=None,
+    )
+    assert design.objective_nm[0] < 1e-3
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("coefficients", [[0.99], [1.9, -0.93]])
+def test_without_demands_the_optimum_is_the_kalman_filter(delay, coefficients):
+    model = lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=20.0, frame_rate_hz=RATE)
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=model, noise_nm=NOISE, modes=1, delay_frames=delay
+    )
+    objective = lbt.design.shaping.ResidualVariance(turbulence=model, noise_nm=NOISE)
+    design = lbt.design.shape(plant.hardware, spec(objective=objective), functions=30, states=None)
+    best = lbt.kalman(plant).rms
+    assert best * (1 - 1e-7) <= design.objective_nm[0] <= best * 1.002
+
+
+def test_few_poles_reach_the_kalman_filter_too():
+    plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, noise_nm=NOISE, modes=1)
+    design = lbt.design.shape(plant.hardware, spec(), functions=24, states=8, loss=0.01)
+    assert design.states_per_mode <= 8
+    assert design.objective_nm[0] <= lbt.kalman(plant).rms * 1.012
+    assert design.loss <= 0.01
+
+
+def test_every_demand_holds_in_a_loop_measured_by_other_means():
+    demands = (
+        lbt.design.shaping.ModulusMargin(at_least=0.55),
+        lbt.design.shaping.NoisePeak(at_most=1.9),
+        lbt.design.shaping.Attenuation(low_hz=0, high_hz=2, at_most=0.12),
+        lbt.design.shaping.Attenuation(low_hz=4, high_hz=6, at_most=0.5, sensor_gain=0.6),
+        lbt.design.shaping.SensorGainRange(low=0.3, high=1.6),
+        lbt.design.shaping.MirrorUncertainty(relative=0.7, low_hz=150, high_hz=400),
+        lbt.design.shaping.DelayError(frames=0.5),
+        lbt.design.shaping.CommandRms(at_most_nm=40, turbulence=SLOW, noise_nm=NOISE, rate=True),
+    )
+    design = lbt.design.shape(ONE, spec(*demands), functions=30, states=None)
+    free = lbt.design.shape(ONE, spec(), functions=30, states=None)
+    assert design.objective_nm[0] > free.objective_nm[0]
+    loop = lbt.close_loop(ONE, design.controller)
+    f = np.linspace(0, 400, 8001)
+    S = np.abs(loop.sensitivity(f)[:, 0, 0])
+    T = np.abs(1 - loop.sensitivity(f)[:, 0, 0])
+    assert np.max(S) < 1 / 0.55
+    assert np.max(np.abs(loop.noise_transfer(f))) < 1.9
+    assert np.max(S[f <= 2]) < 0.12
+    weak = lbt.close_loop(ONE, design.controller, sensor_gain=0.6)
+    assert np.max(np.abs(weak.sensitivity(f[(f >= 4) & (f <= 6)]))) < 0.5
+    low, high = lbt.loop.stable_sensor_gains(ONE, design.controller)
+    assert low < 0.3
+    assert high > 1.6
+    assert 0.7 * np.max(T[f >= 150]) < 1
+    assert lbt.loop_margins(loop).delay_frames > 0.5
+    run = lbt.simulate(
+        design.controller,
+        lbt.Truth(turbulence=SLOW, noise_nm=NOISE),
+        hardware=ONE,
+        frames=40_000,
+        cases=1,
+        seed=1,
+        settle_frames=2000,
+    )
+    assert np.std(np.diff(run.commands[0, :, 0])) < 40 * 1.03
+
+
+def test_each_mode_may_have_its_own_specification():
+    still = lbt.design.shaping.ResidualVariance(turbulence=SLOW, noise_nm=NOISE)
+    line = lbt.design.shaping.Total(
+        terms=(still, lbt.design.shaping.VibrationBand(low_hz=19, high_hz=21, rms_nm=100))
+    )
+    sensor = np.array([[1.0, 0.3], [-0.2, 0.9], [0.4, 0.0]])
+    mirror = np.array([[0.8, 0.1, 0.0], [0.0, 0.5, 0.4]])
+    path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=sensor, influence_matrix=mirror)
+    design = lbt.design.shape(
+        path, [spec(objective=still), spec(objective=line)], functions=20, states=None
+    )
+    assert design.certificate.passed
+    assert design.objective_nm[0] < design.objective_nm[1]
+    rejected = np.abs(lbt.close_loop(path, design.controller).sensitivity([20.0])[0])
+    assert rejected[1, 1] < 0.5 * rejected[0, 0]
+    assert max(rejected[0, 1], rejected[1, 0]) < 1e-9
+
+
+def test_robust_scales_the_noise_with_the_sensor_and_shares_equal_modes():
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=SLOW, noise_nm=NOISE, sensor_matrix=np.diag([1.0, 2.0])
+    )
+    line = lbt.design.shaping.VibrationBand(low_hz=19, high_hz=21, rms_nm=100)
+    design = lbt.robust(plant, bands=[line], functions=16, states=None)
+    assert [s.objective.terms[0].noise_nm for s in design.specifications] == pytest.approx(
+        [20.0, 10.0]
+    )
+    same = lbt.robust(replace_sensor(plant), bands=[line], functions=16, states=None)
+    assert same.specifications[0] is same.specifications[1]
+    assert same.method == "robust"
+
+
+def replace_sensor(plant):
+    return lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=plant.turbulence[0], noise_nm=NOISE)
+
+
+def test_too_few_states_for_the_loss_are_refused():
+    objective = lbt.design.shaping.Total(
+        terms=(BASIC, lbt.design.shaping.VibrationBand(low_hz=15, high_hz=25, rms_nm=500))
+    )
+    with pytest.raises(
+        lbt.errors.InfeasibleError, match="no controller of 5 states a mode came within 1 %"
+    ):
+        lbt.design.shape(ONE, spec(objective=objective), functions=30, states=5, loss=0.01)
+
+
+@pytest.fixture
+def small():
+    return shaped_design()
+
+
+def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certificate(small):
+    parameter = small.parameters[0]
+    other = lbt.Controller(
+        A=parameter.A, B=parameter.B, C=parameter.C * 1.01, D=parameter.D, dt_s=parameter.dt_s
+    )
+    failed = [
+        c.name for c in replace(small, parameters=(other,)).recertify().checks if not c.passed
+    ]
+    assert "controller against its parameters" in failed
+    stricter = replace(
+        small.specifications[0], demands=(lbt.design.shaping.ModulusMargin(at_least=0.9),)
+    )
+    assert not replace(small, specifications=(stricter,)).recertify().passed
+    assert not replace(small, objective_nm=(small.objective_nm[0] * 0.999,)).recertify().passed
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: lbt.design.shaping.ResidualVariance(turbulence=None, noise_nm=0),
+            "turbulence or noise; got neither",
+        ),
+        (
+            lambda: lbt.design.shaping.ResidualVariance(turbulence=3, noise_nm=1),
+            "must be an Atmosphere",
+        ),
+        (
+            lambda: lbt.design.shaping.ResidualVariance(turbulence=SLOW, noise_nm=-1),
+            "noise_nm must be at least 0",
+        ),
+        (
+            lambda: lbt.design.shaping.VibrationBand(low_hz=5, high_hz=5, rms_nm=1),
+            "high_hz must be above 5",
+        ),
+        (
+            lambda: lbt.design.shaping.VibrationBand(low_hz=5, high_hz=6, rms_nm=0),
+            "rms_nm must be above 0",
+        ),
+        (lambda: lbt.design.shaping.Total(terms=()), "at least one term"),
+        (lambda: lbt.design.shaping.Total(terms=(3,)), "an objective is made of"),
+        (lambda: lbt.design.shaping.Worst(terms=(BASIC,), weights=(1, 2)), "one a term, 1; got 2"),
+        (lambda: lbt.design.shaping.ModulusMargin(at_least=1), "at_least must be below 1"),
+        (lambda: lbt.design.shaping.NoisePeak(at_most=0), "at_most must be above 0"),
+        (
+            lambda: lbt.design.shaping.Attenuation(low_hz=0, high_hz=1, at_most=3, sensor_gain=0.5),
+            "at_most must be below 2 at sensor gain 0.5",
+        ),
+        (lambda: lbt.design.shaping.SensorGainRange(low=1.1, high=1.3), "low must be at most 1"),
+        (lambda: lbt.design.shaping.SensorGainRange(low=0.5, high=0.9), "high must be at least 1"),
+        (lambda: lbt.design.shaping.DelayError(frames=1.5), "frames must be at most 1"),
+        (
+            lambda: lbt.design.shaping.MirrorUncertainty(relative=0, low_hz=0, high_hz=1),
+            "relative must be above 0",
+        ),
+        (
+            lambda: lbt.design.shaping.CommandRms(at_most_nm=-1, turbulence=SLOW, noise_nm=1),
+            "at_most_nm must be above 0",
+        ),
+        (lambda: spec(3), "a demand must be one of ModulusMargin"),
+        (lambda: spec(objective=3), "an objective is made of"),
+        (lambda: lbt.design.shape(3, spec()), "hardware must be a LoopHardware"),
+        (lambda: lbt.design.shape(ONE, 3), "expected a Specification"),
+        (lambda: lbt.design.shape(ONE, [spec(), spec()]), "one for each of 1 modes; got 2"),
+        (lambda: lbt.design.shape(ONE, spec(), functions=401), "functions must be at most 400"),
+        (lambda: lbt.design.shape(ONE, spec(), pole=1.0), "pole must be below 1"),
+        (lambda: lbt.design.shape(ONE, spec(), states=1), "states must be at least 2"),
+        (
+            lambda: lbt.design.shape(
+                ONE,
+                spec(objective=lbt.design.shaping.VibrationBand(low_hz=5, high_hz=500, rms_nm=1)),
+            ),
+            "below the Nyquist frequency 400 Hz; got 5 to 500",
+        ),
+        (
+            lambda: lbt.design.shape(
+                lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[1.0, 1.0]]), spec()
+            ),
+            "sensor_matrix must have rank 2",
+        ),
+        (
+            lambda: lbt.design.shape(
+                ONE,
+                spec(
+                    lbt.design.shaping.CommandRms(at_most_nm=9, turbulence=OTHER_RATE, noise_nm=1)
+                ),
+            ),
+            "sampled at the loop's 800 Hz; got 100",
+        ),
+        (
+            lambda: lbt.design.shaping.CommandRms(
+                at_most_nm=9, turbulence=SLOW, noise_nm=1, rate="x"
+            ),
+            "rate must be True or False",
+        ),
+        (lambda: lbt.design.shaping.Total(terms=BASIC), "terms must be a list"),
+        (
+            lambda: lbt.design.shaping.Specification(
+                objective=BASIC, demands=lbt.design.shaping.NoisePeak(at_most=3)
+            ),
+            "demands must be a list",
+        ),
+        (lambda: lbt.robust(plant_of_one(), bands=None), "bands must be a list"),
+        (lambda: lbt.robust(plant_of_one(), bands=[], sensor_gain=(1,)), r"must be \(low, high\)"),
+        (lambda: lbt.robust(plant_of_one(), bands=[], scenarios=1.0), "scenarios must be a list"),
+        (
+            lambda: lbt.studies.robustness_map(
+                None,
+                lbt.Truth(turbulence=None),
+                lbt.Imaging(diameter_m=8),
+                errors_hz=[0],
+                sensor_gains=[1],
+            ),
+            "expected a Design",
+        ),
+        (lambda: lbt.loop.least_residual(None, None), "expected a LoopHardware"),
+        (lambda: lbt.robust(3, bands=[]), "plant must be a TipTiltPlant"),
+        (
+            lambda: lbt.robust(replace_sensor(plant_of_one()), bands=[3]),
+            "bands must be VibrationBands",
+        ),
+        (lambda: lbt.robust(plant_of_one(), bands=[], scenarios=[]), "at least one sensor gain"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(make, message):
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        make()
+
+
+def plant_of_one():
+    return lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, noise_nm=NOISE, modes=1)
+
+
+def test_noise_of_any_size_stays_with_its_mode():
+    tiny = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=1e-11, frame_rate_hz=RATE)
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=tiny, noise_nm=4e-10, sensor_matrix=np.diag([1.0, 3.0])
+    )
+    design = lbt.robust(plant, bands=[], functions=8, states=None)
+    noise = [s.objective.terms[0].noise_nm for s in design.specifications]
+    assert noise == pytest.approx([4e-10, 4e-10 / 3], rel=1e-6)
+
+
+def test_few_states_may_be_as_few_as_are_needed():
+    design = lbt.design.shape(ONE, spec(), functions=20, states=4, loss=0.01)
+    assert design.states_per_mode == 2

@@ -1,0 +1,53 @@
+"""The robust design of the example."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.robust_config import EXAMPLE
+
+import lbt_synth as lbt
+from lbt_synth.config.robust import design_robust
+
+
+@pytest.fixture(scope="module")
+def example():
+    return design_robust(lbt.load_config(EXAMPLE))
+
+
+def test_the_example_holds_at_every_row_and_sensor_gain(example):
+    config = lbt.load_config(EXAMPLE)
+    camera = replace(config.imaging, other_modes=0.841)
+    noise = replace(config.truth, noise_nm=15.5)
+    found = lbt.studies.robustness_map(
+        example, noise, camera, errors_hz=np.arange(-7, 8) / 2, sensor_gains=[1, 0.7, 0.5, 0.358]
+    )
+    worst = 100 * np.min(found.strehl[0], axis=1)
+    assert np.all(worst >= [83, 82.5, 82, 80.5])
+    assert np.all(worst <= 84.1)
+
+
+def test_the_example_is_stable_over_its_interval_with_its_margin_and_few_states(example):
+    hardware = example.hardware
+    low, high = lbt.loop.stable_sensor_gains(hardware, example.controller)
+    assert low < 0.25
+    assert high > 1.3
+    assert lbt.loop_margins(lbt.close_loop(hardware, example.controller)).modulus >= 0.45
+    assert example.states_per_mode <= 20
+    assert example.controller.n_states == 2 * example.states_per_mode
+    assert 0 < example.loss <= 0.25
+
+
+def test_the_example_simulates_as_it_is_computed(example):
+    config = lbt.load_config(EXAMPLE)
+    truth = replace(config.truth, sensor_gain=0.5)
+    exact = lbt.strehl(
+        lbt.residual_budget(
+            lbt.close_loop(config.hardware, example.controller, sensor_gain=0.5), truth
+        ),
+        config.imaging,
+    )
+    run = lbt.simulate(
+        example.controller, truth, hardware=config.hardware, frames=8000, cases=2, seed=3
+    )
+    assert np.mean(run.strehl(config.imaging)) == pytest.approx(exact, abs=0.004)

@@ -1,0 +1,70 @@
+"""Series of many systems, against their recursion."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lbt_synth as lbt
+from lbt_synth.loop.simulation.block_filtering import BatchedSystems
+
+
+@given(
+    count=st.integers(1, 4),
+    n=st.integers(1, 5),
+    m=st.integers(1, 2),
+    p=st.integers(1, 3),
+    frames=st.integers(1, 200),
+    seed=st.integers(0, 100),
+)
+def test_stacked_series_are_the_recursion(count, n, m, p, frames, seed):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((count, n, n))
+    A *= (0.999 / np.abs(np.linalg.eigvals(A)).max(axis=1))[:, None, None]
+    B, C = rng.standard_normal((count, n, m)), rng.standard_normal((count, p, n))
+    D, u = rng.standard_normal((count, p, m)), rng.standard_normal((count, frames, m))
+    out = BatchedSystems(A, B, C, D).filter(u)
+    for i in range(count):
+        system = lbt.linear.StateSpace(A=A[i], B=B[i], C=C[i], D=D[i])
+        expected = lbt.loop.filter_series(system, u[i])
+        assert np.allclose(out[i], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    if m == p:
+        again = u.copy()
+        assert BatchedSystems(A, B, C, D).filter(again, in_place=True) is again
+        assert np.array_equal(again, out)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    n=st.integers(1, 5),
+    frames=st.integers(1, 700),
+    cases=st.integers(1, 3),
+)
+def test_block_products_are_the_recursion(seed, n, frames, cases):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    A *= 0.999 / max(abs(np.linalg.eigvals(A)))
+    system = lbt.linear.StateSpace(
+        A=A,
+        B=rng.standard_normal((n, 2)),
+        C=rng.standard_normal((3, n)),
+        D=rng.standard_normal((3, 2)),
+    )
+    u = rng.standard_normal((cases, frames, 2))
+    expected = np.empty((cases, frames, 3))
+    for case in range(cases):
+        x = np.zeros(n)
+        for k in range(frames):
+            expected[case, k] = system.C @ x + system.D @ u[case, k]
+            x = system.A @ x + system.B @ u[case, k]
+    out = lbt.loop.filter_series(system, u)
+    assert np.allclose(out, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def test_filter_series_against_python_control(axis_plant):
+    loop = lbt.close_loop(axis_plant.hardware, lbt.kalman(axis_plant).controller)
+    u = np.random.default_rng(0).standard_normal((3000, 2))
+    _, expected = control.forced_response(loop.system.to_control(), U=u.T)
+    assert np.allclose(lbt.loop.filter_series(loop.system, u), expected.T, atol=1e-9)

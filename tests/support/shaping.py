@@ -1,0 +1,48 @@
+"""Loops of one mode and specifications to shape them."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+import lbt_synth as lbt
+from lbt_synth.design.shaping.basis import laguerre_basis
+from lbt_synth.design.shaping.channel import Channel
+
+RATE = 800.0
+SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=RATE)
+AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
+ONE = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+NOISE = 20.0
+BASIC = lbt.design.shaping.ResidualVariance(turbulence=SLOW, noise_nm=NOISE)
+
+
+def channel(size=12, pole=0.6, delay=2.0):
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
+    return Channel(hardware=path, basis=laguerre_basis(size, pole, dt_s=1 / RATE))
+
+
+def spec(*demands, objective=BASIC):
+    return lbt.design.shaping.Specification(objective=objective, demands=demands)
+
+
+def random_coefficients(size, seed=0):
+    return np.random.default_rng(seed).normal(size=size) * 0.3
+
+
+@functools.cache
+def shaped_design():
+    """A shaped design of few states."""
+    demands = (
+        lbt.design.shaping.ModulusMargin(at_least=0.5),
+        lbt.design.shaping.CommandRms(at_most_nm=200, turbulence=SLOW, noise_nm=NOISE, rate=True),
+    )
+    table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 10, 100], density_nm2_hz=[500, 20, 0.1])
+    objective = lbt.design.shaping.Total(
+        terms=(
+            lbt.design.shaping.ResidualVariance(turbulence=table, noise_nm=NOISE),
+            lbt.design.shaping.VibrationBand(low_hz=9, high_hz=11, rms_nm=50),
+        )
+    )
+    return lbt.design.shape(ONE, spec(*demands, objective=objective), functions=16, states=10)
