@@ -17,7 +17,6 @@ from .prediction.stretches import split_halves as split_halves
 from .prediction.table import PredictionRow as PredictionRow
 from .prediction.table import PredictionTable as PredictionTable
 from .records.from_arrays import loop_record as loop_record
-from .records.from_arrays import require_length as require_length
 from .records.from_file import load_record as load_record
 from .records.from_telemetry import record_from_telemetry as record_from_telemetry
 from .records.health import Finding as Finding
@@ -26,6 +25,7 @@ from .records.line_priors import LinePrior as LinePrior
 from .records.line_priors import accelerometer_lines as accelerometer_lines
 from .records.line_priors import load_lines as load_lines
 from .records.record import LoopRecord as LoopRecord
+from .records.required_length import require_length as require_length
 from .records.spectrum import SpectrumRecord as SpectrumRecord
 from .tracking.line_follower import LineFollower as LineFollower
 from .tracking.loop_identifier import LoopIdentifier as LoopIdentifier

@@ -1,9 +1,9 @@
-"""Times and frame counters: the regular grid on which the frames of a record lie."""
+"""The clock of a record: its rows on a regular grid, by times or frame counters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,23 +15,22 @@ from lbt_synth.identification.records.frame_grid import (
 )
 from lbt_synth.validation import FloatArray, IntArray, number, real_array
 
-_MOST_APART = 5e-3  # by which a stated rate may ever differ from that of the times
-_SAME_RATE = 1e-4  # that is allowed in a record of any length
-_SAME_FRAMES = 3.0  # the same over the record, where that is more
-_SAID_FRAMES = 0.5  # over the record, from where a difference is noted
-_MOST_UNEVEN = 0.1  # of the steps over more than a frame, where the times tell the rate
-_FEW_ROWS = 20  # of which no share is taken
+_MOST_APART = 5e-3  # by which a stated rate may differ from that of the times at all
+_SAME_RATE = 1e-4  # by which it may differ in a record of any length
+_SAME_FRAMES = 3.0  # by which it may differ over the record, if that is more
+_SAID_FRAMES = 0.5  # over the record, beyond which a difference is noted
+_MOST_UNEVEN = 0.1  # of the steps, longer than a frame, if the times give the rate
+_FEW_ROWS = 20  # too few for that share
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Clock:
     """Where each row of a record lies."""
 
-    frame_rate_hz: float  # Frame rate [Hz]
-    # (rows,): frame of each row, from 0, never falling; equal for rows of the same time
-    frame_of_row: IntArray
-    frames: int  # Frames from the first to the last row
-    notes: tuple[str, ...] = field(default=())  # What was found
+    frame_rate_hz: float
+    frame_of_row: IntArray  # (rows,), from 0, never falling; equal for rows of the same time
+    frames: int  # from the first row to the last
+    notes: tuple[str, ...] = ()
 
 
 def build_clock(
@@ -41,7 +40,7 @@ def build_clock(
     times_s: FloatArray | None = None,
     frame_numbers: FloatArray | None = None,
 ) -> Clock:
-    """Lay rows on a regular grid. Shapes: times_s (rows,), frame_numbers (rows,)."""
+    """Lay rows on a regular grid, by their times (rows,) or frame numbers (rows,)."""
     rate = None if frame_rate_hz is None else number(frame_rate_hz, "frame_rate_hz", above=0)
     notes: list[str] = []
     frame = np.arange(rows)
@@ -75,7 +74,7 @@ def build_clock(
 def first_per_frame(
     clock: Clock, same: Callable[[IntArray], bool]
 ) -> tuple[IntArray, IntArray, int]:
-    """Return the rows to keep, the frames that are contradicted, and how many rows are left out."""
+    """Return the first row of each frame, frames with rows that differ, and rows left out."""
     frame = clock.frame_of_row
     first = np.concatenate([[True], np.diff(frame) > 0])
     keep = np.flatnonzero(first)
@@ -89,7 +88,7 @@ def first_per_frame(
 
 
 def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:
-    """Say how far a stated rate is from that of the times; refuse what they do not allow."""
+    """Note how far a stated rate is from that of the times; refuse a contradiction."""
     span = max(int(frame[-1]), 1)
     loose = float(np.ptp((times - times[0]) * found - frame))  # rounding, jitter
     apart = abs(found / rate - 1) * span
@@ -111,7 +110,7 @@ def _check_rising(values: FloatArray, name: str, rows: int) -> FloatArray:
     out = real_array(values, name)
     if out.shape != (rows,):
         raise DimensionError(
-            f"{name} must have shape ({rows},), one a frame of the measurements; got {out.shape}."
+            f"{name} must have shape ({rows},), one per frame of the measurements; got {out.shape}."
         )
     back = np.flatnonzero(np.diff(out) < 0)
     if back.size:
@@ -130,7 +129,7 @@ def _frames_from_counter(numbers: FloatArray) -> IntArray:
     steps = steps[steps > 0]
     if steps.size and np.median(steps) != 1:
         raise ProblemError(
-            "frame_numbers must mostly rise by 1 a row; got a median step of "
+            "frame_numbers must mostly rise by 1 per row; got a median step of "
             f"{np.median(steps):.6g}. A record of every second frame is one of half the rate."
         )
     require_few_holes(float(numbers[-1]) - float(numbers[0]) + 1, len(numbers))

@@ -1,4 +1,4 @@
-"""Which columns of a file are what: by their names, or as they were chosen."""
+"""The columns of a file that make a record, by their names or as they were chosen."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ class Series:
     """Columns that make a record."""
 
     kind: str  # "closed_loop", "open_loop" or "spectrum"
-    # Measurements, the open-loop series, or densities; one an axis
-    measurements: tuple[Column, ...]
-    commands: tuple[Column, ...] = ()  # Commands, one an axis; none otherwise
-    # times, frame_numbers, frequency: Clocks and frequencies
+    measurements: tuple[Column, ...]  # per axis; of an open loop its series, or densities
+    commands: tuple[Column, ...] = ()  # per axis, of a closed loop
     times: Column | None = None
     frame_numbers: Column | None = None
     frequency: Column | None = None
-    amplitude: bool = False  # Whether the densities are named as those of an amplitude
-    notes: tuple[str, ...] = ()  # What was taken for what
+    amplitude: bool = False  # whether the densities are named as those of an amplitude
+    notes: tuple[str, ...] = ()  # which columns were taken for what
 
 
 def select_series(
@@ -102,14 +100,14 @@ def _require_same_axes(series: Series) -> None:
 
 
 def number_axes(columns: Sequence[Column]) -> list[Column]:
-    """Columns as axes, in the order in which they stand."""
+    """Return columns numbered as axes, in their order."""
     return [replace(each, axis=axis) for axis, each in enumerate(columns)]
 
 
 def _assign_roles(
     columns: Sequence[Column], chosen: Mapping[str, Any] | None
 ) -> dict[str, list[Column]]:
-    """Columns of each role: those that were chosen, then by names."""
+    """Return the columns of each role: those that were chosen, then by names."""
     out: dict[str, list[Column]] = {role: [] for role in ROLES}
     if chosen is not None and not isinstance(chosen, Mapping):
         raise ProblemError(
@@ -136,7 +134,7 @@ def _assign_roles(
 
 
 def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
-    """Columns of a name (all of an array), or of a number."""
+    """Find the columns of a name, all of an array, or of a number."""
     if isinstance(wanted, str):
         hits = [each for each in columns if each.name.strip().lower() == wanted.strip().lower()]
         whole = wanted.strip().lower() + "["
@@ -155,7 +153,7 @@ def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
 def _assign_by_kind(
     columns: Sequence[Column], kind: str | None, notes: list[str]
 ) -> dict[str, list[Column]]:
-    """Roles of columns whose names tell nothing, where the kind does."""
+    """Return the roles of columns that only the kind of the record tells."""
     out: dict[str, list[Column]] = {role: [] for role in ROLES}
     if kind is None:
         raise ProblemError(
@@ -170,8 +168,8 @@ def _assign_by_kind(
         for number, each in enumerate(columns):
             if rises(each.values):
                 raise ProblemError(
-                    f"column {number} ({_join_names([each])}) rises from row to row, as a clock does: "
-                    f"choose by columns={{'times': {number}, 'open_loop': ...}}, by names or "
+                    f"column {number} ({_join_names([each])}) rises from row to row, as a clock "
+                    f"does: choose by columns={{'times': {number}, 'open_loop': ...}}, by names or "
                     "numbers from 0."
                 )
         out["open_loop"] = number_axes(columns)
@@ -180,7 +178,7 @@ def _assign_by_kind(
 
 
 def _find_kind(roles: Mapping[str, list[Column]], columns: Sequence[Column]) -> str:
-    """Return what kind the names tell."""
+    """Return the kind of record that the names tell."""
     spectrum = bool(roles["frequency"]) and bool(_first_role(roles, "density", "amplitude"))
     found = [
         name
@@ -223,12 +221,12 @@ def _only_column(roles: Mapping[str, list[Column]], role: str) -> Column | None:
 def _choose_axes(
     found: Sequence[Column], role: str, axes: Sequence[int] | None
 ) -> tuple[Column, ...]:
-    """Columns of the axes, in the order of the axes that their names tell."""
+    """Return the columns of the axes, in the order that their names tell."""
     known = [each.axis for each in found if each.axis is not None]
     if len(found) > 1 and (len(known) < len(found) or len(set(known)) < len(known)):
         raise ProblemError(
-            f"{_join_names(found)} are all named as {role}, and not each of an axis of its own; choose "
-            f"by columns={{'{role}': ...}}."
+            f"{_join_names(found)} are all named as {role}, and not each of an axis of its own; "
+            f"choose by columns={{'{role}': ...}}."
         )
     ordered = sorted(found, key=lambda each: each.axis or 0)
     if axes is None:
@@ -248,36 +246,21 @@ def _choose_axes(
 
 
 def _add_notes(series: Series, columns: Sequence[Column], notes: list[str]) -> Series:
-    """Say which columns were taken for what, and which were not taken."""
+    """Add notes on which columns were taken for what, and which were not used."""
     what = {"closed_loop": "measurements", "open_loop": "the open loop", "spectrum": "densities"}
-    parts = [
-        (what[series.kind], series.measurements),
-        ("commands", series.commands),
-        *(
-            (word, (each,))
-            for word, each in (
-                ("times", series.times),
-                ("frame numbers", series.frame_numbers),
-                ("frequencies", series.frequency),
-            )
-            if each is not None
-        ),
-    ]
+    parts = [(what[series.kind], series.measurements), ("commands", series.commands)]
+    for word, each in (
+        ("times", series.times),
+        ("frame numbers", series.frame_numbers),
+        ("frequencies", series.frequency),
+    ):
+        parts += [(word, (each,))] if each is not None else []
     said = [f"{word}: {_join_names(chosen)}" for word, chosen in parts if chosen]
     used = {id(each.values) for _, chosen in parts for each in chosen}
     left = [each for each in columns if id(each.values) not in used]
     if left:
         said.append(f"not used: {_join_names(left)}")
-    return Series(
-        kind=series.kind,
-        measurements=series.measurements,
-        commands=series.commands,
-        times=series.times,
-        frame_numbers=series.frame_numbers,
-        frequency=series.frequency,
-        amplitude=series.amplitude,
-        notes=(*said, *notes),
-    )
+    return replace(series, notes=(*said, *notes))
 
 
 def _join_names(columns: Sequence[Column]) -> str:

@@ -1,4 +1,4 @@
-"""Names of columns, arrays and HDUs: what each is, of which axis, in which unit."""
+"""Columns of a file: what each is by its name, of which axis, in which unit."""
 
 from __future__ import annotations
 
@@ -11,82 +11,37 @@ from lbt_synth.errors import TelemetryError
 from lbt_synth.identification.records.units import FREQUENCIES, TIMES, density_unit, unit_name
 from lbt_synth.validation import FloatArray
 
+# Names by which columns and numbers are recognised, separated by blanks.
 ROLES = {
     "measurements": (
-        "y",
-        "meas",
-        "measure",
-        "measured",
-        "measurement",
-        "measurements",
-        "residual",
-        "residuals",
-        "res",
-        "slope",
-        "slopes",
-        "error",
-        "errors",
-        "tip_tilt",
-        "tiptilt",
-        "tt",
+        "y meas measure measured measurement measurements residual residuals res slope "
+        "slopes error errors tip_tilt tiptilt tt"
     ),
-    "open_loop": (
-        "pol",
-        "pseudo_open_loop",
-        "pseudoopenloop",
-        "open_loop",
-        "openloop",
-        "disturbance",
-        "disturbances",
-    ),
-    "commands": ("u", "cmd", "cmds", "command", "commands", "comm", "comms"),
-    "times": ("t", "time", "times", "timestamp", "timestamps", "time_stamp", "seconds"),
+    "open_loop": "pol pseudo_open_loop pseudoopenloop open_loop openloop disturbance disturbances",
+    "commands": "u cmd cmds command commands comm comms",
+    "times": "t time times timestamp timestamps time_stamp seconds",
     "frame_numbers": (
-        "frame",
-        "frames",
-        "frame_number",
-        "frame_numbers",
-        "framenumber",
-        "frame_no",
-        "frameno",
-        "frame_counter",
-        "framecounter",
-        "frame_id",
-        "counter",
-        "count",
-        "index",
+        "frame frames frame_number frame_numbers framenumber frame_no frameno frame_counter "
+        "framecounter frame_id counter count index"
     ),
-    "frequency": ("f", "freq", "freqs", "frequency", "frequencies"),
-    "density": ("psd", "psds", "density", "power", "power_density", "spectrum", "spectra"),
-    "amplitude": ("asd", "amplitude_density", "amplitude_spectrum"),
+    "frequency": "f freq freqs frequency frequencies",
+    "density": "psd psds density power power_density spectrum spectra",
+    "amplitude": "asd amplitude_density amplitude_spectrum",
 }
 FACTS = {
     "frame_rate_hz": (
-        "frame_rate_hz",
-        "frame_rate",
-        "framerate",
-        "framrate",
-        "framerat",
-        "rate_hz",
-        "fps",
-        "loop_rate",
-        "looprate",
-        "loop_freq",
-        "loopfreq",
-        "sampling_hz",
-        "sampling_rate",
-        "sampling_frequency",
-        "fs",
+        "frame_rate_hz frame_rate framerate framrate framerat rate_hz fps loop_rate "
+        "looprate loop_freq loopfreq sampling_hz sampling_rate sampling_frequency fs"
     ),
-    "delay_frames": ("delay_frames", "delayfrm", "delay_fr", "loop_delay_frames"),
-    "diameter_m": ("diameter_m", "diameter", "telescope_diameter", "teldiam", "tel_diam"),
-    "obstruction": ("obstruction", "obstruct"),
-    "averages": ("averages", "navg", "n_averages"),
-    "unit": ("unit", "units", "bunit"),
+    "delay_frames": "delay_frames delayfrm delay_fr loop_delay_frames",
+    "diameter_m": "diameter_m diameter telescope_diameter teldiam tel_diam",
+    "obstruction": "obstruction obstruct",
+    "averages": "averages navg n_averages",
+    "unit": "unit units bunit",
 }
-_BASES = {name: role for role, names in ROLES.items() for name in names}
+_BASES = {name: role for role, names in ROLES.items() for name in names.split()}
 _OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
-_CLOCK_ROWS = 8  # of noise rise with a chance of 1 in 40 000
+_CLOCK_ROWS = 8  # rows of noise all rise with a chance of 1 in 40 000
 _AXES = {"0": 0, "1": 1, "2": 2, "tip": 0, "tilt": 1, "x": 0, "y": 1}
 _WITH_AXIS = re.compile(r"^(?P<base>.*?)_?(?P<axis>0|1|2|tip|tilt|x|y)$")
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*(?:\([^)]*\))?[^\])]*)[\])]\s*$")
@@ -96,17 +51,17 @@ _BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*(?:\([^)]*\))?[^\
 class Column:
     """One series of a file."""
 
-    name: str  # As the file has it
-    values: FloatArray  # (frames,): the numbers
-    role: str | None = None  # What it is, by its name: a key of ``ROLES``
-    axis: int | None = None  # Which axis, as the name counts; None where it does not
-    unit: str | None = None  # Its unit
+    name: str  # as the file has it
+    values: FloatArray  # (frames,)
+    role: str | None = None  # what it is by its name, a key of ROLES
+    axis: int | None = None  # as the name counts axes
+    unit: str | None = None
 
 
 def parse_column(
     name: str, values: FloatArray, *, unit: str | None = None, axis: int | None = None
 ) -> Column:
-    """Read a name: its unit in brackets or behind an underscore, its axis, and what it is."""
+    """Make a column; its name tells its role, its axis, and its unit (in brackets or after _)."""
     plain, named_unit = _split_unit(name.strip())
     given = (unit or "").strip()
     if given and named_unit and _unit_key(given) != _unit_key(named_unit):
@@ -122,7 +77,7 @@ def parse_column(
 
 
 def array_columns(name: str, values: FloatArray, *, unit: str | None = None) -> list[Column]:
-    """Columns of an array (frames, n) of one name."""
+    """Return the columns of an array (frames, n) of one name."""
     if values.shape[1] == 1:
         return [parse_column(name, values[:, 0], unit=unit)]
     base = parse_column(name, values[:, 0], unit=unit)
@@ -133,7 +88,7 @@ def array_columns(name: str, values: FloatArray, *, unit: str | None = None) -> 
 
 
 def pair_x_and_y(columns: list[Column]) -> list[Column]:
-    """Take x and y that stand together for two axes; x of a clock is none."""
+    """Take columns x and y for two axes, unless x rises as a clock does."""
     plain = [_split_unit(each.name.strip())[0].lower() for each in columns]
     if plain.count("x") != 1 or plain.count("y") != 1:
         return columns
@@ -182,6 +137,6 @@ def _split_axis(name: str) -> tuple[str | None, int | None]:
 
 
 def recognise_fact(key: str) -> str | None:
-    """Return the fact that a header's keyword, or the name of a number, stands for."""
+    """Return the fact that a header's keyword or a number's name stands for."""
     word = re.sub(r"[\s\-.]+", "_", key.strip().lower())
-    return next((fact for fact, names in FACTS.items() if word in names), None)
+    return next((fact for fact, names in FACTS.items() if word in names.split()), None)

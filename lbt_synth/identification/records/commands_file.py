@@ -1,4 +1,4 @@
-"""Measurements and commands of two files: the same frames beside each other."""
+"""Commands from a second file, matched with the measurements of the first."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lbt_synth.identification.records.column_selection import number_axes
 from lbt_synth.identification.records.columns import Column
 from lbt_synth.identification.records.contents import Contents
 from lbt_synth.identification.records.units import seconds_per
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 _SAME_TIME = 0.25  # of a step
 _LEAST_SHARE = 0.5  # of the measurements, that have a command
@@ -20,10 +20,10 @@ _CLOCKS = ("frame_numbers", "times")
 
 
 def join_commands(contents: Contents, other: Contents, path: Path) -> None:
-    """Add the commands of another file; those of the first one give way.
+    """Add the commands of another file, in place of those of the first.
 
-    Rows belong together by the counters of both files, else by the times of both (within a
-    quarter of a step). Where not both have the same clock, they have to be equally many.
+    Rows are matched by the counters of both files, or else by the times of both (within a
+    quarter of a step). Without a common clock both files must have equally many rows.
     """
     named = [each for each in other.columns if each.role == "commands"]
     if not named:
@@ -43,7 +43,7 @@ def join_commands(contents: Contents, other: Contents, path: Path) -> None:
         if fact == "unit":
             continue
         for where, value in places.items():
-            contents.tell(fact, value, f"{where} in {path.name}")
+            contents.add_fact(fact, value, f"{where} in {path.name}")
     # a unit is that of its own file
     contents.facts["command unit"] = dict(other.facts.get("unit", {}))
     contents.notes += [f"commands are from {path}", *other.notes]
@@ -52,7 +52,7 @@ def join_commands(contents: Contents, other: Contents, path: Path) -> None:
 def _match_commands(
     contents: Contents, other: Contents, named: list[Column], path: Path
 ) -> list[Column]:
-    """Return the commands in the rows of the measurements; NaN where there are none."""
+    """Return the commands in the rows of the measurements, NaN where there are none."""
     counts = {len(each.values) for each in named}
     rows = {len(each.values) for each in contents.columns}
     for role in _CLOCKS:
@@ -99,8 +99,8 @@ def _clock_values(column: Column, role: str) -> FloatArray:
 
 def _match_rows(
     mine: FloatArray, theirs: FloatArray, role: str, path: Path
-) -> tuple[IntArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-    """Row of the second clock for each of the first, and whether there is one."""
+) -> tuple[IntArray, BoolArray]:
+    """Return the row of the second clock for each of the first, and whether there is one."""
     for clock in (mine, theirs):
         if not np.all(np.isfinite(clock)) or np.any(np.diff(clock) < 0):
             raise TelemetryError(f"the {role} of both files must rise, without gaps.", path=path)

@@ -1,4 +1,4 @@
-"""Files of recorded series: FITS, NPY, NPZ and CSV as named columns and facts."""
+"""What a file of series holds: columns and facts of FITS, NPY, NPZ and CSV."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FITS = (".fits", ".fit", ".fts")
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
 _DELAY_CARD = "DELAY"
-_SUFFIXES = {  # what a text may have behind its number
+_SUFFIXES = {  # what may follow a number in a text
     "frame_rate_hz": r"\s*hz$",
     "delay_frames": r"\s*frames?$",
     "diameter_m": r"\s*m$",
@@ -42,26 +42,26 @@ _IN_FRAMES = re.compile(r"[\[(]\s*frames?\s*[\])]|^[^\[(]*\bin frames\b|^\s*fram
 class Contents:
     """What a file holds."""
 
-    columns: list[Column] = field(default_factory=list)  # The series, in their order
-    # Frame rate, delay and the like, each with the places that tell it
+    columns: list[Column] = field(default_factory=list)
+    # frame rate, delay and the like: values by the places that give them
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)  # What was taken for what
+    notes: list[str] = field(default_factory=list)
 
-    def tell(self, fact: str, value: Any, where: str) -> None:
-        """Add what a place of the file says."""
+    def add_fact(self, fact: str, value: Any, where: str) -> None:
+        """Add a fact that a place of the file gives."""
         self.facts.setdefault(fact, {})[where] = value
 
     def add_number(self, fact: str, value: Any, where: str) -> None:
-        """Add a number, perhaps written as a text; say so where it is none."""
+        """Add a number that may be written as a text, or note that it is none."""
         if isinstance(value, str) and fact in _SUFFIXES:
             value = re.sub(_SUFFIXES[fact], "", value.strip(), flags=re.I)
         try:
-            self.tell(fact, float(value), where)
+            self.add_fact(fact, float(value), where)
         except (TypeError, ValueError):
             self.notes.append(f"{where} was not taken for {fact}: {value!r} is no number")
 
-    def add(self, name: str, values: npt.NDArray[Any], unit: str | None = None) -> None:
-        """Add an array; one that is no series of one or several columns is passed over."""
+    def add_array(self, name: str, values: npt.NDArray[Any], unit: str | None = None) -> None:
+        """Add the columns of an array; leave out what is no series of numbers."""
         if values.dtype.kind not in "fiub" or values.size == 0:
             self.notes.append(f"{name or 'an array'} holds no real numbers and was left out")
             return
@@ -119,7 +119,7 @@ def _read_fits(content: bytes) -> Contents:
                     data = _native_order(unit.data)
                     if blank is not None and data.dtype.kind in "iu":
                         data = np.where(data == blank + zero, np.nan, data)
-                    out.add(name, data, str(own) if own is not None else None)
+                    out.add_array(name, data, str(own) if own is not None else None)
     return out
 
 
@@ -135,16 +135,16 @@ def _add_card(out: Contents, card: Any, where: str) -> None:
 
 
 def _add_table(out: Contents, unit: Any) -> None:
-    for described in unit.columns:
-        data = _native_order(np.asarray(unit.data[described.name]))
-        if described.null is not None and data.dtype.kind in "iuf":
+    for card in unit.columns:
+        data = _native_order(np.asarray(unit.data[card.name]))
+        if card.null is not None and data.dtype.kind in "iuf":
             scale, zero = (
                 default if each in (None, "") else float(each)
-                for each, default in ((described.bscale, 1.0), (described.bzero, 0.0))
+                for each, default in ((card.bscale, 1.0), (card.bzero, 0.0))
             )
-            null = scale * float(described.null) + zero  # the card has it before scaling
+            null = scale * float(card.null) + zero  # the card has it before scaling
             data = np.where(np.abs(data - null) < 0.25 * abs(scale), np.nan, data)
-        out.add(described.name, data, described.unit)
+        out.add_array(card.name, data, card.unit)
 
 
 def _native_order(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -155,7 +155,7 @@ def _read_npy(content: bytes) -> Contents:
     out = Contents()
     if not content.startswith(b"\x93NUMPY"):
         raise ValueError("it does not begin as an NPY file does; it is damaged, or another kind")
-    _add_named(out, "", _plain(np.load(io.BytesIO(content), allow_pickle=False)))
+    _add_named(out, "", np.asarray(np.load(io.BytesIO(content), allow_pickle=False)))
     return out
 
 
@@ -165,31 +165,27 @@ def _read_npz(content: bytes) -> Contents:
         raise ValueError("it is no ZIP archive; it is damaged, or of another kind")
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         for name in archive.files:
-            _add_named(out, name, _plain(archive[name]))
+            _add_named(out, name, np.asarray(archive[name]))
     return out
 
 
-def _plain(array: Any) -> npt.NDArray[Any]:
-    return np.asarray(array)
-
-
 def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
-    """Add an array, a field of a structured one each, or a number or text as a fact."""
+    """Add an array, each field of a structured one, or a number or text as a fact."""
     if array.dtype.names:
         for each in array.dtype.names:
-            out.add(each, array[each])
+            out.add_array(each, array[each])
         return
     fact, text = recognise_fact(name), array.dtype.kind in "US"
     if array.size == 1 and (array.ndim == 0 or text or fact is not None):
         value = array.reshape(-1)[0]
         if fact == "unit":
-            out.tell(fact, str(value), name)
+            out.add_fact(fact, str(value), name)
         elif fact is not None:
             out.add_number(fact, value, name)
         else:
             out.notes.append(f"not used: {name}, a single value")
         return
-    out.add(name, array)
+    out.add_array(name, array)
 
 
 def _read_text(content: bytes) -> Contents:
@@ -214,6 +210,6 @@ def _add_comments(out: Contents, comments: Iterable[str]) -> None:
         if fact == "unit" and " " in match[2]:
             out.notes.append(f"{where} was not taken for a unit: {match[2]!r}")
         elif fact == "unit":
-            out.tell(fact, match[2], where)
+            out.add_fact(fact, match[2], where)
         else:
             out.add_number(fact, match[2], where)

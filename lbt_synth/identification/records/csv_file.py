@@ -1,4 +1,4 @@
-"""Tables of numbers in text, with or without a heading, and with gaps."""
+"""Tables of numbers in text files, with or without a heading, and with gaps."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _LOOKED_AT = 20  # rows, to find decimal commas
 class TextTable:
     """A table of numbers."""
 
-    names: list[str]  # Headings; empty texts where there are none
-    values: FloatArray  # (rows, columns): the numbers, NaN where a cell is empty
-    comments: list[str]  # Lines that begin with ``#``, without it
-    notes: list[str]  # What was taken for what
+    names: list[str]  # headings; empty texts without a heading
+    values: FloatArray  # (rows, columns), NaN in empty cells
+    comments: list[str]  # lines that begin with #, without it
+    notes: list[str]
 
 
 def read_csv(text: str) -> TextTable:
@@ -84,7 +84,7 @@ def read_csv(text: str) -> TextTable:
 
 
 def _find_delimiter(line: str) -> str | None:
-    """Sign between the cells, by the first row; None for blanks, or for a single column."""
+    """Return the sign between cells, by the first row; None for blanks or a single column."""
     return next((sign for sign in _DELIMITERS if sign in line), None)
 
 

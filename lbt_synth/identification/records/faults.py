@@ -1,4 +1,4 @@
-"""Faults of one recorded series: stuck, saturated, outlying values.
+"""Faults of one series: stuck, saturated and outlying values.
 
 Each finder takes a series (frames,) and the frames that count so far, and returns the
 frames that are at fault. Nothing is known of the sensor, so thresholds come from the series:
@@ -14,7 +14,7 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray
 _SHORTEST_RUN = 5  # equal values, a stuck sensor
 _RARE = 1e-3  # runs of chance allowed in a record
 _QUANTISED = 2**20  # levels at most, where equal neighbours say little
-_MANY_RUNS = 100  # that a chance is computed from
+_MANY_RUNS = 100  # needed to compute a chance
 _SAME_LEVEL = 1e-9  # of the range
 _LEAST_AT_LIMIT = 4  # values at an end of the range
 _LIMIT_RATIO = 4  # over the next values inside
@@ -40,7 +40,7 @@ def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
 
 
 def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Frames of a value that is held for longer than chance or quantisation hold it."""
+    """Find frames of a value that is held for longer than chance or quantisation hold it."""
     out = np.zeros(len(series), dtype=np.bool_)
     if not good.any():
         return out
@@ -78,7 +78,7 @@ def _is_quantised(values: FloatArray) -> bool:
 
 
 def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Frames at an end of the range that is reached far more often than what is next to it.
+    """Find frames at an end of the range that is reached far more often than values beside it.
 
     The end of a sinusoid's range is reached often, too, but not by a factor of 4 more often
     than the next values; an end that is cut off is.
@@ -104,13 +104,13 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
 
 
 def _sort_levels(values: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:
-    """Return the values from the largest on, and where a next level begins."""
+    """Return the values from the largest down, and where each next level begins."""
     near = np.sort(values)[::-1]
     return near, np.flatnonzero(-np.diff(near) > tolerance) + 1
 
 
 def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Frames whose second difference is beyond what the series around shows.
+    """Find frames whose second difference is beyond what the series around shows.
 
     The scale is the median deviation of the second differences, that of the whole record or
     of the 256 frames around, whichever is larger: a burst of vibration is no outlier, and one
@@ -149,7 +149,7 @@ def _resolution(series: FloatArray, good: BoolArray) -> float:
 
 
 def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Second differences, and where there are some: between two good frames."""
+    """Return second differences, and where they are defined: between two good frames."""
     bend = np.zeros(len(series))
     valid = np.zeros(len(series), dtype=np.bool_)
     if len(series) > 2:
@@ -159,7 +159,7 @@ def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray,
 
 
 def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
-    """Scale of the second difference at each frame, never below that of the record."""
+    """Return the scale of the second difference at each frame, at least that of the record."""
     frames = len(size)
     whole = _MAD * float(np.median(size[valid]))
     blocks = -(-frames // _BLOCK)
@@ -175,7 +175,7 @@ def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
 
 
 def fill(series: FloatArray, good: BoolArray) -> FloatArray:
-    """Return the series with finite fillers, by linear interpolation, where it is not good."""
+    """Return the series with the frames that are not good filled by linear interpolation."""
     out = np.where(good, series, 0.0)
     if good.any() and not good.all():
         frames = np.arange(len(series))

@@ -1,4 +1,4 @@
-"""Frames of rows by their times: missing frames, repeated rows, rounded times."""
+"""The frame of each row by its time, with missing frames, repeated rows and rounded times."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.validation import FloatArray, IntArray
 
 MOST_HOLES = 9  # missing frames over those that are there
-_CLEAR = 0.3  # of a frame: how far a step may be from a whole number of frames
+_CLEAR = 0.3  # of a frame, by which a step may differ from a whole number of frames
 _LEAST_GAP = 0.1  # of a frame, between the latest and the earliest row of a frame
 _COARSE = 0.02  # of a frame: times in smaller steps count as exact
 _WHOLE = 0.02  # of a step, by which times may differ from whole ones
-_EXACT = 0.05  # of a frame over the record: a quantum and a period that do not part
-_ABOVE = 1.05  # quantum over period, from where equal times are of different frames
-_FEW = 3  # steps that are not like the others, to see an order in them
+_EXACT = 0.05  # of a frame over the record, below which quantum and period are one
+_ABOVE = 1.05  # quantum over period above which different frames have equal times
+_FEW = 3  # odd steps that show an order
 _DENOMINATOR = 100_000
 _BLOCKS = 16  # of rows, whose mean distance from the grid is compared
 _SEARCH = 60
 
 
 def frames_from_times(times: FloatArray, rate: float | None) -> tuple[IntArray, str]:
-    """Return the frame of each row, from 0, and a note (empty for none).
+    """Return the frame of each row, from 0, and a note that may be empty.
 
     Rounded to a quantum q, the times of frames without a hole stay within ``q rate`` of a
     straight line; a missing frame leaves it by 1. Rows are laid on the grid where only one of
@@ -54,7 +54,7 @@ def require_few_holes(frames: float, rows: int) -> None:
 
 
 def _quantum(times: FloatArray, steps: FloatArray) -> float:
-    """Return what all steps in time are whole multiples of; 0 if there is nothing such."""
+    """Return the quantum of which all steps in time are multiples; 0 if there is none."""
     noise = 8 * float(np.spacing(np.max(np.abs(times))))
     levels = np.unique(steps)
     levels = np.concatenate([levels[:1], levels[1:][np.diff(levels) > noise]])
@@ -69,12 +69,12 @@ def _quantum(times: FloatArray, steps: FloatArray) -> float:
 
 
 def _grid_distance(times: FloatArray, rate: float) -> FloatArray:
-    """Return how far rows without a hole are from a grid, (rows,) [frames]."""
+    """Return how far complete rows are from a grid, (rows,) [frames]."""
     return np.asarray((times - times[0]) * rate - np.arange(len(times)))
 
 
 def _closest_rate(times: FloatArray) -> tuple[float, float]:
-    """Return the rate that all rows without a hole are closest to, and their spread [frames]."""
+    """Return the rate whose grid complete rows are closest to, and their spread [frames]."""
     rate = fit_rate(times, np.arange(len(times)))
     low, high = (rate * (1 + sign * 2 / len(times)) for sign in (-1, 1))
     for _ in range(_SEARCH):  # the spread is convex in the rate
@@ -88,7 +88,7 @@ def _closest_rate(times: FloatArray) -> tuple[float, float]:
 
 
 def _lay_by_steps(times: FloatArray, steps: FloatArray, period: float, quantum: float) -> IntArray:
-    """Lay rows by the steps in time, where the rate is not known."""
+    """Lay rows by the steps in time, for an unknown rate."""
     counts = np.round(steps / period)
     if np.any(np.abs(steps / period - counts) >= _CLEAR):
         k = int(np.argmax(np.abs(steps / period - counts)))
@@ -139,8 +139,8 @@ def _lay_by_rate(
         if placed is None or second >= 1 - step + _finest_distance(step) - slack:
             raise ProblemError(
                 f"times_s in steps of {quantum:.6g} s leave the grid of {rate:.9g} Hz by up to "
-                f"{np.ptp(_grid_distance(times, rate)):.3g} frames, and cannot tell which frames are "
-                "missing or repeated. Give a counter of frames, or cut the record there."
+                f"{np.ptp(_grid_distance(times, rate)):.3g} frames, and cannot tell which frames "
+                "are missing or repeated. Give a counter of frames, or cut the record there."
             )
     if placed is not None:
         return placed, ""
@@ -160,13 +160,13 @@ def _is_complete(apart: FloatArray, step: float, slack: float) -> bool:
 
 
 def _finest_distance(step: float) -> float:
-    """Return what the distances from the grid are multiples of; rounding reaches one end only."""
+    """Return the quantum of the distances from the grid; rounding reaches one end only."""
     part = Fraction(step).limit_denominator(_DENOMINATOR)
     return 1 / part.denominator if abs(float(part) - step) < 1e-9 else 0.0
 
 
 def _may_hide_frame(apart: FloatArray, step: float, slack: float) -> bool:
-    """Whether a frame may be missing and rounding hide it, but for the ends of the record."""
+    """Whether rounding may hide a missing frame, the ends of the record aside."""
     high, low = np.maximum.accumulate, np.minimum.accumulate
     top = np.maximum(high(apart)[:-1], high(apart[::-1])[::-1][1:] - 1)
     bottom = np.minimum(low(apart)[:-1], low(apart[::-1])[::-1][1:] - 1)
@@ -178,7 +178,7 @@ def _may_hide_frame(apart: FloatArray, step: float, slack: float) -> bool:
 def _part_in_widest_gap(
     times: FloatArray, steps: FloatArray, rate: float
 ) -> tuple[IntArray | None, float, float]:
-    """Return frames parted in the widest gap (None where it is narrow), and the two widest."""
+    """Return frames that begin in the widest gap (None if it is narrow), and the two widest."""
     grid = (times - times[0]) * rate
     parts = np.sort(grid - np.floor(grid))
     gaps = np.diff(np.append(parts, parts[0] + 1))

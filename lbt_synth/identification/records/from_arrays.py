@@ -1,4 +1,4 @@
-"""Records from arrays: units, the regular grid, faults."""
+"""Records from arrays, converted to nm, laid on a regular grid and searched for faults."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import DimensionError
 from lbt_synth.identification.records.clock import build_clock, first_per_frame
 from lbt_synth.identification.records.faults import (
     equal_runs,
@@ -17,19 +17,16 @@ from lbt_synth.identification.records.faults import (
     find_stuck,
     runs,
 )
-from lbt_synth.identification.records.health import Finding, RecordHealth, merge_notes
+from lbt_synth.identification.records.health import Finding, RecordHealth, finding_in, merge_notes
 from lbt_synth.identification.records.record import LoopRecord, known_frames
 from lbt_synth.identification.records.units import nm_per
 from lbt_synth.models import PositionLoop
-from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array, integer, number
+from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
-_LEAST_FRAMES = 4096
-_LEAST_SECONDS = 4.0
-_SHORTEST_STRETCH = 256  # frames of a stretch that counts
-_LARGEST_NM = 1e100  # beyond it a number is none, and its square overflows
-_OPEN_FRAMES = 20  # of zero commands
-_TREND = 2.0
-_LEAST_QUARTER = 64  # pairs of frames, to speak of a trend
+_LARGEST_NM = 1e100  # a larger number is none: its square would overflow
+_OPEN_FRAMES = 20  # of zero or equal commands
+_TREND = 2.0  # ratio of scatters
+_LEAST_QUARTER = 64  # pairs of frames that show a trend
 
 Finder = Callable[[FloatArray, BoolArray], BoolArray]
 
@@ -79,7 +76,7 @@ def loop_record(
     source : str, optional
         Where it is from.
     notes : sequence of str, optional
-        What is to be said of it in ``health``.
+        Notes for its ``health``.
 
     Returns
     -------
@@ -139,13 +136,13 @@ def loop_record(
     there[torn] = False
     missing = np.ones(frames, dtype=np.bool_)
     missing[at] = False
-    _report(findings, "missing", "frames", None, missing, spoils=True)
+    _report(findings, "missing", "frames", None, missing)
     if again:
         said.append(f"{again} rows of a time that had been recorded already were left out")
         if torn.size:
             contradicted = np.zeros(frames, dtype=np.bool_)
             contradicted[torn] = True
-            _report(findings, "repeated", "frames", None, contradicted, spoils=True)
+            _report(findings, "repeated", "frames", None, contradicted)
     y = _lay_on_grid(y[keep], at, frames)
     y, measured = _judge_series(
         y,
@@ -174,8 +171,7 @@ def loop_record(
             health=RecordHealth(frames=frames, usable=0),
         )
         usable, unknown = known_frames(path.mirror_taps, measured, commanded)
-        if unknown is not None:
-            findings.append(unknown)
+        findings.append(unknown)
     return LoopRecord(
         frame_rate_hz=clock.frame_rate_hz,
         measurements=y,
@@ -197,70 +193,8 @@ def loop_record(
     )
 
 
-def require_length(
-    record: LoopRecord,
-    *,
-    frames: int = _LEAST_FRAMES,
-    seconds: float = _LEAST_SECONDS,
-    resolution_hz: float | None = None,
-) -> int:
-    """Refuse a record that is too short to say anything of a model.
-
-    Parameters
-    ----------
-    record : LoopRecord
-        The record.
-    frames : int, optional
-        Usable frames that are needed, in stretches of at least 256.
-    seconds : float, optional
-        The same as a time [s].
-    resolution_hz : float, optional
-        Frequencies that are to be told apart [Hz]: the longest stretch has to last
-        ``1 / resolution_hz``.
-
-    Returns
-    -------
-    int
-        Usable frames in stretches of at least 256.
-
-    Raises
-    ------
-    ProblemError
-        That says what is there, what is needed, and what was found in the record.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> brief = lbt.identification.loop_record([[1.0], [2.5], [2.0]], frame_rate_hz=800, unit="nm")
-    >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s) ...
-    """
-    rate = record.frame_rate_hz
-    needed = integer(frames, "frames", at_least=1)
-    needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
-    lengths = [stop - start for start, stop in record.stretches()]
-    count = sum(length for length in lengths if length >= _SHORTEST_STRETCH)
-    longest = max(lengths, default=0)
-    if count < needed:
-        raise ProblemError(
-            f"the record needs {needed} usable frames ({needed / rate:.3g} s) in stretches of at "
-            f"least {_SHORTEST_STRETCH}; got {count}, the longest stretch {longest}. "
-            f"{record.health.summary()} Record more, or bridge short holes (record.bridged())."
-        )
-    if resolution_hz is not None:
-        line = int(np.ceil(rate / number(resolution_hz, "resolution_hz", above=0) * (1 - 1e-12)))
-        if longest < line:
-            raise ProblemError(
-                f"to tell frequencies {resolution_hz:g} Hz apart a stretch of {line} frames "
-                f"({line / rate:.3g} s) is needed; the longest has {longest}."
-            )
-    return count
-
-
 def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
-    """Return a series as (frames, axes) in nm; NaN is what is masked, not finite or absurd."""
+    """Return a series as (frames, axes) in nm, NaN where it is masked, not finite or absurd."""
     if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "fiub":
         value = np.ma.filled(value.astype(np.float64), np.nan)
     out = float_array(value, name)
@@ -289,16 +223,16 @@ def _judge_series(
     findings: list[Finding],
     finders: Sequence[tuple[str, Finder]],
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the series with fillers, and the frames that are good on all axes."""
+    """Return the series with faults filled, and the frames that are good on all axes."""
     out, all_good = np.empty(series.shape), np.ones(len(series), dtype=np.bool_)
     for axis in range(series.shape[1]):
         column = series[:, axis]
         finite = np.isfinite(column)
-        _report(findings, "not finite", name, axis, there & ~finite, spoils=True)
+        _report(findings, "not finite", name, axis, there & ~finite)
         good = there & finite
         for kind, finder in finders:
             found = finder(np.where(finite, column, 0.0), good)
-            _report(findings, kind, name, axis, found, spoils=True)
+            _report(findings, kind, name, axis, found)
             good = good & ~found
         out[:, axis] = fill(column, good)
         all_good &= good
@@ -312,25 +246,14 @@ def _report(
     axis: int | None,
     found: BoolArray,
     *,
-    spoils: bool,
+    spoils: bool = True,
 ) -> None:
-    where = np.flatnonzero(found)
-    if where.size:
-        findings.append(
-            Finding(
-                kind=kind,
-                series=series,
-                axis=axis,
-                count=where.size,
-                first_frame=int(where[0]),
-                fraction=where.size / len(found),
-                spoils=spoils,
-            )
-        )
+    if found.any():
+        findings.append(finding_in(found, kind, series, axis, spoils=spoils))
 
 
 def _find_clipped(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Find commands at a limit; zero is none, but that of an open loop."""
+    """Find commands at a limit; zeros are those of an open loop."""
     return find_saturated(series, good & (series != 0))
 
 
@@ -350,7 +273,7 @@ def _report_held(commands: FloatArray, good: BoolArray, findings: list[Finding])
 
 
 def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
-    """Say where the scatter from frame to frame changes between the ends of the record."""
+    """Note where the scatter from frame to frame changes between the ends of the record."""
     pairs = np.flatnonzero(good[1:] & good[:-1])
     quarter = pairs.size // 4
     said = []

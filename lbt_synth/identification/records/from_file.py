@@ -1,10 +1,11 @@
-"""Records from files of any origin: what a file tells, what was given, and no guesses."""
+"""Records from files of any origin, by what the file tells and what the call gives."""
 
 from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -37,7 +38,7 @@ KINDS = ("closed_loop", "open_loop", "spectrum")
 _OURS = "LBTTELEM"  # card of our own telemetry
 _AOT = "AOT-VERS"
 _ARRAYS_OF_OURS = {"META", "COMMANDS", "MEASURE"}
-_RATES_HZ = (5.0, 1e5)  # of times whose unit is not told
+_RATES_HZ = (5.0, 1e5)  # plausible for times without a unit
 
 
 def load_record(
@@ -73,7 +74,7 @@ def load_record(
     frame_rate_hz : float, optional
         Frame rate [Hz], where the file does not tell it; a contradiction is refused.
     delay_frames : float, optional
-        Total delay [frames], where the file does not tell it, or in place of what it tells.
+        Total delay [frames], where the file does not tell it, or in place of that of the file.
     unit : str, optional
         Unit of the measurements (nm, um, m, mas, arcsec, urad, rad; of a spectrum nm^2/Hz or
         nm/sqrt(Hz) and so on), where the file does not tell it; a contradiction is refused.
@@ -92,7 +93,7 @@ def load_record(
         "open_loop", "commands", "times", "frame_numbers", "frequency", "density" or "amplitude".
     commands : path-like, optional
         Another file, with the commands. Rows are matched by the frame counters of both files,
-        or else by the times of both; where one has neither, as they stand.
+        or else by the times of both; without a common clock, row by row.
 
     Returns
     -------
@@ -128,9 +129,8 @@ def load_record(
             )
         if averages is not None:
             raise ProblemError(f"{source} is telemetry: averages are of a spectrum.")
-        return _name_file(
-            source,
-            lambda: record_from_telemetry(
+        with _name_in_errors(source):
+            return record_from_telemetry(
                 load_telemetry(source),
                 modes=None if axes is None else tuple(axes),
                 frame_rate_hz=frame_rate_hz,
@@ -141,51 +141,40 @@ def load_record(
                 diameter_m=diameter_m,
                 obstruction=obstruction,
                 source=str(source),
-            ),
-        )
+            )
     contents = read_contents(source, content)
     if commands is not None:
         other = Path(commands)
         join_commands(contents, read_contents(other, _read_bytes(other)), other)
-
-    def build() -> LoopRecord | SpectrumRecord:
+    with _name_in_errors(source):
         series = select_series(contents, kind=kind, axes=axes, columns=columns)
         facts = {
             "frame_rate_hz": _find_fact(contents, "frame_rate_hz", frame_rate_hz, may_differ=False),
             "diameter_m": _find_fact(contents, "diameter_m", diameter_m),
+            "source": str(source),
+            "unit": unit,
         }
         if series.kind == "spectrum":
-            return _build_spectrum_record(
-                series,
-                contents,
-                unit=unit,
-                source=str(source),
-                averages=_find_fact(contents, "averages", averages),
-                **facts,
-            )
+            facts["averages"] = _find_fact(contents, "averages", averages)
+            return _build_spectrum_record(series, contents, **facts)
         if averages is not None:
             raise ProblemError(f"averages are of a spectrum; the record is of kind {series.kind}.")
         return _build_loop_record(
             series,
             contents,
-            unit=unit,
             command_unit=command_unit,
             mirror=mirror,
-            source=str(source),
             delay_frames=_find_fact(contents, "delay_frames", delay_frames),
             obstruction=_find_fact(contents, "obstruction", obstruction),
             **facts,
         )
 
-    return _name_file(source, build)
 
-
-def _name_file(
-    source: Path, build: Callable[[], LoopRecord | SpectrumRecord]
-) -> LoopRecord | SpectrumRecord:
-    """Call what may refuse the file, and name the file then."""
+@contextmanager
+def _name_in_errors(source: Path) -> Iterator[None]:
+    """Name the file in errors that do not name it yet."""
     try:
-        return build()
+        yield
     except TelemetryError:
         raise
     except ProblemError as error:
@@ -217,20 +206,20 @@ def _is_telemetry(path: Path, content: bytes) -> bool:
 
 
 def _find_fact(contents: Contents, name: str, given: Any, *, may_differ: bool = True) -> Any:
-    """Return what was given, or what the file tells; it may not tell two things."""
+    """Return what was given, or what the file has; refuse two values of a file."""
     places = contents.facts.get(name, {})
-    told = {where: number(value, f"{where} ({name})") for where, value in places.items()}
-    first = next(iter(told), None)
+    own = {where: number(value, f"{where} ({name})") for where, value in places.items()}
+    first = next(iter(own), None)
     if given is None:
-        if len(set(told.values())) > 1:
-            found = ", ".join(f"{value:.9g} by {where}" for where, value in told.items())
-            raise ProblemError(f"{name} is told twice: {found}. Give it.")
+        if len(set(own.values())) > 1:
+            found = ", ".join(f"{value:.9g} by {where}" for where, value in own.items())
+            raise ProblemError(f"the file gives {name} twice: {found}. Choose one in the call.")
         if first is None:
             return None
-        contents.notes.append(f"{name} {told[first]:.9g}, by {first}")
-        return int(told[first]) if name == "averages" else told[first]
+        contents.notes.append(f"{name} {own[first]:.9g}, by {first}")
+        return int(own[first]) if name == "averages" else own[first]
     wanted = number(given, name)
-    others = {where: value for where, value in told.items() if abs(value - wanted) > 1e-6 * wanted}
+    others = {where: value for where, value in own.items() if abs(value - wanted) > 1e-6 * wanted}
     for where, value in others.items():
         if not may_differ:
             raise ProblemError(
@@ -274,7 +263,7 @@ def _build_loop_record(
         if facts["frame_rate_hz"] is None and not low <= record.frame_rate_hz <= high:
             raise ProblemError(
                 f"the frame rate would be {record.frame_rate_hz:.6g} Hz with "
-                f"{series.times.name or 'the times'} in seconds, and their unit is not told; name "
+                f"{series.times.name or 'the times'} in seconds, and their unit is not given; name "
                 "it, as in time_ms, or give frame_rate_hz."
             )
     return record
@@ -283,12 +272,12 @@ def _build_loop_record(
 def _find_unit(
     chosen: Sequence[Column], given: str | None, contents: Contents, fact: str, what: str
 ) -> str:
-    """Return the unit of some columns: by their names or headers, the file, or as given."""
-    told = {str(value): where for where, value in contents.facts.get(fact, {}).items()}
-    found = {each.unit or next(iter(told), "") for each in chosen}
-    if len(found) > 1 or len(told) > 1:
+    """Return the unit of some columns by their names or headers, the file, or the call."""
+    units = {str(value): where for where, value in contents.facts.get(fact, {}).items()}
+    found = {each.unit or next(iter(units), "") for each in chosen}
+    if len(found) > 1 or len(units) > 1:
         raise ProblemError(
-            f"the {what} must all have the same unit; got {', '.join(sorted(found | set(told)))}."
+            f"the {what} must all have the same unit; got {', '.join(sorted(found | set(units)))}."
         )
     own = found.pop()
     option = "command_unit" if what == "commands" else "unit"

@@ -1,4 +1,4 @@
-"""Records from telemetry: tip and tilt out of what a loop recorded."""
+"""Records of tip and tilt from telemetry."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lbt_synth.identification.records.units import unit_name
 from lbt_synth.models import PositionLoop
 from lbt_synth.validation import FloatArray, integer, number, require_instance, sequence
 
-_FOREIGN = "timing"  # metadatum of telemetry of another program
+_FOREIGN = "timing"  # key of metadata in telemetry of other programs
 _CONDITION = 1e8
 _SAME_RATE = 1e-6
 
@@ -146,7 +146,7 @@ def _check_modes(modes: Any, n: int) -> list[int]:
 def _modal_measurements(
     seen: Telemetry, chosen: list[int], unit: str | None, notes: list[str]
 ) -> tuple[FloatArray, str]:
-    """Coefficients of the chosen modes, and their unit."""
+    """Return the measurements of the chosen modes, and their unit."""
     y, n, q = seen.measurements, seen.modes, seen.measurements.shape[1]
     response = seen.interaction_matrix
     if seen.slopes is not None and response is not None:
@@ -184,7 +184,7 @@ def _slopes_message(q: int, n: int) -> str:
 def _modal_commands(
     seen: Telemetry, chosen: list[int], unit: str | None, notes: list[str]
 ) -> tuple[FloatArray, str]:
-    """Commands as coefficients of the chosen modes, and their unit."""
+    """Return the commands of the chosen modes, and their unit."""
     u, n, m = seen.commands, seen.modes, seen.commands.shape[1]
     influence = seen.influence_matrix
     if influence is None:
@@ -204,7 +204,7 @@ def _modal_commands(
 
 
 def _choose_unit(own: str, given: str | None, what: str) -> str:
-    """Return the unit that the telemetry has, or the one that was given."""
+    """Return the unit of the telemetry, or the one that was given; refuse a contradiction."""
     known = unit_name(own)
     if given is None:
         if known is None:

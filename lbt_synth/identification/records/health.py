@@ -1,9 +1,13 @@
-"""What is wrong with a record: findings, and a table of them."""
+"""The health of a record: faults that were found, and a table of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.validation import BoolArray
 
 HEADINGS = ("finding", "series", "axis", "frames", "%", "first frame", "effect")
 
@@ -20,7 +24,7 @@ class Finding:
     series : str
         "measurements", "commands" or "frames".
     axis : int or None
-        Axis from 0; None where it is of all.
+        Axis from 0; None for all axes.
     count : int
         Frames.
     first_frame : int
@@ -28,7 +32,7 @@ class Finding:
     fraction : float
         Their part of all frames.
     spoils : bool
-        Whether these frames are not usable; else they are only reported.
+        Whether these frames are not usable; otherwise they are only reported.
     """
 
     kind: str
@@ -78,7 +82,7 @@ class RecordHealth:
         return not any(found.spoils for found in self.findings)
 
     def rows(self) -> tuple[tuple[str, str, int | None, int, float, int, str], ...]:
-        """Return a row a finding, under the headings ``HEADINGS`` of this module."""
+        """Return a row per finding, under the headings ``HEADINGS`` of this module."""
         return tuple(
             (
                 found.kind,
@@ -99,6 +103,22 @@ class RecordHealth:
         return f"{text}; {', '.join(spoilt)}." if spoilt else f"{text}."
 
 
+def finding_in(
+    found: BoolArray, kind: str, series: str, axis: int | None, *, spoils: bool
+) -> Finding:
+    """Return the finding of a fault in some frames, (frames,), at least one."""
+    where = np.flatnonzero(found)
+    return Finding(
+        kind=kind,
+        series=series,
+        axis=axis,
+        count=where.size,
+        first_frame=int(where[0]),
+        fraction=where.size / len(found),
+        spoils=spoils,
+    )
+
+
 def merge_notes(*parts: Sequence[str]) -> tuple[str, ...]:
-    """Return notes in their order, each once."""
+    """Return the notes of all parts in their order, each once."""
     return tuple(dict.fromkeys(note for part in parts for note in part))

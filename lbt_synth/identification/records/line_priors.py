@@ -1,4 +1,4 @@
-"""What is known of vibration lines beforehand: lists, and accelerometers on the structure."""
+"""Vibration lines that are known beforehand, from lists or from accelerometers."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from lbt_synth.identification.records.units import hz_per
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, integer, number, real_array
 
 _FEWEST_AVERAGES = 8
-_AVERAGES = 32  # that a segment is chosen for
+_AVERAGES = 32  # segments that a record is cut into
 _FINEST_HZ = 0.25
 _SHORTEST_SEGMENT = 64
-_DIP = 0.5  # of a peak: how far the power falls before the next counts as another
+_DIP = 0.5  # of a peak, by which the power must fall before another peak counts
 _ERRORS = (
     "error",
     "frequency_error",
@@ -79,7 +79,7 @@ def load_lines(lines: Any) -> tuple[LinePrior, ...]:
     Parameters
     ----------
     lines : path-like or sequence
-        A text file (.csv, .tsv, .txt, .dat) with a frequency a row [Hz], and its error in a
+        A text file (.csv, .tsv, .txt, .dat) with a frequency per row [Hz], and its error in a
         second column if there is one (or by the headings frequency_hz and error_hz); or a list
         of frequencies, of pairs of frequency and error, or of LinePrior.
 
@@ -153,7 +153,7 @@ def _read_lines(path: Path) -> list[LinePrior]:
 
 
 def _find_columns(names: list[str]) -> tuple[int, int | None]:
-    """Return the columns of frequencies and of their errors; by place without a heading."""
+    """Return the columns of frequencies and errors; without a heading the first two."""
     if not any(names):
         return 0, 1 if len(names) > 1 else None
     found: dict[str, int] = {}
@@ -173,10 +173,7 @@ def _find_columns(names: list[str]) -> tuple[int, int | None]:
 
 
 def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
-    """Read a column a sensor from a file of any format that records have.
-
-    Shapes: returns (frames, sensors).
-    """
+    """Read accelerations (frames, sensors) from a file of any format that records have."""
     source = Path(path)
     try:
         content = source.read_bytes()
@@ -212,9 +209,8 @@ def accelerometer_lines(
     that do not overlap (Hann's window, on differences of two frames, which leak less). Of K
     segments of independent series it exceeds t with probability ``(1 - t)^(K-1)``
     (G. C. Carter, C. H. Knapp, A. H. Nuttall, IEEE Trans. Audio Electroacoust. 21, 337 (1973),
-    doi:10.1109/TAU.1973.1162496); the threshold is
-    that for which no bin of no pair is expected to exceed it but with the probability
-    ``false_alarm``.
+    doi:10.1109/TAU.1973.1162496); at the threshold the
+    probability that any bin of any pair exceeds it is ``false_alarm``.
 
     Parameters
     ----------
@@ -237,8 +233,8 @@ def accelerometer_lines(
     Returns
     -------
     tuple of LinePrior
-        A line a peak of the coherent power, by rising frequency; the error is that of a peak
-        within a bin, a whole bin over sqrt(12) at least.
+        A line per peak of the coherent power, by rising frequency; the error is that of a peak
+        within a bin, at least a whole bin over sqrt(12).
 
     Raises
     ------
@@ -267,7 +263,7 @@ def accelerometer_lines(
     chance = number(false_alarm, "false_alarm", above=0, below=1)
     good = np.ones(len(z), dtype=np.bool_) if usable is None else np.asarray(usable)
     if good.shape != (len(z),) or good.dtype != np.bool_:
-        raise DimensionError(f"usable must be {len(z)} truth values, one a frame.")
+        raise DimensionError(f"usable must be {len(z)} truth values, one per frame.")
     if segment_frames is None:
         longest = rate / _FINEST_HZ
         length = int(min(longest, max((len(z) - 1) / _AVERAGES, _SHORTEST_SEGMENT)))
@@ -306,7 +302,7 @@ def _as_columns(value: Any, name: str) -> FloatArray:
 
 
 def _segment_transforms(series: FloatArray, good: BoolArray, length: int) -> Any:
-    """Return the transforms of the segments in which all is usable, (segments, f, columns)."""
+    """Return the transforms of the segments without a spoilt frame, (segments, f, columns)."""
     steps, fine = np.diff(series, axis=0), good[1:] & good[:-1]
     count = len(steps) // length
     whole = fine[: count * length].reshape(count, length).all(axis=1)
@@ -318,16 +314,14 @@ def _segment_transforms(series: FloatArray, good: BoolArray, length: int) -> Any
 def _find_lines(
     frequency: FloatArray, power: FloatArray, significant: BoolArray, source: str
 ) -> tuple[LinePrior, ...]:
-    """Local maxima among the significant bins, each with a dip to the next."""
-    from scipy.signal import find_peaks
+    """Return the local maxima among the significant bins, each with a dip to the next."""
+    from scipy.signal import find_peaks, peak_prominences
 
     width = frequency[1]
     seen = np.where(significant, power, 0.0)
     at, _ = find_peaks(seen)
     if not at.size:
         return ()
-    from scipy.signal import peak_prominences
-
     prominence = peak_prominences(seen, at)[0]
     out = []
     for k in at[prominence >= _DIP * seen[at]]:

@@ -1,4 +1,4 @@
-"""A record of tip and tilt: measurements, commands, and which frames count."""
+"""A record of tip and tilt: measurements, commands, and the frames that are usable."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.records.faults import runs
-from lbt_synth.identification.records.health import Finding, RecordHealth, merge_notes
+from lbt_synth.identification.records.health import (
+    Finding,
+    RecordHealth,
+    finding_in,
+    merge_notes,
+)
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import BoolArray, FloatArray, integer, matrix, number, require_instance
@@ -141,7 +146,7 @@ class LoopRecord:
 
     @property
     def hardware(self) -> LoopHardware:
-        """The loop: delay and mirror, one measurement and one command an axis.
+        """The loop: delay and mirror, one measurement and one command per axis.
 
         Raises
         ------
@@ -207,7 +212,7 @@ class LoopRecord:
         given = np.atleast_1d(np.asarray(sensor_gain, dtype=object))
         if given.shape not in {(1,), (self.axes,)}:
             raise DimensionError(
-                f"sensor_gain must be a number, or {self.axes} of them, one an axis; got shape "
+                f"sensor_gain must be a number, or {self.axes} of them, one per axis; got shape "
                 f"{given.shape}."
             )
         return np.array([number(value, "sensor_gain", above=0) for value in given])
@@ -242,16 +247,12 @@ class LoopRecord:
         )
         measured = self.usable if self.measured is None else self.measured
         commanded = np.ones(self.frames, np.bool_) if self.commanded is None else self.commanded
-        usable, unknown = measured, None
+        findings = tuple(found for found in self.health.findings if found.kind != NOT_KNOWN)
+        usable = measured
         if self.commands is not None:
             usable, unknown = known_frames(path.mirror_taps, measured, commanded)
-        findings = tuple(found for found in self.health.findings if found.kind != NOT_KNOWN)
-        health = replace(
-            self.health,
-            usable=int(np.sum(usable)),
-            findings=findings if unknown is None else (*findings, unknown),
-            bridged=0,
-        )
+            findings = (*findings, unknown)
+        health = replace(self.health, usable=int(np.sum(usable)), findings=findings, bridged=0)
         return replace(
             self,
             delay_frames=path.delay_frames,
@@ -333,10 +334,10 @@ class LoopRecord:
 
 def known_frames(
     taps: FloatArray, measured: BoolArray, commanded: BoolArray
-) -> tuple[BoolArray, Finding | None]:
-    """Frames with a good measurement whose correction is made of good commands.
+) -> tuple[BoolArray, Finding]:
+    """Return the frames with a good measurement and a known correction, and a finding of others.
 
-    Shapes: taps (t,), measured, commanded (frames,).
+    The correction of a frame is known if all commands that enter it are good.
     """
     frames = len(measured)
     unknown = np.zeros(frames, dtype=np.bool_)
@@ -345,17 +346,7 @@ def known_frames(
     for i in np.flatnonzero(taps):
         hit = bad + 1 + i
         unknown[hit[hit < frames]] = True
-    where = np.flatnonzero(unknown)
-    found = Finding(
-        kind=NOT_KNOWN,
-        series="frames",
-        axis=None,
-        count=where.size,
-        first_frame=int(where[0]),
-        fraction=where.size / frames,
-        spoils=True,
-    )
-    return measured & ~unknown, found
+    return measured & ~unknown, finding_in(unknown, NOT_KNOWN, "frames", None, spoils=True)
 
 
 def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
@@ -376,7 +367,7 @@ def _check_flags(value: Any, name: str, frames: int) -> BoolArray:
     out = np.array(value)
     if out.dtype != np.bool_ or out.shape != (frames,):
         raise DimensionError(
-            f"{name} must be {frames} truth values, one a frame; got {out.dtype} {out.shape}."
+            f"{name} must be {frames} truth values, one per frame; got {out.dtype} {out.shape}."
         )
     out.setflags(write=False)
     return out

@@ -1,4 +1,4 @@
-"""A recorded power spectrum of tip and tilt."""
+"""A record that consists of power spectra of tip and tilt."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SpectrumRecord:
     source : str, optional
         Where it is from.
     notes : tuple of str, optional
-        What was taken for what.
+        How the file was read.
 
     Raises
     ------
@@ -64,7 +64,7 @@ class SpectrumRecord:
         frequency = real_array(self.frequency_hz, "frequency_hz")
         if frequency.shape != density.shape[:1] or not 1 <= density.shape[1] <= 2:
             raise DimensionError(
-                "density_nm2_hz must have a row a frequency, and one or two axes; got "
+                "density_nm2_hz must have a row per frequency, and one or two axes; got "
                 f"{density.shape} and {frequency.shape} frequencies."
             )
         for column in density.T:
@@ -92,13 +92,13 @@ class SpectrumRecord:
 
     @property
     def rms_nm(self) -> FloatArray:
-        """Root of the integral over the frequencies that are there, (axes,) [nm]."""
+        """Root of the integral over the frequencies of the record, (axes,) [nm]."""
         middles = (self.density_nm2_hz[1:] + self.density_nm2_hz[:-1]) / 2
         return frozen_copy(np.sqrt(np.diff(self.frequency_hz) @ middles))
 
     @property
     def spectra(self) -> tuple[TabulatedSpectrum, ...]:
-        """The spectra as disturbances of a :class:`Truth`, one an axis."""
+        """The spectra as disturbances of a :class:`Truth`, one per axis."""
         return tuple(
             TabulatedSpectrum(frequency_hz=self.frequency_hz, density_nm2_hz=column)
             for column in self.density_nm2_hz.T

@@ -1,4 +1,4 @@
-"""Units of recorded tip and tilt, and what makes nanometres of wavefront of them."""
+"""Units of tip and tilt, times and spectra, and their factors to nm of wavefront, s and Hz."""
 
 from __future__ import annotations
 
@@ -17,28 +17,18 @@ _MAS = {
     "rad": math.degrees(1.0) * 3600e3,
 }
 UNITS = (*_NM, *_MAS)
-_ALIASES = {
-    "nanometer": "nm",
-    "nanometre": "nm",
-    "micron": "um",
-    "micrometer": "um",
-    "micrometre": "um",
-    "µm": "um",
-    "μm": "um",
-    "meter": "m",
-    "metre": "m",
-    "µrad": "urad",
-    "μrad": "urad",
-    "microrad": "urad",
-    "radian": "rad",
-    "arcsecond": "arcsec",
-    "asec": "arcsec",
-    '"': "arcsec",
-    "milliarcsec": "mas",
-    "milliarcsecond": "mas",
+_OTHER_NAMES = {
+    "nm": ["nanometer", "nanometre"],
+    "um": ["micron", "micrometer", "micrometre", "µm", "μm"],
+    "m": ["meter", "metre"],
+    "urad": ["µrad", "μrad", "microrad"],
+    "rad": ["radian"],
+    "arcsec": ["arcsecond", "asec", '"'],
+    "mas": ["milliarcsec", "milliarcsecond"],
 }
+_ALIASES = {other: unit for unit, names in _OTHER_NAMES.items() for other in names}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": None}  # mHz or MHz: capitals tell
+FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": None}  # mHz or MHz, which only capitals tell
 _SQUARED = re.compile(r"^(?P<unit>.+?)(?:\^2|\*\*2|²|2)\s*(?:/|_|\s|per)\s*hz$", re.IGNORECASE)
 _ROOT = re.compile(
     r"^(?P<unit>.+?)\s*(?:/|_|per)\s*(?:sqrt\(?hz\)?|rthz|√hz|hz\^?(?:0\.5|\(1/2\)))$",
@@ -47,7 +37,7 @@ _ROOT = re.compile(
 
 
 def unit_name(text: str) -> str | None:
-    """Return the name that this package has for a unit; None if it knows none such."""
+    """Return the name that this package has for a unit, None for an unknown one."""
     word = text.strip()
     lower = word.lower()
     found = _ALIASES.get(lower) or _ALIASES.get(lower.removesuffix("s")) or lower
@@ -71,7 +61,7 @@ def nm_per(unit: str, *, diameter_m: float | None = None) -> float:
 
 
 def seconds_per(unit: str | None) -> float:
-    """Return the seconds of a unit of time; of none, 1."""
+    """Return the seconds of a unit of time, 1 if no unit is given."""
     factor = TIMES.get((unit or "s").strip().lower())
     if factor is None:
         raise ProblemError(f"times must be in one of {', '.join(TIMES)}; got {unit!r}.")
@@ -79,7 +69,7 @@ def seconds_per(unit: str | None) -> float:
 
 
 def hz_per(unit: str | None) -> float:
-    """Return the hertz of a unit of frequency; of none, 1."""
+    """Return the hertz of a unit of frequency, 1 if no unit is given."""
     word = (unit or "Hz").strip()
     if word in ("mHz", "MHz"):
         return 1e-3 if word == "mHz" else 1e6
@@ -90,7 +80,7 @@ def hz_per(unit: str | None) -> float:
 
 
 def density_unit(text: str) -> tuple[str, int] | None:
-    """Part a unit of a spectrum: the unit and the power that the density has of it."""
+    """Split the unit of a spectrum into a unit and its power, 1 or 2; None for others."""
     for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
         if match := pattern.match(text.strip()):
             unit = unit_name(match["unit"])

@@ -162,7 +162,7 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     assert seen.delay_frames is None
     assert any("does not say that it is in frames" in note for note in seen.health.notes)
     twice = hdus(tmp_path / "c.fits", image("POL", y, "nm", FPS=400.0), FRAMRATE=RATE)
-    with pytest.raises(lbt.errors.ProblemError, match="frame_rate_hz is told twice"):
+    with pytest.raises(lbt.errors.ProblemError, match="the file gives frame_rate_hz twice"):
         lbt.load_record(twice)
 
 
@@ -370,6 +370,6 @@ def test_capitals_of_frequencies(tmp_path):
 def test_times_that_are_no_seconds(tmp_path, series, step):
     path = csv(tmp_path / "a.csv", time=10 + step * np.arange(FRAMES), pol_nm=series[0][:, 0])
     with pytest.raises(
-        lbt.errors.ProblemError, match="Hz with time in seconds, and their unit is not to"
+        lbt.errors.ProblemError, match="Hz with time in seconds, and their unit is not gi"
     ):
         lbt.load_record(path)

@@ -15,7 +15,7 @@ import lbt_synth as lbt
 RATE = 1000.0
 
 
-SHELL = lbt.models.PositionLoop.of_bandwidth(
+SHELL = lbt.models.PositionLoop.from_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
 )
 
@@ -171,7 +171,7 @@ def test_a_hole_with_one_frame_beside_it_is_bridged_straight():
 
 
 def test_another_delay_keeps_the_mirror_and_drops_the_bridges():
-    shell = lbt.models.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.from_bandwidth(
         natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
     )
     rng = np.random.default_rng(0)

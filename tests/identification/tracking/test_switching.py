@@ -13,7 +13,9 @@ import lbt_synth as lbt
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 
-SHELL = lbt.models.PositionLoop.of_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
+SHELL = lbt.models.PositionLoop.from_bandwidth(
+    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300
+)
 
 
 class Exchanged:
@@ -119,7 +121,7 @@ def test_the_new_filter_is_as_if_it_had_always_run(name):
     """Against its estimator in parallel; from zero it would be far off."""
     plant = PLANTS[name]
     hw = plant.hardware
-    moved = [v.moved(v.frequency_hz + 2) for v in plant.vibrations]
+    moved = [v.at_frequency(v.frequency_hz + 2) for v in plant.vibrations]
     slower = lbt.Vibration(frequency_hz=33, damping=0.02, rms_nm=50, direction=moved[0].direction)
     old, new = lbt.kalman(plant), lbt.kalman(with_vibrations(plant, [*moved, slower]))
     truth = lbt.Truth(turbulence=AIR, vibrations=(replace(moved[0], rms_nm=250.0),), noise_nm=15.5)

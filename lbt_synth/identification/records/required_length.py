@@ -1,0 +1,75 @@
+"""The length that a record needs to be identified."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.validation import integer, number
+
+_LEAST_FRAMES = 4096
+_LEAST_SECONDS = 4.0
+_SHORTEST_STRETCH = 256  # frames of a stretch that counts
+
+
+def require_length(
+    record: LoopRecord,
+    *,
+    frames: int = _LEAST_FRAMES,
+    seconds: float = _LEAST_SECONDS,
+    resolution_hz: float | None = None,
+) -> int:
+    """Refuse a record that is too short for a model to be found.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record.
+    frames : int, optional
+        Usable frames that are needed, in stretches of at least 256.
+    seconds : float, optional
+        The same as a time [s].
+    resolution_hz : float, optional
+        Distance of frequencies that must be resolved [Hz]: the longest stretch has to last
+        ``1 / resolution_hz``.
+
+    Returns
+    -------
+    int
+        Usable frames in stretches of at least 256.
+
+    Raises
+    ------
+    ProblemError
+        That says what is there, what is needed, and what was found in the record.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> brief = lbt.identification.loop_record([[1.0], [2.5], [2.0]], frame_rate_hz=800, unit="nm")
+    >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s) ...
+    """
+    rate = record.frame_rate_hz
+    needed = integer(frames, "frames", at_least=1)
+    needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
+    lengths = [stop - start for start, stop in record.stretches()]
+    count = sum(length for length in lengths if length >= _SHORTEST_STRETCH)
+    longest = max(lengths, default=0)
+    if count < needed:
+        raise ProblemError(
+            f"the record needs {needed} usable frames ({needed / rate:.3g} s) in stretches of at "
+            f"least {_SHORTEST_STRETCH}; got {count}, the longest stretch {longest}. "
+            f"{record.health.summary()} Record more, or bridge short holes (record.bridged())."
+        )
+    if resolution_hz is not None:
+        line = int(np.ceil(rate / number(resolution_hz, "resolution_hz", above=0) * (1 - 1e-12)))
+        if longest < line:
+            raise ProblemError(
+                f"to tell frequencies {resolution_hz:g} Hz apart a stretch of {line} frames "
+                f"({line / rate:.3g} s) is needed; the longest has {longest}."
+            )
+    return count
