@@ -30,7 +30,7 @@ from lbt_synth.report.study.sections import (
 from lbt_synth.storage.tables import Table
 from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
 from lbt_synth.studies.study.controller_samples import read_column, read_controller_samples
-from lbt_synth.studies.study.table_names import short_names
+from lbt_synth.studies.study.summary import short_names
 
 
 def write_study_page(

@@ -1,9 +1,10 @@
-"""What a study says: each controller by itself, against the others, and what it depends on."""
+"""Statistics of a study: each controller, comparisons between them, and sensitivities."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ LEVELS = (0.3, 0.5, 0.7, 0.8)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerStatistics:
-    """One controller over all samples.
+    """Statistics of one controller over all samples.
 
     Attributes
     ----------
@@ -35,7 +36,7 @@ class ControllerStatistics:
     samples : int
         Samples on which it was evaluated.
     failed : int
-        Samples on which the evaluation failed; they are in none of the following.
+        Samples on which the evaluation failed; all that follows leaves them out.
     unstable : Share
         Loops that are unstable. Their Strehl ratio counts as 0, their residual as infinite.
     mean, mean_error : float
@@ -49,7 +50,7 @@ class ControllerStatistics:
     parts_nm : dict of str to float
         Median of each part of the residual over the stable loops [nm rms].
     loss : Loss
-        Against the best controller of each sample.
+        Loss against the best controller of each sample.
     worst : tuple of WorstRow
         Samples on which it does worst.
     """
@@ -70,7 +71,7 @@ class ControllerStatistics:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StudyStatistics:
-    """What a study says.
+    """Statistics of a study.
 
     Attributes
     ----------
@@ -79,11 +80,11 @@ class StudyStatistics:
     parameters : tuple of str
         Their names.
     controllers : tuple of ControllerStatistics
-        Each by itself.
+        Each controller by itself.
     comparisons : tuple of Comparison
-        Each against each later one, on the same samples.
+        Each controller against each later one, on the same samples.
     sensitivities : tuple of ControllerSensitivity
-        What each depends on.
+        What each controller depends on.
     """
 
     samples: int
@@ -101,7 +102,7 @@ def study_statistics(
     levels: Sequence[float] = LEVELS,
     worst: int = 10,
 ) -> StudyStatistics:
-    """Statistics of a study's results.
+    """Compute the statistics of a study's results.
 
     Parameters
     ----------
@@ -109,13 +110,13 @@ def study_statistics(
         Results: each parameter under its name and, for each controller, ``NAME.strehl`` (nan
         where unstable or failed), ``NAME.residual_nm`` and ``NAME.stable`` (1, 0; nan where the
         evaluation failed); ``NAME.turbulence_nm``, ``NAME.vibration_nm``, ``NAME.noise_nm`` and
-        ``row`` (number of the sample) as far as they are there.
+        ``row`` (number of the sample) are optional.
     parameters : sequence of str
         Names of the parameters.
     controllers : sequence of str
         Names of the controllers.
     levels : sequence of float, optional
-        Strehl ratios in [0, 1] to count the samples above of.
+        Strehl ratios in [0, 1]: the samples above each are counted.
     worst : int, optional
         Worst samples to list for each controller.
 
@@ -128,7 +129,7 @@ def study_statistics(
     Raises
     ------
     ProblemError
-        If a column is missing or holds what cannot be, or a value is out of range.
+        If a column is missing or holds impossible values, or a value is out of range.
 
     Examples
     --------
@@ -165,22 +166,18 @@ def study_statistics(
         samples=size,
         parameters=tuple(parameters),
         controllers=tuple(
-            _controller(each, loss, levels, worst_rows(each, rows, values, count=worst))
+            _controller_statistics(each, loss, levels, worst_rows(each, rows, values, count=worst))
             for each, loss in zip(found, losses(found), strict=True)
         ),
-        comparisons=tuple(
-            compare(first, second)
-            for place, first in enumerate(found)
-            for second in found[place + 1 :]
-        ),
+        comparisons=tuple(compare(first, second) for first, second in combinations(found, 2)),
         sensitivities=sensitivities(found, values),
     )
 
 
-def _controller(
+def _controller_statistics(
     each: ControllerSamples, loss: Loss, levels: Sequence[float], worst: tuple[WorstRow, ...]
 ) -> ControllerStatistics:
-    """One controller by itself."""
+    """Return the statistics of one controller."""
     strehl = each.strehl[each.evaluated]
     n = len(strehl)
     mean, error = mean_and_error(strehl)

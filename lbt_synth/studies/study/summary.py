@@ -1,4 +1,4 @@
-"""Statistics of a study as tables, for the terminal and for pages."""
+"""Tables of a study's statistics, for the terminal and for pages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
     Returns
     -------
     tuple of Table
-        Those that have rows; the worst samples are in :func:`worst_table`.
+        Those that have rows; :func:`worst_table` lists the worst samples.
 
     Examples
     --------
@@ -57,47 +57,41 @@ def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
 def strehl_table(statistics: StudyStatistics) -> Table:
     """Strehl ratio of each controller: mean, percentiles, parts of the samples."""
     found = statistics.controllers
-    ranks = range(len(found[0].strehl))
-    rows: list[Row] = [
-        (
-            "mean ± standard error",
-            *(with_error(c.mean, c.mean_error, scale=100, digits=2) for c in found),
-        )
-    ]
-    rows.extend(
-        (ordinal(found[0].strehl[i].percent), *(_percentile(c.strehl[i]) for c in found))
-        for i in ranks
-    )
-    rows.append(("part of the samples [%]",))
-    rows.extend(
-        (f"above {100 * level:g} %", *(_share(c.above[level]) for c in found))
-        for level in found[0].above
-    )
-    rows.append(("unstable, counted as 0", *(_unstable(c.unstable) for c in found)))
-    rows.append(("best of all controllers", *(_share(c.loss.best) for c in found)))
-    rows.append(("samples",))
-    rows.append(("evaluated", *(str(c.samples) for c in found)))
-    rows.append(
-        ("failed", *(Cell(text=str(c.failed), tone="bad" if c.failed else "plain") for c in found))
-    )
+    first = found[0]
     return Table(
         caption="Strehl ratio over the samples, with 95 % intervals for independent samples",
         headings=("of the Strehl ratio [%]", *(c.controller for c in found)),
-        rows=tuple(rows),
+        rows=(
+            (
+                "mean ± standard error",
+                *(with_error(c.mean, c.mean_error, scale=100, digits=2) for c in found),
+            ),
+            *(
+                (ordinal(each.percent), *(_percentile(c.strehl[i]) for c in found))
+                for i, each in enumerate(first.strehl)
+            ),
+            ("part of the samples [%]",),
+            *(
+                (f"above {100 * level:g} %", *(_share(c.above[level]) for c in found))
+                for level in first.above
+            ),
+            ("unstable, counted as 0", *(_unstable(c.unstable) for c in found)),
+            ("best of all controllers", *(_share(c.loss.best) for c in found)),
+            ("samples",),
+            ("evaluated", *(str(c.samples) for c in found)),
+            ("failed", *(_bad_if(c.failed, str(c.failed)) for c in found)),
+        ),
     )
 
 
 def residual_table(statistics: StudyStatistics) -> Table:
     """Residual of each controller, and the medians of its parts."""
     found = statistics.controllers
-    parts = list(dict.fromkeys(part for c in found for part in c.parts_nm))
     rows: list[Row] = [
-        (
-            ordinal(found[0].residual_nm[i].percent),
-            *(nanometres(c.residual_nm[i].value) for c in found),
-        )
-        for i in range(len(found[0].residual_nm))
+        (ordinal(each.percent), *(nanometres(c.residual_nm[i].value) for c in found))
+        for i, each in enumerate(found[0].residual_nm)
     ]
+    parts = dict.fromkeys(part for c in found for part in c.parts_nm)
     if parts:
         rows.append(("median over the stable loops",))
         rows.extend(
@@ -140,7 +134,7 @@ def comparison_table(statistics: StudyStatistics) -> Table:
 def sensitivity_table(
     statistics: StudyStatistics, *, names: Mapping[str, str] | None = None
 ) -> Table:
-    """First-order indices of the parameters, one column a controller."""
+    """First-order indices of the parameters, one column per controller."""
     found = statistics.sensitivities
     rows = _by_parameter(statistics, _index, names)
     if rows:
@@ -190,7 +184,7 @@ def worst_table(
 
 
 def varying_parameters(statistics: StudyStatistics) -> tuple[str, ...]:
-    """Parameters with an index for any controller, in order of the greatest."""
+    """Return the parameters with an index for any controller, by falling greatest index."""
     greatest: dict[str, float] = {}
     for one in statistics.sensitivities:
         for each in one.ranked:
@@ -199,13 +193,36 @@ def varying_parameters(statistics: StudyStatistics) -> tuple[str, ...]:
     return tuple(sorted(greatest, key=lambda name: -greatest[name]))
 
 
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return for each path its last keys, as many as distinguish it from the others.
+
+    Examples
+    --------
+    >>> from lbt_synth.studies.study.summary import short_names
+    >>> found = short_names(
+    ...     ["truth.vibrations[0].rms_mas", "truth.vibrations[1].rms_mas", "truth.sensor_gain"]
+    ... )
+    >>> list(found.values())
+    ['vibrations[0].rms_mas', 'vibrations[1].rms_mas', 'sensor_gain']
+    """
+    out = {}
+    for name in names:
+        keys = name.split(".")
+        for count in range(1, len(keys) + 1):
+            short = ".".join(keys[-count:])
+            if sum(other == short or other.endswith(f".{short}") for other in names) == 1:
+                break
+        out[name] = short
+    return out
+
+
 def percent(value: float, digits: int = 1) -> str:
-    """Return a part as a percentage; a dash where there is none."""
+    """Return a part as a percentage, a dash if it is nan."""
     return "-" if np.isnan(value) else _number(100 * value, digits)
 
 
 def with_error(value: float, error: float, *, scale: float = 1.0, digits: int = 3) -> str:
-    """Return a number with its standard error; a dash where there is none."""
+    """Return a number with its standard error, a dash if it is nan."""
     if np.isnan(value):
         return "-"
     text = _number(scale * value, digits)
@@ -213,14 +230,14 @@ def with_error(value: float, error: float, *, scale: float = 1.0, digits: int = 
 
 
 def nanometres(value: float) -> str:
-    """Return a residual; "unstable" where it is infinite, a dash where there is none."""
+    """Return a residual: "unstable" if it is infinite, a dash if it is nan."""
     if np.isnan(value):
         return "-"
     return _number(value, 1) if np.isfinite(value) else "unstable"
 
 
 def ordinal(percentile: float) -> str:
-    """Name of a percentile.
+    """Return the name of a percentile.
 
     Examples
     --------
@@ -238,7 +255,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def _range(text: str, low: float, high: float, digits: int) -> str:
-    """Return a value and its interval, as far as it has limits [percent]."""
+    """Return a value and the limits of its interval that there are [percent]."""
     if np.isnan(low) and np.isnan(high):
         return text
     if np.isnan(low):
@@ -257,13 +274,17 @@ def _share(part: Share, digits: int = 1) -> str:
 
 
 def _unstable(part: Share) -> str | Cell:
-    text = _share(part, 2)
-    return Cell(text=text, tone="bad") if part.count else text
+    return _bad_if(part.count, _share(part, 2))
+
+
+def _bad_if(count: int, text: str) -> str | Cell:
+    """Return a text, marked as bad if it counts any."""
+    return Cell(text=text, tone="bad") if count else text
 
 
 def _points(difference: Percentile) -> str:
-    value = 100 * difference.value
-    return "-" if np.isnan(value) else f"{round(value, 1) + 0.0:+.1f}"
+    value = round(100 * difference.value, 1) + 0.0
+    return "-" if np.isnan(value) else f"{value:+.1f}"
 
 
 def _by_parameter(
@@ -271,7 +292,7 @@ def _by_parameter(
     text: Callable[[ParameterSensitivity], str],
     names: Mapping[str, str] | None,
 ) -> list[Row]:
-    """One row a parameter that varies, one column a controller."""
+    """Return a row per varying parameter, with a column per controller."""
     found = [{p.parameter: p for p in one.parameters} for one in statistics.sensitivities]
     return [
         ((names or {}).get(name, name), *(text(by_name[name]) for by_name in found))

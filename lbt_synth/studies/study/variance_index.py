@@ -1,4 +1,4 @@
-"""How much of a result's variance one parameter explains by itself, from the samples there are."""
+"""The part of a result's variance that one parameter explains, estimated from given samples."""
 
 from __future__ import annotations
 
@@ -8,39 +8,37 @@ import numpy as np
 
 from lbt_synth.validation import FloatArray, IntArray
 
-FEWEST = 20  # samples below which no index is given
-_VALUES = 32  # a parameter with no more distinct values than this is a list
-_COARSE = 8, 4096  # no more intervals than this, below that many samples
+FEWEST = 20  # samples for an index
+_VALUES = 32  # distinct values of a list, at most
+_COARSE = 8, 4096  # intervals, at most, with fewer than that many samples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VarianceIndex:
     """First-order index of one parameter."""
 
-    # Variance of the mean given the parameter over the whole variance; slightly below 0 at times
-    # where there is none. nan where the result or the parameter does not vary.
-    value: float
-    error: float  # Standard error for independent samples; too large for samples that are more even
-    correction: float  # What was subtracted for the scatter of the fit
-    groups: int  # Values of a list, or intervals of a continuous parameter
+    value: float  # about 0 without an effect; nan if the result or the parameter is constant
+    error: float  # standard error for independent samples; too large for more even ones
+    correction: float  # subtracted for the scatter of the fit
+    groups: int  # values of a list, or intervals of a continuous parameter
 
 
 NO_INDEX = VarianceIndex(value=np.nan, error=np.nan, correction=np.nan, groups=0)
 
 
 def is_list(ordered: FloatArray) -> bool:
-    """Whether a parameter, its samples in order, takes a few values only."""
+    """Whether a parameter, given in rising order, takes few values only."""
     distinct = 1 + int(np.count_nonzero(np.diff(ordered)))
     return distinct <= min(_VALUES, max(2, len(ordered) // 5))
 
 
 def value_starts(ordered: FloatArray) -> IntArray:
-    """First place of each value of a list, its samples in order."""
+    """Return the first index of each value of a list, given in rising order."""
     return np.concatenate(([0], 1 + np.flatnonzero(np.diff(ordered)))).astype(np.int64)
 
 
 def group_starts(n: int, groups: int) -> IntArray:
-    """First place of each of so many groups of equal size, to one."""
+    """Return the first index of each of some groups whose sizes differ by one at most."""
     return (np.arange(groups) * n // groups).astype(np.int64)
 
 
@@ -105,7 +103,7 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
         jumps = ends[0][1:] - ends[1][:-1]
         scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
     correction = (coefficients - 1) * scatter / total
-    # the part that a sample adds to the index, to first order; then the scatter of the fit
+    # what a sample adds to the index, to first order; then the scatter of the fit
     influence = (squares - unexplained * spread * spread) * (n / total)
     error = max(
         float(np.std(influence)) / np.sqrt(n),
@@ -119,13 +117,9 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
     )
 
 
-def _counts(n: int, starts: IntArray) -> IntArray:
-    return np.diff(np.append(starts, n))
-
-
 def _means(values: FloatArray, starts: IntArray) -> FloatArray:
-    """Mean of its group for every sample."""
-    counts = _counts(len(values), starts)
+    """Return for every sample the mean of its group."""
+    counts = np.diff(np.append(starts, len(values)))
     means: FloatArray = np.repeat(np.add.reduceat(values, starts) / counts, counts)
     return means
 
@@ -133,9 +127,9 @@ def _means(values: FloatArray, starts: IntArray) -> FloatArray:
 def _lines(
     values: FloatArray, starts: IntArray
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
-    """Straight line over each group: its value at every sample, and at either end of the group."""
+    """Return a line fitted to each group, at every sample and at either end of the group."""
     n = len(values)
-    counts = _counts(n, starts)
+    counts = np.diff(np.append(starts, n))
     middle = starts + (counts - 1) / 2
     place = (np.arange(n) - np.repeat(middle, counts)) / np.repeat(counts / 2, counts)
     means = np.add.reduceat(values, starts) / counts

@@ -1,4 +1,4 @@
-"""The samples on which a controller does worst."""
+"""The samples of a study on which a controller does worst."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from lbt_synth.validation import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorstRow:
-    """One sample, and what became of the controller."""
+    """One controller on one sample."""
 
-    row: int  # Number of the sample in the study
-    stable: bool  # Whether the loop is stable
-    strehl: float  # Strehl ratio; 0 if unstable
-    residual_nm: float  # Residual [nm rms]; inf if unstable
-    parameters: dict[str, float]  # The sample
+    row: int  # of the sample in the study
+    stable: bool
+    strehl: float  # 0 if unstable
+    residual_nm: float  # [nm rms]; inf if unstable
+    parameters: dict[str, float]  # of the sample
 
 
 def worst_rows(
@@ -29,15 +29,12 @@ def worst_rows(
     *,
     count: int,
 ) -> tuple[WorstRow, ...]:
-    """Return the samples of least Strehl ratio: unstable ones first, then in order of the ratio.
-
-    Shapes: rows (n,), parameters (n,).
-    """
+    """Return the samples of least Strehl ratio, the unstable ones first; arrays are (n,)."""
     indices = np.flatnonzero(controller.evaluated)
     key = np.where(controller.unstable, -1.0, controller.strehl)[indices]
-    if 0 < count < len(indices):  # only those not above the last one wanted need be sorted
-        kept = key <= np.partition(key, count - 1)[count - 1]
-        indices, key = indices[kept], key[kept]
+    if 0 < count < len(indices):  # sort no more than those up to the last one wanted
+        least = key <= np.partition(key, count - 1)[count - 1]
+        indices, key = indices[least], key[least]
     order = np.lexsort((rows[indices], key))[:count]
     return tuple(
         WorstRow(
