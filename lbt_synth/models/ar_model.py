@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.validation import FloatArray, frozen, number, real_array
+from lbt_synth.validation import FloatArray, frozen_copy, number, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,7 +47,7 @@ class ARModel:
             raise DimensionError(
                 f"coefficients must be a list of at least one number; got shape {a.shape}."
             )
-        object.__setattr__(self, "coefficients", frozen(a))
+        object.__setattr__(self, "coefficients", frozen_copy(a))
         object.__setattr__(
             self, "driving_rms_nm", number(self.driving_rms_nm, "driving_rms_nm", above=0)
         )

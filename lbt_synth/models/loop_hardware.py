@@ -7,9 +7,9 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, lifted_mirror, settled_mirror
+from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, instant_mirror, lifted_mirror
 from lbt_synth.models.mirror.position_loop import PositionLoop
-from lbt_synth.validation import FloatArray, frozen, instance, matrix, number
+from lbt_synth.validation import FloatArray, frozen_copy, matrix, number, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +57,7 @@ class LoopHardware:
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.25)
     >>> [float(tap) for tap in path.mirror_taps]  # of u(k), u(k-1), u(k-2)
     [0.0, 0.75, 0.25]
-    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
     ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
     ... )
     >>> moving = lbt.LoopHardware(frame_rate_hz=800, mirror=shell)
@@ -87,9 +87,11 @@ class LoopHardware:
             if value is not None and not np.any(value):
                 raise ProblemError(f"{name} must respond to something; got only zeros.")
         object.__setattr__(self, "modes", n)
-        object.__setattr__(self, "sensor_matrix", frozen(np.eye(n)) if sensor is None else sensor)
         object.__setattr__(
-            self, "influence_matrix", frozen(np.eye(n)) if influence is None else influence
+            self, "sensor_matrix", frozen_copy(np.eye(n)) if sensor is None else sensor
+        )
+        object.__setattr__(
+            self, "influence_matrix", frozen_copy(np.eye(n)) if influence is None else influence
         )
         object.__setattr__(
             self, "frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0)
@@ -106,7 +108,7 @@ class LoopHardware:
             ),
         )
         if self.mirror is not None:
-            instance(self.mirror, PositionLoop)
+            require_instance(self.mirror, PositionLoop)
             lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
 
     @property
@@ -124,7 +126,7 @@ class LoopHardware:
     @property
     def projector(self) -> FloatArray:
         """Generalised inverse of the influence matrix, (m, n)."""
-        return frozen(np.linalg.pinv(self.influence))
+        return frozen_copy(np.linalg.pinv(self.influence))
 
     @property
     def n_commands(self) -> int:
@@ -145,7 +147,7 @@ class LoopHardware:
     def mirror_system(self) -> MirrorSystem:
         """Mirror and delay as a system at the frame rate, of one command."""
         if self.mirror is None:
-            return settled_mirror(self.delay_frames)
+            return instant_mirror(self.delay_frames)
         return lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
 
     @property
@@ -154,7 +156,7 @@ class LoopHardware:
         return self.mirror_system.taps
 
 
-def same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
+def have_same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
     """Whether two loops have the same dynamics of the mirror."""
     if one.mirror is None or other.mirror is None:
         return one.mirror is other.mirror
@@ -172,7 +174,7 @@ def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
         np.array_equal(own.sensor, here.sensor) and np.array_equal(own.influence, here.influence)
     ):
         notes.append("designed for another sensor or influence matrix than it is run with.")
-    if not same_mirror(own, here):
+    if not have_same_mirror(own, here):
         kinds = [
             "a mirror that settles at once" if h.mirror is None else "a mirror with dynamics"
             for h in (own, here)

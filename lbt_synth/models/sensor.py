@@ -6,7 +6,7 @@ import numpy as np
 
 from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.models.units import nm_per_mas
-from lbt_synth.validation import FloatArray, frozen, number
+from lbt_synth.validation import FloatArray, frozen_copy, number
 
 
 def illuminated_subapertures(across: float, obstruction: float = 0.0) -> float:
@@ -150,4 +150,4 @@ def pyramid_modal_noise_nm(
     tilt = number(tilt_noise_nm, "tilt_noise_nm", above=0)
     modulation = number(modulation_lambda_over_d, "modulation_lambda_over_d", above=0)
     radial, _ = noll_orders(modes)
-    return frozen(tilt * np.maximum(2 / (radial + 1), 1 / max(modulation, 1.0)))
+    return frozen_copy(tilt * np.maximum(2 / (radial + 1), 1 / max(modulation, 1.0)))

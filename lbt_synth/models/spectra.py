@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
-from lbt_synth.validation import FloatArray, frozen, real_array, sequence
+from lbt_synth.validation import FloatArray, frozen_copy, real_array, sequence
 
 
 @runtime_checkable
@@ -119,7 +119,7 @@ class SumSpectrum:
     def breakpoints_hz(self) -> FloatArray:
         """Frequencies where one of the parts says that it has kinks [Hz]."""
         kinks = [breakpoints_below(part, np.inf) for part in self.parts]
-        return frozen(np.unique(np.concatenate(kinks)))
+        return frozen_copy(np.unique(np.concatenate(kinks)))
 
     def psd(self, frequency_hz: Any) -> FloatArray:
         """Return the spectrum at frequencies [Hz], the sum of the parts' [nm^2/Hz]."""

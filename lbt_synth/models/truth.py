@@ -14,12 +14,12 @@ from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
 from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.models.vibration.sinusoid import SinusoidalVibration
-from lbt_synth.validation import FloatArray, frozen, number, real_array
+from lbt_synth.validation import FloatArray, frozen_copy, number, real_array
 
 TrueVibration: TypeAlias = Vibration | SinusoidalVibration | DriftingVibration
 
 
-def fitted_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
+def checked_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
     """Return the direction (n,) of a vibration that fits a loop."""
     if isinstance(vibration, DriftingVibration):
         frequency_hz = vibration.highest_hz
@@ -94,7 +94,7 @@ class Truth:
     >>> uneven = lbt.Truth(turbulence=[slow, None], noise_nm=[15.5, 12.0])
     >>> [modes for _, modes in uneven.turbulence_groups(2)]
     [(0,)]
-    >>> uneven.noise_of(2).tolist()
+    >>> uneven.noise_per_measurement(2).tolist()
     [15.5, 12.0]
     """
 
@@ -137,7 +137,7 @@ class Truth:
         """Whether one spectrum serves all modes."""
         return self._per_mode is None
 
-    def turbulence_of(self, modes: int) -> tuple[Spectrum | None, ...]:
+    def turbulence_per_mode(self, modes: int) -> tuple[Spectrum | None, ...]:
         """Return the turbulence of each mode.
 
         Parameters
@@ -183,12 +183,12 @@ class Truth:
             If there are spectra for another number of modes.
         """
         found: dict[object, tuple[Spectrum, list[int]]] = {}
-        for mode, spectrum in enumerate(self.turbulence_of(modes)):
+        for mode, spectrum in enumerate(self.turbulence_per_mode(modes)):
             if spectrum is not None:
                 found.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
         return tuple((spectrum, tuple(own)) for spectrum, own in found.values())
 
-    def noise_of(self, measurements: int) -> FloatArray:
+    def noise_per_measurement(self, measurements: int) -> FloatArray:
         """Return the standard deviation of the noise on each measurement, (q,) [nm].
 
         Parameters
@@ -211,7 +211,7 @@ class Truth:
                 f"noise_nm must be one number, or one a measurement ({measurements}); "
                 f"got {np.size(self.noise_nm)}."
             )
-        return frozen(np.broadcast_to(self.noise_nm, (measurements,)))
+        return frozen_copy(np.broadcast_to(self.noise_nm, (measurements,)))
 
 
 def _deviations(noise_nm: Any) -> float | FloatArray:

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import run
+from support.processes import alive, wait_for
 from support.studies import study_file
-from test_campaign import alive, wait_for
 from test_study_run import TWO, assert_whole, quick, table
 
 import lbt_synth as lbt

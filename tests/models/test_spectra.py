@@ -1,4 +1,4 @@
-"""Sums of spectra."""
+"""Spectra in tables, and sums of spectra."""
 
 from __future__ import annotations
 
@@ -33,3 +33,16 @@ def test_sum_of_spectra():
 def test_sums_of_no_spectra_are_refused(parts, text):
     with pytest.raises(lbt.errors.ProblemError, match=text):
         lbt.models.SumSpectrum(parts=parts)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "density", "text"),
+    [
+        ([1, 2, 3], [1, 1], "same length"),
+        ([2, 1], [1, 1], "increase"),
+        ([1, 2], [1, -1], "at least 0"),
+    ],
+)
+def test_spectrum_tables_are_checked(frequency, density, text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.models.TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=density)

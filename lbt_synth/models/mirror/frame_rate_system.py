@@ -17,9 +17,9 @@ from functools import lru_cache
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.state_space import bordered_scaling
+from lbt_synth.linear.state_space import balancing_scales
 from lbt_synth.models.mirror.position_loop import PositionLoop
-from lbt_synth.validation import ComplexArray, FloatArray, frozen
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 _WHOLE = 1e-9  # by which the ratio of the rates may miss an integer, relative
 _NOTHING = 1e-14  # a leading tap of at most this is none
@@ -40,7 +40,7 @@ class Response:
 
     def __post_init__(self) -> None:
         for name in "ABC":  # systems are kept, and shared
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            object.__setattr__(self, name, frozen_copy(getattr(self, name)))
 
     @property
     def n_states(self) -> int:
@@ -76,7 +76,7 @@ class MirrorSystem:
 
 
 @lru_cache(maxsize=64)
-def settled_mirror(delay_frames: float) -> MirrorSystem:
+def instant_mirror(delay_frames: float) -> MirrorSystem:
     """Return the system of a mirror that takes its position at once.
 
     Its states are the past commands, the newest first.
@@ -88,7 +88,10 @@ def settled_mirror(delay_frames: float) -> MirrorSystem:
     if fraction > 0:
         taps[lead + 1] = fraction
     return MirrorSystem(
-        whole=tapped_mirror(taps), core=tapped_mirror(taps[lead:]), lead=lead, taps=frozen(taps)
+        whole=tapped_mirror(taps),
+        core=tapped_mirror(taps[lead:]),
+        lead=lead,
+        taps=frozen_copy(taps),
     )
 
 
@@ -98,7 +101,7 @@ def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float)
     The samples of the local loop are counted from the arrival of each command; the edges of
     an exposure may lie between them.
     """
-    return _lifted(
+    return _lift(
         loop.natural_frequency_hz,
         loop.damping,
         loop.proportional_per_s2,
@@ -113,7 +116,7 @@ def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float)
 
 
 @lru_cache(maxsize=64)
-def _lifted(
+def _lift(
     natural_frequency_hz: float,
     damping: float,
     proportional_per_s2: float,
@@ -135,23 +138,23 @@ def _lifted(
         delay_samples=delay_samples,
         ramp_samples=ramp_samples,
     )
-    samples = samples_a_frame(loop, frame_rate_hz)
+    samples = samples_per_frame(loop, frame_rate_hz)
     lead = int(np.floor(delay_frames - 1))
     fraction = delay_frames - 1 - lead
-    core = _frame(loop, samples, (1 - fraction) * samples)
+    core = _one_frame(loop, samples, (1 - fraction) * samples)
     while abs(core.D) <= _NOTHING:  # the mirror has not moved yet: one frame of delay more
         core = Response(A=core.A, B=core.B, C=core.C @ core.A, D=float(core.C @ core.B))
         lead += 1
-    core = _balanced(core)
+    core = _balance(core)
     return MirrorSystem(
-        whole=_delayed(core, lead),
+        whole=_delay(core, lead),
         core=core,
         lead=lead,
-        taps=frozen(np.concatenate([np.zeros(lead), _taps(core)])),
+        taps=frozen_copy(np.concatenate([np.zeros(lead), _taps(core)])),
     )
 
 
-def samples_a_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
+def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
     """Return the samples of a local loop in a frame."""
     ratio = loop.sampling_hz / frame_rate_hz
     if not ratio <= _MOST_SAMPLES:
@@ -179,7 +182,7 @@ def samples_a_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
     return samples
 
 
-def _frame(loop: PositionLoop, samples: int, split: float) -> Response:
+def _one_frame(loop: PositionLoop, samples: int, split: float) -> Response:
     """One frame after the arrival of a command, seen by the two exposures that it lies in.
 
     ``split`` samples of it belong to the exposure under way, the rest to the next one.
@@ -188,8 +191,8 @@ def _frame(loop: PositionLoop, samples: int, split: float) -> Response:
     n, ramped, late = local.n_states, loop.ramp_samples > 1, split < samples
     width = n + 2  # the local loop's states at the arrival, the command, the one before it
     state, first, last = np.eye(n, width), np.zeros(width), np.zeros(width)
-    whole, edge = loop.travelled(1.0), int(split)
-    part = loop.travelled(split - edge)
+    whole, edge = loop.position_integral(1.0), int(split)
+    part = loop.position_integral(split - edge)
     for i in range(samples):
         r = np.zeros(width)
         r[n] = min(1.0, (i + 1) / loop.ramp_samples)
@@ -231,7 +234,7 @@ def _taps(core: Response) -> FloatArray:
     return np.asarray(taps / taps.sum())
 
 
-def _delayed(core: Response, lead: int) -> Response:
+def _delay(core: Response, lead: int) -> Response:
     """Put the output of a core through a delay."""
     n = core.n_states
     A, B, C = np.eye(n + lead, k=-1), np.zeros(n + lead), np.zeros(n + lead)
@@ -248,12 +251,12 @@ def tapped_mirror(taps: FloatArray) -> Response:
     n = len(taps) - 1
     B = np.zeros(n)
     B[:1] = 1.0
-    return Response(A=np.eye(n, k=-1), B=B, C=frozen(taps[1:]), D=float(taps[0]))
+    return Response(A=np.eye(n, k=-1), B=B, C=frozen_copy(taps[1:]), D=float(taps[0]))
 
 
-def _balanced(core: Response) -> Response:
+def _balance(core: Response) -> Response:
     """Put the states into units, powers of two, that balance the system."""
     n = core.n_states
-    scaling = bordered_scaling(core.A, np.abs(core.B), np.abs(core.C))
+    scaling = balancing_scales(core.A, np.abs(core.B), np.abs(core.C))
     units = scaling[:n] / scaling[n]
     return Response(A=core.A * units / units[:, None], B=core.B / units, C=core.C * units, D=core.D)

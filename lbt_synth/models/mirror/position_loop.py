@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
-from lbt_synth.validation import FloatArray, frozen, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _STABLE = 1 - 1e-9
 _MOST_SAMPLES = 500_000
@@ -97,7 +97,7 @@ class PositionLoop:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> shell = lbt.models.PositionLoop.of_bandwidth(
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
     ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500, bandwidth_damping=0.7
     ... )
     >>> step = shell.step_response()
@@ -157,7 +157,7 @@ class PositionLoop:
             )
 
     @classmethod
-    def of_bandwidth(
+    def from_bandwidth(
         cls,
         *,
         natural_frequency_hz: float,
@@ -253,7 +253,7 @@ class PositionLoop:
         C[0, 0] = 1.0
         return StateSpace(A=A, B=B, C=C, D=np.zeros((1, 1)), dt_s=1 / self.sampling_hz)
 
-    def travelled(self, samples: float) -> FloatArray:
+    def position_integral(self, samples: float) -> FloatArray:
         """Integral of the position over a part of a sample, in samples.
 
         Parameters
@@ -299,12 +299,12 @@ class PositionLoop:
         parts = [self._motion(p / _POINTS)[0] for p in range(_POINTS)]
         rows = np.stack(parts) / self.static_gain
         r = np.minimum(1.0, np.arange(1, samples + 1) / self.ramp_samples)
-        states = _driven(loop, r)
+        states = _driven_states(loop, r)
         x = (states @ rows[:, :-1].T + r[:, None] * rows[:, -1]).ravel()
         time = np.arange(x.size) / (_POINTS * self.sampling_hz)
         return StepResponse(
-            time_s=frozen(time),
-            position=frozen(x),
+            time_s=frozen_copy(time),
+            position=frozen_copy(x),
             tolerance=band,
             rise_s=_crossing(time, x, 0.9) - _crossing(time, x, 0.1),
             overshoot=max(float(np.max(x)) - 1, 0.0),
@@ -354,7 +354,7 @@ class PositionLoop:
         return np.asarray(out)
 
 
-def _driven(loop: StateSpace, command: FloatArray) -> FloatArray:
+def _driven_states(loop: StateSpace, command: FloatArray) -> FloatArray:
     """States at each sample from rest, (samples, n), many samples at once."""
     n, blocks = loop.n_states, -(-command.size // _BLOCK)
     powers = [np.eye(n)]
@@ -381,7 +381,7 @@ def _exponential(omega: float, damping: float, time: float) -> FloatArray:
     generator[1, :2] = -(omega**2), -2 * damping * omega
     generator[1, 3] = 1.0
     generator[2, 0] = 1.0
-    return frozen(expm(generator * time))
+    return frozen_copy(expm(generator * time))
 
 
 def _crossing(time: FloatArray, x: FloatArray, level: float) -> float:

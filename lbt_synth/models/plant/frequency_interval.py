@@ -51,7 +51,7 @@ class FrequencyInterval:
         half = number(self.half_width_hz, "half_width_hz", at_least=0)
         object.__setattr__(self, "half_width_hz", half)
         for end in (self.low_hz, self.high_hz):
-            first.moved(end).ar_model(plant.hardware.frame_rate_hz)
+            first.at_frequency(end).ar_model(plant.hardware.frame_rate_hz)
 
     @property
     def low_hz(self) -> float:
@@ -75,7 +75,7 @@ class FrequencyInterval:
 
     def coefficient(self, frequency_hz: float) -> float:
         """Return the coefficient a1 at a frequency."""
-        model = self._line.moved(frequency_hz).ar_model(self.plant.hardware.frame_rate_hz)
+        model = self._line.at_frequency(frequency_hz).ar_model(self.plant.hardware.frame_rate_hz)
         return float(model.coefficients[0])
 
     def frequency_hz(self, coefficient: float) -> float:

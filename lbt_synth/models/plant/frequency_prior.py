@@ -124,6 +124,6 @@ def spread_lines(
         )
     parts = np.sqrt(share / share.sum())
     return [
-        replace(line.moved(float(f)), rms_nm=line.rms_nm * float(part))
+        replace(line.at_frequency(float(f)), rms_nm=line.rms_nm * float(part))
         for f, part in zip(frequencies_hz, parts, strict=True)
     ]

@@ -11,10 +11,10 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, definite, frozen, number, real_array
+from lbt_synth.validation import FloatArray, definite, frozen_copy, number, real_array
 
 
-def per_mode(
+def checked_turbulence(
     turbulence: ARModel | Sequence[ARModel], hardware: LoopHardware
 ) -> tuple[ARModel, ...]:
     """Return one turbulence model a mode."""
@@ -57,22 +57,22 @@ def checked_vibrations(
 def noise_factor(noise_nm: Any, q: int) -> FloatArray:
     """Return the square root of the noise covariance, (q, q)."""
     if np.ndim(noise_nm) == 0:
-        return frozen(number(noise_nm, "noise_nm", above=0) * np.eye(q))
+        return frozen_copy(number(noise_nm, "noise_nm", above=0) * np.eye(q))
     if np.ndim(noise_nm) == 1:
         deviations = real_array(noise_nm, "noise_nm")
         if deviations.size != q:
             raise DimensionError(
                 f"noise_nm must have one deviation a measurement ({q}); got {deviations.size}."
             )
-        return frozen(np.diag([number(value, "noise_nm", above=0) for value in deviations]))
+        return frozen_copy(np.diag([number(value, "noise_nm", above=0) for value in deviations]))
     covariance = definite(noise_nm, "noise_nm", size=(q, "to match the measurements"))
-    return frozen(np.linalg.cholesky(covariance))
+    return frozen_copy(np.linalg.cholesky(covariance))
 
 
 def measurement_gains(sensor_gain: Any, q: int) -> FloatArray:
     """Return the sensor gain of each measurement, (q,)."""
     if np.ndim(sensor_gain) == 0:
-        return frozen(np.full(q, number(sensor_gain, "sensor_gain", above=0)))
+        return frozen_copy(np.full(q, number(sensor_gain, "sensor_gain", above=0)))
     gains = real_array(sensor_gain, "sensor_gain")
     if gains.shape != (q,):
         raise DimensionError(

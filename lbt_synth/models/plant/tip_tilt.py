@@ -27,13 +27,13 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.full_state import FullStatePlant
 from lbt_synth.models.plant.part_checks import (
+    checked_turbulence,
     checked_vibrations,
     measurement_gains,
     noise_factor,
-    per_mode,
 )
 from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, frozen, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,8 +92,8 @@ class TipTiltPlant(EstimationProblem):
             C=C,
             D=self.D,
             L=np.hstack([self.L, np.zeros((self.L.shape[0], past))]),
-            B_known=frozen(B_known),
-            D_known=frozen(mirror.D * response),
+            B_known=frozen_copy(B_known),
+            D_known=frozen_copy(mirror.D * response),
             hardware=hw,
             dt_s=self.dt_s,
         )
@@ -281,7 +281,7 @@ def tip_tilt_plant(
             influence_matrix=hardware.influence,
             mirror=hardware.mirror,
         )
-    models = per_mode(turbulence, hardware)
+    models = checked_turbulence(turbulence, hardware)
     lines = checked_vibrations(vibrations, hardware)
     factor = noise_factor(noise_nm, hardware.n_measurements)
 

@@ -18,7 +18,7 @@ from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.resonance_spectrum import coefficients, log_density
 from lbt_synth.models.turbulence.atmosphere import Atmosphere
 from lbt_synth.models.turbulence.frozen_flows import FrozenFlows
-from lbt_synth.validation import FloatArray, frozen, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 
 def le_roux_pole(
@@ -101,7 +101,7 @@ def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
     )
     driving = atmosphere.tilt_rms_nm * np.sqrt(1 - pole**2)
     return ARModel(
-        coefficients=frozen([pole]), driving_rms_nm=float(driving), frame_rate_hz=frame_rate_hz
+        coefficients=frozen_copy([pole]), driving_rms_nm=float(driving), frame_rate_hz=frame_rate_hz
     )
 
 
@@ -199,5 +199,5 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     a1, a2, drive = coefficients(*unpack(fit.x))
     rms = float(np.exp(fit.x[2]))
     return ARModel(
-        coefficients=frozen([a1, a2]), driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
+        coefficients=frozen_copy([a1, a2]), driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
     )

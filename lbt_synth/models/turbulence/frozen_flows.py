@@ -22,7 +22,7 @@ from lbt_synth.models.turbulence.atmosphere import (
     tilt_strength_nm2,
     tilt_variance,
 )
-from lbt_synth.validation import FloatArray, IntArray, instance, real_array
+from lbt_synth.validation import FloatArray, IntArray, real_array, require_instance
 
 _TERMS = 12  # of the polynomial over an octave of the outer scale
 _FEW_SCALES = 16  # outer scales that have a table each
@@ -64,7 +64,7 @@ class FrozenFlows:
     outer_scale_m: Any = None
 
     def __post_init__(self) -> None:
-        instance(self.atmosphere, Atmosphere)
+        require_instance(self.atmosphere, Atmosphere)
         given = {}
         for name in ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m"):
             value = getattr(self, name)

@@ -15,12 +15,12 @@ from lbt_synth.models.turbulence.atmosphere import Atmosphere
 from lbt_synth.models.turbulence.zernike import noll_orders, zernike_variances
 from lbt_synth.validation import (
     FloatArray,
-    frozen,
-    instance,
+    frozen_copy,
     integer,
     matrix,
     number,
     real_array,
+    require_instance,
     sequence,
 )
 
@@ -122,7 +122,7 @@ class ModalTurbulence:
             row[: model.order] = model.coefficients
         return cls(
             coefficients=coefficients,
-            driving_rms_nm=frozen([model.driving_rms_nm for model in each]),
+            driving_rms_nm=frozen_copy([model.driving_rms_nm for model in each]),
             frame_rate_hz=rate,
         )
 
@@ -148,7 +148,7 @@ class ModalTurbulence:
     @property
     def rms_nm(self) -> FloatArray:
         """Stationary standard deviation of each mode [nm], (n,)."""
-        return frozen(self.driving_rms_nm * np.sqrt(variance_ratios(self.coefficients)))
+        return frozen_copy(self.driving_rms_nm * np.sqrt(variance_ratios(self.coefficients)))
 
     def model(self, mode: int) -> ARModel:
         """Return the process of one mode.
@@ -246,7 +246,7 @@ def modal_turbulence(
     >>> modes.coefficients[[0, 2, 671], 0].round(4).tolist()
     [0.9886, 0.9829, 0.8089]
     """
-    instance(atmosphere, Atmosphere)
+    require_instance(atmosphere, Atmosphere)
     radial, _ = noll_orders(modes)
     orders = range(1, int(radial[-1]) + 1)
     poles = np.array(

@@ -12,7 +12,7 @@ from scipy.special import jv
 
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models.turbulence.atmosphere import Atmosphere, kolmogorov_constant_nm2
-from lbt_synth.validation import FloatArray, IntArray, frozen, integer
+from lbt_synth.validation import FloatArray, IntArray, frozen_copy, integer
 
 _FURTHEST = 30  # times the order plus 2: where the integral goes over to its tail
 
@@ -87,7 +87,7 @@ def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
         # beyond, J^2 is 1 / (pi x) in the mean, and the outer scale is not felt
         integral += per_x ** (11 / 3) * edges[-1] ** (-14 / 3) * 3 / (14 * np.pi)
         out[n - 1] = 8 * np.pi * (n + 1) / per_x**2 * integral
-    return frozen(kolmogorov_constant_nm2(atmosphere) * out)
+    return frozen_copy(kolmogorov_constant_nm2(atmosphere) * out)
 
 
 def _read_only(values: list[int]) -> IntArray:

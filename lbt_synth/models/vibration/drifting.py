@@ -68,7 +68,7 @@ class DriftingVibration:
         )
         if self.damping is not None:
             object.__setattr__(self, "damping", line.damping)
-            line.moved(self.end_hz)
+            line.at_frequency(self.end_hz)
         object.__setattr__(self, "rms_nm", line.rms_nm)
         object.__setattr__(self, "direction", line.direction)
 

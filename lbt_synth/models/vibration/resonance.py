@@ -125,7 +125,7 @@ class Vibration:
         ratio = drive / moved.ar_model(frame_rate_hz).driving_rms_nm
         return replace(moved, rms_nm=self.rms_nm * ratio)
 
-    def moved(self, frequency_hz: float) -> Vibration:
+    def at_frequency(self, frequency_hz: float) -> Vibration:
         """Return this vibration at another frequency, with the same rms and the same decay.
 
         The decay rate is damping times frequency, so the coefficient a2 of the AR2 process
@@ -150,7 +150,7 @@ class Vibration:
         --------
         >>> import lbt_synth as lbt
         >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
-        >>> line.moved(25).damping
+        >>> line.at_frequency(25).damping
         0.008
         """
         rate = self.damping * self.frequency_hz

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+from support.drifting import drifting
+from support.plants import LBT_YAML
 from support.small_telescope import PLANT, SETUP, SHAKE, needs_specula
 
 import lbt_synth as lbt
-from lbt_synth.interop.specula.json_cases import make_case, run_case
+from lbt_synth.interop.specula.json_cases import _build_vibration, make_case, run_case
 
 
 def test_a_case_holds_all_that_decides_and_fits_into_json(setup):
@@ -44,3 +46,10 @@ def test_a_case_is_its_run(cache):
     case = json.loads(json.dumps(make_case(setup, None, vibrations=[shake], seed=5)))
     run = replace(setup, vibrations=(shake,)).run(None, cache=cache)
     assert run_case(case, cache=cache)["tip_rms_nm"] == float(run.rms_nm[0])
+
+
+def test_a_case_keeps_a_drifting_vibration():
+    setup = lbt.load_config(LBT_YAML).end_to_end
+    line = drifting(direction=(1, 0), damping=0.01)
+    case = json.loads(json.dumps(make_case(setup, None, vibrations=[line])))
+    assert _build_vibration(case["vibrations"][0]) == line

@@ -1,0 +1,381 @@
+"""solve_dare against published examples, closed forms and other solvers."""
+
+from __future__ import annotations
+
+import runpy
+
+import mpmath
+import numpy as np
+import pytest
+import scipy.linalg
+import slycot
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.darex import EXAMPLES, example_2_1, example_2_4, example_2_5
+from support.plants import ROOT, lbt_axis_plant
+
+import lbt_synth as lbt
+
+
+def residual(A, B, Q, R, S, X):
+    gain = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
+    return A.T @ X @ A - X + Q - (A.T @ X @ B + S) @ gain
+
+
+def test_golden_ratio():
+    assert lbt.solve_dare(1, 1, 1, 1).X[0, 0] == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-15)
+
+
+@given(a=st.floats(-3, 3), q=st.floats(1e-6, 1e6), r=st.floats(1e-6, 1e6))
+def test_scalar_closed_form(a, q, r):
+    # x^2 + (r - r a^2 - q) x - q r = 0, b = 1
+    half = (r * a**2 + q - r) / 2
+    root = np.hypot(half, np.sqrt(q * r))
+    exact = half + root if half >= 0 else q * r / (root - half)
+    assert lbt.solve_dare(a, 1, q, r).X[0, 0] == pytest.approx(exact, rel=1e-9)
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 8), m=st.integers(1, 3))
+def test_random_equations_against_scipy(seed, n, m):
+    rng = np.random.default_rng(seed)
+    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
+    W = rng.standard_normal((n + m, n + m))
+    W = W @ W.T + 1e-3 * np.eye(n + m)
+    Q, S, R = W[:n, :n], W[:n, n:], W[n:, n:]
+    solution = lbt.solve_dare(A, B, Q, R, S)
+    expected = scipy.linalg.solve_discrete_are(A, B, Q, R, s=S)
+    assert np.allclose(solution.X, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    assert np.max(np.abs(solution.poles)) < 1
+    scale = np.linalg.norm(solution.X, 1) * (1 + np.linalg.norm(A, 1) ** 2)
+    assert np.linalg.norm(residual(A, B, Q, R, S, solution.X), 1) / scale < 1e-10
+
+
+@given(seed=st.integers(0, 10_000))
+def test_similarity_and_scaling(seed):
+    rng = np.random.default_rng(seed)
+    A, B = rng.standard_normal((4, 4)), rng.standard_normal((4, 2))
+    Q, R = np.eye(4), np.eye(2)
+    X = lbt.solve_dare(A, B, Q, R).X
+    T = np.linalg.qr(rng.standard_normal((4, 4)))[0]
+    turned = lbt.solve_dare(T.T @ A @ T, T.T @ B, T.T @ Q @ T, R).X
+    assert np.allclose(T @ turned @ T.T, X, rtol=1e-8, atol=1e-8 * np.abs(X).max())
+    assert np.allclose(lbt.solve_dare(A, B, 1e6 * Q, 1e6 * R).X, 1e6 * X, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((np.eye(2), np.ones((3, 1)), np.eye(2), 1), r"B must have 2 rows to match A \(2, 2\)"),
+        ((np.eye(2), np.ones((2, 1)), np.eye(3), 1), "Q must have 2 rows"),
+        ((np.eye(2), np.ones((2, 1)), np.eye(2), np.eye(2)), "R must have 1 row "),
+        ((np.eye(2), np.ones((2, 1)), [[1, 1], [0, 1]], 1), "Q must be symmetric"),
+        ((np.eye(2), np.zeros((2, 0)), np.eye(2), np.zeros((0, 0))), "at least one column"),
+        ((0.5 * np.eye(2), np.ones((2, 2)), np.eye(2), np.zeros((2, 2))), "R must be positive def"),
+        ((0.5, 1, 0, 0), "must not be singular; it is, whatever X"),
+        ((np.eye(2), np.ones((2, 1)), np.eye(2), np.nan), "R must be finite"),
+        ((np.eye(2)[None], np.ones((2, 1)), np.eye(2), 1, np.ones((3, 1))), "S must have 2 rows"),
+        ((np.ones((2, 1, 1)), 1, np.ones((3, 1, 1)), 1), "leading dimensions.*A .2, 1, 1."),
+        ((1, 1, [1], 1), "Q must be a matrix .2-D. or a stack"),
+    ],
+)
+def test_wrong_equations_are_refused(arguments, text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.solve_dare(*arguments)
+
+
+def random_stack(seed, count, n, m):
+    rng = np.random.default_rng(seed)
+    W = rng.standard_normal((count, n + m, n + m))
+    W = W @ np.swapaxes(W, -1, -2) + 1e-2 * np.eye(n + m)
+    A, B = rng.standard_normal((count, n, n)), rng.standard_normal((count, n, m))
+    return A, B, W[:, :n, :n], W[:, n:, n:], W[:, :n, n:]
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 5), m=st.integers(1, 3))
+def test_a_stack_is_its_equations_one_by_one(seed, n, m):
+    parts = random_stack(seed, 6, n, m)
+    stack = lbt.solve_dare(*(part.reshape(2, 3, *part.shape[1:]) for part in parts))
+    assert stack.X.shape == (2, 3, n, n)
+    assert stack.gain_feedback.shape == (2, 3, m, n)
+    assert stack.poles.shape == (2, 3, n)
+    assert stack.residuals.shape == stack.negative.shape == (2, 3)
+    for name in ("X", "gain_feedback", "poles", "residuals", "errors", "negative"):
+        assert not getattr(stack, name).flags.writeable
+    for i in range(6):
+        one = lbt.solve_dare(*(part[i] for part in parts))
+        where = np.unravel_index(i, (2, 3))
+        assert np.allclose(stack.X[where], one.X, rtol=1e-13, atol=1e-13 * np.abs(one.X).max())
+        assert one.X.shape == (n, n)
+
+
+def test_leading_dimensions_are_broadcast():
+    A, B, Q, R, _ = random_stack(1, 4, 3, 1)
+    many = lbt.solve_dare(A[0], B[0], Q, R[0])
+    assert many.X.shape == (4, 3, 3)
+    assert np.allclose(many.X[2], lbt.solve_dare(A[0], B[0], Q[2], R[0]).X, rtol=1e-12)
+    assert lbt.solve_dare(A[:0], B[0], Q[0], R[0]).X.shape == (0, 3, 3)
+
+
+def test_one_bad_equation_of_a_stack_is_named():
+    A = np.array([[[0.5]], [[2.0]], [[0.5]]])
+    B = np.array([[[1.0]], [[0.0]], [[1.0]]])
+    with pytest.raises(
+        lbt.errors.DetectabilityError, match=r"equation 1: \(A, B\) must be stabilis.* at 2"
+    ):
+        lbt.solve_dare(A, B, 1, 1)
+    with pytest.raises(lbt.errors.DetectabilityError, match=r"equation \(0, 1\)"):
+        lbt.solve_dare(A[None], B[None], 1, 1)
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(2, 6), m=st.integers(1, 2))
+def test_singular_input_weights(seed, n, m):
+    """R = 0: the solution has a stable loop and no residual, and the route says why."""
+    rng = np.random.default_rng(seed)
+    A, B, C = rng.standard_normal((n, n)), rng.standard_normal((n, m)), rng.standard_normal((m, n))
+    if (
+        np.linalg.cond(C @ B) > 1e3
+        or np.min(abs(abs(transmission_zeros(A, B, C)) - 1), initial=1) < 1e-3
+    ):
+        return
+    Q = C.T @ C
+    solution = lbt.solve_dare(A, B, Q, np.zeros((m, m)))
+    assert solution.route in ("shifted doubling", "schur")
+    assert solution.attempts[0].route == "doubling"
+    assert solution.attempts[0].solved == 0
+    zero = np.zeros((n, m))
+    scale = np.linalg.norm(solution.X) * (1 + np.linalg.norm(A) ** 2)
+    assert np.linalg.norm(residual(A, B, Q, np.zeros((m, m)), zero, solution.X)) / scale < 1e-9
+    assert np.max(np.abs(np.linalg.eigvals(A - B @ solution.gain_feedback))) < 1
+
+
+def transmission_zeros(A, B, C):
+    n, m = B.shape
+    M = np.block([[A, B], [C, np.zeros((m, m))]])
+    N = np.zeros_like(M)
+    N[:n, :n] = np.eye(n)
+    values = scipy.linalg.eigvals(M, N)
+    return values[np.isfinite(values)]
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 4))
+def test_indefinite_weights_against_slycot(seed, n):
+    """State feedback H-infinity: R = diag(-gamma^2, 1); the level is generous."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    A *= 0.9 / max(abs(np.linalg.eigvals(A)))
+    B = rng.standard_normal((n, 2))
+    open_loop = float(lbt.hinf_norm((A, B[:, :1], np.eye(n), np.zeros((n, 1)))))
+    R = np.diag([-((1.5 * open_loop) ** 2), 1.0])
+    solution = lbt.solve_dare(A, B, np.eye(n), R)
+    with np.errstate(all="ignore"):
+        expected = slycot.sb02od(n, 2, A, B, np.eye(n), R, "D")[0]
+    assert np.allclose(solution.X, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+    assert solution.negative == 1
+    assert np.linalg.eigvalsh(solution.X)[0] > 0
+
+
+def test_an_indefinite_level_that_cannot_be_met_is_refused():
+    """x+ = 0.9 x + w + u, z = x: below the least level of state feedback there is no X."""
+    met = lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-4.0, 1.0]))
+    assert met.X[0, 0] > 0
+    with pytest.raises(
+        (lbt.errors.InfeasibleError, lbt.errors.NumericalError, lbt.errors.DetectabilityError)
+    ):
+        lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-0.5, 1.0]))
+
+
+def test_a_saddle_with_the_wrong_signs_is_refused(monkeypatch):
+    """A stabilising X that changes the signs of the weight is no H-infinity solution."""
+    with pytest.raises(lbt.errors.InfeasibleError, match="as many negative eigenvalues as R"):
+        lbt.solve_dare([[0.0]], [[1.0]], [[2.0]], [[-1.0]])
+    with pytest.raises(lbt.errors.InfeasibleError, match="X must be positive semidefinite"):
+        lbt.solve_dare([[0.0]], [[0.5]], [[-2.0]], [[-1.0]])
+
+
+def test_badly_scaled_states_are_balanced():
+    """States in units of 1e-6 to 1e6 times their own: the same solution, to rounding."""
+    rng = np.random.default_rng(4)
+    plant = lbt_axis_plant(damping=1e-4)
+    exact = lbt.solve_dare(plant.A.T, plant.C.T, plant.Q, plant.R).X
+    for _ in range(20):
+        units = 10.0 ** rng.uniform(-6, 6, 4)
+        A, C = plant.A * units[:, None] / units, plant.C / units
+        found = lbt.solve_dare(A.T, C.T, plant.Q * np.outer(units, units), plant.R)
+        assert found.route == "doubling"
+        assert np.allclose(
+            found.X / np.outer(units, units), exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max()
+        )
+
+
+def test_the_chain_is_reported_when_everything_fails(monkeypatch):
+    import lbt_synth.linear.riccati.dare as module
+
+    def nothing(equations):
+        return np.full_like(equations.Q, np.nan), np.zeros(len(equations.Q), dtype=np.int64)
+
+    monkeypatch.setattr(module, "ROUTES", (("one", nothing), ("two", nothing)))
+    with pytest.raises(lbt.errors.NumericalError, match="one, two gave no stable closed loop"):
+        lbt.solve_dare(0.5, 1, 1, 1)
+
+
+def test_a_later_route_takes_over(monkeypatch):
+    import lbt_synth.linear.riccati.dare as module
+
+    def wrong(equations):
+        return 2 * np.ones_like(equations.Q) * 1e9, np.ones(len(equations.Q), dtype=np.int64)
+
+    routes = dict(module.ROUTES)
+    monkeypatch.setattr(
+        module,
+        "ROUTES",
+        (
+            ("broken", lambda e: (np.full_like(e.Q, np.nan), wrong(e)[1])),
+            ("schur", routes["schur"]),
+        ),
+    )
+    solution = lbt.solve_dare(1, 1, 1, 1)
+    assert solution.X[0, 0] == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-14)
+    assert solution.route == "schur"
+    assert [(a.route, a.tried, a.solved) for a in solution.attempts] == [
+        ("broken", 1, 0),
+        ("schur", 1, 1),
+    ]
+
+
+def test_sb10dd_the_published_digits():
+    """SLICOT's printed controller, from two equations with indefinite weights."""
+    script = runpy.run_path(str(ROOT / "examples" / "output_feedback.py"))
+    sizes = {"controls": 2, "measurements": 2}
+    plant = [script[name] for name in "ABCD"]
+    controller = script["central_controller"](*plant, gamma=111.294, **sizes)
+    printed = (
+        [
+            [-18.0030, 52.0376, 26.0831, -0.4271, -40.9022, 18.0857],
+            [18.8203, -57.6244, -29.0938, 0.5870, 45.3309, -19.8644],
+            [-26.5994, 77.9693, 39.0368, -1.4020, -60.1129, 26.6910],
+            [-21.4163, 62.1719, 30.7507, -0.9201, -48.6221, 21.8351],
+            [-0.8911, 4.2787, 2.3286, -0.2424, -3.0376, 1.2169],
+            [-5.3286, 16.1955, 8.4824, -0.2489, -12.2348, 5.1590],
+        ],
+        [
+            [16.9788, 14.1648],
+            [-18.9215, -15.6726],
+            [25.2046, 21.2848],
+            [20.1122, 16.8322],
+            [1.4104, 1.2040],
+            [5.3181, 4.5149],
+        ],
+        [
+            [-9.1941, 27.5165, 13.7364, -0.3639, -21.5983, 9.6025],
+            [3.6490, -10.6194, -5.2772, 0.2432, 8.1108, -3.6293],
+        ],
+        [[9.0317, 7.5348], [-3.4006, -2.8219]],
+    )
+    for found, digits in zip(controller, printed, strict=True):
+        assert np.max(np.abs(found - digits)) < 5.1e-5
+    loop = script["closed_loop"](*plant, controller, **sizes)
+    assert float(lbt.hinf_norm(loop)) < 111.294
+
+
+def test_sizes_from_1e_minus_300_to_1e300():
+    """Weights of any size give X of that size; nothing under- or overflows on the way."""
+    A, B = np.array([[1.2, 1.0], [0.0, 0.5]]), [[0.0], [1.0]]
+    expected = lbt.solve_dare(A, B, np.eye(2), 1.0)
+    assert expected.X[0, 0] == pytest.approx(4.517, abs=1e-3)
+    for size in (1e-300, 1e-162, 1e-150, 1e150, 1e155, 1e300):
+        found = lbt.solve_dare(A, B, size * np.eye(2), size)
+        assert np.allclose(found.X / size, expected.X, rtol=1e-12)
+        assert 0 < found.residual < 1e-14
+    for numbers in ((1e200, 1, 1, 1), ([[0, 1e160], [0, 0]], [[0], [1]], np.eye(2), 1)):
+        with pytest.raises(lbt.errors.NumericalError, match="was not solved"):
+            lbt.solve_dare(*numbers)
+
+
+@pytest.mark.parametrize("weight", [1e-8, 1e-12, 1e-16, 1e-20])
+def test_a_pole_next_to_the_circle_is_accurate(weight):
+    """x^2 = weight (x + 1): the pole is 1 / (1 + x), the closer the smaller the weight."""
+    exact = (weight + np.sqrt(weight**2 + 4 * weight)) / 2
+    solution = lbt.solve_dare(1, 1, weight, 1)
+    assert solution.X[0, 0] == pytest.approx(exact, rel=1e-14)
+    assert 1 - abs(solution.poles[0]) == pytest.approx(exact / (1 + exact), rel=1e-5)
+
+
+def test_empty_stacks():
+    empty = lbt.solve_dare(
+        np.zeros((0, 2, 2)), np.zeros((0, 2, 1)), np.zeros((0, 2, 2)), np.zeros((0, 1, 1))
+    )
+    assert empty.X.shape == (0, 2, 2)
+    assert empty.residual == empty.error == 0
+
+
+def test_the_estimated_error_is_of_the_size_of_the_error():
+    """A nearly singular problem: 2.5 of DAREX with tau = 1e8, and an easy one."""
+    hard = example_2_5(1e8)
+    solution = lbt.solve_dare(hard.A, hard.B, hard.Q, hard.R)
+    error = np.linalg.norm(solution.X - hard.X) / np.linalg.norm(hard.X)
+    assert 1e-15 < solution.error < 1e-10
+    assert error < 100 * solution.error
+    assert lbt.solve_dare(1, 1, 1, 1).error < 1e-15
+
+
+# The DAREX examples with known solutions, beside scipy and SLICOT.
+ROUNDING = np.finfo(float).eps
+
+
+def relative(X, exact):
+    return np.linalg.norm(X - exact) / np.linalg.norm(exact)
+
+
+def peers(e):
+    """Answers of scipy and SLICOT, those that they give."""
+    answers = {}
+    for name, call in (
+        ("scipy", lambda: scipy.linalg.solve_discrete_are(e.A, e.B, e.Q, e.R)),
+        ("slycot", lambda: slycot.sb02od(len(e.A), e.B.shape[1], e.A, e.B, e.Q, e.R, "D")[0]),
+    ):
+        try:
+            with np.errstate(all="ignore"):
+                answers[name] = call()
+        except (np.linalg.LinAlgError, ValueError, ArithmeticError):
+            continue
+    return answers
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda e: e.name)
+def test_known_solutions(example):
+    """Never worse than ten times the better of the peers, nor than rounding."""
+    solution = lbt.solve_dare(example.A, example.B, example.Q, example.R)
+    error = relative(solution.X, example.X)
+    best = min(relative(X, example.X) for X in peers(example).values())
+    assert error <= 10 * max(best, ROUNDING)
+    assert error < 1e-12
+    assert np.max(np.abs(solution.poles)) < 1
+
+
+def exact_solution(e):
+    """Newton's method with 40 digits on the data as they are in double precision."""
+    with mpmath.workdps(40):
+        A, B, Q, R, X = (mpmath.matrix(M.tolist()) for M in (e.A, e.B, e.Q, e.R, e.X))
+        for _ in range(6):
+            gain = mpmath.inverse(R + B.T * X * B) * (B.T * X * A)
+            power = A - B * gain
+            X = Q + gain.T * R * gain
+            for _ in range(60):
+                X, power = X + power.T * X * power, power * power
+        return X
+
+
+def error_in_digits(X, exact):
+    with mpmath.workdps(40):
+        difference = mpmath.matrix(X.tolist()) - exact
+        return float(mpmath.sqrt(sum(x * x for x in difference) / sum(x * x for x in exact)))
+
+
+@pytest.mark.parametrize("example", [example_2_1(1e6), example_2_4(1e6)], ids=lambda e: e.name)
+def test_ten_times_better_than_the_peers(example):
+    """Against the exact solution of the rounded data: the printed one is only as good as those."""
+    exact = exact_solution(example)
+    ours = error_in_digits(lbt.solve_dare(example.A, example.B, example.Q, example.R).X, exact)
+    best = min(error_in_digits(X, exact) for X in peers(example).values())
+    assert 10 * ours <= best

@@ -1,0 +1,68 @@
+"""Frequency responses, and the way to python-control and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lbt_synth as lbt
+
+
+def random_system(seed, n, m, p, radius):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    A *= radius / max(abs(np.linalg.eigvals(A)))
+    return A, rng.standard_normal((n, m)), rng.standard_normal((p, n)), rng.standard_normal((p, m))
+
+
+def test_round_trip_through_python_control():
+    A, B, C, D = random_system(4, 5, 2, 3, 0.9)
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
+    back = lbt.linear.StateSpace.of(system.to_control())
+    for name in "ABCD":
+        assert np.array_equal(getattr(back, name), getattr(system, name))
+    assert back.dt_s == 0.002
+
+
+def test_frequency_response_against_python_control():
+    A, B, C, D = random_system(7, 5, 2, 3, 0.9)
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D, dt_s=0.002)
+    f = np.linspace(0.0, 250, 40)
+    expected = np.moveaxis(system.to_control()(np.exp(2j * np.pi * f * 0.002)), 2, 0)
+    assert np.allclose(system.frequency_response(f), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("n", [2, 5, 12])
+def test_frequency_responses_of_defective_matrices(n):
+    """A Jordan block at 0.9, turned at random: no basis of eigenvectors, a closed form."""
+    turn = np.linalg.qr(np.random.default_rng(n).standard_normal((n, n)))[0]
+    block = 0.9 * np.eye(n) + np.eye(n, k=1)
+    system = lbt.linear.StateSpace(
+        A=turn @ block @ turn.T, B=turn[:, -1:], C=turn[:, :1].T, D=[[0.0]], dt_s=1.0
+    )
+    frequency = np.linspace(0.1, 0.5, 5000)
+    z = np.exp(2j * np.pi * frequency)
+    response = system.frequency_response(frequency)[:, 0, 0]
+    assert np.max(np.abs(response * (z - 0.9) ** n - 1)) < 1e-9
+
+
+@given(seed=st.integers(0, 100_000), n=st.integers(1, 9), m=st.integers(1, 4), p=st.integers(1, 4))
+def test_many_points_and_few_points_agree(seed, n, m, p):
+    A, B, C, D = random_system(seed, n, m, p, 0.95)
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D)
+    frequency = np.linspace(0, 0.5, 101)
+    many = system.frequency_response(frequency)
+    few = np.concatenate([system.frequency_response(frequency[i : i + 1]) for i in range(101)])
+    assert np.allclose(many, few, rtol=1e-10, atol=1e-10 * np.abs(few).max())
+    sigma = np.linalg.svd(few, compute_uv=False)[:, 0]
+    assert np.allclose(lbt.linear.largest_singular_values(system, frequency), sigma, rtol=1e-10)
+
+
+def test_a_pole_on_the_unit_circle_has_no_response():
+    integrator = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.1)
+    for frequency in ([0.0], np.linspace(0, 5, 50)):
+        with pytest.raises(lbt.errors.ProblemError, match="pole at 0 Hz, on the unit circle"):
+            integrator.frequency_response(frequency)
+    assert np.isfinite(integrator.frequency_response(np.linspace(0.1, 5, 50))).all()

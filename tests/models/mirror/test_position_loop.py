@@ -1,0 +1,111 @@
+"""The local position loop of the mirror, against python-control and closed forms."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import lbt_synth as lbt
+
+QUICK = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 500}
+
+
+SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_samples": 2}
+
+
+def shell(**changes):
+    return lbt.models.PositionLoop.from_bandwidth(**{**QUICK, **changes})
+
+
+def test_the_step_is_that_of_a_second_order_system_when_sampled_fast():
+    w, z = 2 * np.pi * 500, 0.6
+    mirror = shell(bandwidth_damping=z, sampling_hz=2e6, delay_samples=0)
+    step = mirror.step_response()
+    t, wd = step.time_s, w * np.sqrt(1 - z**2)
+    exact = 1 - np.exp(-z * w * t) * (np.cos(wd * t) + z / np.sqrt(1 - z**2) * np.sin(wd * t))
+    np.testing.assert_allclose(step.position, exact, atol=2e-3)
+    assert step.overshoot == pytest.approx(np.exp(-np.pi * z / np.sqrt(1 - z**2)), rel=2e-2)
+    enters = brentq(lambda s: np.interp(s, t, exact) - 0.9, 0, np.pi / wd)
+    assert step.settling_s == pytest.approx(enters, rel=2e-3)
+    quarter = (1 - 2 * z**2) + np.sqrt((1 - 2 * z**2) ** 2 + 1)
+    assert mirror.bandwidth_hz == pytest.approx(500 * np.sqrt(quarter), rel=2e-3)
+
+
+def test_the_lag_converges_with_the_sampling():
+    """Sampled feedback differs from the continuous one by a term of first order in the sample."""
+    t = np.linspace(0, 2e-3, 50)
+    w, z = 2 * np.pi * 500, 0.7
+    wd = w * np.sqrt(1 - z**2)
+    exact = 1 - np.exp(-z * w * t) * (np.cos(wd * t) + z / np.sqrt(1 - z**2) * np.sin(wd * t))
+    errors = []
+    for rate in (2e5, 4e5, 8e5):
+        step = shell(sampling_hz=rate, delay_samples=0).step_response()
+        errors.append(np.max(np.abs(np.interp(t, step.time_s, step.position) - exact)))
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.05)
+    assert errors[1] / errors[2] == pytest.approx(2, rel=0.05)
+
+
+@pytest.mark.parametrize("changes", [{}, {"ramp_samples": 37, "delay_samples": 0}, SLOW])
+def test_a_step_response_in_blocks_is_that_sample_by_sample(changes):
+    mirror = shell(**changes)
+    loop, step = mirror.closed_loop(), mirror.step_response()
+    state = np.zeros(loop.n_states)
+    for i in range(300):
+        assert step.position[8 * i] == pytest.approx(state[0], abs=1e-12)
+        r = min(1.0, (i + 1) / mirror.ramp_samples)
+        state = loop.A @ state + loop.B[:, 0] * r
+
+
+def test_the_motion_within_a_sample_is_that_of_python_control():
+    mirror = lbt.models.PositionLoop(
+        natural_frequency_hz=300,
+        damping=0.2,
+        proportional_per_s2=0,
+        derivative_per_s=0,
+        sampling_hz=9000,
+        delay_samples=0,
+    )
+    w = 2 * np.pi * 300
+    plant = control.tf([w**2], [1, 2 * 0.2 * w, w**2])
+    peer = control.sample_system(plant, 1 / 9000, method="zoh")
+    f = np.array([10.0, 100, 290, 1000, 4000])
+    ours = mirror.closed_loop().frequency_response(f)[:, 0, 0]
+    np.testing.assert_allclose(ours, peer(np.exp(2j * np.pi * f / 9000)), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"bandwidth_hz": 30}, "bandwidth_hz must be at least 50"),
+        ({"natural_frequency_hz": 0}, "natural_frequency_hz must be above 0"),
+        ({"damping": -0.1}, "damping must be at least 0"),
+        ({"bandwidth_hz": 5000, "delay_samples": 6}, "local loop of the mirror must be stable"),
+        ({"delay_samples": 0.5}, "delay_samples must be an integer"),
+        ({"delay_samples": 1000}, "delay_samples must be at most 64"),
+        ({"ramp_samples": 0}, "ramp_samples must be at least 1"),
+        ({"sampling_hz": 80.0}, "natural_frequency_hz must lie below half"),
+        ({"feed_forward": 11}, "feed_forward must be at most 10"),
+        ({"damping": 20.0}, "bandwidth_damping must be at least"),
+    ],
+)
+def test_impossible_local_loops_are_refused(changes, message):
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        shell(**changes)
+
+
+def test_a_mirror_without_any_force_is_refused():
+    with pytest.raises(lbt.errors.ProblemError, match="must follow its command"):
+        lbt.models.PositionLoop(
+            natural_frequency_hz=10,
+            damping=1,
+            proportional_per_s2=0,
+            derivative_per_s=0,
+            feed_forward=0,
+        )
+
+
+def test_a_tolerance_out_of_range_is_refused():
+    with pytest.raises(lbt.errors.ProblemError, match="tolerance must be below 1"):
+        shell().step_response(1.0)

@@ -1,0 +1,33 @@
+"""Variance and spectrum of auto-regressive processes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import solve_discrete_lyapunov
+
+import lbt_synth as lbt
+
+
+@given(poles=st.lists(st.floats(-0.95, 0.95), min_size=1, max_size=5))
+def test_variance_against_a_lyapunov_equation(poles):
+    coefficients = -np.poly(poles)[1:]
+    model = lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=3.0, frame_rate_hz=1)
+    drive = np.zeros((len(poles), len(poles)))
+    drive[0, 0] = 9.0
+    expected = solve_discrete_lyapunov(model.companion, drive)[0, 0]
+    assert model.rms_nm**2 == pytest.approx(expected, rel=1e-6)
+
+
+def test_ar_spectrum_integrates_to_its_variance():
+    model = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=7.0).ar_model(800)
+    f = np.linspace(0, 400, 400_001)
+    assert np.trapezoid(model.psd(f), f) == pytest.approx(49.0, rel=1e-6)
+
+
+def test_the_papers_literal_sign_is_refused():
+    a1, a2 = 1.972279, 0.996863  # erratum 1: + A2
+    with pytest.raises(lbt.errors.ProblemError, match="Check the signs"):
+        lbt.models.ARModel(coefficients=[a1, a2], driving_rms_nm=1, frame_rate_hz=800)

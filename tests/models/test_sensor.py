@@ -1,0 +1,19 @@
+"""Measurement noise of the pyramid sensor."""
+
+from __future__ import annotations
+
+import pytest
+
+import lbt_synth as lbt
+
+
+def test_pyramid_noise_of_the_lbt():
+    noise = lbt.models.pyramid_tilt_noise_nm(
+        photons=50,
+        read_noise_electrons=8,
+        modulation_lambda_over_d=4,
+        subapertures=704,
+        wavelength_um=0.75,
+        diameter_m=8.22,
+    )
+    assert noise == pytest.approx(15.5, abs=0.05)

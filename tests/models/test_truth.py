@@ -1,0 +1,37 @@
+"""A truth, and all its parts, refuse impossible values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda v: lbt.Vibration(frequency_hz=v, damping=0.1, rms_nm=1),
+        lambda v: lbt.Vibration(frequency_hz=1, damping=v, rms_nm=1),
+        lambda v: lbt.Vibration(frequency_hz=1, damping=0.1, rms_nm=v),
+        lambda v: lbt.models.SinusoidalVibration(frequency_hz=1, rms_nm=v),
+        lambda v: lbt.models.ARModel(coefficients=[v], driving_rms_nm=1, frame_rate_hz=1),
+        lambda v: lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=v, frame_rate_hz=1),
+        lambda v: lbt.Truth(turbulence=None, noise_nm=v),
+        lambda v: lbt.Truth(turbulence=None, sensor_gain=v),
+        lambda v: lbt.Imaging(diameter_m=v),
+        lambda v: lbt.LoopHardware(frame_rate_hz=v),
+        lambda v: lbt.LoopHardware(frame_rate_hz=1, delay_frames=v),
+        lambda v: lbt.models.nm_per_mas(v),
+        lambda v: lbt.models.TabulatedSpectrum(frequency_hz=[0, v], density_nm2_hz=[1, 1]),
+    ],
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -2.0])
+def test_impossible_values_are_refused(make, value):
+    with pytest.raises(lbt.errors.ProblemError):
+        make(value)
+
+
+def test_a_truth_needs_a_spectrum():
+    with pytest.raises(lbt.errors.ProblemError, match="psd"):
+        lbt.Truth(turbulence=3.0)

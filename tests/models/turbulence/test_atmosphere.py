@@ -1,0 +1,96 @@
+"""The tilt of von Karman turbulence, against published numbers and adaptive quadrature."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.special import jv
+
+import lbt_synth as lbt
+
+
+def test_tilt_rms_of_the_lbt(air):
+    assert air.fried_parameter_m == pytest.approx(0.1258, abs=1e-4)
+    assert air.tilt_rms_nm == pytest.approx(591.7, abs=0.5)
+
+
+def test_tilt_variance_against_adaptive_quadrature(air):
+    r0, D = air.fried_parameter_m, 8.22
+
+    def integrand(f):
+        bessel = 2 * jv(2, np.pi * D * f) / (np.pi * D * f)
+        return f * 0.0228956 * r0 ** (-5 / 3) * (f**2 + 22.0**-2) ** (-11 / 6) * bessel**2
+
+    total = sum(quad(integrand, a, b, limit=400)[0] for a, b in ((1e-9, 0.1), (0.1, 1), (1, 40)))
+    variance_rad2 = 2 * np.pi * 2 * total
+    assert air.tilt_rms_nm == pytest.approx(np.sqrt(variance_rad2) * 500 / (2 * np.pi), rel=1e-5)
+
+
+def test_tilt_spectrum_between_the_points_of_its_table(air):
+    """By adaptive quadrature over the other spatial frequency."""
+    r0, D, V = air.fried_parameter_m, air.diameter_m, air.wind_speed_m_s
+    scale = 0.0228956 * r0 ** (-5 / 3) * (500 / (2 * np.pi)) ** 2
+
+    def spatial(fy, fx):
+        f = np.hypot(fx, fy)
+        tilt = 2 * (4 * jv(2, np.pi * D * f) / (2 * np.pi * D * f)) ** 2
+        return scale * (f**2 + 22.0**-2) ** (-11 / 6) * tilt
+
+    # those between two points of the table, in units of V / D
+    for x in (0.011, 0.27, 0.8137, 1.9371, 4.4417, 9.97):
+        f = x * V / D
+        edges = np.concatenate([[0], np.geomspace(1e-3, 40, 60)]) / D
+        total = sum(
+            quad(spatial, low, high, args=(f / V,), limit=200)[0]
+            for low, high in itertools.pairwise(edges)
+        )
+        assert air.psd(f) == pytest.approx(4 / V * total, rel=2e-5)
+
+
+def test_kolmogorov_tilt_has_nolls_coefficient():
+    air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=None, wind_speed_m_s=1, diameter_m=8.0)
+    # Noll 1976, Table IV: each tilt has the variance 0.449 (D/r0)^(5/3) rad^2
+    coefficient = (air.tilt_rms_nm * 2 * np.pi / 500) ** 2 / (8.0 / air.fried_parameter_m) ** (
+        5 / 3
+    )
+    assert coefficient == pytest.approx(0.449, abs=0.002)
+
+
+def test_annulus_shakes_a_little_more():
+    annulus = lbt.Atmosphere(
+        seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22, obstruction=0.11
+    )
+    assert annulus.tilt_rms_nm == pytest.approx(595.3, abs=0.5)
+
+
+def test_spectrum_integrates_to_the_variance(air):
+    f = np.geomspace(1e-5, 400, 100_001)
+    assert np.trapezoid(air.psd(f), f) == pytest.approx(air.tilt_rms_nm**2, rel=2e-3)
+
+
+def test_two_frame_increment_of_frozen_flow(air):
+    f = np.geomspace(1e-5, 400, 100_001)
+    increment = np.trapezoid(2 * air.psd(f) * (1 - np.cos(2 * np.pi * f * 2 / 800)), f)
+    assert np.sqrt(increment) == pytest.approx(10.4, abs=0.1)
+
+
+def test_spectrum_falls_with_the_power_17_thirds(air):
+    slope = np.diff(np.log(air.psd([300.0, 3000.0])))[0] / np.log(10)
+    assert slope == pytest.approx(-17 / 3, abs=0.05)
+
+
+@settings(max_examples=5)
+@given(factor=st.floats(0.2, 5))
+def test_taylor_wind_only_stretches_time(factor):
+    def at(speed):
+        return lbt.Atmosphere(
+            seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=speed, diameter_m=8.22
+        )
+
+    f = np.array([0.3, 1.0, 4.0])
+    assert np.allclose(at(20 * factor).psd(f * factor) * factor, at(20).psd(f), rtol=1e-6)

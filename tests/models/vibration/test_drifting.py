@@ -1,0 +1,124 @@
+"""A drifting vibration has the frequency, phase and variance that it should."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import hilbert
+from support.drifting import drifting
+
+import lbt_synth as lbt
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.models.truth import checked_direction
+
+PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+
+
+def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):
+    truth = lbt.Truth(turbulence=None, vibrations=(line,))
+    rng = np.random.default_rng(seed)
+    return draw_disturbance(
+        truth, PATH, frames=frames, cases=cases, rng=rng, zero_frame=zero_frame
+    )[..., 0]
+
+
+def test_the_sinusoid_has_the_frequency_at_each_time():
+    """By its analytic signal (Hilbert), and by counting zero crossings second by second."""
+    line = drifting()
+    (series,) = drawn(line, frames=14 * 800, zero_frame=1600)
+    time_s = (np.arange(series.size) - 1600) / 800
+    phase = np.unwrap(np.angle(hilbert(series)))
+    found = np.gradient(phase, time_s) / (2 * np.pi)
+    inside = slice(400, -400)  # the ends of a Hilbert transform are wrong
+    assert np.max(np.abs(found - line.frequency_hz_at(time_s))[inside]) < 0.06
+    assert np.abs(np.mean((found - line.frequency_hz_at(time_s))[inside])) < 1e-3
+    for second in range(14):
+        part = series[800 * second : 800 * (second + 1)]
+        crossings = np.count_nonzero(np.diff(np.signbit(part)))
+        middle = line.frequency_hz_at(second - 2 + 0.5)
+        assert abs(crossings / 2 - middle) <= 1
+    assert np.max(np.abs(series)) == pytest.approx(100 * np.sqrt(2), rel=1e-3)
+
+
+def test_the_phase_is_the_integral_of_the_frequency():
+    line = drifting(start_hz=23, end_hz=17, duration_s=3)
+    time_s = np.linspace(-2, 5, 70_001)
+    summed = np.concatenate(
+        [[0], np.cumsum((line.frequency_hz_at(time_s)[1:] + line.frequency_hz_at(time_s)[:-1]) / 2)]
+    ) * (time_s[1] - time_s[0])
+    turns = line.turns_at(time_s)
+    assert np.allclose(turns - turns[0], summed, atol=1e-8)
+    assert line.turns_at(0.0) == 0
+
+
+def test_without_a_drift_it_is_the_sinusoid_and_the_resonance():
+    still = drifting(start_hz=20, end_hz=20)
+    (series,) = drawn(still, frames=4000, zero_frame=321)
+    plain = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
+    a, b = np.cos(2 * np.pi * 20 * np.arange(4000) / 800), np.sin(2 * np.pi * np.arange(4000) / 40)
+    basis = np.stack([a, b], axis=1)
+    left = series - basis @ np.linalg.lstsq(basis, series, rcond=None)[0]
+    assert np.max(np.abs(left)) < 1e-8
+    assert np.std(series) == pytest.approx(np.std(drawn(plain, frames=4000)), rel=1e-3)
+
+    damped = drifting(start_hz=20, end_hz=20, damping=0.01)
+    a1, a2, driving = damped.ar_process(np.arange(-5, 5) / 800, 800)
+    model = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100).ar_model(800)
+    assert np.allclose(a1, model.coefficients[0], rtol=1e-14)
+    assert a2 == pytest.approx(model.coefficients[1], rel=1e-14)
+    assert np.allclose(driving, model.driving_rms_nm, rtol=1e-9)
+
+
+@given(
+    start=st.floats(5, 60),
+    end=st.floats(5, 60),
+    duration=st.floats(2, 30),
+    damping=st.floats(0.02, 0.3),
+)
+def test_the_variance_of_the_resonance_is_held_exactly(start, end, duration, damping):
+    """Against the recursion of the covariance of two frames, whatever the drift."""
+    line = drifting(
+        start_hz=start, end_hz=max(end, 0.5 * start), duration_s=duration, damping=damping
+    )
+    time_s = (np.arange(600) - 100) / 800
+    try:
+        a1, a2, driving = line.ar_process(time_s, 800)
+    except lbt.errors.ProblemError:
+        assert end < start  # only a falling frequency pumps up the amplitude
+        return
+    together = a1[0] / (1 - a2)
+    P = 100**2 * np.array([[1, together], [together, 1]])
+    for k in range(len(time_s)):
+        A = np.array([[a1[k], a2], [1, 0]])
+        P = A @ P @ A.T
+        P[0, 0] += driving[k] ** 2
+        assert P[0, 0] == pytest.approx(100**2, rel=1e-8)
+
+
+def test_wrong_drifts_are_refused():
+    for wrong, words in (
+        ({"start_hz": 0}, "start_hz must be above 0"),
+        ({"end_hz": -1}, "end_hz must be above 0"),
+        ({"duration_s": 0}, "duration_s must be above 0"),
+        ({"rms_nm": float("nan")}, "rms_nm must be finite"),
+        ({"damping": 1.0}, "damping must be below 1"),
+        ({"direction": (0,)}, "direction must be a vector"),
+        ({"damping": 0.5, "end_hz": 8}, "frequency above that"),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            drifting(**wrong)
+    with pytest.raises(lbt.errors.ProblemError, match="time_s must be finite"):
+        drifting().frequency_hz_at(np.nan)
+    with pytest.raises(lbt.errors.ProblemError, match="a sinusoid has no AR2 process"):
+        drifting().ar_process(np.arange(3) / 800, 800)
+    falls = drifting(start_hz=23, end_hz=10, duration_s=0.5, damping=1e-4)
+    with pytest.raises(lbt.errors.ProblemError, match="must move slowly beside its decay"):
+        drawn(falls, frames=800)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"
+    ):
+        checked_direction(drifting(end_hz=500), PATH)
+    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
+        checked_direction(drifting(direction=(1, 0)), PATH)
