@@ -177,3 +177,14 @@ def whole_page(name: str = "first") -> Page:
             ),
         ),
     )
+
+
+def many_panels(count, title="p", columns=2):
+    """A chart of so many equal panels."""
+    x = np.linspace(0, 1, 5)
+    panel = Panel(
+        title=title, x=Axis(label="x"), y=Axis(label="y"), marks=(Curve(name="a", x=x, y=x),)
+    )
+    return Chart(
+        key="many", title="Many", caption="c", alt="a", panels=count * (panel,), columns=columns
+    )

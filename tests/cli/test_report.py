@@ -1,0 +1,188 @@
+"""The command ``report``: its files, its output, and its errors in one line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support.commands import run
+from support.design_reports import SMALL, three_designs
+from support.pages import Reader
+from support.plants import lbt_axis_plant
+
+import lbt_synth as lbt
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("report")
+    (place / "small.yaml").write_text(SMALL)
+    return place
+
+
+@pytest.fixture(scope="module")
+def config(folder):
+    return lbt.load_config(folder / "small.yaml")
+
+
+@pytest.fixture(scope="module")
+def designs(config):
+    return three_designs(config)
+
+
+@pytest.fixture(scope="module")
+def report(config, designs):
+    return lbt.report.design_report(config, designs)
+
+
+def test_command(folder, designs, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    for name in ("kalman", "slow"):
+        lbt.save_gain(f"{name}.fits", designs[name])
+    command = ("report", "small.yaml", "kalman.fits", "slow.fits")
+    status, out, error = run(capsys, *command, "-o", "r.html", "--pdf", "r.pdf", "--json")
+    assert (status, error) == (0, "")
+    data = json.loads(out)
+    assert data["files"] == ["r.html", "r.pdf"]
+    assert list(data["designs"]) == ["kalman", "slow"]
+    kalman = data["designs"]["kalman"]
+    loop = lbt.close_loop(lbt.load_config("small.yaml").hardware, designs["kalman"].controller)
+    budget = lbt.residual_budget(loop, lbt.load_config("small.yaml").truth)
+    assert kalman["residual_nm"] == pytest.approx(budget.rms_nm)
+    assert kalman["certified"] is True
+    assert (
+        data["sha256"]["kalman.fits"]
+        == hashlib.sha256(Path("kalman.fits").read_bytes()).hexdigest()
+    )
+    assert data["made"] == "2023-11-14 22:13:20 UTC"
+    first = [Path(name).read_bytes() for name in ("r.html", "r.pdf")]
+    status, out, _ = run(capsys, *command, "-o", "r.html")
+    assert status == 0
+    assert "kalman leaves the least" in out
+    assert "written: r.html" in out
+    assert [Path(name).read_bytes() for name in ("r.html", "r.pdf")] == first
+
+
+def test_hostile_files_are_quoted(folder, designs, tmp_path, capsys):
+    name = "<script>alert('x')<" + "_k.fits"
+    lbt.save_gain(tmp_path / name, designs["slow"])
+    yaml = tmp_path / "a&b.yaml"
+    yaml.write_text("# </code></pre><script>alert(2)</script>\n" + SMALL)
+    out_file = tmp_path / "r.html"
+    status, _, error = run(
+        capsys,
+        "report",
+        str(yaml),
+        str(tmp_path / name),
+        "-o",
+        str(out_file),
+        "--title",
+        "<i>T</i>",
+    )
+    assert (status, error) == (0, "")
+    text = out_file.read_text()
+    reader = Reader(text)
+    assert len(reader.named("script")) == 3
+    assert not reader.named("i")
+    assert reader.texts["title"] == ["<i>T</i>"]
+    assert reader.texts["code"][0].startswith("# </code></pre><script>alert(2)</script>")
+    assert "<script>alert('x')<_k" in reader.texts["th"]
+
+
+def test_pages_name_no_directories(folder, designs, tmp_path, capsys):
+    for place in ("a", "b"):
+        (tmp_path / place).mkdir()
+        lbt.save_gain(tmp_path / place / "k.fits", designs["slow"])
+    files = [str(tmp_path / place / "k.fits") for place in ("a", "b")]
+    status, out, _ = run(
+        capsys, "report", str(folder / "small.yaml"), *files, "-o", str(tmp_path / "r.html")
+    )
+    assert status == 0
+    assert "a/k.fits and b/k.fits leave the least" in out
+    text = (tmp_path / "r.html").read_text()
+    assert "a/k.fits" in text
+    assert str(tmp_path) not in text
+
+
+@pytest.mark.parametrize("name", ["red\x1b[31m", "two\nlines", "bad\udcff", "turned\u202e"])
+def test_names_that_no_page_can_show_are_refused(folder, designs, report, tmp_path, capsys, name):
+    with pytest.raises(lbt.errors.ProblemError, match="name of a design must be of letters"):
+        lbt.report.design_report(report.config, {name: designs["slow"]})
+    with pytest.raises(lbt.errors.ProblemError, match="title must be of letters"):
+        lbt.report.write_report(report, tmp_path / "r.html", title=name)
+    lbt.save_gain(tmp_path / "k.fits", designs["slow"])
+    odd = (tmp_path / "k.fits").rename(tmp_path / f"{name}.fits")
+    status, out, error = run(
+        capsys, "report", str(folder / "small.yaml"), str(odd), "-o", str(tmp_path / "r.html")
+    )
+    assert (status, out) == (2, "")
+    assert "must be of letters that a page can show" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "r.html").exists()
+
+
+@pytest.mark.parametrize("wrong", ["tomorrow", "", str(10**30)])
+def test_a_wrong_time_is_refused_before_libraries_read_it(wrong):
+    # numpy and scipy read it when they are loaded: only a new process shows that
+    done = subprocess.run(
+        [sys.executable, "-m", "lbt_synth.cli.main", "report", "a.yaml", "k.fits", "-o", "x.html"],
+        env=os.environ | {"SOURCE_DATE_EPOCH": wrong},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "SOURCE_DATE_EPOCH must be a number of seconds" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def gains(folder, designs, config):
+    lbt.save_gain(folder / "ok.fits", designs["slow"])
+    lbt.save_gain(folder / "one_axis.fits", lbt.kalman(lbt_axis_plant(modes=1)))
+    other = replace(config.hardware, frame_rate_hz=1000.0)
+    lbt.save_gain(folder / "fast.fits", lbt.integrator(other, gain=0.4))
+    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    lbt.save_gain(folder / "bare.fits", lbt.kalman(walk))
+    drift = SMALL.replace(
+        "{kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}",
+        "{kind: drift, axis: tip, frequency_hz: 20.0, end_hz: 21.0, duration_s: 5.0, rms_mas: 80.0}",
+    )
+    (folder / "drift.yaml").write_text(drift)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (
+            ("small.yaml", "one_axis.fits", "-o", "x.html"),
+            "one_axis must be for the configuration's 2",
+        ),
+        (("small.yaml", "fast.fits", "-o", "x.html"), "800 Hz; got a design for 1000 Hz"),
+        (("small.yaml", "bare.fits", "-o", "x.html"), "bare estimation problem"),
+        (("small.yaml", "none.fits", "-o", "x.html"), "cannot read none.fits"),
+        (("none.yaml", "ok.fits", "-o", "x.html"), "cannot read none.yaml"),
+        (("small.yaml", "ok.fits", "ok.fits", "-o", "x.html"), "given once"),
+        (("small.yaml", "ok.fits", "-o", "x.pdf"), "a page must end in .html; got 'x.pdf'"),
+        (("small.yaml", "ok.fits", "-o", "x.html", "--pdf", "x.ps"), "a page must end in .pdf"),
+        (("small.yaml", "ok.fits", "-o", "no/x.html"), "no directory no"),
+        (("small.yaml", "ok.fits", "-o", "x.html", "--pdf", "no/x.pdf"), "no directory no"),
+        (("small.yaml", "ok.fits", "-o", "x.html", "--title", " "), "--title must hold"),
+        (("drift.yaml", "ok.fits", "-o", "x.html"), "a truth that is stationary"),
+    ],
+)
+def test_bad_input_ends_in_one_line(gains, capsys, monkeypatch, arguments, text):
+    monkeypatch.chdir(gains)
+    status, out, error = run(capsys, "report", *arguments)
+    assert (status, out) == (2, "")
+    assert text in error
+    assert error.count("\n") == 1
+    assert not Path("x.html").exists()

@@ -1,0 +1,36 @@
+"""A report of three designs, one of which is unstable."""
+
+from __future__ import annotations
+
+import pytest
+from support.design_reports import SMALL, three_designs
+
+import lbt_synth as lbt
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("report")
+    (place / "small.yaml").write_text(SMALL)
+    return place
+
+
+@pytest.fixture(scope="session")
+def config(folder):
+    return lbt.load_config(folder / "small.yaml")
+
+
+@pytest.fixture(scope="session")
+def designs(config):
+    return three_designs(config)
+
+
+@pytest.fixture(scope="session")
+def report(config, designs):
+    return lbt.report.design_report(config, designs)
+
+
+@pytest.fixture(scope="session")
+def text(report, folder):
+    lbt.report.write_report(report, folder / "a.html", pdf=folder / "a.pdf")
+    return (folder / "a.html").read_text()

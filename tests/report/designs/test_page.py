@@ -1,0 +1,169 @@
+"""The report of designs as a page: it has all that it should, and says loudly what is wrong."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from dataclasses import replace
+
+import pytest
+from support.design_reports import SMALL, words_of
+from support.pages import Reader
+
+import lbt_synth as lbt
+from lbt_synth.report.designs.page import design_page
+from lbt_synth.report.designs.verdict import verdict
+from lbt_synth.report.number_text import fixed_text
+from lbt_synth.storage.tables import Table
+
+
+def test_an_unstable_loop_is_told_loudly(report, text):
+    wild = report.assessments[2]
+    assert not wild.stable
+    assert wild.spectral_radius > 1
+    assert wild.budget is None
+    assert wild.margins is None
+    assert "wild" not in report.simulations
+    # an integrator of 1.5 in two frames is stable below 1 / 1.5
+    (ends,) = wild.sensor_gains
+    assert ends == pytest.approx((0.0, 2 / 3), abs=1e-6)
+    assert not wild.certified  # its loop at the assumed gain, computed anew
+    reader = Reader(text)
+    notices = [a for a in reader.named("p") if "bad" in (a.get("class") or "")]
+    assert len(notices) == 2
+    assert "wild is UNSTABLE in the loop of this configuration" in text
+    assert "The certificate of wild fails: spectral radius of the closed loop" in text
+    assert "wild is UNSTABLE in this loop." in verdict(report)
+    assert 'class="bad">UNSTABLE' in text
+    assert text.count("wild: unstable") > 5
+
+
+def test_a_limit_of_nothing_is_no_limit(config, designs):
+    still = lbt.Truth(turbulence=None, noise_nm=config.truth.noise_nm)
+    report = lbt.report.design_report(replace(config, truth=still), {"slow": designs["slow"]})
+    assert report.limits.limit.rms_nm == 0
+    assert "above the limit" not in words_of(report)
+    assert "passed, 1 check " in words_of(report) + " "
+
+
+def test_the_page_has_all_that_it_should(text, report, config):
+    reader = Reader(text)
+    titles = " ".join(reader.texts["h2"] + reader.texts["h3"])
+    for word in (
+        "Summary",
+        "Rejection and noise",
+        "Strehl ratio over the frequency error",
+        "Poles",
+        "Answer to a step",
+        "Certificates",
+        "Configuration and versions",
+    ):
+        assert word in titles
+    for heading in (
+        "method",
+        "Strehl ratio, exact [%]",
+        "modulus margin",
+        "states of the controller",
+        "stable real sensor gains",
+        "certificate, computed anew",
+    ):
+        assert heading in reader.texts["th"]
+    kalman = report.assessments[0]
+    cells = reader.texts["td"]
+    assert fixed_text(kalman.residual_nm, 1) in cells
+    assert fixed_text(100 * kalman.strehl, 2) in cells
+    assert hashlib.sha256(config.source.read_bytes()).hexdigest() in cells
+    assert lbt.__version__ in cells
+    assert "# The adaptive optics of the Large Binocular Telescope" in reader.texts["code"][0]
+    assert reader.texts["code"][0] == SMALL
+    assert len(text) < 5e6
+    for figure in reader.named("figure"):
+        assert figure["id"] in {a["href"][1:] for a in reader.named("a")}
+
+
+def test_the_pdf(folder, text):
+    pdf = (folder / "a.pdf").read_bytes()
+    assert pdf.startswith(b"%PDF")
+    assert 8 <= len(re.findall(rb"/Type /Page\b", pdf)) <= 14
+    assert b"/Author (lbt_synth" in pdf
+    assert b"/Title (Controllers for small.yaml)" in pdf
+
+
+def test_a_truth_without_vibrations(config, designs):
+    calm = replace(config, truth=replace(config.truth, vibrations=()))
+    report = lbt.report.design_report(calm, {"slow": designs["slow"]})
+    assert report.errors_hz.tolist() == [0.0]
+    page = design_page(report, title="calm")
+    assert "sensor-gain" in [chart.key for chart in page.charts]
+    assert page.title == "calm"
+    assert "no vibration" in words_of(report)
+    assert "slow leaves" in verdict(report)
+
+
+def test_many_designs_fill_several_sheets(config):
+    many = {f"design {i}": lbt.integrator(config.hardware, gain=0.2 + 0.02 * i) for i in range(8)}
+    report = lbt.report.design_report(config, many)
+    keys = [chart.key for chart in design_page(report).charts]
+    assert {"map", "map-2", "poles-2", "spectra-2", "series-2"} <= set(keys)
+    (section,) = [s for s in design_page(report).sections if s.key == "summary"]
+    (table,) = [block for block in section.blocks if isinstance(block, Table)]
+    assert len(table.headings) == 9
+
+
+def test_nothing_stable_is_needed(config, designs):
+    report = lbt.report.design_report(config, {"wild": designs["wild"]})
+    text = words_of(report)
+    charts = design_page(report).charts
+    assert [chart.key for chart in charts] == ["map", "poles"]  # none of them is empty
+    honest = replace(report.assessments[0], checks=())
+    assert "passed; they are about the loops that the designs were made for" in verdict(
+        replace(report, assessments=(honest,))
+    )
+    assert "No loop is stable, so none was simulated." in text
+    assert "No loop is stable, so none has a rejection" in text
+    assert "Of 0" not in text
+
+
+def test_a_certificate_that_cannot_be_computed(config, monkeypatch):
+    slow = lbt.integrator(config.hardware, gain=0.4)
+
+    def broken(self):
+        raise lbt.errors.NumericalError("the norm did not settle.")
+
+    monkeypatch.setattr(type(slow), "recertify", broken)
+    report = lbt.report.design_report(config, {"slow": slow})
+    assert not report.assessments[0].certified
+    text = words_of(report)
+    assert "The certificate of slow fails: the norm did not settle." in text
+    assert "slow: not computed: the norm did not settle." in text
+    assert "NOT COMPUTED" in text
+
+
+def test_both_files_or_none(report, tmp_path, monkeypatch):
+    (tmp_path / "a.html").write_text("old")
+    monkeypatch.setattr("lbt_synth.report.page.page_files.page_html", lambda page: b"new")
+    monkeypatch.setattr("lbt_synth.report.page.page_files.page_pdf", lambda page: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        lbt.report.write_report(report, tmp_path / "a.html", pdf=tmp_path / "a.pdf")
+    assert (tmp_path / "a.html").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
+
+
+def test_refused_in_the_library(report, config, designs, tmp_path):
+    with pytest.raises(lbt.errors.ProblemError, match="needs 1 to 36 designs; got 0"):
+        lbt.report.design_report(config, {})
+    with pytest.raises(lbt.errors.ProblemError, match="title must hold"):
+        lbt.report.write_report(report, tmp_path / "a.html", title=" ")
+    with pytest.raises(lbt.errors.OutputError, match="must end in .html"):
+        lbt.report.write_report(report, tmp_path / "a.txt")
+    with pytest.raises(lbt.errors.FileError, match="cannot read"):
+        lbt.report.design_report(config, designs, gain_files={"kalman": tmp_path / "none.fits"})
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Config"):
+        lbt.report.design_report("lbt.yaml", designs)
+    gone = tmp_path / "gone.yaml"
+    shutil.copy(config.source, gone)
+    loaded = lbt.load_config(gone)
+    gone.unlink()
+    with pytest.raises(lbt.errors.FileError, match="cannot read"):
+        lbt.report.design_report(loaded, designs)

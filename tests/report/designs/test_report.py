@@ -1,0 +1,61 @@
+"""The numbers of a report are those of the library."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.report.designs.report import count_steps, frequency_errors
+
+
+def test_the_numbers_are_those_of_the_library(report, config, designs):
+    study = lbt.studies.limits(
+        designs,
+        config.hardware,
+        config.truth,
+        config.imaging,
+        errors_hz=config.settings.robustness.errors_hz,
+    )
+    for (one, row), limits in zip(report.rows, study.rows, strict=True):
+        assert row.residual_nm == pytest.approx(limits.residual_nm, rel=1e-9, nan_ok=True)
+        assert row.above_limit_percent == pytest.approx(limits.above_limit_percent, nan_ok=True)
+        if not one.stable:
+            continue
+        loop = lbt.close_loop(config.hardware, one.design.controller)
+        budget = lbt.residual_budget(loop, config.truth)
+        assert one.residual_nm == pytest.approx(budget.rms_nm, rel=1e-12)
+        assert one.strehl == pytest.approx(lbt.strehl(budget, config.imaging), rel=1e-12)
+        assert one.margins == lbt.loop_margins(loop)
+        low, high = lbt.loop.stable_sensor_gains(config.hardware, one.design.controller)
+        assert one.sensor_gains == (pytest.approx((low, high), rel=1e-9),)
+        found = lbt.studies.robustness_map(
+            one.design, config.truth, config.imaging, errors_hz=[-2.0, 0.0], sensor_gains=[0.5, 1.0]
+        )
+        at = [int(np.flatnonzero(one.map.errors_hz == e)[0]) for e in (-2.0, 0.0)]
+        gains = [int(np.flatnonzero(one.map.sensor_gains == g)[0]) for g in (0.5, 1.0)]
+        assert one.map.strehl[0][np.ix_(gains, at)] == pytest.approx(found.strehl[0], rel=1e-9)
+        assert one.curve.strehl[0, 0, at] == pytest.approx(found.strehl[0, 1], rel=1e-9)
+        peak = np.linalg.norm(loop.sensitivity(report.frequency_hz), 2, axis=(1, 2))
+        assert one.rejection == pytest.approx(peak, rel=1e-9)
+    kalman = report.assessments[0]
+    assert (kalman.gamma, kalman.estimation_rms) == (kalman.design.gamma, kalman.design.rms)
+    assert kalman.checks == designs["kalman"].recertify().checks
+
+
+def test_errors_that_would_leave_the_band_are_left_out(config):
+    line = lbt.models.SinusoidalVibration(frequency_hz=2.0, rms_nm=10)
+    low = replace(config, truth=replace(config.truth, vibrations=(line,)))
+    errors = frequency_errors(low)
+    assert errors[0] == -3.5
+    assert errors[-1] < 2.0
+    assert np.all(np.diff(errors) > 0)
+    assert frequency_errors(config)[[0, -1]].tolist() == [-3.5, 3.5]
+
+
+def test_what_is_counted(config, designs):
+    done = []
+    lbt.report.design_report(config, designs, advance=done.append)
+    assert sum(done) == count_steps(3) - 1  # the unstable one is not simulated

@@ -1,0 +1,48 @@
+"""Simulations of a report beside the exact answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.report.designs.simulation import exact_spectrum, step_response
+
+
+def test_simulations_agree_with_the_exact_answer(report):
+    for one in report.stable:
+        run_ = report.simulations[one.name]
+        assert run_.residual_nm == pytest.approx(one.residual_nm, rel=0.15)
+        inside = run_.frequency_hz > 5
+        ratio = run_.residual_nm2_hz[inside] / run_.exact_nm2_hz[inside]
+        assert np.mean(ratio) == pytest.approx(1, abs=0.06)
+        assert run_.scatter > 0
+
+
+def test_the_exact_spectrum_has_the_exact_power():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    design = lbt.integrator(path, gain=0.4)
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=10.0, frame_rate_hz=800)
+    shake = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=40, direction=(1,))
+    line = lbt.models.SinusoidalVibration(frequency_hz=31.7, rms_nm=30.0, direction=(1,))
+    truth = lbt.Truth(turbulence=slow, vibrations=(shake, line), noise_nm=5.0)
+    loop = lbt.close_loop(path, design.controller)
+    length = 2048
+    grid = np.arange(length // 2 + 1) * 800 / length
+    density = exact_spectrum(loop, truth, grid, length)
+    power = np.sum(density[1:-1]) * 800 / length  # the ends hold half a bin
+    assert np.sqrt(power) == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=2e-3)
+
+
+def test_a_step_is_answered_frame_by_frame():
+    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
+    time_s, residual, command = step_response(loop)
+    assert time_s[:2] == pytest.approx([0, 0.002])
+    # two frames pass before anything moves: y(1) sees the step, u(1) acts in frame 2
+    expected, u = [100.0], [0.0]
+    for k in range(1, 20):
+        u.append(u[-1] + 0.5 * expected[k - 1])
+        expected.append(100.0 - u[k - 1])
+    assert residual[:20] == pytest.approx(expected)
+    assert command[:20] == pytest.approx(u)

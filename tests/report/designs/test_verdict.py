@@ -1,0 +1,38 @@
+"""The verdict of a report is made of its numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import lbt_synth as lbt
+from lbt_synth.report.designs.verdict import good_range, verdict
+from lbt_synth.report.number_text import signed_text
+
+
+def test_the_verdict_is_made_of_the_numbers(report):
+    words = verdict(report).replace("\u00a0", " ")
+    kalman, slow, _ = report.assessments
+    assert f"kalman leaves the least, {kalman.residual_nm:.1f} nm rms" in words
+    assert f"Strehl ratio {100 * kalman.strehl:.1f} %" in words
+    assert f"{100 * np.min(slow.curve.strehl):.1f} % for slow" in words
+    found = good_range(kalman)
+    strehls, errors = kalman.curve.strehl[0, 0], kalman.curve.errors_hz
+    inside = (errors >= found.low_hz) & (errors <= found.high_hz)
+    assert np.all(strehls[inside] >= 0.9 * strehls.max())
+    outside = np.flatnonzero(np.diff(inside.astype(int)))
+    for edge in outside:
+        assert min(strehls[edge], strehls[edge + 1]) < 0.9 * strehls.max()
+    assert f"kalman from {signed_text(found.low_hz)} to {signed_text(found.high_hz)} Hz" in words
+    assert good_range(report.assessments[2]) is None
+    assert "The certificate of wild does NOT hold." in words
+
+
+def test_equals_are_told_as_equals(config, designs):
+    kalman = designs["kalman"]
+    pair = {"one": kalman, "two": kalman}
+    words = verdict(lbt.report.design_report(config, pair)).replace("\u00a0", " ")
+    assert "Of 2 stable designs, one and two leave the least, " in words
+    assert ": they bear them alike." in words
+    three = verdict(lbt.report.design_report(config, {"slow": designs["slow"], **pair}))
+    assert "Of 3 stable designs, one and two leave the least, " in three
+    assert ": one and two bear them best." in three or ": slow bears them best." in three

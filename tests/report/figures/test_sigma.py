@@ -1,0 +1,37 @@
+"""The sigma plot: labels, units, marked vibrations, and loops that are unstable."""
+
+from __future__ import annotations
+
+import pytest
+from support.figures import legend
+
+import lbt_synth as lbt
+
+
+def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
+    error, rejection, noise = lbt.report.figures.sigma_figure(designs).axes
+    assert legend(error) == ["Kalman", "H-infinity", "vibration"]
+    assert legend(rejection) == ["Kalman", "H-infinity", "integrator", "vibration"]
+    assert "[nm]" in error.get_ylabel()
+    assert noise.get_xlabel() == "frequency [Hz]"
+    marks = [line for line in error.get_lines() if line.get_label() == "vibration"]
+    assert marks[0].get_xdata()[0] == 20
+    # the curve is the achieved norm at its highest point
+    curve = error.get_lines()[0].get_ydata()
+    assert curve.max() == pytest.approx(designs["Kalman"].gamma, rel=1e-3)
+
+
+def test_curves_are_told_apart_in_grey(designs):
+    lines = lbt.report.figures.sigma_figure(designs).axes[1].get_lines()[:3]
+    assert len({str(line.get_linestyle()) for line in lines}) == 3
+    assert len({line.get_color() for line in lines}) == 3
+
+
+def test_an_unstable_loop_is_named_and_not_drawn(designs):
+    _, rejection, noise = lbt.report.figures.sigma_figure(designs, sensor_gain=0.4).axes
+    assert "sensor gain 0.4" in rejection.get_title(loc="right")
+    for axis in (rejection, noise):
+        assert "H-infinity: unstable" in legend(axis)
+        curves = {line.get_label(): len(line.get_xdata()) for line in axis.get_lines()}
+        assert curves["H-infinity: unstable"] == 0
+        assert curves["Kalman"] > 100

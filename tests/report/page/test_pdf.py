@@ -1,0 +1,78 @@
+"""Pages on sheets of A4: no date, and nothing that does not fit."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from support.pages import HOSTILE, many_panels, whole_page
+
+from lbt_synth.report.page.blocks import Listing, Page, Paragraph, Section
+from lbt_synth.report.page.charts import Axis, Bars, Chart, Panel
+from lbt_synth.report.page.pdf import HEIGHT, block_height, page_pdf, split_by_sheets
+from lbt_synth.report.page.typeset import MONO
+from lbt_synth.storage.tables import Table
+
+
+@pytest.fixture(scope="module")
+def sheets():
+    return page_pdf(whole_page())
+
+
+def pages_of(pdf):
+    return len(re.findall(rb"/Type /Page\b", pdf))
+
+
+def test_a_pdf_has_its_pages_and_no_date(sheets):
+    pdf = sheets
+    assert pdf.startswith(b"%PDF")
+    assert pages_of(pdf) == 4
+    assert b"CreationDate" not in pdf
+    assert b"/Title (Page of first)" in pdf
+    assert b"/MediaBox [ 0 0 595.44 841.68 ]" in pdf
+    assert b"/Type3" not in pdf
+    assert page_pdf(whole_page(HOSTILE)).startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("count", [1, 6, 7, 40])
+def test_charts_that_are_too_high_go_on_on_the_next_sheet(count):
+    chart = many_panels(count)
+    parts = list(split_by_sheets(chart))
+    assert sum(len(part.panels) for part in parts) == count
+    assert all(block_height(part) <= HEIGHT - 1.25 - 0.5 for part in parts)
+    assert [part.title for part in parts[:2]] == ["Many", "Many (continued)"][: len(parts)]
+    page = Page(
+        title="t",
+        subtitle="s",
+        creator="c",
+        sections=(
+            Section(key="a", title="A", blocks=(Paragraph(text="a"),)),
+            Section(key="b", title="B", blocks=(chart,)),
+        ),
+    )
+    assert pages_of(page_pdf(page)) == len(parts) + (count >= 6)
+
+
+def test_bars_fit_a_sheet():
+    names = tuple(f"parameter {i}" for i in range(60))
+    bars = tuple(Bars(name=f"c{i}", values=np.ones(60), look=i) for i in range(3))
+    panel = Panel(x=Axis(label="x", low=0), y=Axis(label="y"), marks=bars, categories=names)
+    chart = Chart(key="bars", title="t", caption="c", alt="a", panels=(panel,))
+    assert block_height(chart) <= HEIGHT - 1.25 - 0.5
+
+
+def test_long_listings_and_tables_go_on_on_the_next_sheet():
+    def count(block):
+        section = Section(key="a", title="A", blocks=(block,))
+        page = Page(title="t", subtitle="s", creator="c", sections=(section,))
+        return pages_of(page_pdf(page))
+
+    inside = HEIGHT - 0.6 - 0.65
+    assert count(Listing(caption="l", text="line\n" * 10)) == 1
+    used = 0.25 + 0.15 + 0.2 + 0.55 + 1000 * MONO.leading  # headings
+    assert count(Listing(caption="l", text="line\n" * 1000)) == pytest.approx(
+        np.ceil(used / inside), abs=1
+    )
+    rows = tuple((f"row {i}", "value") for i in range(200))
+    assert 3 <= count(Table(caption="t", headings=("a", "b"), rows=rows)) <= 5

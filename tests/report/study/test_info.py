@@ -1,0 +1,24 @@
+"""What the page of a study says besides its results."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from support.plants import ROOT
+
+import lbt_synth as lbt
+from lbt_synth.report.study.info import study_info
+
+
+@pytest.fixture(scope="module")
+def study():
+    return lbt.studies.load_study(ROOT / "examples" / "study.yaml")
+
+
+def test_digests_are_of_the_matrices(study):
+    first = study_info(study, directory="out")
+    other = replace(study, controllers=study.controllers[::-1])
+    assert study_info(other, directory="out").digests == first.digests
+    assert len(set(first.digests.values())) == 3
+    assert first.replay.endswith("study.yaml -o out --row {row}")

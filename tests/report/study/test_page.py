@@ -1,0 +1,188 @@
+"""The page of a study: what it says, and what it must not depend on."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.plants import ROOT
+from support.study_pages import CONTROLLERS, INFO, PARAMETERS, page_of, results
+
+import lbt_synth as lbt
+from lbt_synth.report.page.blocks import Listing, Notice, Paragraph
+from lbt_synth.report.page.html import page_html
+from lbt_synth.report.study.page import study_page
+from lbt_synth.storage.tables import Cell, Table
+
+
+@pytest.fixture(scope="module")
+def page():
+    return page_of(results())
+
+
+def blocks(page, kind):
+    return [block for section in page.sections for block in section.blocks if type(block) is kind]
+
+
+def table(page, start):
+    return next(t for t in blocks(page, Table) if t.caption.startswith(start))
+
+
+def text(cell):
+    return cell.text if isinstance(cell, Cell) else cell
+
+
+def test_what_is_wrong_is_said_first(page):
+    first = page.sections[0].blocks
+    assert [type(block) for block in first[:3]] == [Notice, Notice, Paragraph]
+    unstable = int(np.sum(results()["sharp.stable"] == 0))
+    assert f"sharp in {unstable} of 300" in first[0].text
+    assert "frail 6" in first[1].text
+    assert all(block.tone == "bad" for block in first[:2])
+
+
+def test_a_study_that_is_not_complete_says_so():
+    columns = {name: values[:100] for name, values in results().items()}
+    first = page_of(columns).sections[0].blocks[0]
+    assert isinstance(first, Notice)
+    assert first.tone == "bad"
+    assert "100 of 300 samples" in first.text
+
+
+def test_a_study_in_which_all_is_well_says_so():
+    columns = {name: values for name, values in results().items() if not name.startswith("frail")}
+    first = page_of(columns, ("steady",)).sections[0].blocks[0]
+    assert (first.tone, "stable in every sample" in first.text) == ("good", True)
+
+
+def test_the_leader_is_named_by_each_measure(page):
+    columns = results()
+    words = next(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
+    steady = columns["steady.strehl"]
+    assert f"Highest mean Strehl ratio: steady, {100 * steady.mean():.1f} %" in words
+    low = 100 * np.percentile(steady, 5)
+    assert f"Highest 5th percentile, which 19 of 20 samples exceed: steady, {low:.1f} %" in words
+
+
+def test_failures_are_listed_and_counted(page):
+    found = table(page, "Evaluations that failed")
+    assert len(found.rows) == 10
+    assert found.caption.endswith("the first 10, and 5 more")
+    html = page_html(page).decode()
+    assert "&lt;b&gt;no&lt;/b&gt; design in row 20" in html
+    assert "<b>no</b>" not in html
+    assert "<script>" not in re.sub(r"<script[ >].*?</script>", "", html, flags=re.DOTALL)
+
+
+def test_worst_rows_come_with_the_command_that_replays_them(page):
+    rows = table(page, "Worst samples of sharp").rows
+    assert all(text(row[1]) == "unstable" for row in rows)
+    commands = next(b.text for b in blocks(page, Listing) if "replay" in b.caption).splitlines()
+    assert commands[1] == f"lbt-synth study night.yaml -o out --row {text(rows[0][0])}"
+
+
+def test_names_are_short_and_explained_once(page):
+    first = {text(row[0]): text(row[1]) for row in table(page, "Parameters").rows}
+    assert first["sensor_gain"] == "truth.sensor_gain"
+    assert {text(row[0]) for row in table(page, "Variance").rows} >= {"sensor_gain", "delay_frames"}
+
+
+def test_every_section_has_content_and_every_chart_its_words(page):
+    assert [section.key for section in page.sections] == [
+        "summary",
+        "samples",
+        "controllers",
+        "comparison",
+        "dependence",
+        "worst",
+        "reading",
+        "origin",
+    ]
+    keys = [chart.key for chart in page.charts]
+    assert keys == [
+        "distribution",
+        "parameters",
+        "loss",
+        "sensitivity",
+        "curves",
+        "unstable",
+        "map-1",
+        "map-2",
+        "map-3",
+    ]
+
+
+@pytest.mark.parametrize("n", [1, 21])
+def test_few_samples_make_a_page_all_the_same(n):
+    columns = {name: values[:n] for name, values in results().items()}
+    html = page_html(page_of(columns))
+    assert b"nan" not in re.sub(rb"<script[ >].*?</script>", b"", html, flags=re.DOTALL)
+
+
+def test_nothing_evaluated_makes_a_page_without_figures():
+    columns = results(30)
+    for name in columns:
+        if "." in name and name.split(".")[0] in CONTROLLERS:
+            columns[name] = np.full(30, np.nan)
+    page = page_of(columns)
+    assert page.sections[0].blocks[-2].text == "No controller was evaluated on any sample."
+    assert page_html(page)
+
+
+def test_no_sample_yet_is_refused():
+    columns = {name: values[:0] for name, values in results().items()}
+    with pytest.raises(lbt.errors.ProblemError, match="at least one sample; got none"):
+        page_of(columns)
+
+
+def test_columns_of_other_results_are_refused():
+    statistics = lbt.studies.study_statistics(results(), PARAMETERS, CONTROLLERS)
+    with pytest.raises(lbt.errors.ProblemError, match="300 samples of the statistics; got 200"):
+        study_page(INFO, statistics, results(200))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("a{b}.yaml", "'a{b}.yaml'"), ("my night.yaml", "'my night.yaml'")]
+)
+def test_names_of_files_cannot_break_the_command(page, name, words):
+    info = replace(INFO, replay=f"lbt-synth study {words} --row {{row}}")
+    found = page_of(results(), info=info)
+    commands = next(b.text for b in blocks(found, Listing) if "replay" in b.caption)
+    assert f"lbt-synth study {words} --row " in commands
+
+
+@pytest.fixture(scope="module")
+def study():
+    return lbt.studies.load_study(ROOT / "examples" / "study.yaml")
+
+
+def test_a_page_from_a_study_file(study, tmp_path):
+    values = study.values(0, 3)
+    columns = dict(zip(study.parameter_names, values.T, strict=True))
+    columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    folder = tmp_path / "a folder"
+    folder.mkdir()
+    files = lbt.report.write_study_page(
+        study, columns, folder / "summary.html", pdf=folder / "summary.pdf"
+    )
+    assert [file.name for file in files] == ["summary.html", "summary.pdf"]
+    assert files[1].read_bytes().startswith(b"%PDF")
+    html = files[0].read_text(encoding="utf-8")
+    for words in (
+        "3 of 4096 samples",
+        "normal, 20 with deviation 0.5, from 18, to 22",
+        "hinf (gamma_ratio 1.2) for the configuration",
+        study.digest,
+        "samples: 4096",
+        "diameter_m: 8.22",
+        "a folder&#39; --row 0",
+    ):
+        assert words in html, words
+
+
+def test_a_page_must_have_the_name_of_one(study, tmp_path):
+    with pytest.raises(lbt.errors.OutputError, match=r"must end in \.html"):
+        lbt.report.write_study_page(study, {}, tmp_path / "summary.txt")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,14 @@
+"""Colours, dashes and markers of curves."""
+
+from __future__ import annotations
+
+from lbt_synth.report.line_styles import colour, dashes, marker_name
+
+
+def test_unequal_looks_are_told_apart():
+    looks = [(colour(i), dashes(i)) for i in range(36)]
+    assert len(set(looks)) == 36
+    marks = {(colour(i), marker_name("own", i)) for i in range(36)}
+    assert len(marks) == 36
+    assert colour(None) not in [look[0] for look in looks]
+    assert marker_name("cross", 3) == "cross"

@@ -1,0 +1,29 @@
+"""Numbers and lists as texts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
+
+
+def test_numbers_as_texts():
+    assert [
+        number_text(v) for v in (0.0, 27.701, 1234.56, 123456.0, 1e-9, -2.5, np.inf, np.nan)
+    ] == [
+        "0",
+        "27.7",
+        "1235",
+        "123456",
+        "1e\u22129",
+        "\u22122.5",
+        "∞",
+        "\u2013",
+    ]
+    assert fixed_text(-0.001, 1) == "0.0"
+    assert fixed_text(float("nan"), 1) == "\u2013"
+    assert fixed_text(float("-inf"), 1) == "\u2212∞"
+    assert signed_text(0.5) == "+0.5"
+    assert signed_text(0.0) == "0"
+    assert listing_text([]) == ""
+    assert listing_text(["a", "b", "c"]) == "a, b and c"

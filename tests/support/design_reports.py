@@ -1,0 +1,40 @@
+"""A small configuration, designs for it, and what tests read out of their report."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+from lbt_synth.report.designs.page import design_page
+from lbt_synth.storage.tables import Table
+
+SMALL = re.sub(
+    r"errors_hz: .*",
+    "errors_hz: [-3.5, -2, 2, 3.5]\n  sensor_gains: [0.3, 0.5, 1.0, 1.3]",
+    LBT_YAML.read_text().replace("frames: 8000", "frames: 1000").replace("cases: 4", "cases: 2"),
+)
+
+
+def words_of(report):
+    """All texts of the page of a report but those of its charts."""
+    blocks = [block for section in design_page(report).sections for block in section.blocks]
+    texts = [block.text for block in blocks if hasattr(block, "text")]
+    tables = [block for block in blocks if isinstance(block, Table)]
+    return " ".join(texts + [c.text for table in tables for row in table.cells() for c in row])
+
+
+def three_designs(config):
+    """A Kalman filter, an integrator, and one whose loop is unstable."""
+    slow = lbt.integrator(config.hardware, gain=0.4)
+    fast = lbt.Controller(
+        A=np.eye(2), B=1.5 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800
+    )
+    return {
+        "kalman": lbt.kalman(config.plant),
+        "slow": slow,
+        "wild": replace(slow, controller=fast, gain=1.5),  # unstable at gains above 2/3
+    }
