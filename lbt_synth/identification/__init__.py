@@ -1,4 +1,4 @@
-"""From a recorded loop to a model, and to a design tested on data.
+"""Identification of a recorded loop, and designs tested on its data.
 
 Records come from files of any origin, with a report on their health.
 The fit returns turbulence, vibration lines, noise and sensor gain with standard errors.

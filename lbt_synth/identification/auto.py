@@ -1,4 +1,4 @@
-"""From a record to a certified controller, with a test on data that it has not seen."""
+"""A certified controller from a record, tested on data that it has not seen."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lbt_synth.models import TipTiltPlant
 from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
-_APART = 3.0  # standard errors
+_APART = 3.0  # standard errors between gains that disagree
 _NAMES = {"kalman": "Kalman filter", "hinf": "H-infinity filter", "lqg": "LQG controller"}
 METHODS = tuple(_NAMES)
 
@@ -46,7 +46,7 @@ class RecordedDesign:
     name : str
         Row of the design in ``held_out``.
     notes : tuple of str
-        What speaks against the design.
+        Warnings about the design.
     """
 
     model: IdentifiedModel
@@ -182,7 +182,7 @@ def design_from_record(
 
 
 def _check_gains(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:
-    """Return warnings of sensor gains that do not agree; refuse loops that would not hold."""
+    """Warn of sensor gains that disagree; refuse a design that is unstable at one of them."""
     out = []
     for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
         if whole.sensor_gain_error is None or first.sensor_gain_error is None:

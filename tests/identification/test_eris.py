@@ -39,8 +39,8 @@ def model(seen) -> lbt.identification.IdentifiedModel:
 
 
 def test_data_come_unchanged_with_their_licence():
-    told = (FILE.parent / "README.md").read_text("utf-8")
-    assert hashlib.sha256(FILE.read_bytes()).hexdigest() in told
+    readme = (FILE.parent / "README.md").read_text("utf-8")
+    assert hashlib.sha256(FILE.read_bytes()).hexdigest() in readme
     licence = (FILE.parent / "LICENSE.astro-tiptop").read_text("utf-8")
     assert "Copyright (c) 2021 FabioRossiArcetri" in licence
     assert "The above copyright notice and this permission notice shall be included" in licence

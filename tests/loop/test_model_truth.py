@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.replays import (
+from support.predictions import (
     CASES,
     RATE,
     SHELL,

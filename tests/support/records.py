@@ -7,7 +7,7 @@ import numpy as np
 import lbt_synth as lbt
 
 RATE = 1000.0
-SHELL = lbt.models.PositionLoop.of_bandwidth(
+SHELL = lbt.models.PositionLoop.from_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
 )
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)

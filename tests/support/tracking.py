@@ -70,7 +70,7 @@ class Oracle:
         middle_s = self.first_s + self.calls * self.every_s - len(measurements) / 1600
         self.calls += 1
         frequency_hz = float(self.at(middle_s))
-        return with_vibrations(self.plant, [self.plant.vibrations[0].moved(frequency_hz)])
+        return with_vibrations(self.plant, [self.plant.vibrations[0].at_frequency(frequency_hz)])
 
 
 DRIFT = lbt.models.DriftingVibration(

@@ -1,1 +1,1 @@
-"""From a record to a model of turbulence, vibrations, noise and sensor."""
+"""The fit of turbulence, vibrations, noise and sensor gain to a record."""

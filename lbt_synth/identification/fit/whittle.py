@@ -171,12 +171,7 @@ class Likelihood:
 
 
 def minimise(
-    likelihood: Likelihood,
-    start: FloatArray,
-    priors: Priors,
-    *,
-    free: BoolArray,
-    steps: int = 40,
+    likelihood: Likelihood, start: FloatArray, priors: Priors, *, free: BoolArray, steps: int = 40
 ) -> Minimum:
     """Minimise L from a start (p,) over the free parameters, by scoring in a trust region."""
     from scipy.optimize import minimize

@@ -1,1 +1,1 @@
-"""Prediction against data: what controllers would have left of a recorded disturbance."""
+"""Predictions: the residual that controllers would have left of a recorded disturbance."""

@@ -1,4 +1,4 @@
-"""Controllers on data that nothing was fitted to, beside what a model promises of them."""
+"""Controllers compared on data that nothing was fitted to, beside what the model promises."""
 
 from __future__ import annotations
 
@@ -23,11 +23,7 @@ from lbt_synth.identification.prediction.residual_estimate import (
     ResidualEstimate,
     estimate_residual,
 )
-from lbt_synth.identification.prediction.stretches import (
-    Stretches,
-    checked_stretches,
-    split_halves,
-)
+from lbt_synth.identification.prediction.stretches import Stretches, checked_stretches, split_halves
 from lbt_synth.identification.prediction.table import PredictionRow, PredictionTable
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
@@ -35,12 +31,10 @@ from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.validation import FloatArray, frozen_copy, integer, require_instance
 
-RAN, INTEGRATOR, PREDICTOR, LIMIT = (
-    "what ran",
-    "best integrator",
-    "least-squares predictor",
-    "limit of performance",
-)
+RAN = "what ran"
+INTEGRATOR = "best integrator"
+PREDICTOR = "least-squares predictor"
+LIMIT = "limit of performance"
 _RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
 
 
@@ -88,7 +82,7 @@ def prediction_against_data(
     imaging : Imaging, optional
         The camera, for Strehl ratios on at most two axes.
     taps : int, optional
-        Coefficients of the predictor, a mode.
+        Coefficients of the predictor per mode.
     settle_frames : int, optional
         Frames dropped before each stretch of the test; by default as many as the slowest of the
         loops needs (:func:`replayed_residual`).
@@ -187,7 +181,7 @@ def prediction_against_data(
 
 
 def _note_refuted(entries: Sequence[PredictionRow]) -> tuple[str, ...]:
-    """Say of which rows the noise cannot be right."""
+    """Note rows for which the noise cannot be right."""
     below = {
         entry.name: entry.replayed.errors_below_zero
         for entry in entries
@@ -198,7 +192,7 @@ def _note_refuted(entries: Sequence[PredictionRow]) -> tuple[str, ...]:
     return (
         f"no residual on the data of {', '.join(below)}: its variance is {max(below.values()):.3g} "
         "standard errors below zero, more than chance; the model has more noise than the data, or "
-        "another sensor gain. Identify the noise anew.",
+        "another sensor gain. Identify the noise again.",
     )
 
 
@@ -241,7 +235,7 @@ def _close_stable_loop(plant: TipTiltPlant, name: str, controller: Controller) -
 def _measured_residual(
     data: PredictionData, plant: TipTiltPlant, measurements: Any, settle: int
 ) -> ResidualEstimate:
-    """Residual of the loop that ran, from its own measurements on the same frames."""
+    """Return the residual of the loop that ran, from its own measurements on the same frames."""
     q = plant.hardware.n_measurements
     y, _ = check_series(measurements, q, data.stretches, "measurements")
     if len(y) != len(data.open_loop):
@@ -259,10 +253,7 @@ def _measured_residual(
 
 
 def _build_row(
-    name: str,
-    found: ResidualEstimate | None,
-    promised: FloatArray | None,
-    imaging: Imaging | None,
+    name: str, found: ResidualEstimate | None, promised: FloatArray | None, imaging: Imaging | None
 ) -> PredictionRow:
     strehl = promised_strehl = float("nan")
     if imaging is not None:

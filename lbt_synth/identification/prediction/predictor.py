@@ -1,4 +1,4 @@
-"""The best FIR predictor of a record, by least squares: no model of turbulence or vibrations.
+"""The best FIR predictor of a record by least squares, without a model of the disturbance.
 
 With the mirror's taps c, the filtered series ``zf(k) = c[0] z(k) + c[1] z(k-1) + ...`` and
 commands ``u(k) = a[0] z(k) + a[1] z(k-1) + ...``, the measured residual is ``e(k) = z(k) -
@@ -9,7 +9,7 @@ replay measures, for fractional delays and mirrors that move as well.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
 
 _MOST_TAPS = 1000
-_ROWS_A_TAP = 4  # frames to fit for each coefficient, at least
+_LEAST_ROWS = 4  # frames per coefficient
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,7 +69,7 @@ def least_squares_predictor(
     hardware : LoopHardware
         The loop: delay, mirror, sensor and influence matrix, both square and invertible.
     taps : int, optional
-        Coefficients a mode, at most 1000.
+        Coefficients per mode, at most 1000.
     sensor_gain : float, optional
         Sensor gain g that formed z, relative to the sensor matrix; the controller needs it.
     stretches : sequence of (start, stop), optional
@@ -91,7 +91,7 @@ def least_squares_predictor(
     ------
     ProblemError
         If a value is out of its range, sizes clash, or the stretches hold fewer than four
-        frames a coefficient.
+        frames per coefficient.
 
     Examples
     --------
@@ -124,9 +124,9 @@ def least_squares_predictor(
     X = np.concatenate([block[0] for block in blocks])  # (rows, n, taps)
     Z = np.concatenate([block[1] for block in blocks])  # (rows, n)
     unknowns = count * (n if coupled else 1)
-    if len(X) < _ROWS_A_TAP * unknowns:
+    if len(X) < _LEAST_ROWS * unknowns:
         raise ProblemError(
-            f"a predictor of {unknowns} coefficients needs at least {_ROWS_A_TAP * unknowns} "
+            f"a predictor of {unknowns} coefficients needs at least {_LEAST_ROWS * unknowns} "
             f"frames to fit, beside {count} and the mirror's at the beginning of each stretch; got "
             f"{len(X)}. Record more, or lower taps."
         )
@@ -146,7 +146,7 @@ def least_squares_predictor(
 def _regression(
     part: FloatArray, mirror_taps: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Regressors ``zf(k-1), zf(k-2), ...`` (rows, n, taps) and targets z(k) (rows, n)."""
+    """Return regressors ``zf(k-1), zf(k-2), ...`` (rows, n, taps) and targets z(k) (rows, n)."""
     frames, n = part.shape
     m = len(mirror_taps)
     rows = frames - (m - 1) - count  # the first needs zf(k-taps), which needs m values of z
@@ -158,7 +158,7 @@ def _regression(
 
 
 def _solve_least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[FloatArray, float]:
-    """Coefficients of least squares, of least norm, and the mean square that is left."""
+    """Return the least-squares coefficients of least norm, and the mean square that is left."""
     unknowns = X.shape[1]
     together = np.column_stack([X, z])
     # the triangle of the data has their squares, and no digit is lost by squaring
@@ -176,21 +176,14 @@ def _solve_least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[Fl
 def _build_controller(
     hardware: LoopHardware, coefficients: FloatArray, back: FloatArray, gain: float
 ) -> Controller:
-    """Make the controller from y to u of a filter of z: the newest values of z are its states."""
+    """Return the controller from y to u of an FIR filter of z; its states are the last z."""
     n, _, count = coefficients.shape
-    A = np.eye(n * count, k=-n)
     B = np.zeros((n * count, n))
     B[:n] = back
     rows = coefficients.transpose(0, 2, 1).reshape(n, count * n)
-    believed = LoopHardware(
-        frame_rate_hz=hardware.frame_rate_hz,
-        delay_frames=hardware.delay_frames,
-        sensor_matrix=gain * hardware.sensor,
-        influence_matrix=hardware.influence,
-        mirror=hardware.mirror,
-    )
+    believed = replace(hardware, sensor_matrix=gain * hardware.sensor)
     parameter = Controller(
-        A=A,
+        A=np.eye(n * count, k=-n),
         B=B,
         C=np.linalg.inv(hardware.influence) @ rows,
         D=np.zeros((n, n)),

@@ -1,4 +1,4 @@
-"""What a controller would have left of a recorded disturbance."""
+"""The residual that a controller would have left of a recorded disturbance."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from lbt_synth.validation import (
 class PredictionData:
     """A recorded pseudo-open-loop series that fits a loop, and what is known of its noise."""
 
-    open_loop: FloatArray  # (frames, n): the series z(k) [nm]; finite in the stretches
-    stretches: Stretches  # list of (start, stop): frames that can be used
-    noise_nm2: FloatArray  # (n, n): covariance of the noise in z [nm^2]
-    noise_error_nm4: FloatArray  # (n, n): covariance of the errors of the noise variances [nm^4]
+    open_loop: FloatArray  # (frames, n): the series z(k) [nm], finite in the stretches
+    stretches: Stretches  # frames that can be used
+    noise_nm2: FloatArray  # (n, n): covariance of the noise in z
+    noise_error_nm4: FloatArray  # (n, n): covariance of the errors of the noise variances
 
 
 def replayed_residual(
@@ -61,7 +61,7 @@ def replayed_residual(
     Parameters
     ----------
     open_loop : (frames, n) array_like
-        Recorded series z, a row a frame [nm]; what lies outside the stretches is not read.
+        Recorded series z, a row per frame [nm]; what lies outside the stretches is not read.
     controller : Controller
         From y(k) to u(k).
     hardware : LoopHardware
@@ -75,8 +75,8 @@ def replayed_residual(
     stretches : sequence of (start, stop), optional
         Contiguous usable frames, in order; by default the whole record.
     settle_frames : int, optional
-        Frames dropped at the beginning of each stretch, where the controller begins anew from
-        a zero state; by default until the slowest mode of the loop has decayed to 1e-4, and at
+        Frames dropped at the beginning of each stretch, where the controller starts from a zero
+        state; by default until the slowest mode of the loop has decayed to 1e-4, and at
         least as many as the loop has states. A stretch that is no longer is left out.
 
     Returns
@@ -165,7 +165,7 @@ def check_series(
     series = float_array(open_loop, name)
     if series.ndim != 2 or series.shape[1] != modes or len(series) == 0:
         raise DimensionError(
-            f"{name} must be (frames, {modes}), a row a frame and a column a mode; got "
+            f"{name} must be (frames, {modes}), a row per frame and a column per mode; got "
             f"{series.shape}."
         )
     parts = checked_stretches(stretches, len(series))
@@ -176,7 +176,7 @@ def check_series(
 
 
 def inverse_sensor(hardware: LoopHardware) -> FloatArray:
-    """Inverse of the sensor matrix, (n, n)."""
+    """Return the inverse of the sensor matrix, (n, n)."""
     S = hardware.sensor
     if S.shape[0] != S.shape[1] or np.linalg.matrix_rank(S) < len(S):
         raise ProblemError(
@@ -189,19 +189,19 @@ def inverse_sensor(hardware: LoopHardware) -> FloatArray:
 def _per_measurement(value: Any, name: str, count: int) -> FloatArray:
     out = real_array(value, name)
     if out.ndim > 1 or (out.ndim == 1 and out.size != count):
-        raise DimensionError(f"{name} must be a number or {count}, one a measurement; got {out}.")
+        raise DimensionError(f"{name} must be a number or {count}, one per measurement; got {out}.")
     if np.any(out < 0):
         raise ProblemError(f"{name} must be at least 0; got {np.min(out):.6g}.")
     return np.broadcast_to(out, (count,))
 
 
 def frames_to_settle(loop: ClosedLoop) -> int:
-    """Frames until a loop has forgotten how it began."""
+    """Return the frames after which a loop has forgotten its start."""
     return max(settling_frames(loop.spectral_radius), loop.system.n_states)
 
 
 def predict_residual(data: PredictionData, loop: ClosedLoop, settle: int) -> ResidualEstimate:
-    """Replay a stable loop on recorded data."""
+    """Return the residual of a stable loop replayed on recorded data."""
     kept = drop_settling(data.stretches, settle)
     # z(k) for phi_tot(k-1), and no noise: the residual of frame k-1 is e(k)
     path = loop.rejection()
@@ -209,15 +209,12 @@ def predict_residual(data: PredictionData, loop: ClosedLoop, settle: int) -> Res
         filter_series(path, data.open_loop[start - settle : stop])[settle:] for start, stop in kept
     ]
     return estimate_residual(
-        np.concatenate(parts),
-        kept,
-        noise_nm2=data.noise_nm2,
-        noise_error_nm4=data.noise_error_nm4,
+        np.concatenate(parts), kept, noise_nm2=data.noise_nm2, noise_error_nm4=data.noise_error_nm4
     )
 
 
 def drop_settling(stretches: Stretches, settle: int) -> Stretches:
-    """Return what is left of stretches after settling."""
+    """Return the stretches without the frames in which a loop settles."""
     kept = tuple((start + settle, stop) for start, stop in stretches if stop - start > settle)
     if not kept:
         longest = max(stop - start for start, stop in stretches)

@@ -1,4 +1,4 @@
-"""Residual variance from a measured residual: its noise taken out, with a standard error.
+"""Residual variance from a measured residual, without its noise and with a standard error.
 
 For Gaussian series the covariance of two mean squares over K frames is ``2 / K`` times the sum
 of the squared cross-covariances over all lags (M. S. Bartlett, J. Roy. Stat. Soc. Suppl. 8, 27
@@ -18,8 +18,8 @@ from lbt_synth.identification.prediction.stretches import Stretches
 from lbt_synth.loop import Imaging, jitter_strehl
 from lbt_synth.validation import FloatArray, frozen_copy
 
-_FEWEST = 100  # frames of which a mean square is worth a standard error
-_TOO_FAR = 4.0  # standard errors below zero that are no chance
+_FEWEST = 100  # frames that give a standard error
+_TOO_FAR = 4.0  # standard errors below zero that chance does not explain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -172,11 +172,7 @@ def estimate_residual(
     noise_nm2: FloatArray,
     noise_error_nm4: FloatArray,
 ) -> ResidualEstimate:
-    """Estimate a residual from the measured residual of some stretches.
-
-    Shapes: measured (frames, n), stretches list of (start, stop), noise_nm2 (n, n), noise_error_nm4
-    (n, n).
-    """
+    """Estimate a residual from the measured residual (frames, n) of some stretches."""
     if len(measured) < _FEWEST:
         raise ProblemError(
             f"a residual needs at least {_FEWEST} frames after settling; got {len(measured)}. "
@@ -193,7 +189,7 @@ def estimate_residual(
 
 
 def _mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) -> FloatArray:
-    """Covariance over the axes of the mean products of two Gaussian series, (n, n).
+    """Return the covariance over the axes of mean products of two Gaussian series, (n, n).
 
     ``cov(x_i y_i, x_j y_j)`` over all lags is the mean over the frequencies of ``S(x_i, x_j)
     conj S(y_i, y_j) + S(x_i, y_j) conj S(y_i, x_j)``. On the diagonal the product of the two

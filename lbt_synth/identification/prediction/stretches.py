@@ -1,4 +1,4 @@
-"""Stretches of a record: which frames can be used, which fit, which test."""
+"""Stretches of a record: frames that are usable, to fit on, and to test on."""
 
 from __future__ import annotations
 

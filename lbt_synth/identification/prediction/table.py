@@ -1,4 +1,4 @@
-"""The table of predictions against data: its rows, as numbers."""
+"""The table of controllers on recorded data, and its rows."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class PredictionTable:
         return _AXES[:n] if n <= len(_AXES) else tuple(f"axis_{i}" for i in range(n))
 
     def rows(self) -> tuple[tuple[Any, ...], ...]:
-        """Return one tuple a row, in the order of :attr:`headings`; nan where nothing is known.
+        """Return a tuple per row, in the order of :attr:`headings`; nan where nothing is known.
 
         The axes' columns are of the data, except in the row of the limit.
         """

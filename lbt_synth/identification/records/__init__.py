@@ -1,1 +1,1 @@
-"""What an observatory recorded: files of any origin, their health, the pseudo-open loop."""
+"""Records of a loop from files, telemetry and arrays, with their health."""

@@ -230,12 +230,7 @@ def _find_fact(contents: Contents, name: str, given: Any, *, may_differ: bool = 
 
 
 def _build_loop_record(
-    series: Series,
-    contents: Contents,
-    *,
-    unit: str | None,
-    command_unit: str | None,
-    **facts: Any,
+    series: Series, contents: Contents, *, unit: str | None, command_unit: str | None, **facts: Any
 ) -> LoopRecord:
     y_unit = _find_unit(series.measurements, unit, contents, "unit", "measurements")
     u_unit = None
@@ -312,12 +307,7 @@ def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
 
 
 def _build_spectrum_record(
-    series: Series,
-    contents: Contents,
-    *,
-    unit: str | None,
-    diameter_m: float | None,
-    **facts: Any,
+    series: Series, contents: Contents, *, unit: str | None, diameter_m: float | None, **facts: Any
 ) -> SpectrumRecord:
     assert series.frequency is not None
     text = _find_unit(series.measurements, unit, contents, "unit", "density")

@@ -9,12 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.records.faults import runs
-from lbt_synth.identification.records.health import (
-    Finding,
-    RecordHealth,
-    finding_in,
-    merge_notes,
-)
+from lbt_synth.identification.records.health import Finding, RecordHealth, finding_in, merge_notes
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import BoolArray, FloatArray, integer, matrix, number, require_instance

@@ -1,1 +1,1 @@
-"""Filters that follow vibrations, and filters exchanged in a running loop."""
+"""Tracking: identification and redesign while the loop runs."""

@@ -1,4 +1,4 @@
-"""Single measurements of a window that cannot be right, and the window without them."""
+"""Single measurements of a window that cannot be right, and a window without them."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ import numpy as np
 from lbt_synth.identification.records.faults import fill, find_outliers, runs
 from lbt_synth.validation import BoolArray, FloatArray
 
-_APART = 10  # frames between two: nearer ones are what a glitch left in a loop of another gain
+_APART = 10  # frames between two glitches; nearer ones are echoes in a loop of another gain
 
 
 def find_glitches(open_loop: FloatArray) -> BoolArray:
     """Return the frames with an outlier in any column of a pseudo-open-loop series.
 
-    What a glitch does to the commands is not in that series, but the glitch itself is: it bends the
-    series as nothing around it does (see ``records.faults.outliers``). Shapes: open_loop (frames,
-    q) -> (frames,).
+    That series (frames, q) does not show what a glitch does to the commands, but the glitch itself
+    bends it as nothing around does (see ``records.faults.find_outliers``).
 
     Examples
     --------
@@ -35,8 +34,8 @@ def stand_alone(flags: BoolArray, delay_frames: float) -> bool:
     """Whether glitches are short and far from each other.
 
     A glitch ends before its own command comes back. Otherwise the sensor does not see the
-    commands as the model believes, and after a glitch the series has what it did to them: to
-    leave out a part of that would be wrong.
+    commands as the model assumes, and the series after a glitch shows what it did to them:
+    leaving out a part of that would be wrong.
     """
     each = runs(flags)
     lengths, gaps = each[:, 1] - each[:, 0], each[1:, 0] - each[:-1, 1]

@@ -1,4 +1,4 @@
-"""Frequencies of lines by the Whittle likelihood, of those that may be mistaken at once."""
+"""Frequencies of lines by the Whittle likelihood, of neighbouring lines together."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from lbt_synth.models import Vibration
 from lbt_synth.validation import BoolArray, FloatArray
 
 _EVIDENCE = 20.0  # twice the gain in log likelihood that makes a line
-_SWEEPS = 4
+_MOST_ROUNDS = 4
 _SETTLED_HZ = 1e-3
-_WIDTH, _WIDTH_BESIDE = 1.0, 0.5  # bins: least half width of a line alone, and of neighbours
+_WIDTH, _WIDTH_BESIDE = 1.0, 0.5  # least half width of a single line, and of neighbours [bins]
 _RESOLUTION = 2.0  # bins from the top of a line to the first zero of a Hann window's spectrum
 
 
@@ -22,28 +22,17 @@ _RESOLUTION = 2.0  # bins from the top of a line to the first zero of a Hann win
 class Search:
     """Where a line is looked for."""
 
-    line: Vibration  # The line as it was last
-    bins: BoolArray  # (k,): frequencies in which it may be
-    # power, rest (k,): periodogram along its direction, and spectrum there without this line and
-    # those that are fitted with it [nm^2/Hz]
-    power: FloatArray
-    rest: FloatArray
+    line: Vibration  # as it was found last
+    bins: BoolArray  # (k,): frequencies where it may be
+    power: FloatArray  # (k,): periodogram along its direction [nm^2/Hz]
+    rest: FloatArray  # (k,): spectrum there without the lines that are fitted [nm^2/Hz]
 
 
 class LineFit:
-    """Lines of one periodogram.
+    """Lines of one periodogram on the frequencies ``grid_hz``, (k,).
 
-    Parameters
-    ----------
-    grid_hz : (k,) ndarray
-        Its frequencies [Hz].
-    length_s : float
-        Length of the window [s].
-    frame_rate_hz : float
-        Frame rate [Hz].
-    beside : bool, optional
-        Whether lines are fitted beside each other. A line narrower than a bin then has half the
-        width, next to that of the window's own peak, so that it does not cover its neighbours.
+    For lines ``beside`` each other, one narrower than a bin has half the width, next to that of
+    the window's own peak, so that it does not cover its neighbours.
     """
 
     def __init__(
@@ -53,32 +42,33 @@ class LineFit:
         self._least_width = _WIDTH_BESIDE if beside else _WIDTH
 
     def fit_alone(self, search: Search) -> float | None:
-        """Frequency of a line that no other one is near [Hz]; None if it is not there."""
+        """Return the frequency of a line without neighbours [Hz]; None if it is not there."""
         at, grid = search.bins, self._grid[search.bins]
         peak = float(grid[np.argmax(search.power[at] / search.rest[at])])
-        found = self._fitted(search, search.rest, (peak, 0.0))
-        return None if found is None or not self._there(search, search.rest, found) else found[0]
+        found = self._fit_line(search, search.rest, (peak, 0.0))
+        return None if found is None or not self._is_there(search, search.rest, found) else found[0]
 
     def fit_together(self, searches: list[Search], shared: FloatArray) -> list[float] | None:
-        """Frequencies of neighbouring lines, in the order that they had [Hz].
+        """Return the frequencies of neighbouring lines, in the order that they had [Hz].
 
         Each is fitted beside the others in turn, from the highest peaks and from where they were
-        last; the likelier end counts. Shapes: shared (m, m).
+        last; the likelier end counts. ``shared`` (m, m) is the power that one line has along
+        another.
         """
         last = [search.line.frequency_hz for search in searches]
-        starts = [[self._at(s, f) for s, f in zip(searches, last, strict=True)]]
+        starts = [[self._start_at(s, f) for s, f in zip(searches, last, strict=True)]]
         peaks = self._peaks(searches)
         if peaks is not None:
-            starts.append([self._at(s, f) for s, f in zip(searches, peaks, strict=True)])
-        ends = [end for end in (self._sweep(searches, shared, s, 1) for s in starts) if end]
+            starts.append([self._start_at(s, f) for s, f in zip(searches, peaks, strict=True)])
+        ends = [end for end in (self._fit_in_turn(searches, shared, s, 1) for s in starts) if end]
         if not ends:
             return None
         best = min(ends, key=lambda end: self._contrast(searches, shared, end))
-        end = self._sweep(searches, shared, best, _SWEEPS)
+        end = self._fit_in_turn(searches, shared, best, _MOST_ROUNDS)
         if end is None:
             return None
         for i, search in enumerate(searches):
-            if not self._there(search, self._beside(searches, shared, end, i), end[i]):
+            if not self._is_there(search, self._spectrum_beside(searches, shared, end, i), end[i]):
                 return None
         found = [f for f, _ in end]
         for i, j in combinations(range(len(found)), 2):
@@ -96,7 +86,7 @@ class LineFit:
         return max(float(grid[0]), 1.01 * self._width_hz(search.line)), float(grid[-1])
 
     def _spectrum(self, line: Vibration, at: tuple[float, float], bins: BoolArray) -> FloatArray:
-        """Spectrum of a line at a frequency, its rms times the exponential of a number."""
+        """Return the spectrum of a line at a frequency and a logarithm of its rms over the last."""
         there = Vibration(
             frequency_hz=at[0],
             damping=self._width_hz(line) / at[0],
@@ -105,8 +95,8 @@ class LineFit:
         )
         return there.ar_model(self._rate).psd(self._grid[bins])
 
-    def _at(self, search: Search, frequency_hz: float) -> tuple[float, float]:
-        """Start of a fit: a line as high as the periodogram there."""
+    def _start_at(self, search: Search, frequency_hz: float) -> tuple[float, float]:
+        """Return the start of a fit: a line as high as the periodogram there."""
         low, high = self._bounds(search)
         frequency = float(np.clip(frequency_hz, low, max(low, high)))
         nearest = np.zeros(len(self._grid), dtype=np.bool_)
@@ -117,7 +107,7 @@ class LineFit:
         return frequency, float(np.clip(0.5 * np.log(max(seen, 1e-6)), -9, 9))
 
     def _peaks(self, searches: list[Search]) -> list[float] | None:
-        """Frequencies of as many peaks as there are lines, in order; None if there are not."""
+        """Return the frequencies of as many peaks as there are lines; None if there are fewer."""
         ratio = np.max([np.where(s.bins, s.power / s.rest, 0.0) for s in searches], axis=0)
         found: list[float] = []
         for _ in searches:
@@ -130,26 +120,28 @@ class LineFit:
             )
         return sorted(found)
 
-    def _beside(
+    def _spectrum_beside(
         self, searches: list[Search], shared: FloatArray, at: list[tuple[float, float]], i: int
     ) -> FloatArray:
-        """Spectrum along line i of everything else."""
+        """Return the spectrum of everything but line i, along it."""
         bins, rest = searches[i].bins, searches[i].rest.copy()
         for j, other in enumerate(searches):
             if j != i and shared[i, j] > 0:
                 rest[bins] += shared[i, j] * self._spectrum(other.line, at[j], bins)
         return rest
 
-    def _sweep(
+    def _fit_in_turn(
         self, searches: list[Search], shared: FloatArray, at: list[tuple[float, float]], most: int
     ) -> list[tuple[float, float]] | None:
-        """Fit each line beside the others, until they stay."""
+        """Fit each line beside the others until they stay."""
         at = list(at)
         for _ in range(most):
             before = [f for f, _ in at]
             heights = [p + np.log(s.line.rms_nm) for s, (_, p) in zip(searches, at, strict=True)]
             for i in np.argsort(heights)[::-1].tolist():  # the strongest first
-                found = self._fitted(searches[i], self._beside(searches, shared, at, i), at[i])
+                found = self._fit_line(
+                    searches[i], self._spectrum_beside(searches, shared, at, i), at[i]
+                )
                 if found is None:
                     return None
                 at[i] = found
@@ -162,15 +154,15 @@ class LineFit:
     ) -> float:
         total = 0.0
         for i, search in enumerate(searches):
-            model = self._beside(searches, shared, at, i)[search.bins]
+            model = self._spectrum_beside(searches, shared, at, i)[search.bins]
             model = model + self._spectrum(search.line, at[i], search.bins)
             total += _whittle(search.power[search.bins], model)
         return total
 
-    def _fitted(
+    def _fit_line(
         self, search: Search, rest: FloatArray, start: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Frequency and logarithm of the rms over the line's own; None if they are not found."""
+        """Return frequency and logarithm of the rms over the last; None if no fit settles."""
         low, high = self._bounds(search)
         at, power, known = search.bins, search.power[search.bins], rest[search.bins]
 
@@ -190,7 +182,7 @@ class LineFit:
         )
         return (float(fit.x[0]), float(fit.x[1])) if fit.success and np.isfinite(fit.fun) else None
 
-    def _there(self, search: Search, rest: FloatArray, found: tuple[float, float]) -> bool:
+    def _is_there(self, search: Search, rest: FloatArray, found: tuple[float, float]) -> bool:
         """Whether a line makes the data likelier by enough."""
         power, known = search.power[search.bins], rest[search.bins]
         model = known + self._spectrum(search.line, found, search.bins)

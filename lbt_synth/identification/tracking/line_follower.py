@@ -1,4 +1,4 @@
-"""The quickest estimator for tracking: all is known but the frequencies of the lines."""
+"""The quickest identifier for tracking: it finds only the frequencies of known lines."""
 
 from __future__ import annotations
 
@@ -75,10 +75,7 @@ class LineFollower:
         self._lines = list(self._plant.vibrations)
 
     def __call__(self, measurements: FloatArray, corrections: FloatArray) -> TipTiltPlant | None:
-        """Find the frequencies in a window.
-
-        Shapes: measurements (frames, q), corrections (frames, n).
-        """
+        """Find the frequencies in measurements (frames, q) and corrections (frames, n)."""
         hw = self._plant.hardware
         q, n = hw.sensor.shape
         if measurements.shape[1:] != (q,) or corrections.shape != (len(measurements), n):
@@ -120,7 +117,7 @@ class LineFollower:
         return with_vibrations(self._plant, found)
 
     def _groups(self, shared: FloatArray) -> list[list[int]]:
-        """Lines that could be found on one peak, by rising frequency."""
+        """Return groups of lines that could be found on one peak, by rising frequency."""
         frequency = [line.frequency_hz for line in self._lines]
         groups: list[list[int]] = []
         for i in np.argsort(frequency, kind="stable").tolist():
@@ -139,7 +136,7 @@ class LineFollower:
         return groups
 
     def _background(self, group: list[int], index: int, frequency_hz: FloatArray) -> FloatArray:
-        """Spectrum along the direction of a line without the lines of its group [nm^2/Hz]."""
+        """Return the spectrum along a line without the lines of its group [nm^2/Hz]."""
         rate = self._plant.hardware.frame_rate_hz
         along = np.array(self._lines[index].direction)
         noise = along @ self._inverse

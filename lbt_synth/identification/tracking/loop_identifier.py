@@ -1,4 +1,4 @@
-"""The whole model of a loop, identified anew in each window."""
+"""The identifier that finds the whole model of a loop in each window."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from lbt_synth.validation import FloatArray, integer, require_instance
 class LoopIdentifier:
     """Identify turbulence, lines and noise of each axis in a window (:func:`identify_axis`).
 
-    Each window begins with what the last one gave. The sensor gain is found in the data, too; a
-    window that does not tell it takes the plant's.
+    Each window starts from the model of the last one. The sensor gain is found in the data, too; a
+    window that does not show it takes the plant's.
 
     Parameters
     ----------
     plant : TipTiltPlant
-        Loop, and sensor gains in its sensor matrix: one measurement an axis, each of its own.
+        Loop, and sensor gains in its sensor matrix: one measurement per axis.
     find_gain : bool, optional
         Whether the sensor gain is found; otherwise it is the plant's.
     most_lines : int, optional
@@ -72,14 +72,14 @@ class LoopIdentifier:
         self._last: Sequence[IdentifiedAxis | None] = [None] * len(self._gains)
 
     def __call__(self, measurements: FloatArray, corrections: FloatArray) -> TipTiltPlant | None:
-        """Identify a window. Shapes: measurements, corrections (frames, n)."""
+        """Identify a window of measurements and corrections, (frames, n)."""
         hw, count = self._plant.hardware, len(self._gains)
         if measurements.shape[1:] != (count,) or corrections.shape != measurements.shape:
             raise DimensionError(
                 f"the series must be (frames, {count}); got {measurements.shape} and "
                 f"{corrections.shape}."
             )
-        last, self._last = self._last, [None] * count  # a fit that fails is no beginning
+        last, self._last = self._last, [None] * count  # a fit that fails is no start
         found = tuple(
             identify_axis(
                 measurements[:, i],

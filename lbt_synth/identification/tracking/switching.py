@@ -1,9 +1,9 @@
-"""Filters that are exchanged while the loop runs, without a bump.
+"""Filters exchanged in a running loop without a bump.
 
 The error of an estimator does not depend on the commands (:attr:`FilterDesign.estimator`): what
 it sees are the measurements with the correction taken out, the pseudo-open-loop series
 ``ybar(k) = y(k) + sensor_matrix c(k)``. So a new filter, run over the recorded ``ybar``, is in
-the state in which it were had it always run, whoever gave the commands. The correction c(k)
+the state that it would have had it always run, whoever gave the commands. The correction c(k)
 follows from the commands that were really given, by the mirror's own states, which outlive
 every filter.
 """

@@ -1,4 +1,4 @@
-"""A filter that follows vibrations: identified anew, designed anew, exchanged without a bump."""
+"""The tracking controller: it identifies and redesigns its filter while the loop runs."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from lbt_synth.models import LoopHardware, TipTiltPlant, Vibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.validation import FloatArray, number, require_instance
 
-_MOST_SPOILT = 0.01  # of a window; fillers stand in for the measurements
+_MOST_SPOILT = 0.01  # of a window, filled by interpolation
 _LEAST_FRAMES = 16
-_NARROW = 0.1  # damping ratio; a wide resonance is a part of the background and has no trend
+_NARROW = 0.1  # damping ratio; wider resonances belong to the background and have no trend
 
 
 @runtime_checkable
@@ -53,7 +53,7 @@ class TrackingUpdate:
     rms_nm : tuple of float
         Their rms [nm].
     noise_nm : tuple of float
-        Standard deviation of the noise that it assumes, one a measurement [nm].
+        Standard deviation of the noise that it assumes, one per measurement [nm].
     left_out : int
         Frames of the window that were left out: not finite, or outliers.
     switched : bool
@@ -79,7 +79,7 @@ class TrackingUpdate:
 
 
 class _KeepFilterError(Exception):
-    """The running filter is kept, and why."""
+    """The reason why the running filter is kept."""
 
 
 class TrackingController:
@@ -245,10 +245,10 @@ class TrackingController:
         self._left_out = 0
         reason, clock = "", [time.perf_counter()]
         try:
-            found = self._identified()
+            found = self._identify_window()
             fitted_hz = tuple(line.frequency_hz for line in found.vibrations)
             clock.append(time.perf_counter())
-            designed = self._designed(self._ahead(found, time_s))
+            designed = self._design_filter(self._extrapolate_lines(found, time_s))
             clock.append(time.perf_counter())
             self._running.switch(designed)
         except _KeepFilterError as kept:
@@ -276,12 +276,12 @@ class TrackingController:
             )
         )
 
-    def _identified(self) -> TipTiltPlant:
-        """Plant of the last window."""
+    def _identify_window(self) -> TipTiltPlant:
+        """Return the plant of the last window."""
         window = self._clean_window()
         try:
             found = self._identify(*window)
-        except Exception as error:  # whatever a fit trips over, the loop goes on
+        except Exception as error:  # whatever stops a fit, the loop goes on
             raise _KeepFilterError(f"the fit failed: {type(error).__name__}: {error}") from error
         if found is None:
             raise _KeepFilterError("the fit found no plant")
@@ -291,7 +291,7 @@ class TrackingController:
         return found
 
     def _clean_window(self) -> tuple[FloatArray, FloatArray]:
-        """Measurements and corrections of the last window, without outliers."""
+        """Return measurements and corrections of the last window, without outliers."""
         measurements, corrections = self._running.window(self._window)
         missing = ~self._running.usable(self._window)
         plant = self.design.problem
@@ -312,15 +312,15 @@ class TrackingController:
             measurements = bridge_frames(measurements + seen, wrong) - seen
         return measurements, corrections
 
-    def _designed(self, plant: TipTiltPlant) -> FilterDesign:
-        """Certified filter of a plant."""
+    def _design_filter(self, plant: TipTiltPlant) -> FilterDesign:
+        """Return the certified filter of a plant."""
         try:
             return self._design(plant)
         except Exception as error:  # as above
             raise _KeepFilterError(f"the design failed: {type(error).__name__}: {error}") from error
 
-    def _ahead(self, found: TipTiltPlant, time_s: float) -> TipTiltPlant:
-        """Plant with the frequencies of the middle of the time until the next update."""
+    def _extrapolate_lines(self, found: TipTiltPlant, time_s: float) -> TipTiltPlant:
+        """Return the plant with its lines as expected halfway to the next update."""
         if not self._extrapolate or not found.vibrations:
             return found
         middle_s = time_s - self._window_s / 2
@@ -337,15 +337,13 @@ class TrackingController:
         return with_vibrations(
             found,
             [
-                _move_line(line, track.at(ahead_s, overlap=overlap), self._rate)
+                _move_line(line, track.frequency_at(ahead_s, overlap=overlap), self._rate)
                 for line, track in zip(found.vibrations, tracks, strict=True)
             ],
         )
 
 
 def _move_line(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:
-    """Vibration at an extrapolated frequency; a wide one, or where there can be none, as it is."""
-    lowest = line.damping * line.frequency_hz
-    if line.damping > _NARROW:
-        return line
-    return line.at_frequency(frequency_hz) if lowest < frequency_hz < frame_rate_hz / 2 else line
+    """Return a narrow vibration moved to a frequency, if it can be there; others unchanged."""
+    possible = line.damping * line.frequency_hz < frequency_hz < frame_rate_hz / 2
+    return line.at_frequency(frequency_hz) if possible and line.damping <= _NARROW else line

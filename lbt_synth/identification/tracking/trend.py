@@ -1,4 +1,4 @@
-"""Where a line is going: a straight line through its last frequencies."""
+"""The trend of a line: a straight line through its last frequencies."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def extrapolate(
     The trend is a least-squares line through what is left when outliers from a Theil-Sen line are
     dropped (P. K. Sen, J. Am. Stat. Assoc. 63, 1379 (1968), doi:10.1080/01621459.1968.10480934).
     Between the last frequency and the line the answer is weighted with ``slope^2 / (slope^2 +
-    error^2)``: a slope within its error changes little. Shapes: time_s, frequency_hz (k,).
+    error^2)``: a slope within its error changes little.
 
     Examples
     --------
@@ -60,29 +60,29 @@ def extrapolate(
 
 @dataclass(slots=True, eq=False)
 class LineTrack:
-    """What was found of one line, window after window."""
+    """The frequencies of one line, window after window."""
 
     direction: FloatArray
     time_s: list[float] = field(default_factory=list)
     frequency_hz: list[float] = field(default_factory=list)
 
     def add(self, time_s: float, frequency_hz: float, *, since_s: float) -> None:
-        """Add what a window gave, and forget what is older than a time."""
+        """Add the frequency of a window, and forget those before a time."""
         self.time_s.append(time_s)
         self.frequency_hz.append(frequency_hz)
         while self.time_s[0] < since_s - 1e-6:  # not for rounding
             del self.time_s[0], self.frequency_hz[0]
 
-    def at(self, time_s: float, *, overlap: float) -> float:
+    def frequency_at(self, time_s: float, *, overlap: float) -> float:
         """Return the frequency at a time by the trend [Hz]."""
         times, frequencies = np.array(self.time_s), np.array(self.frequency_hz)
         return extrapolate(times, frequencies, time_s, overlap=overlap)[0]
 
 
 def match_tracks(tracks: list[LineTrack], lines: tuple[Vibration, ...]) -> list[LineTrack]:
-    """Return a track for each line: the one along its direction with the nearest last frequency.
+    """Return a track for each line: the nearest in frequency of those along its direction.
 
-    A line that fits none begins a new track. The closest pairs are matched first.
+    The closest pairs are matched first. A line without a near track begins a new one.
     """
     pairs = sorted(
         (abs(track.frequency_hz[-1] - line.frequency_hz), i, j)

@@ -125,11 +125,11 @@ def test_an_announced_line_is_found_where_a_search_would_not_dare() -> None:
     n = 16_384
     y = rng.standard_normal(n) + 0.05 * np.sin(2 * np.pi * 90.0 * np.arange(n) / RATE)
     plain = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE)
-    told = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
+    known = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
     wrong = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(140.0, 0.05)])
     assert not plain.lines
     assert not wrong.lines
-    (line,) = told.lines
+    (line,) = known.lines
     assert line.announced
     assert line.frequency_hz == pytest.approx(90, abs=0.1)
 
@@ -144,7 +144,7 @@ def test_a_start_leads_to_the_same_place() -> None:
     )
 
 
-def test_two_close_lines_are_told_apart() -> None:
+def test_two_close_lines_are_separated() -> None:
     y, c = integrator_loop(lines=((60.0, 0.002, 40), (61.2, 0.002, 25)), frames=40_000)
     found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     assert [line.frequency_hz for line in found.lines] == pytest.approx([60.0, 61.2], abs=0.1)

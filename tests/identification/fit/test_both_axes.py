@@ -67,11 +67,11 @@ def test_commands_in_other_units_are_doubted(factor: float) -> None:
         unit="nm",
     )
     found = lbt.identify(wrong)
-    told = any("units, signs and axes of the commands" in note for note in found.notes)
-    assert told or found.axes[0].sensor_gain_error is None
+    doubted = any("units, signs and axes of the commands" in note for note in found.notes)
+    assert doubted or found.axes[0].sensor_gain_error is None
 
 
-def test_wide_resonances_that_hide_the_gain_are_told() -> None:
+def test_wide_resonances_that_hide_the_gain_are_noted() -> None:
     lines = ((20.0, 0.1, 60.0), (60.0, 0.3, 40.0), (130.0, 0.5, 40.0))
     axis = lbt.identify(spliced_record((1,), lines=lines, frames=60_000, noise=8.0)).axes[0]
     if axis.sensor_gain_error is None:
@@ -114,7 +114,7 @@ def test_standard_errors_hold_the_error_of_the_gain() -> None:
     assert 0.5 < np.sqrt(np.mean(np.square(deviations))) < 1.6
 
 
-def test_the_number_of_lines_is_kept_and_its_limit_told() -> None:
+def test_the_limit_of_lines_is_kept_and_noted() -> None:
     lines = tuple((10.0 + 12 * i, 0.004, 30.0) for i in range(8))
     record = spliced_record(lines=lines, frames=20_000)
     found = lbt.identify(record, most_lines=5, sensor_gain=0.6)

@@ -10,7 +10,7 @@ import lbt_synth as lbt
 from lbt_synth.identification.fit.jumps import cut_around
 
 
-def test_a_jump_is_found_cut_and_told() -> None:
+def test_a_jump_is_found_noted_and_cut() -> None:
     clean = lbt.identify(spliced_record(lines=LINE, frames=20_000))
     spliced = spliced_record((0, 1), lines=LINE, frames=20_000)
     found = lbt.identify(spliced)

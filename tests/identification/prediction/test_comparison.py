@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from support.replays import (
+from support.predictions import (
     CAMERA,
     GOOD,
     LINES,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.replays import (
+from support.predictions import (
     CASES,
     FLAT,
     GOOD,

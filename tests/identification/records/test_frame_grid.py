@@ -55,7 +55,7 @@ def test_rounded_times_do_not_tell_the_rate(rate):
     quantum=st.sampled_from([1e-3, 1e-4, 1e-6]),
 )
 def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, quantum):
-    """Never silently elsewhere, but where the rate is so that rounding cannot be told apart."""
+    """Never silently elsewhere, unless rounding cannot be distinguished at that rate."""
     kept = np.setdiff1d(np.arange(frames), lost)
     times = quantum * np.round((kept / rate + phase) / quantum)
     y = noise(frames)

@@ -178,7 +178,7 @@ def test_facts_in_comments(tmp_path, series):
     assert np.allclose(seen.measurements, 1e3 * series[0][:, :1])
 
 
-def test_units_have_to_be_told(tmp_path, series):
+def test_units_must_be_given(tmp_path, series):
     y, _ = series
     path = write_csv(tmp_path / "a.csv", ["pol"], [y[:, 0]])
     with pytest.raises(
@@ -188,12 +188,12 @@ def test_units_have_to_be_told(tmp_path, series):
     assert lbt.load_record(path, frame_rate_hz=RATE, unit="um").measurements[0, 0] == pytest.approx(
         1e3 * y[0, 0]
     )
-    told = write_csv(tmp_path / "b.csv", ["pol_nm"], [y[:, 0]])
+    named = write_csv(tmp_path / "b.csv", ["pol_nm"], [y[:, 0]])
     with pytest.raises(
         lbt.errors.ProblemError, match="unit must be that of the file, 'nm'; got 'mas'"
     ):
-        lbt.load_record(told, frame_rate_hz=RATE, unit="mas", diameter_m=8)
-    assert lbt.load_record(told, frame_rate_hz=RATE, unit="nanometer").axes == 1
+        lbt.load_record(named, frame_rate_hz=RATE, unit="mas", diameter_m=8)
+    assert lbt.load_record(named, frame_rate_hz=RATE, unit="nanometer").axes == 1
     mixed = write_csv(tmp_path / "c.csv", ["pol0_nm", "pol1_um"], y.T)
     with pytest.raises(lbt.errors.ProblemError, match="must all have the same unit; got nm, um"):
         lbt.load_record(mixed, frame_rate_hz=RATE)

@@ -54,7 +54,7 @@ def test_wrong_identifiers_are_refused():
     identify = lbt.identification.LoopIdentifier(plant)
     with pytest.raises(lbt.errors.DimensionError, match=r"must be \(frames, 1\)"):
         identify(np.zeros((3200, 1)), np.zeros((3200, 2)))
-    # a window that is too short is told in the history of the tracker
+    # a window that is too short is noted in the history of the tracker
     tracker = lbt.identification.TrackingController(plant, window_s=0.25)
     simulated(tracker, frames=400)
     assert tracker.kept == len(tracker.history) > 0

@@ -219,7 +219,7 @@ def test_only_filters_of_the_same_loop_are_exchanged():
             lbt.identification.SwitchedController(design, memory_s=memory_s)
 
 
-def test_a_filter_of_another_sensor_gain_is_told_by_its_own():
+def test_a_filter_of_another_sensor_gain_keeps_its_own():
     """The record is of measurements and corrections, so each filter takes them as it must."""
     plant, weak = axis(20), axis(20, sensor_gain=0.6)
     old, new = lbt.kalman(plant), lbt.kalman(weak)

@@ -48,8 +48,8 @@ def test_the_tracker_follows_a_drift_and_a_fixed_filter_does_not():
         assert abs(update.frequencies_hz[0] - true) < 0.15
     last = slice(5600, None)
     rms = [np.sqrt(np.mean(r.residual_nm[0, last] ** 2)) for r in (followed, fixed)]
-    told = np.sqrt(np.mean(simulated(lbt.kalman(axis(22)).controller).residual_nm[0, last] ** 2))
-    assert rms[0] < 1.1 * told
+    knowing = np.sqrt(np.mean(simulated(lbt.kalman(axis(22)).controller).residual_nm[0, last] ** 2))
+    assert rms[0] < 1.1 * knowing
     assert rms[0] < 0.7 * rms[1]
     # the same again after a reset
     again = simulated(tracker)
@@ -76,7 +76,7 @@ def test_without_a_change_the_commands_are_those_of_the_fixed_filter():
         (lambda _y, _c: axis(20, delay_frames=3), "must be for the running loop"),
     ],
 )
-def test_a_fit_that_fails_keeps_the_filter_and_is_told(identifier, words):
+def test_a_fit_that_fails_keeps_the_filter_and_is_noted(identifier, words):
     plant = axis(18)
     tracker = lbt.identification.TrackingController(plant, identifier, window_s=0.5, update_s=0.25)
     out = simulated(tracker, frames=800)

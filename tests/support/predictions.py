@@ -1,4 +1,4 @@
-"""Loops and records that the tests of replays share."""
+"""Loops and records that the tests of predictions share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import lbt_synth as lbt
 RATE = 800
 CAMERA = lbt.Imaging(diameter_m=8.22)
 SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
-SHELL = lbt.models.PositionLoop.of_bandwidth(natural_frequency_hz=20, damping=0.5, bandwidth_hz=300)
+SHELL = lbt.models.PositionLoop.from_bandwidth(
+    natural_frequency_hz=20, damping=0.5, bandwidth_hz=300
+)
 LINES = (
     lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 0)),
     lbt.Vibration(frequency_hz=33, damping=0.02, rms_nm=100, direction=(0, 1)),
