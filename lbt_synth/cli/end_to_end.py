@@ -15,7 +15,7 @@ from lbt_synth.cli.progress import count_progress
 from lbt_synth.design import Design
 from lbt_synth.files import Telemetry, load_gain, save_telemetry
 from lbt_synth.interop import Calibration, EndToEndRun
-from lbt_synth.interop.specula.json_cases import summarize_run
+from lbt_synth.interop.specula.json_cases import summarise_run
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.report.figures import end_to_end_figure
 from lbt_synth.report.figures.style import save_figure
@@ -38,7 +38,7 @@ def run(arguments: Namespace) -> Report:
     total = setup.frames + setup.settle_frames
     with count_progress(total=total, what="frames", quiet=arguments.json) as count:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
-    figures = summarize_run(loop_run)
+    figures = summarise_run(loop_run)
     inverse = calibration.reconstructor
     data: dict[str, Any] = {
         "gain": str(arguments.gain),

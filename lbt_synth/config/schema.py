@@ -7,18 +7,20 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Damping = Annotated[float, Field(gt=0, lt=1)]
+Count = Annotated[int, Field(ge=1)]
 ONE, EACH = "one", "each"  # one value for all axes, or a list with one per axis
 
 
-def _one_or_each(value: Any) -> str:
+def _tag_one_or_each(value: Any) -> str:
     return EACH if isinstance(value, list) else ONE
 
 
 PositiveOrEach = Annotated[
     Annotated[Positive, Tag(ONE)] | Annotated[list[Positive], Field(min_length=1), Tag(EACH)],
-    Discriminator(_one_or_each),
+    Discriminator(_tag_one_or_each),
 ]
 
 
@@ -49,9 +51,9 @@ class PyramidSection(Section):
 
     wavelength_um: Positive
     modulation_lambda_over_d: Positive
-    subapertures_across: Annotated[int, Field(ge=1)]
+    subapertures_across: Count
     photons: Positive
-    read_noise_electrons: Annotated[float, Field(ge=0)]
+    read_noise_electrons: NonNegative
 
 
 class SensorSection(Section):
@@ -63,7 +65,7 @@ class SensorSection(Section):
     matrix: list[list[float]] | None = None
 
     @model_validator(mode="after")
-    def _one_noise(self) -> SensorSection:
+    def _require_one_noise(self) -> SensorSection:
         given = [v is not None for v in (self.noise_nm, self.noise_mas, self.pyramid)]
         if sum(given) != 1:
             raise ValueError("expected exactly one of noise_nm, noise_mas, pyramid")
@@ -74,18 +76,18 @@ class LocalLoopSection(Section):
     """The mirror's local position loop: its gains, or the frequency and damping they make."""
 
     natural_frequency_hz: Positive
-    damping: Annotated[float, Field(ge=0)]
+    damping: NonNegative
     bandwidth_hz: Positive | None = None
     bandwidth_damping: Positive | None = None
-    proportional_per_s2: Annotated[float, Field(ge=0)] | None = None
-    derivative_per_s: Annotated[float, Field(ge=0)] | None = None
-    feed_forward: Annotated[float, Field(ge=0)] = 1.0
+    proportional_per_s2: NonNegative | None = None
+    derivative_per_s: NonNegative | None = None
+    feed_forward: NonNegative = 1.0
     sampling_hz: Positive = 72_000.0
     delay_samples: Annotated[int, Field(ge=0)] = 1
-    ramp_samples: Annotated[int, Field(ge=1)] = 1
+    ramp_samples: Count = 1
 
     @model_validator(mode="after")
-    def _one_kind_of_gains(self) -> LocalLoopSection:
+    def _require_one_kind_of_gains(self) -> LocalLoopSection:
         gains = (self.proportional_per_s2 is not None, self.derivative_per_s is not None)
         if gains[0] != gains[1] or gains[0] == (self.bandwidth_hz is not None):
             raise ValueError(
@@ -100,7 +102,7 @@ class LocalLoopSection(Section):
 class MirrorSection(Section):
     """Deformable mirror; ``modes`` counts the controlled ones, for modal designs and end to end."""
 
-    modes: Annotated[int, Field(ge=1)] | None = None
+    modes: Count | None = None
     influence_matrix: list[list[float]] | None = None
     local_loop: LocalLoopSection | None = None
 
@@ -113,7 +115,7 @@ class LoopSection(Section):
     delay_frames: Annotated[float, Field(ge=1)] = 2.0
 
 
-class _Line(Section):
+class _LineSection(Section):
     # which of axis and direction_deg is needed depends on the number of axes
     axis: Literal["tip", "tilt", "both"] | None = None
     direction_deg: float | None = None
@@ -122,7 +124,7 @@ class _Line(Section):
     rms_mas: Positive | None = None
 
     @model_validator(mode="after")
-    def _one_size_one_direction(self) -> _Line:
+    def _require_one_size_and_direction(self) -> _LineSection:
         if (self.rms_nm is None) == (self.rms_mas is None):
             raise ValueError("expected exactly one of rms_nm, rms_mas")
         if self.axis is not None and self.direction_deg is not None:
@@ -130,7 +132,7 @@ class _Line(Section):
         return self
 
 
-class VibrationSection(_Line):
+class VibrationSection(_LineSection):
     """A vibration of the model; ``spread_hz`` makes several ``lines`` of it."""
 
     damping: Damping
@@ -138,13 +140,13 @@ class VibrationSection(_Line):
     lines: Annotated[int, Field(ge=1, le=64)] | None = None
 
     @model_validator(mode="after")
-    def _lines_of_a_spread(self) -> VibrationSection:
+    def _require_spread_of_lines(self) -> VibrationSection:
         if self.lines is not None and self.spread_hz is None:
             raise ValueError("lines goes with spread_hz, and only with it")
         return self
 
 
-class TrueVibrationSection(_Line):
+class TrueVibrationSection(_LineSection):
     """A vibration of the truth: a sinusoid, a resonance with its damping, or one that drifts."""
 
     kind: Literal["sinusoid", "resonance", "drift"]
@@ -153,7 +155,7 @@ class TrueVibrationSection(_Line):
     duration_s: Positive | None = None
 
     @model_validator(mode="after")
-    def _damping_of_a_resonance(self) -> TrueVibrationSection:
+    def _require_what_the_kind_needs(self) -> TrueVibrationSection:
         if self.kind != "drift" and (self.kind == "resonance") != (self.damping is not None):
             raise ValueError(
                 "damping goes with kind: resonance, and only with it or with kind: drift"
@@ -193,7 +195,7 @@ class ModelSection(Section):
     turbulence: Annotated[
         Annotated[TurbulenceSection, Tag(ONE)]
         | Annotated[list[TurbulenceSection], Field(min_length=1), Tag(EACH)],
-        Discriminator(_one_or_each),
+        Discriminator(_tag_one_or_each),
     ]
     vibrations: Annotated[list[VibrationSection], Field(min_length=1)] | None = None
     sensor_gain: PositiveOrEach = 1.0
@@ -205,7 +207,7 @@ class TruthSection(Section):
     turbulence: Literal["frozen_flow", "model", "none"] | None = None
     vibrations: Annotated[
         Annotated[Literal["model"], Tag(ONE)] | Annotated[list[TrueVibrationSection], Tag(EACH)],
-        Discriminator(_one_or_each),
+        Discriminator(_tag_one_or_each),
     ] = []
     sensor_gain: PositiveOrEach = 1.0
 
@@ -220,13 +222,13 @@ class ImagingSection(Section):
 class BandSection(Section):
     """A band in which a vibration may be anywhere."""
 
-    low_hz: Annotated[float, Field(ge=0)]
+    low_hz: NonNegative
     high_hz: Positive
     rms_nm: Positive | None = None
     rms_mas: Positive | None = None
 
     @model_validator(mode="after")
-    def _one_size(self) -> BandSection:
+    def _require_one_size(self) -> BandSection:
         if (self.rms_nm is None) == (self.rms_mas is None):
             raise ValueError("expected exactly one of rms_nm, rms_mas")
         return self
@@ -235,7 +237,7 @@ class BandSection(Section):
 class AttenuationSection(Section):
     """One step of a mask on the rejection."""
 
-    low_hz: Annotated[float, Field(ge=0)]
+    low_hz: NonNegative
     high_hz: Positive
     at_most: Positive
     sensor_gain: Positive | None = None
@@ -245,7 +247,7 @@ class MirrorUncertaintySection(Section):
     """Relative uncertainty of the mirror in a band."""
 
     relative: Positive
-    low_hz: Annotated[float, Field(ge=0)]
+    low_hz: NonNegative
     high_hz: Positive
 
 
@@ -263,17 +265,17 @@ class RobustSection(Section):
     command_step_nm: Positive | None = None
     attenuation: list[AttenuationSection] = []
     mirror_uncertainty: list[MirrorUncertaintySection] = []
-    functions: Annotated[int, Field(ge=1)] = 60
+    functions: Count = 60
     pole: Annotated[float, Field(ge=0, lt=1)] = 0.7
     states: Annotated[int, Field(ge=2)] | None = 20
-    loss: Annotated[float, Field(ge=0)] = 0.1
+    loss: NonNegative = 0.1
 
 
 class DesignSection(Section):
     """Defaults of the synthesis."""
 
     gamma_ratio: Annotated[float, Field(ge=1)] = 1.2
-    command_weight: Annotated[float, Field(ge=0)] = 0.0
+    command_weight: NonNegative = 0.0
     robust: RobustSection | None = None
 
 
@@ -281,7 +283,7 @@ class SimulationSection(Section):
     """Time-domain runs."""
 
     frames: Annotated[int, Field(ge=2)] = 8000
-    cases: Annotated[int, Field(ge=1)] = 4
+    cases: Count = 4
     seed: Annotated[int, Field(ge=0)] = 0
     settle_frames: Annotated[int, Field(ge=0)] = 2000
 
@@ -301,7 +303,7 @@ class EndToEndSection(Section):
     pixels: Annotated[int, Field(ge=8)] = 60
     frames: Annotated[int, Field(ge=2)] = 1600
     settle_frames: Annotated[int, Field(ge=200)] = 400
-    gain: Annotated[float, Field(ge=0)] = 0.5
+    gain: NonNegative = 0.5
     leak: Annotated[float, Field(ge=0, le=1)] = 0.97
     leak_from_mode: Annotated[int, Field(ge=2)] = 50
     actuators_across: Annotated[int, Field(ge=3)] = 31

@@ -80,8 +80,8 @@ def test_every_command_runs(tmp_path, capsys, model):
 
     limits = answer(capsys, "limits", config, integrator, "-o", tmp_path / "l.png")
     assert limits["limit_nm"] == pytest.approx(made["rms"], rel=1e-6)
-    anew = answer(capsys, "robustness", config, "-o", tmp_path / "r.csv")
-    best = {row["method"]: row for row in anew["rows"] if row["error_hz"] == 0}
+    rows = answer(capsys, "robustness", config, "-o", tmp_path / "r.csv")
+    best = {row["method"]: row for row in rows["rows"] if row["error_hz"] == 0}
     assert best["kalman"]["residual_nm"] == pytest.approx(made["rms"], rel=1e-6)
     mapped = answer(
         capsys,

@@ -63,16 +63,16 @@ def make_case(
 def run_case(
     case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
 ) -> dict[str, Any]:
-    """Run a case made by :func:`make_case`, and summarize it."""
+    """Run a case made by :func:`make_case`, and summarise it."""
     system = EndToEndSystem(hardware=_build_hardware(case["hardware"]), **case["system"])
     lines = tuple(_build_vibration(line) for line in case["vibrations"])
     setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
     matrices = case["controller"]
     controller = None if matrices is None else Controller(**matrices)
-    return summarize_run(setup.run(controller, cache=cache))
+    return summarise_run(setup.run(controller, cache=cache))
 
 
-def summarize_run(run: EndToEndRun) -> dict[str, Any]:
+def summarise_run(run: EndToEndRun) -> dict[str, Any]:
     """Return the main numbers of a run."""
     rms = run.rms_nm
     return {
@@ -95,9 +95,9 @@ def _installed_version(package: str) -> str | None:
         return None
 
 
-def _build_hardware(path: Mapping[str, Any]) -> LoopHardware:
-    mirror = path["mirror"]
-    return LoopHardware(**{**path, "mirror": None if mirror is None else PositionLoop(**mirror)})
+def _build_hardware(values: Mapping[str, Any]) -> LoopHardware:
+    mirror = values["mirror"]
+    return LoopHardware(**{**values, "mirror": None if mirror is None else PositionLoop(**mirror)})
 
 
 def _build_vibration(line: Mapping[str, Any]) -> TrueVibration:

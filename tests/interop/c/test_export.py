@@ -44,7 +44,7 @@ def test_the_compiled_controller_closes_the_loop(tmp_path, loaded, designs, name
 @pytest.mark.parametrize("precision", LIMITS)
 @pytest.mark.parametrize("name", ["kalman", "hinf", "prior", "turned"])
 def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, precision):
-    """Bit for bit in the loop, and the error that is told is that of the compiled source."""
+    """Bit for bit in the loop, and the reported error is that of the compiled source."""
     design, single = designs[name], precision == "single"
     written = lbt.interop.export_c(tmp_path / "ctl.c", design, precision=precision)
     theirs = Compiled(written.files[0], single=single)

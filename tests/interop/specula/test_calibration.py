@@ -35,7 +35,7 @@ def test_a_calibration_is_kept_by_its_content(cache, calibration):
 
 
 @needs_specula
-def test_a_damaged_calibration_is_measured_anew(tmp_path, calibration):
+def test_a_damaged_calibration_is_measured_again(tmp_path, calibration):
     first = lbt.interop.calibrate(BRIGHT, cache=tmp_path)
     (file,) = tmp_path.glob("calibration-*.npz")
     whole = file.read_bytes()

@@ -98,7 +98,9 @@ def test_a_controller_that_returns_something_else(cache, returned, match):
 
 
 @needs_specula
-def test_phase_screens_are_kept_by_their_content_and_drawn_anew_if_damaged(tmp_path, calibration):
+def test_phase_screens_are_kept_by_their_content_and_computed_again_if_damaged(
+    tmp_path, calibration
+):
     setup = replace(SETUP, frames=20, settle_frames=200)
     known = {"cache": tmp_path, "calibration": calibration}
     first = setup.run(None, **known)
