@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.processes import alive, wait_for
-from support.studies import study_file
-from test_study_run import TWO, assert_whole, quick, table
+from support.studies import TWO, assert_whole, evaluate_quickly, read_table, study_file
 
 import lbt_synth as lbt
 from lbt_synth.studies.study.cluster import connect_cluster
@@ -99,7 +98,7 @@ def test_json(tmp_path, capsys):
     data = json.loads(out)
     assert (status, data["computed"], data["failures"]) == (0, 20, 0)
     only = data["statistics"]["controllers"][0]
-    mean = np.mean(table(tmp_path / "out" / "results.csv")["slow.strehl"])
+    mean = np.mean(read_table(tmp_path / "out" / "results.csv")["slow.strehl"])
     assert only["mean"] == pytest.approx(mean, rel=1e-7)
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "3", "--json")
     again = json.loads(out)
@@ -154,7 +153,7 @@ def test_killed_it_goes_on_where_it_was(tmp_path, capsys, jobs):
     assert f"{missing} of 600 samples computed" in out
     status, _, _ = run(capsys, "study", path, "-o", tmp_path / "undisturbed")
     assert status == 0
-    found, undisturbed = (table(f / "results.csv") for f in (folder, tmp_path / "undisturbed"))
+    found, undisturbed = (read_table(f / "results.csv") for f in (folder, tmp_path / "undisturbed"))
     assert found["row"].tolist() == list(range(600))
     for name, column in undisturbed.items():
         np.testing.assert_allclose(found[name], column, rtol=1e-6, err_msg=name)
@@ -203,7 +202,7 @@ def cluster():
 
 def waits(study, values, start):
     time.sleep(0.02 * len(values))
-    return quick(study, values, start)
+    return evaluate_quickly(study, values, start)
 
 
 @pytest.mark.e2e
@@ -238,7 +237,7 @@ def test_a_worker_killed_on_dask(tmp_path, cluster):
 def poison(study, values, start):
     if start <= 4 < start + len(values):
         os._exit(5)
-    return quick(study, values, start)
+    return evaluate_quickly(study, values, start)
 
 
 @pytest.mark.e2e
@@ -254,9 +253,9 @@ def test_a_row_that_kills_its_workers_on_dask(tmp_path, cluster, monkeypatch):
             study, folder, executor=client.get_executor(pure=False), workers=2, evaluate=poison
         )
     assert (result.failures, result.retry) == (1, 1)
-    found = table(folder / "results.csv")
+    found = read_table(folder / "results.csv")
     assert np.flatnonzero(np.isnan(found["slow.strehl"])).tolist() == [4]
-    again = lbt.studies.run_study(study, folder, evaluate=quick)
+    again = lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
     assert (again.computed, again.retry) == (1, 0)
     assert_whole(folder, study)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from pathlib import Path
 
+import numpy as np
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
@@ -41,8 +43,45 @@ def study_file(folder: Path, *, base: str = BASE, **changes: str) -> Path:
     return path
 
 
-def loaded(folder: Path, **changes: str) -> lbt.studies.Study:
+def load_small_study(folder: Path, **changes: str) -> lbt.studies.Study:
     return lbt.studies.load_study(study_file(folder, **changes))
 
 
 LBT_TEXT = LBT_YAML.read_text()
+TWO = "{a: {design: kalman}, b: {design: integrator, gain: 0.4}}"
+
+
+def evaluate_quickly(study, values, start):
+    """Columns that tell which row they are of."""
+    rows = start + np.arange(len(values))
+    columns = {name: rows + values[:, 0] / 7 + i for i, name in enumerate(study.result_columns)}
+    return lbt.studies.BatchResult(start=start, columns=columns)
+
+
+def make_folder(tmp_path, name="out"):
+    folder = tmp_path / name
+    folder.mkdir()
+    return folder
+
+
+def read_table(path):
+    with path.open() as stream:
+        names = stream.readline().rstrip("\n").split(",")
+        content = np.loadtxt(stream, delimiter=",", ndmin=2)
+    return dict(zip(names, content.T, strict=True))
+
+
+def assert_whole(folder, study, evaluate=evaluate_quickly):
+    """Every row is there once, in order, with what the evaluation says."""
+    found = read_table(folder / "results.csv")
+    assert tuple(found) == study.columns
+    np.testing.assert_array_equal(found["row"], np.arange(study.samples))
+    values = study.values()
+    for name, column in zip(study.parameter_names, values.T, strict=True):
+        np.testing.assert_allclose(found[name], column, rtol=1e-11)
+    expected = evaluate(study, values, 0).columns
+    for name in study.result_columns:
+        # which samples are in a batch moves what is below the accuracy of the evaluation
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-6, err_msg=name)
+    assert not (folder / "parts").exists()
+    assert json.loads((folder / "study.json").read_text())["finished"]

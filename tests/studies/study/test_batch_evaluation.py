@@ -1,4 +1,4 @@
-"""Many samples at once, against each on its own."""
+"""Samples evaluated at once, against each on its own."""
 
 from dataclasses import replace
 
@@ -9,12 +9,19 @@ from support.studies import BASE, LBT_TEXT, study_file
 import lbt_synth as lbt
 from lbt_synth.studies.study import batch_evaluation
 from lbt_synth.studies.study import reference_evaluation as reference
-from lbt_synth.studies.study.sample_arrays import changes_assumptions_only, changes_numbers_only
 
 COUNT = 8
+
+
 LBT = LBT_TEXT.replace("kind: ar1", "kind: {kind}")
+
+
 FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
+
+
 TOLD = "{told: {design: kalman, for: sample}}"
+
+
 BOTH = "{kalman: {design: kalman}, told: {design: kalman, for: sample}}"
 
 
@@ -250,33 +257,6 @@ def test_simulations_are_done_one_by_one(tmp_path):
         count=2,
         evaluation="simulation",
     )
-
-
-def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
-    study = lbt.studies.load_study(
-        study_file(
-            tmp_path, base=LBT_TEXT, controllers=FIXED, parameters="{truth.sensor_gain: 1.0}"
-        )
-    )
-    numbers = [
-        ("truth", "sensor_gain"),
-        ("atmosphere", "seeing_arcsec"),
-        ("truth", "vibrations", 0, "rms_mas"),
-        ("sensor", "pyramid", "photons"),
-    ]
-    assert all(changes_numbers_only(study, keys) for keys in numbers)
-    others = [
-        ("telescope", "diameter_m"),
-        ("model", "turbulence"),
-        ("loop", "frame_rate_hz"),
-        ("model", "vibrations", 0, "rms_mas"),
-        ("imaging", "wavelength_um"),
-        ("atmosphere", "seeing_wavelength_um"),
-    ]
-    assert not any(changes_numbers_only(study, keys) for keys in others)
-    assert changes_assumptions_only(study, ("model", "vibrations", 0, "rms_mas"))
-    assert changes_assumptions_only(study, ("model", "sensor_gain"))
-    assert not changes_assumptions_only(study, ("model", "turbulence", "driving_rms_nm"))
 
 
 def test_two_answers_stop_a_study(tmp_path, monkeypatch):

@@ -1,0 +1,140 @@
+"""Executors, and processes that die."""
+
+from __future__ import annotations
+
+import os
+import signal
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.studies import (
+    assert_whole,
+    evaluate_quickly,
+    load_small_study,
+    make_folder,
+    read_table,
+)
+
+import lbt_synth as lbt
+from lbt_synth.errors import NumericalError
+from lbt_synth.studies.study.engine import DIED
+from lbt_synth.studies.study.store import list_parts
+
+
+def wrong(study, values, start):
+    return {"a": 1}
+
+
+def short(study, values, start):
+    return evaluate_quickly(study, values[:-1], start)
+
+
+def raises(study, values, start):
+    raise RuntimeError("no such thing.")
+
+
+@pytest.mark.parametrize(
+    ("evaluate", "message"),
+    [
+        (wrong, "must return a BatchResult of rows 0 to"),
+        (short, "must return a BatchResult of rows 0 to"),
+        (raises, r"rows 0 to 3 could not be computed \(RuntimeError: no such thing\)"),
+    ],
+)
+def test_evaluations_that_are_none(tmp_path, evaluate, message):
+    with pytest.raises(NumericalError, match=message):
+        lbt.studies.run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=evaluate)
+
+
+def test_any_executor(tmp_path):
+    study = load_small_study(tmp_path, samples="300")
+    with ThreadPoolExecutor(3) as pool:
+        lbt.studies.run_study(
+            study, folder := make_folder(tmp_path), executor=pool, evaluate=evaluate_quickly
+        )
+        assert pool.submit(int, "3").result() == 3  # it was left open
+    assert_whole(folder, study)
+
+
+class Breaks(ThreadPoolExecutor):
+    """An executor that ends after some calls."""
+
+    calls = 0
+    kind = BrokenExecutor
+
+    def submit(self, fn, *args, **kwargs):
+        Breaks.calls += 1
+        if Breaks.calls <= 3:
+            return super().submit(fn, *args, **kwargs)
+        if self.kind is BrokenExecutor:
+            raise BrokenExecutor("it is gone")
+        lost: Future = Future()
+        lost.cancel()
+        lost.set_running_or_notify_cancel()
+        return lost
+
+
+@pytest.mark.usefixtures("small_batches")
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [(BrokenExecutor, "the executor broke: it is gone"), (None, "the executor cancelled")],
+)
+def test_an_executor_that_breaks_keeps_what_is_finished(tmp_path, kind, message):
+    study, folder = load_small_study(tmp_path, samples="300"), make_folder(tmp_path)
+    Breaks.calls, Breaks.kind = 0, kind
+    with Breaks(1) as pool, pytest.raises(NumericalError, match=message):
+        lbt.studies.run_study(study, folder, executor=pool, evaluate=evaluate_quickly)
+    assert 1 <= len(list_parts(folder)) <= 3
+    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert_whole(folder, study)
+
+
+def dies(study, values, start):
+    """Row 3 always ends its process, row 9 does once."""
+    rows = range(start, start + len(values))
+    once = Path(os.environ["STUDY_DIED"])
+    if 9 in rows and not once.exists():
+        once.write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    if 3 in rows and os.environ.get("STUDY_POISON"):
+        os._exit(7)
+    return evaluate_quickly(study, values, start)
+
+
+@pytest.mark.usefixtures("small_batches")
+def test_processes_that_die(tmp_path, monkeypatch):
+    monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
+    monkeypatch.setenv("STUDY_POISON", "1")
+    study, folder = load_small_study(tmp_path, samples="10"), make_folder(tmp_path)
+    run = lbt.studies.run_study(study, folder, jobs=2, evaluate=dies)
+    assert (tmp_path / "died").exists()
+    assert (run.computed, run.failures, run.retry) == (10, 1, 1)
+    found = read_table(folder / "results.csv")
+    np.testing.assert_array_equal(found["row"], np.arange(10))
+    assert np.flatnonzero(np.isnan(found["slow.strehl"])).tolist() == [3]
+    lines = (folder / "failed.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in lines[1:]] == ["3"]
+    assert DIED in lines[1]
+    monkeypatch.delenv("STUDY_POISON")
+
+    def interrupted(results):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # its tables are new, what it knows of them is not
+        lbt.studies.run_study(study, folder, evaluate=dies, whole=interrupted)
+    again = lbt.studies.run_study(study, folder, evaluate=dies)  # only that is tried again
+    assert (again.computed, again.failures, again.retry) == (0, 0, 0)
+    assert_whole(folder, study)
+
+
+def always_dies(study, values, start):
+    os._exit(3)
+
+
+def test_processes_that_die_without_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("lbt_synth.studies.study.engine._MOST_DEATHS", 0)
+    study = load_small_study(tmp_path, samples="400")
+    with pytest.raises(NumericalError, match="1 times one after the other a process ended"):
+        lbt.studies.run_study(study, make_folder(tmp_path), jobs=2, evaluate=always_dies)

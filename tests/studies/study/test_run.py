@@ -1,0 +1,285 @@
+"""Runs of studies: what they write, resume and refuse."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+from support.studies import (
+    TWO,
+    assert_whole,
+    evaluate_quickly,
+    load_small_study,
+    make_folder,
+    read_table,
+)
+
+import lbt_synth as lbt
+from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.studies.study.store import list_parts
+
+ONE = "truth.vibrations[0].rms_nm"
+
+
+def test_a_run_and_its_results(tmp_path):
+    study, folder, counts = (
+        load_small_study(tmp_path, samples="50", controllers=TWO),
+        make_folder(tmp_path),
+        [],
+    )
+    run = lbt.studies.run_study(study, folder, progress=counts.append)
+    assert (run.samples, run.computed, run.failures, run.retry) == (50, 50, 0, 0)
+    assert sum(counts) == 50
+    assert_whole(folder, study, lbt.studies.evaluate_samples)
+    assert (folder / "failed.csv").read_text() == "row,controller,error\n"
+    assert lbt.load_gain(folder / "a.fits").method == "kalman"
+    text = (folder / "results.csv").read_text()
+    assert text.splitlines()[0] == ",".join(study.columns)
+    assert text.splitlines()[7].startswith("6,")
+
+
+def test_a_finished_study_is_not_run_again(tmp_path):
+    study, folder, counts = load_small_study(tmp_path), make_folder(tmp_path), []
+    lbt.studies.run_study(study, folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    again = lbt.studies.run_study(study, folder, evaluate=None, progress=counts.append)
+    assert (again.computed, sum(counts)) == (0, 16)
+    seen = []
+    lbt.studies.run_study(study, folder, evaluate=None, whole=seen.append)
+    assert not seen[0].new
+    assert seen[0].computing_s == json.loads(before["study.json"])["computing_seconds"] > 0
+    np.testing.assert_array_equal(seen[0].columns["row"], np.arange(16))
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_failures_are_listed_and_their_rows_are_there(tmp_path):
+    study = load_small_study(
+        tmp_path,
+        samples="8",
+        controllers="{a: {design: integrator, gain: 0.3}, tight: {design: integrator, gain: 0.7, "
+        "for: sample}}",
+        parameters="{loop.delay_frames: {list: [2, 4]}}",
+    )
+    folder = make_folder(tmp_path)
+    run = lbt.studies.run_study(study, folder)
+    found = read_table(folder / "results.csv")
+    assert_whole(folder, study, lbt.studies.evaluate_samples)
+    noisy = np.flatnonzero(found["loop.delay_frames"] == 4)
+    lines = (folder / "failed.csv").read_text().splitlines()[1:]
+    assert [line.split(",")[:2] for line in lines] == [[str(row), "tight"] for row in noisy]
+    assert all("failed its certificate" in line for line in lines)
+    assert (run.failures, run.retry) == (4, 0)
+    assert np.all(np.isnan(found["tight.strehl"][noisy]))
+    assert not np.any(np.isnan(found["a.strehl"]))
+
+
+@pytest.mark.usefixtures("small_batches")
+def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
+    study, folder = load_small_study(tmp_path, samples="100"), make_folder(tmp_path)
+    seen = []
+
+    def stops(study, values, start):
+        seen.append((start, start + len(values)))
+        if len(seen) == 4:
+            raise KeyboardInterrupt
+        return evaluate_quickly(study, values, start)
+
+    with pytest.raises(KeyboardInterrupt):
+        lbt.studies.run_study(study, folder, evaluate=stops)
+    parts = [(part.start, part.stop) for part in list_parts(folder)]
+    assert parts == seen[:3]
+    list_parts(folder)[1].path.unlink()  # a hole
+    seen.clear()
+
+    def watches(study, values, start):
+        seen.append((start, start + len(values)))
+        return evaluate_quickly(study, values, start)
+
+    counts = []
+    run = lbt.studies.run_study(study, folder, evaluate=watches, progress=counts.append)
+    kept = parts[0][1] + parts[2][1] - parts[2][0]
+    assert (run.computed, counts[0], sum(counts)) == (100 - kept, kept, 100)
+    assert sum(stop - start for start, stop in seen) == run.computed
+    assert_whole(folder, study)
+
+
+@pytest.mark.usefixtures("small_batches")
+def test_other_studies_and_damage_are_refused(tmp_path):
+    study, folder = load_small_study(tmp_path, samples="60", controllers=TWO), make_folder(tmp_path)
+
+    def stops(study, values, start):
+        if start >= 40:
+            raise KeyboardInterrupt
+        return evaluate_quickly(study, values, start)
+
+    with pytest.raises(KeyboardInterrupt):
+        lbt.studies.run_study(study, folder, evaluate=stops)
+    other = load_small_study(tmp_path, samples="60", controllers=TWO, seed="8")
+    with pytest.raises(OutputError, match="is of another study"):
+        lbt.studies.run_study(other, folder)
+    with pytest.raises(OutputError, match="is of another study"):
+        lbt.studies.load_study(other.source, directory=folder)
+    with pytest.raises(OutputError, match="is of another study"):
+        lbt.studies.replay_row(other, folder, 0)
+    manifest = (folder / "study.json").read_text()
+    (folder / "study.json").write_text(
+        manifest.replace(lbt.__version__, "0.0.1").replace(study.digest, "0")
+    )
+    with pytest.raises(OutputError, match=r"was made by lbt_synth 0\.0\.1; this is"):
+        lbt.studies.run_study(study, folder)
+    (folder / "study.json").write_text("{}")
+    with pytest.raises(OutputError, match="no manifest of a study"):
+        lbt.studies.run_study(study, folder)
+    (folder / "study.json").write_text(
+        json.dumps({"schema": "lbt_synth study", "schema_version": 1})
+    )
+    with pytest.raises(OutputError, match="no manifest of a study"):
+        lbt.studies.run_study(study, folder)
+    (folder / "study.json").write_text("{")
+    with pytest.raises(OutputError, match="cannot read"):
+        lbt.studies.run_study(study, folder)
+    (folder / "study.json").unlink()
+    with pytest.raises(OutputError, match=r"parts of a study without its study\.json"):
+        lbt.studies.run_study(study, folder)
+    (folder / "study.json").write_text(manifest)
+    part = list_parts(folder)[0].path
+    content = part.read_bytes()
+    for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
+        part.write_bytes(damage)
+        with pytest.raises(OutputError, match="is damaged. Delete it"):
+            lbt.studies.run_study(study, folder)
+    part.write_bytes(content)
+    twin = part.with_name("0000000003-0000000005.npz")
+    twin.write_bytes(content)
+    with pytest.raises(OutputError, match="has rows that are in"):
+        lbt.studies.run_study(study, folder)
+    twin.unlink()
+    design = (folder / "b.fits").read_bytes()
+    lbt.save_gain(folder / "b.fits", lbt.integrator(study.config.hardware, gain=0.2))
+    with pytest.raises(OutputError, match="is not the design that the study was begun with"):
+        lbt.studies.run_study(study, folder)
+    (folder / "b.fits").write_bytes(design)
+    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert_whole(folder, study)
+
+
+def test_designs_are_read_where_a_study_was_begun(tmp_path, monkeypatch):
+    study, folder = load_small_study(tmp_path, controllers=TWO), make_folder(tmp_path)
+    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    monkeypatch.setattr(
+        "lbt_synth.studies.study.load.design_by_method", None
+    )  # nothing is designed
+    again = lbt.studies.load_study(study.source, directory=folder)
+    for one, other in zip(study.controllers, again.controllers, strict=True):
+        np.testing.assert_array_equal(one.design.controller.A, other.design.controller.A)
+    assert again.digest == study.digest
+
+
+def test_no_directory_and_inputs_in_the_way(tmp_path):
+    study = load_small_study(tmp_path)
+    with pytest.raises(OutputError, match="cannot write into"):
+        lbt.studies.run_study(study, tmp_path / "nowhere")
+    made = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
+    lbt.save_gain(tmp_path / "b.fits", made)
+    study = load_small_study(tmp_path, controllers="{a: {file: b.fits}, b: {design: kalman}}")
+    with pytest.raises(OutputError, match="must not replace the input"):
+        lbt.studies.run_study(study, tmp_path)
+
+
+def test_files_of_others_are_not_replaced(tmp_path):
+    study, folder = load_small_study(tmp_path), make_folder(tmp_path)
+    for name in ("slow.fits", "results.csv", "summary.html", "summary.pdf"):
+        (folder / name).write_text("mine")
+        with pytest.raises(OutputError, match=f"{name} is of no study that was begun there"):
+            lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+        assert [path.name for path in folder.iterdir() if path.name != ".lock"] == [name]
+        (folder / name).unlink()
+
+
+def test_killed_before_the_designs_were_written(tmp_path, monkeypatch):
+    study, folder = load_small_study(tmp_path, controllers=TWO), make_folder(tmp_path)
+
+    def interrupted(path, design):
+        if path.name == "b.fits":
+            raise KeyboardInterrupt
+        return lbt.save_gain(path, design)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lbt_synth.studies.study.store.save_gain", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert (folder / "a.fits").exists()
+    assert not (folder / "b.fits").exists()
+    again = lbt.studies.load_study(study.source, directory=folder)
+    lbt.studies.run_study(again, folder, evaluate=evaluate_quickly)
+    assert_whole(folder, study)
+    assert set(json.loads((folder / "study.json").read_text())["designs"]) == {"a", "b"}
+
+
+def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
+    study, folder = load_small_study(tmp_path), make_folder(tmp_path)
+    (folder / "parts").mkdir()
+    begun = [
+        folder / "parts" / ".0000000004-0000000008.npz.abcd_123",
+        folder / ".results.csv.abcd_123",
+        folder / ".summary.html.abcd_123",
+        folder / ".slow.fits.abcd_123",
+    ]
+    for path in begun:
+        path.write_bytes(b"half")
+    (folder / ".mine.csv.abcd_123").write_bytes(b"whole")
+    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert_whole(folder, study)
+    assert not any(path.exists() for path in begun)
+    assert (folder / ".mine.csv.abcd_123").exists()
+
+
+def test_jobs_without_number(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 10)
+    with pytest.raises(ProblemError, match="jobs must be at most 80 on this machine; got 81"):
+        lbt.studies.run_study(load_small_study(tmp_path), make_folder(tmp_path), jobs=81)
+
+
+@pytest.mark.usefixtures("small_batches")
+@pytest.mark.parametrize("calls", [1, 5, 9])
+def test_a_full_disk(tmp_path, monkeypatch, calls):
+    """The manifest and the design, parts, the results: whatever cannot be written."""
+    study, folder = load_small_study(tmp_path, samples="60"), make_folder(tmp_path)
+    left, sync = [calls], os.fsync
+
+    def full(handle):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OutputError, match="No space left on device.*its free space"):
+            lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert not list(folder.rglob(".*.*"))  # nothing half-written
+    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert_whole(folder, study)
+
+
+def test_a_table_of_results_that_was_changed(tmp_path):
+    study, folder = load_small_study(tmp_path), make_folder(tmp_path)
+    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    lines = (folder / "results.csv").read_text().splitlines()
+    (folder / "results.csv").write_text("\n".join(lines[:8]) + "\n")
+    with pytest.raises(OutputError, match="is not as the study wrote it"):
+        lbt.studies.replay_row(study, folder, 9)
+    (folder / "results.csv").write_text("\n".join([*lines[:8], lines[8].replace("7", "8")]))
+    with pytest.raises(OutputError, match="is not as the study wrote it"):
+        lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    (folder / "results.csv").unlink()
+    assert lbt.studies.run_study(study, folder, evaluate=evaluate_quickly).computed == 16
+    (folder / "failed.csv").write_text("row,controller,error\n3,slow,made up\n")
+    with pytest.raises(OutputError, match=r"failed\.csv is not as the study wrote it"):
+        lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    (folder / "failed.csv").unlink()
+    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert_whole(folder, study)

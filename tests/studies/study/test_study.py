@@ -1,0 +1,72 @@
+"""Rows of a study, whichever are requested."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from support.studies import load_small_study
+
+import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+
+ONE = "truth.vibrations[0].rms_nm"
+
+
+@pytest.mark.parametrize("sampling", ["sobol", "latin_hypercube"])
+def test_rows_do_not_depend_on_who_asks(tmp_path, sampling):
+    study = load_small_study(
+        tmp_path,
+        sampling=sampling,
+        samples="37",  # no power of two
+        parameters=f"{{'{ONE}': {{uniform: [1, 2]}}, truth.sensor_gain: {{normal: "
+        "{mean: 1, deviation: 0.1}}, loop.delay_frames: 2.5, sensor.noise_nm: {list: [1, 5]}}",
+    )
+    whole = study.values()
+    assert whole.shape == (37, 4)
+    pieces = [study.values(a, b) for a, b in [(0, 1), (1, 2), (2, 20), (20, 20), (20, 37)]]
+    np.testing.assert_array_equal(np.vstack(pieces), whole)
+    np.testing.assert_array_equal(lbt.studies.load_study(study.source).values(), whole)
+    assert np.all(whole[:, 2] == 2.5)
+    again = pickle.loads(pickle.dumps(study))
+    np.testing.assert_array_equal(again.values(5, 9), whole[5:9])
+    with pytest.raises(ProblemError, match="has 37 samples"):
+        study.values(0, 38)
+
+
+@pytest.mark.parametrize(
+    ("sampling", "expected"),
+    [
+        (
+            "sobol",
+            [
+                (0.6132053462788463, 1.133682976967863, 9.0),
+                (1.425886674784124, 0.8811522781022142, 1.0),
+                (1.042492190375924, 1.011796284607197, 9.0),
+            ],
+        ),
+        (
+            "latin_hypercube",
+            [
+                (1.0911643969210378, 1.0221509991610271, 9.0),
+                (1.2114263432286294, 0.8760264961071796, 1.0),
+                (0.9813972291557166, 1.1199074340906254, 5.0),
+            ],
+        ),
+    ],
+)
+def test_rows_for_ever(tmp_path, sampling, expected):
+    """Found once; a study that was begun must go on with the same rows, in later versions too."""
+    study = load_small_study(
+        tmp_path,
+        sampling=sampling,
+        parameters=f"{{'{ONE}': {{uniform: [0.5, 1.5]}}, truth.sensor_gain: {{normal: {{mean: 1, "
+        "deviation: 0.1, low: 0.5, high: 1.2}}, sensor.noise_nm: {list: [1, 5, 9]}}",
+    )
+    np.testing.assert_allclose(study.values(0, 3), expected, rtol=1e-12)
+
+
+def test_more_samples_begin_with_the_same(tmp_path):
+    few, many = (load_small_study(tmp_path, samples=n).values(0, 16) for n in ("16", "64"))
+    np.testing.assert_array_equal(few, many)
