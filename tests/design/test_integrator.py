@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.replays import a_plant, a_truth
+from support.predictions import a_plant, a_truth
 
 import lbt_synth as lbt
 
