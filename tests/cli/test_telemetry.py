@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.plants import LBT_YAML
-from test_telemetry import full, same
+from support.telemetry import full, same
 
 import lbt_synth as lbt
 from lbt_synth.files.telemetry.aot import lost_fields

@@ -1,12 +1,15 @@
-"""Closed loop, exact residual, margins: against formulas and against each other."""
+"""The exact residual of a loop against closed forms and brute force."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.plants import lbt_axis_plant
+from support.uneven_axes import LINES, LOOPS, QUICK, RATE, SLOW, TABLE, one_axis
 
 import lbt_synth as lbt
 
@@ -19,37 +22,6 @@ class Anonymous:
 
     def psd(self, frequency_hz):
         return self.model.psd(frequency_hz)
-
-
-@given(gain=st.floats(0.2, 1.5))
-def test_error_transfer_of_the_lbt(gain):
-    """Error ``E = (1-h)/(1-(1-g) h)``, noise ``-z^-1 H/(1-(1-g) h)``, h = z^-2 H."""
-    plant = lbt_axis_plant()
-    design = lbt.kalman(plant)
-    loop = lbt.close_loop(plant.hardware, design.controller, sensor_gain=gain)
-    f = np.geomspace(0.1, 399, 60)
-    z = np.exp(2j * np.pi * f / 800)
-    closed = plant.A - design.gain_predictor @ plant.C
-    H = np.array(
-        [
-            v * (plant.L @ np.linalg.solve(v * np.eye(4) - closed, design.gain_predictor))[0, 0]
-            for v in z
-        ]
-    )
-    h = H / z**2
-    assert np.allclose(loop.sensitivity(f)[:, 0, 0], (1 - h) / (1 - (1 - gain) * h), rtol=1e-8)
-    noise = -(H / z) / (1 - (1 - gain) * h)
-    assert np.allclose(loop.noise_transfer(f)[:, 0, 0], noise, rtol=1e-8)
-
-
-@given(gain=st.floats(0.01, 0.99), delay=st.integers(1, 4))
-def test_integrator_loop_is_its_textbook_transfer_function(gain, delay):
-    g = gain * lbt.design.integrator_gain_limit(delay)
-    path = lbt.LoopHardware(frame_rate_hz=500, delay_frames=delay, modes=1)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=g).controller)
-    z = np.exp(2j * np.pi * np.array([1.0, 40, 200]) / 500)
-    open_loop = g * z**-delay / (1 - 1 / z)
-    assert np.allclose(loop.sensitivity([1.0, 40, 200])[:, 0, 0], 1 / (1 + open_loop), rtol=1e-9)
 
 
 def test_noise_of_an_integrator_has_a_closed_form():
@@ -151,23 +123,6 @@ def test_a_decoupled_loop_treats_all_directions_alike(angle):
     assert budget.rms_nm == pytest.approx(same.rms_nm, rel=1e-6)
 
 
-def test_marginal_and_unstable_loops_have_no_residual():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    truth = lbt.Truth(turbulence=None, noise_nm=1.0)
-    for gain, word in ((1.0, "marginally stable"), (1.5, "unstable")):
-        controller = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=1 / 800)
-        loop = lbt.close_loop(path, controller)
-        for ask in (
-            lambda loop=loop: lbt.residual_budget(loop, truth),
-            lambda loop=loop: lbt.loop_margins(loop),
-        ):
-            with pytest.raises(lbt.errors.UnstableLoopError, match=word) as caught:
-                ask()
-            assert caught.value.spectral_radius >= 1 - 1e-6
-        with pytest.raises(lbt.errors.UnstableLoopError):
-            lbt.simulate(controller, truth, hardware=path, frames=10)
-
-
 def test_loops_refuse_what_does_not_fit():
     path = lbt.LoopHardware(frame_rate_hz=800)
     lazy = lbt.integrator(path, gain=0.3).controller
@@ -193,56 +148,55 @@ def test_loops_refuse_what_does_not_fit():
         lbt.residual_budget(loop, lbt.Truth(turbulence=other_rate))
 
 
-# -- margins -------------------------------------------------------------------
-def test_margins_of_an_integrator_against_hand_computation():
-    """g z^-2/(1 - z^-1) = exp(-3j w/2) g / (2j sin(w/2)): |L| = 1 at w = 2 asin(g/2)."""
-    g = 0.5
-    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
-    margins = lbt.loop_margins(lbt.close_loop(path, lbt.integrator(path, gain=g).controller))
-    w = 2 * np.arcsin(g / 2)
-    phase = np.pi / 2 - 1.5 * w
-    assert margins.crossover_hz == pytest.approx(w / (2 * np.pi) * 1000, rel=1e-9)
-    assert margins.phase_deg == pytest.approx(np.degrees(phase), rel=1e-9)
-    assert margins.delay_frames == pytest.approx(phase / w, rel=1e-9)
-    assert margins.gain_high == pytest.approx(2.0, rel=1e-9)
-    theta = np.linspace(1e-4, np.pi, 400_001)
-    z = np.exp(1j * theta)
-    distance = np.abs(1 + g * z**-2 / (1 - 1 / z)).min()
-    assert margins.modulus == pytest.approx(distance, rel=1e-6)
+uneven = partial(lbt.Truth, noise_nm=(15.5, 6.0), sensor_gain=0.8)
 
 
-@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
-def test_the_ends_of_the_gain_interval_are_where_it_turns_unstable(design):
-    plant = lbt_axis_plant(modes=2)
-    controller = design(plant).controller
-    low, high = lbt.loop.stable_sensor_gains(plant.hardware, controller)
-
-    def stable(gain):
-        return lbt.close_loop(plant.hardware, controller, sensor_gain=gain).is_stable
-
-    assert all(stable(g) for g in np.geomspace(low * 1.0001, high * 0.9999, 25))
-    assert not stable(low * 0.999)
-    assert not stable(high * 1.001)
-
-
-def test_the_delay_margin_is_where_a_longer_delay_destabilises():
-    plant = lbt_axis_plant()
-    controller = lbt.kalman(plant).controller
-    margins = lbt.loop_margins(lbt.close_loop(plant.hardware, controller))
-    f = np.geomspace(0.05, 399.9, 20_001)
-    loop = lbt.close_loop(plant.hardware, controller)
-    open_loop = 1 / loop.output_sensitivity().frequency_response(f)[:, 0, 0] - 1
-
-    def distance(delay_s):
-        """Least distance from -1 of the loop with a further delay."""
-        return np.abs(1 + open_loop * np.exp(-2j * np.pi * f * delay_s)).min()
-
-    assert distance(margins.delay_s) < 1e-3
-    before = [distance(t) for t in np.linspace(0, 0.95, 60) * margins.delay_s]
-    assert min(before) > 0.02
+@pytest.mark.parametrize("spectra", [(SLOW, QUICK), (SLOW, TABLE), (None, QUICK), (TABLE, None)])
+def test_axes_without_coupling_are_loops_of_their_own(spectra):
+    both, single = LOOPS
+    truth = uneven(turbulence=spectra, vibrations=LINES)
+    budget = lbt.residual_budget(
+        lbt.close_loop(both, lbt.integrator(both, gain=0.4).controller, sensor_gain=0.8), truth
+    )
+    limit = lbt.loop.least_residual(both, truth)
+    for axis in (0, 1):
+        loop = lbt.close_loop(single, lbt.integrator(single, gain=0.4).controller, sensor_gain=0.8)
+        alone = one_axis(truth, axis)
+        own = lbt.residual_budget(loop, alone)
+        for name in ("turbulence_nm2", "noise_nm2", "vibration_nm2"):
+            assert getattr(budget, name)[axis, axis] == pytest.approx(
+                getattr(own, name)[0, 0], rel=1e-9
+            ), name
+        assert limit.variance_nm2[axis] == pytest.approx(
+            lbt.loop.least_residual(single, alone).variance_nm2[0], rel=1e-9
+        )
+    assert abs(budget.turbulence_nm2[0, 1]) < 1e-9
 
 
-def test_an_unstable_nominal_has_no_interval():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    wild = lbt.Controller(A=1.0, B=3.0, C=1.0, D=0.0, dt_s=1 / 800)
-    assert np.all(np.isnan(lbt.loop.stable_sensor_gains(path, wild)))
+@settings(max_examples=25, deadline=None)
+@given(st.floats(0.1, 50), st.sampled_from([SLOW, QUICK, TABLE, None]))
+def test_equal_axes_are_one_truth_for_all(noise, spectrum):
+    path = lbt.LoopHardware(frame_rate_hz=RATE)
+    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
+    one = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum, noise_nm=noise))
+    each = lbt.residual_budget(loop, lbt.Truth(turbulence=[spectrum] * 2, noise_nm=[noise] * 2))
+    np.testing.assert_allclose(each.total_nm2, one.total_nm2, rtol=1e-12, atol=1e-12)
+
+
+def test_coupled_axes_against_the_frequency_response():
+    """A loop that mixes the axes: the sum of |S e_i|^2 S_i by brute force."""
+    path = lbt.LoopHardware(
+        frame_rate_hz=RATE, sensor_matrix=[[1.0, 0.2], [-0.1, 0.7]], influence_matrix=np.eye(2)
+    )
+    controller = lbt.integrator(lbt.LoopHardware(frame_rate_hz=RATE), gain=0.3).controller
+    loop = lbt.close_loop(path, controller)
+    truth = lbt.Truth(turbulence=[SLOW, TABLE], noise_nm=[3.0, 9.0])
+    f = (np.arange(400_000) + 0.5) * RATE / 2 / 400_000
+    S, N = loop.sensitivity(f), loop.noise_transfer(f)
+    density = np.stack([SLOW.psd(f), TABLE.psd(f)], axis=-1)
+    white = np.array([3.0, 9.0]) ** 2 / (RATE / 2)
+    want = np.einsum("fij,fj,fkj->ik", S, density, S.conj()).real * (f[1] - f[0])
+    noise = np.einsum("fij,j,fkj->ik", N, white, N.conj()).real * (f[1] - f[0])
+    budget = lbt.residual_budget(loop, truth)
+    np.testing.assert_allclose(budget.turbulence_nm2, want, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(budget.noise_nm2, noise, rtol=1e-5, atol=1e-4)

@@ -1,50 +1,13 @@
-"""Time domain against the frame-by-frame loop, python-control and the exact answer."""
+"""Simulated loops against the loop equations and the exact residual."""
 
 from __future__ import annotations
 
-import control
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.plants import lbt_axis_plant
+from support.uneven_axes import LINES, LOOPS, SLOW, TABLE
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
-
-
-@given(
-    seed=st.integers(0, 1000),
-    n=st.integers(1, 5),
-    frames=st.integers(1, 700),
-    cases=st.integers(1, 3),
-)
-def test_block_products_are_the_recursion(seed, n, frames, cases):
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((n, n))
-    A *= 0.999 / max(abs(np.linalg.eigvals(A)))
-    system = lbt.linear.StateSpace(
-        A=A,
-        B=rng.standard_normal((n, 2)),
-        C=rng.standard_normal((3, n)),
-        D=rng.standard_normal((3, 2)),
-    )
-    u = rng.standard_normal((cases, frames, 2))
-    expected = np.empty((cases, frames, 3))
-    for case in range(cases):
-        x = np.zeros(n)
-        for k in range(frames):
-            expected[case, k] = system.C @ x + system.D @ u[case, k]
-            x = system.A @ x + system.B @ u[case, k]
-    out = lbt.loop.filter_series(system, u)
-    assert np.allclose(out, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
-
-
-def test_filter_series_against_python_control(axis_plant):
-    loop = lbt.close_loop(axis_plant.hardware, lbt.kalman(axis_plant).controller)
-    u = np.random.default_rng(0).standard_normal((3000, 2))
-    _, expected = control.forced_response(loop.system.to_control(), U=u.T)
-    assert np.allclose(lbt.loop.filter_series(loop.system, u), expected.T, atol=1e-9)
 
 
 @pytest.mark.parametrize("delay", [1, 1.4, 2, 2.7, 3])
@@ -95,76 +58,12 @@ def test_simulation_agrees_with_the_exact_answer(config):
     assert abs(strehls.mean() - lbt.strehl(exact, config.imaging)) < 4 * scatter + 5e-4
 
 
-def test_drawn_series_have_their_spectrum(air):
-    path = lbt.LoopHardware(frame_rate_hz=400, modes=1)
-    truth = lbt.Truth(turbulence=air)
-    series = draw_disturbance(truth, path, frames=8192, cases=200, rng=np.random.default_rng(0))[
-        ..., 0
-    ]
-    variance = np.mean(series**2, axis=1)
-    error = variance.std(ddof=1) / np.sqrt(len(variance))
-    assert abs(variance.mean() - air.tilt_rms_nm**2) < 4 * error
-    # increments see the high frequencies
-    step = np.mean((series[:, 4:] - series[:, :-4]) ** 2, axis=1)
-    f = np.geomspace(1e-5, 200, 50_001)
-    expected = np.trapezoid(2 * air.psd(f) * (1 - np.cos(2 * np.pi * f * 4 / 400)), f)
-    assert abs(step.mean() - expected) < 5 * step.std(ddof=1) / np.sqrt(len(step))
-
-
-@pytest.mark.parametrize("frames", [100, 1000])
-def test_power_is_drawn_whole_however_short_the_series(frames):
-    """A line between two bins, and a spectrum that rises towards zero, keep their variance."""
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    steep = lbt.Atmosphere(
-        seeing_arcsec=0.8, outer_scale_m=None, wind_speed_m_s=20, diameter_m=8.22
-    )
-    line = lbt.models.TabulatedSpectrum(
-        frequency_hz=[37.2, 37.23, 37.26], density_nm2_hz=[0, 100 / 0.03, 0]
-    )
-    for spectrum, rms in ((steep, steep.tilt_rms_nm), (line, 10.0)):
-        series = draw_disturbance(
-            lbt.Truth(turbulence=spectrum),
-            path,
-            frames=frames,
-            cases=3000,
-            rng=np.random.default_rng(2),
-        )
-        assert np.sqrt(np.mean(series**2)) == pytest.approx(rms, rel=0.05)
-
-
-def test_white_noise_is_drawn_white():
-    flat = lbt.models.TabulatedSpectrum(frequency_hz=[0, 400], density_nm2_hz=[1.0, 1.0])
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    series = draw_disturbance(
-        lbt.Truth(turbulence=flat), path, frames=8, cases=60_000, rng=np.random.default_rng(3)
-    )
-    assert np.mean(series**2) == pytest.approx(400, rel=0.01)
-
-
 def test_runs_beyond_the_memory_are_refused(axis_plant):
     controller = lbt.kalman(axis_plant).controller
     truth = lbt.Truth(turbulence=None, noise_nm=1)
     for size in ({"frames": 10**24}, {"frames": 10**6, "cases": 10**6}):
         with pytest.raises(lbt.errors.ProblemError, match="must fit into 8 GB"):
             lbt.simulate(controller, truth, hardware=axis_plant.hardware, **size)
-
-
-def test_drawn_ar_series_are_stationary_from_the_first_frame():
-    line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=100, direction=(1,))
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    series = draw_disturbance(
-        lbt.Truth(turbulence=None, vibrations=(line,)),
-        path,
-        frames=40,
-        cases=6000,
-        rng=np.random.default_rng(1),
-    )[..., 0]
-    for frame in (0, 1, 20, 39):
-        assert series[:, frame].std() == pytest.approx(100, rel=0.05)
-    model = line.ar_model(800)
-    correlation = np.mean(series[:, 0] * series[:, 1]) / 100**2
-    a1, a2 = model.coefficients
-    assert correlation == pytest.approx(a1 / (1 - a2), abs=0.05)
 
 
 def test_seeds_give_the_same_weather_to_every_controller(config):
@@ -241,3 +140,13 @@ def test_a_line_above_nyquist_is_refused_as_in_the_exact_answer(axis_plant):
         lbt.simulate(
             lbt.kalman(axis_plant).controller, truth, hardware=axis_plant.hardware, frames=10
         )
+
+
+def test_a_simulation_agrees_with_the_exact_answer():
+    both, _ = LOOPS
+    truth = lbt.Truth(turbulence=[SLOW, TABLE], noise_nm=[20.0, 5.0], vibrations=LINES)
+    design = lbt.integrator(both, gain=0.4)
+    run = lbt.simulate(design.controller, truth, hardware=both, frames=20_000, cases=4, seed=3)
+    exact = lbt.residual_budget(lbt.close_loop(both, design.controller), truth)
+    power = np.mean(run.residual_nm**2, axis=(0, 1))
+    np.testing.assert_allclose(power, np.diag(exact.total_nm2), rtol=0.05)

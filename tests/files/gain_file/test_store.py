@@ -1,4 +1,4 @@
-"""Gain files: round trips, other people's loaders, damage of every kind."""
+"""Gain files: round trips, damage, tampering, hostile files."""
 
 from __future__ import annotations
 
@@ -10,27 +10,10 @@ import pytest
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.plants import lbt_axis_plant
+from support.gain_files import DESIGNS, ENDINGS
 
 import lbt_synth as lbt
 from lbt_synth.storage.array_file import digest
-
-ENDINGS = ("fits", "npz", "json")
-
-
-def every_design():
-    plant = lbt_axis_plant(modes=2, delay_frames=2.5)
-    bare = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0, dt_s=0.1)
-    return {
-        "kalman": lbt.kalman(plant),
-        "hinf": lbt.hinf(plant, gamma_ratio=1.3, route="riccati"),
-        "full": lbt.kalman(plant.full()),
-        "bare": lbt.kalman(bare),
-        "integrator": lbt.integrator(plant.hardware, gain=0.3),
-    }
-
-
-DESIGNS = every_design()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -66,47 +49,6 @@ def test_round_trip_keeps_every_bit(tmp_path, name, ending):
 def test_vibrations_survive(tmp_path):
     back = lbt.load_gain(lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"]))
     assert back.problem.vibrations == DESIGNS["kalman"].problem.vibrations
-
-
-def state_space_filter(path):
-    """Read a FITS file as SPECULA's state-space filter does, and return its step function.
-
-    HDUs by name, new state first: x <- A x + B u, y = C x + D u.
-    """
-    with fits.open(path) as hdus:
-        assert hdus[0].header.get("VERSION", 1) == 1
-        assert hdus[0].data is None
-        A, B, C, D = (hdus[name].data.copy() for name in "ABCD")
-        assert hdus[0].header["NFILTER"] == B.shape[1]
-        assert hdus[0].header["NSTATES"] == A.shape[0]
-    assert C.shape == (B.shape[1], A.shape[0])
-    assert D.shape == (B.shape[1], B.shape[1])
-    x = np.zeros(len(A))
-
-    def step(u):
-        nonlocal x
-        x = A @ x + B @ u
-        return C @ x + D @ u
-
-    return step
-
-
-@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
-def test_the_fits_file_drives_a_foreign_state_space_filter(tmp_path, name):
-    design = DESIGNS[name]
-    step = state_space_filter(lbt.save_gain(tmp_path / "g.fits", design))
-    run = design.controller.start()
-    for y in np.random.default_rng(0).standard_normal((100, 2)):
-        assert np.allclose(step(y), run.step(y), rtol=1e-13, atol=1e-13)
-
-
-def test_fits_headers_speak_to_people(tmp_path):
-    header = fits.getheader(lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"]))
-    assert header["METHOD"] == "kalman"
-    assert header["RATE_HZ"] == 800
-    assert header["DELAY"] == 2.5
-    assert header["NEWSTATE"] is True
-    assert header["RMS"] == pytest.approx(DESIGNS["kalman"].rms)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

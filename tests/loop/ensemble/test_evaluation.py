@@ -1,4 +1,4 @@
-"""Many loops at once, against each loop on its own."""
+"""Many loops at once against each loop on its own."""
 
 from dataclasses import replace
 
@@ -6,58 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.ensembles import AIR, LINE, RATE, SLOW, plant, weather
 
 import lbt_synth as lbt
 from lbt_synth.linear.quadrature import adaptive_integral
-from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.loop.budget import distinct_edges, pole_edges
-from lbt_synth.loop.ensemble.frequency_responses import batched_response
-from lbt_synth.loop.ensemble.panels import graded_edges
-from lbt_synth.loop.ensemble.subloops import split_into_subloops
-from lbt_synth.models.turbulence.frozen_flows import _octave_splines
 
-RATE = 800
-SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
-AIR = lbt.Atmosphere(
-    seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22, obstruction=0.11
-)
-LINE = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=563.6)
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
-
-
-def plant(**changes):
-    lines = changes.pop("vibrations", [LINE, replace(LINE, direction=(0, 1))])
-    given = {"frame_rate_hz": RATE, "turbulence": SLOW, "noise_nm": 15.5, "vibrations": lines}
-    return lbt.tip_tilt_plant(**(given | changes))
-
-
-@pytest.fixture(scope="module")
-def kalman():
-    return lbt.kalman(plant())
-
-
-@pytest.fixture(scope="module")
-def coupled():
-    """A sensor turned by 30 degrees, and another diagonal vibration: no axis is independent."""
-    turn = np.deg2rad(30)
-    sensor = 0.9 * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    lines = [replace(LINE, direction=(1, 2)), replace(LINE, frequency_hz=31, direction=(1, 0))]
-    return lbt.kalman(plant(sensor_matrix=sensor, vibrations=lines))
-
-
-def weather(count, seed=0):
-    rng = np.random.default_rng(seed)
-    return {
-        "gains": rng.uniform(0.3, 1.2, count),
-        "delays": rng.choice([1.0, 1.7, 2.0, 2.2, 3.0], count),
-        "noise": rng.uniform(5, 30, count),
-        "seeing": rng.uniform(0.5, 1.5, count),
-        "wind": rng.uniform(8, 30, count),
-        "scale": rng.uniform(12, 60, count),
-        "frequency": rng.uniform(18, 22, count),
-        "rms": rng.uniform(300, 900, count),
-        "damping": rng.uniform(0.002, 0.02, count),
-    }
 
 
 def ensemble_of(w, *, turbulence, direction=(1, 0.5)):
@@ -353,98 +308,6 @@ def test_order_and_scale_do_not_matter(kalman, order, scale):
     assert again.rms_nm == pytest.approx(scale * found.rms_nm[list(order)], rel=1e-7, nan_ok=True)
 
 
-def test_flows_are_those_of_single_atmospheres():
-    w = weather(8, seed=7)
-    f = np.geomspace(1e-5, 399, 300)
-    flows = lbt.models.FrozenFlows(
-        atmosphere=AIR,
-        seeing_arcsec=w["seeing"],
-        wind_speed_m_s=w["wind"],
-        outer_scale_m=[22.0, 30.0] * 4,
-    )
-    for i, psd in enumerate(flows.psd(f)):
-        single = replace(
-            AIR,
-            seeing_arcsec=w["seeing"][i],
-            wind_speed_m_s=w["wind"][i],
-            outer_scale_m=[22.0, 30.0][i % 2],
-        )
-        assert psd == pytest.approx(single.psd(f), rel=1e-11)
-    assert flows.take(np.array([3])).psd(f)[0] == pytest.approx(flows.psd(f)[3], rel=1e-12)
-
-
-def test_flows_of_many_outer_scales():
-    """More scales than have tables of their own: a polynomial over each octave."""
-    scales = np.geomspace(16.5, 31.5, 20)
-    f = np.geomspace(1e-4, 399, 100)
-    found = lbt.models.FrozenFlows(atmosphere=AIR, outer_scale_m=scales).psd(f)
-    for i in (0, 7, 19):
-        single = replace(AIR, outer_scale_m=float(scales[i])).psd(f)
-        assert found[i] == pytest.approx(single, rel=1e-9)
-    assert _octave_splines.cache_info().currsize >= 1
-
-
-def test_kolmogorov_flows():
-    air = replace(AIR, outer_scale_m=None)
-    flows = lbt.models.FrozenFlows(atmosphere=air, wind_speed_m_s=[10.0, 20.0])
-    assert flows.psd([3.0])[1, 0] == pytest.approx(air.psd(3.0), rel=1e-12)
-    assert flows.take(np.array([0])).psd([3.0])[0, 0] == pytest.approx(
-        replace(air, wind_speed_m_s=10).psd(3.0), rel=1e-12
-    )
-
-
-def test_partial_fractions_and_what_has_none():
-    rng = np.random.default_rng(8)
-    A = rng.standard_normal((3, 4, 4)) / 3
-    A[1] = np.eye(4, k=-1)  # a chain of delays: defective
-    B, C, D = rng.standard_normal((3, 4, 2)), rng.standard_normal((3, 1, 4)), np.ones((3, 1, 2))
-    z = np.exp(1j * np.linspace(0.01, 3, 50))
-    found = batched_response(A, B, C, D, z)
-    for k in range(3):
-        system = lbt.linear.StateSpace(A=A[k], B=B[k], C=C[k], D=D[k])
-        assert found[k] == pytest.approx(pointwise_response(system, z), rel=1e-9, abs=1e-9)
-
-
-def test_pieces_of_a_loop(kalman, coupled):
-    def pieces(design):
-        system = design.controller.to_statespace()
-        matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
-        return split_into_subloops(matrices, design.hardware)
-
-    parts, rest = pieces(kalman)
-    assert [part.modes.tolist() for part in parts] == [[0], [1]]
-    assert parts[0].equals(parts[1])
-    assert rest == []
-    assert [part.modes.tolist() for part in pieces(coupled)[0]] == [[0, 1]]
-    # an axis without a vibration is another piece than one with
-    parts, _ = pieces(lbt.kalman(plant(vibrations=[LINE])))
-    assert not parts[0].equals(parts[1])
-
-
-def test_states_in_odd_units_stay_coupled(coupled):
-    """The same controller in states of 1e9 times other units is the same controller."""
-    k = coupled.controller
-    units = 10.0 ** np.linspace(-9, 9, k.n_states)
-    odd = lbt.Controller(
-        A=k.A * units / units[:, None], B=k.B / units[:, None], C=k.C * units, D=k.D, dt_s=k.dt_s
-    )
-    ensemble = lbt.loop.LoopEnsemble(sensor_gain=[0.5, 1.0], noise_nm=15.5, turbulence=AIR)
-    one, other = (lbt.loop.ensemble_residuals(c, coupled.hardware, ensemble) for c in (k, odd))
-    assert other.rms_nm == pytest.approx(one.rms_nm, rel=1e-8)
-
-
-def test_a_state_that_no_mode_sees_counts_for_stability():
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    for pole, stable in ((0.5, True), (1.1, False)):
-        hidden = lbt.Controller(
-            A=np.diag([1.0, pole]), B=[[0.3], [0.0]], C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE
-        )
-        found = lbt.loop.ensemble_residuals(
-            hidden, path, lbt.loop.LoopEnsemble(noise_nm=[1.0, 2.0])
-        )
-        assert found.stable.tolist() == [stable] * 2
-
-
 def test_noise_through_an_integrator():
     """Closed form: g / (2 - g) of the variance at a delay of one frame."""
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=1, modes=1)
@@ -457,96 +320,12 @@ def test_noise_through_an_integrator():
     assert found.noise_nm**2 == pytest.approx(9 * (0.5 / g) ** 2 * g / (2 - g), rel=1e-9)
 
 
-def test_panels_reach_the_narrowest_poles():
-    pole = (1 - 1e-8) * np.exp(0.3j)
-    edges = graded_edges(np.array([pole, pole.conj()]))
-    inside = np.searchsorted(edges, 0.3 / np.pi)
-    assert edges[inside] - edges[inside - 1] <= 2.1e-8 / np.pi
-
-
 def test_nothing_to_meet(kalman):
     found = lbt.loop.ensemble_residuals(
         kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(loops=3)
     )
     assert found.rms_nm.tolist() == [0.0] * 3
     assert found.strehl(CAMERA) == pytest.approx([1.0] * 3)
-
-
-WRONG = [
-    ({"sensor_gain": 0.0}, lbt.errors.ProblemError, "sensor_gain must be above 0"),
-    ({"sensor_gain": [np.nan, 1]}, lbt.errors.ProblemError, "finite"),
-    ({"noise_nm": -1.0}, lbt.errors.ProblemError, "noise_nm must be at least 0"),
-    ({"delay_frames": [0.5, 2]}, lbt.errors.ProblemError, "delay_frames must be at least 1"),
-    ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, lbt.errors.DimensionError, "one entry per loop"),
-    ({"sensor_gain": []}, lbt.errors.DimensionError, "at least one loop"),
-    ({"turbulence": "von Karman"}, lbt.errors.ProblemError, "turbulence must be"),
-    ({"vibrations": [LINE]}, lbt.errors.ProblemError, "EnsembleVibration"),
-    ({"turbulence": (AIR, AIR, AIR)}, lbt.errors.DimensionError, "one entry per mode"),
-    ({"noise_nm": np.ones((2, 3))}, lbt.errors.DimensionError, "one column per measurement"),
-    (
-        {"turbulence": lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
-        lbt.errors.ProblemError,
-        "sampled at the loop's 800 Hz; got 500 Hz",
-    ),
-    (
-        {"vibrations": [lbt.loop.EnsembleVibration(frequency_hz=[20, 400], rms_nm=1)]},
-        lbt.errors.ProblemError,
-        "Nyquist frequency 400 Hz; got 400 Hz",
-    ),
-    (
-        {
-            "vibrations": [
-                lbt.loop.EnsembleVibration(frequency_hz=20, rms_nm=1, direction=[1, 0, 0])
-            ]
-        },
-        lbt.errors.DimensionError,
-        "must have 2 components",
-    ),
-]
-
-
-@pytest.mark.parametrize(("given", "kind", "message"), WRONG)
-def test_what_loops_cannot_meet(kalman, given, kind, message):
-    with pytest.raises(kind, match=message):
-        lbt.loop.ensemble_residuals(
-            kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(**given)
-        )
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"frequency_hz": 0.0}, "frequency_hz must be above 0"),
-        ({"rms_nm": [1.0, -1.0]}, "rms_nm must be above 0"),
-        ({"damping": 1.0}, "damping must be between 0 and 1"),
-        ({"direction": [0.0, 0.0]}, "direction must be a vector"),
-    ],
-)
-def test_what_is_no_vibration(given, message):
-    with pytest.raises(lbt.errors.ProblemError, match=message):
-        lbt.loop.EnsembleVibration(**({"frequency_hz": 20.0, "rms_nm": 1.0} | given))
-
-
-@pytest.mark.parametrize(
-    ("given", "kind", "message"),
-    [
-        ({"seeing_arcsec": [0.5, 0.0]}, lbt.errors.ProblemError, "seeing_arcsec must be above 0"),
-        (
-            {"seeing_arcsec": [0.5, 0.6], "wind_speed_m_s": [1, 2, 3]},
-            lbt.errors.DimensionError,
-            "same length",
-        ),
-        ({"wind_speed_m_s": [[1.0]]}, lbt.errors.DimensionError, "lists, one number a loop"),
-    ],
-)
-def test_what_is_no_flow(given, kind, message):
-    with pytest.raises(kind, match=message):
-        lbt.models.FrozenFlows(atmosphere=AIR, **given)
-
-
-def test_frequencies_of_flows():
-    with pytest.raises(lbt.errors.ProblemError, match="above 0 Hz"):
-        lbt.models.FrozenFlows(atmosphere=AIR).psd([0.0])
 
 
 def test_controllers_that_do_not_fit(kalman):

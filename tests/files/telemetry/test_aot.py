@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
-from test_telemetry import full, same, telemetries
+from support.telemetry import full, same, telemetries
 
 import lbt_synth as lbt
 from lbt_synth.files.telemetry.aot import lost_fields
@@ -32,7 +32,6 @@ class Later:
 
 
 aotpy = Later()
-
 # Lengths change their unit on the way, so that they come back to rounding.
 ROUNDING = 1e-14
 

@@ -1,0 +1,273 @@
+"""Telemetry files: round trips, equations that hold in the file alone, damage."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.plants import lbt_axis_plant
+from support.telemetry import ENDINGS, SHELL, full, same, telemetries
+
+import lbt_synth as lbt
+from lbt_synth.files.telemetry import native_layout
+from lbt_synth.files.telemetry.aot import lost_fields
+from lbt_synth.files.telemetry.native_layout import LAYERS
+from lbt_synth.storage import array_file as archive
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("slopes", [True, False])
+def test_round_trip_keeps_every_bit(tmp_path, ending, slopes):
+    seen = full(with_slopes=slopes)
+    assert same(
+        seen, lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen))
+    )
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_least_telemetry(tmp_path, ending):
+    seen = lbt.files.Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])
+    assert same(
+        seen, lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen))
+    )
+
+
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seen=telemetries(), ending=st.sampled_from(ENDINGS))
+def test_any_telemetry_comes_back(tmp_path, seen, ending):
+    assert same(
+        seen, lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen))
+    )
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_float32_rounds_series_and_nothing_else(tmp_path, ending):
+    seen = full(frames=5000)
+    path = lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen, precision="float32")
+    back = lbt.files.load_telemetry(path)
+    series = [
+        layer.field for layer in LAYERS.values() if layer.is_series and layer.field != "times_s"
+    ]
+    assert same(seen, back, but=series)
+    for name in series:
+        assert np.array_equal(getattr(back, name), getattr(seen, name).astype(np.float32))
+    exact = lbt.files.save_telemetry(tmp_path / f"exact.{ending}", seen)
+    assert path.stat().st_size < 0.75 * exact.stat().st_size
+
+
+def test_float32_refuses_what_it_cannot_hold(tmp_path):
+    seen = lbt.files.Telemetry(frame_rate_hz=1.0, commands=[[1e39]], measurements=[[2.0]])
+    with pytest.raises(
+        lbt.errors.ProblemError, match="commands has values beyond the range of float32"
+    ):
+        lbt.files.save_telemetry(tmp_path / "t.fits", seen, precision="float32")
+    with pytest.raises(lbt.errors.ProblemError, match="precision must be one of float64, float32"):
+        lbt.files.save_telemetry(tmp_path / "t.fits", seen, precision="half")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_telemetry_is_the_same_file(tmp_path):
+    for ending in ENDINGS:
+        one = lbt.files.save_telemetry(tmp_path / f"a.{ending}", full()).read_bytes()
+        assert lbt.files.save_telemetry(tmp_path / f"b.{ending}", full()).read_bytes() == one
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.25, 3.5])
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
+    """What the file says of timing, checked on a simulation without noise."""
+    rng = np.random.default_rng(3)
+    path = lbt.LoopHardware(
+        frame_rate_hz=500.0,
+        delay_frames=delay,
+        sensor_matrix=rng.standard_normal((3, 2)),
+        influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
+    )
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    truth = lbt.Truth(turbulence=slow, noise_nm=0.0, sensor_gain=0.6)
+    design = lbt.integrator(path, gain=0.2)
+    run = lbt.simulate(design.controller, truth, hardware=path, frames=60, cases=2, seed=5)
+    lbt.files.save_telemetry(
+        tmp_path / f"t.{ending}",
+        lbt.files.telemetry_from_simulation(run, path, case=1, sensor_gain=0.6, design=design),
+    )
+    seen = lbt.files.load_telemetry(tmp_path / f"t.{ending}")
+    # y(k) = g S phi_res(k-1)
+    expected = seen.sensor_gain * seen.residual_nm[:-1] @ seen.interaction_matrix.T
+    assert np.allclose(seen.measurements[1:], expected, atol=1e-9)
+    # phi_res(k) = phi_tot(k) - N ((1-f) u(k-j) + f u(k-j-1)), d = j + 1 + f
+    j, f = int(delay - 1), delay - 1 - int(delay - 1)
+    u = seen.commands
+    applied = (1 - f) * u[1 : len(u) - j] + f * u[: len(u) - j - 1]
+    assert np.allclose(
+        seen.residual_nm[j + 1 :],
+        seen.total_nm[j + 1 :] - applied @ seen.influence_matrix.T,
+        atol=1e-9,
+    )
+    # u(k) from y up to k: an integrator is u(k) = u(k-1) + gain R y(k)
+    inverse = np.linalg.pinv(seen.interaction_matrix @ seen.influence_matrix)
+    steps = seen.integrator_gains * (seen.measurements[1:] @ inverse.T)
+    assert np.allclose(np.diff(u, axis=0), steps, atol=1e-9)
+    assert (seen.seed, seen.delay_frames, seen.controller_name) == (5, delay, "integrator")
+    hardware = seen.hardware
+    assert np.array_equal(hardware.sensor, path.sensor)
+    assert np.array_equal(hardware.influence, path.influence)
+    assert np.array_equal(run.commands[1], u)
+
+
+@pytest.mark.parametrize("kind", ["fits", "npz", pytest.param("aot", marks=pytest.mark.e2e)])
+@pytest.mark.parametrize("delay", [2.0, 2.25])
+def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind, delay):
+    """phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...), as the file says, with what it holds."""
+    path = lbt.LoopHardware(
+        frame_rate_hz=800.0,
+        delay_frames=delay,
+        influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
+        mirror=SHELL,
+    )
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
+    design = lbt.integrator(path, gain=0.1)
+    run = lbt.simulate(design.controller, truth, hardware=path, frames=120, seed=5)
+    written = lbt.files.telemetry_from_simulation(run, path, design=design)
+    name = "t.aot.fits" if kind == "aot" else f"t.{kind}"
+    seen = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / name, written))
+    assert "phi_cor(k) = N (c0 u(k) + c1 u(k-1)" in seen.convention
+    assert "u(k-d+1)" not in seen.convention
+    taps, u = seen.mirror_taps, seen.commands
+    assert taps.size > 5
+    corrected = sum(c * np.vstack([np.zeros((i, 2)), u[: len(u) - i]]) for i, c in enumerate(taps))
+    error = run.total_nm[0] - corrected @ seen.influence_matrix.T - run.residual_nm[0]
+    assert np.max(np.abs(error[taps.size :])) < 1e-9
+    if kind != "aot":
+        assert np.array_equal(seen.total_nm, run.total_nm[0])
+    # the loop of the file is the loop that ran
+    assert np.array_equal(seen.hardware.mirror_taps, path.mirror_taps)
+    replayed = lbt.simulate(
+        (seen.controller or design.controller), truth, hardware=seen.hardware, frames=120, seed=5
+    )
+    assert np.allclose(replayed.residual_nm, run.residual_nm, rtol=0, atol=1e-9)
+    assert "mirror" not in lost_fields(seen)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_truncated_files_are_refused(tmp_path, ending):
+    path = lbt.files.save_telemetry(tmp_path / f"t.{ending}", full())
+    content = path.read_bytes()
+    for length in np.linspace(0, len(content) - 40, 30).astype(int):
+        path.write_bytes(content[:length])
+        with pytest.raises(lbt.errors.TelemetryError) as caught:
+            lbt.files.load_telemetry(path)
+        assert "\n" not in str(caught.value)
+        assert caught.value.path == path
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    ending=st.sampled_from(ENDINGS), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7)
+)
+def test_a_flipped_bit_is_found_or_harmless(tmp_path, ending, place, bit):
+    seen = full()
+    path = lbt.files.save_telemetry(tmp_path / f"t.{ending}", seen)
+    content = bytearray(path.read_bytes())
+    content[int(place * len(content))] ^= 1 << bit
+    path.write_bytes(bytes(content))
+    try:
+        back = lbt.files.load_telemetry(path)
+    except lbt.errors.TelemetryError:
+        return
+    assert same(seen, back)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    picture = tmp_path / "image.fits"
+    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
+    other = tmp_path / "other.npz"
+    np.savez(other, a=np.ones(3))
+    gain = lbt.save_gain(tmp_path / "gain.fits", lbt.kalman(lbt_axis_plant()))
+    pickled = tmp_path / "pickled.npz"
+    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    for path in (picture, other, gain, pickled):
+        with pytest.raises(lbt.errors.TelemetryError, match=f"{path.name} is "):
+            lbt.files.load_telemetry(path)
+    with pytest.raises(lbt.errors.GainFileError, match="is not a gain file"):
+        lbt.load_gain(lbt.files.save_telemetry(tmp_path / "t.fits", full()))
+
+
+def edited(tmp_path, change, *, resign=True):
+    """Write a file whose arrays and metadata somebody changed."""
+    arrays, meta = native_layout.pack(full(), "float64")
+    arrays = {name: np.array(array) for name, array in arrays.items()}
+    meta["digest"] = archive.digest(arrays, meta)
+    change(arrays, meta)
+    if resign:
+        meta["digest"] = archive.digest(arrays, meta)
+    path = tmp_path / "t.npz"
+    path.write_bytes(archive.npz_bytes(arrays, json.dumps(meta)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "resign", "text"),
+    [
+        (lambda a, m: m.update(schema="recipes"), True, "is not a telemetry file of lbt_synth"),
+        (lambda a, m: m.update(schema_version=9), True, "layout version 9; this lbt_synth reads 1"),
+        (lambda a, m: a["COMMANDS"].__setitem__(0, 3.0), False, "does not match its digest"),
+        (lambda a, m: m.update(seed=8), False, "does not match its digest"),
+        (lambda a, m: a.pop("COMMANDS"), True, "inconsistent: COMMANDS is missing"),
+        (lambda a, m: a.pop("CTRL_B"), True, "inconsistent: CTRL_B is missing"),
+        (lambda a, m: m.pop("seed"), True, "inconsistent: seed is missing"),
+        (lambda a, m: a.update(EXTRA=np.ones(2)), True, "arrays that no telemetry has: EXTRA"),
+        (lambda a, m: a.update(MEASURE=np.ones((2, 2))), True, "measurements must have 6 rows"),
+        (lambda a, m: a["SLOPES"].fill(np.nan), True, "slopes must be finite"),
+        (lambda a, m: m.update(frame_rate_hz="fast"), True, "frame_rate_hz must be a number"),
+        (lambda a, m: m.update(metadata=3), True, "inconsistent"),
+        (lambda a, m: m.update(metadata={"a": [1]}), True, "metadata must hold"),
+    ],
+)
+def test_edited_files_are_refused(tmp_path, change, resign, text):
+    with pytest.raises(lbt.errors.TelemetryError, match=text):
+        lbt.files.load_telemetry(edited(tmp_path, change, resign=resign))
+
+
+def test_names_and_formats(tmp_path):
+    seen = full()
+    for name, kind, text in (
+        ("t.txt", None, "telemetry must end in .fits, .npz or .aot.fits; got 't.txt'"),
+        ("t.fits", "npz", "does not fit the format 'npz'"),
+        ("t.npz", "fits", "does not fit the format 'fits'"),
+        ("t.aot.fits", "fits", "does not fit the format 'fits'"),
+        ("t.fits", "hdf5", "must be one of fits, npz, aot; got 'hdf5'"),
+    ):
+        with pytest.raises(lbt.errors.OutputError, match=text):
+            lbt.files.save_telemetry(tmp_path / name, seen, format=kind)
+    with pytest.raises(lbt.errors.OutputError, match="holds a Telemetry; got int"):
+        lbt.files.save_telemetry(tmp_path / "t.fits", 3)
+    with pytest.raises(lbt.errors.OutputError, match="No such file or directory"):
+        lbt.files.save_telemetry(tmp_path / "nowhere" / "t.fits", seen)
+    with pytest.raises(lbt.errors.TelemetryError, match="must end in"):
+        lbt.files.load_telemetry(tmp_path / "t.txt")
+    (tmp_path / "folder.fits").mkdir()
+    with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
+        lbt.files.load_telemetry(tmp_path / "folder.fits")
+    with pytest.raises(lbt.errors.TelemetryError, match="null"):
+        lbt.files.load_telemetry("x\0y.npz")
+
+
+def test_nothing_half_written_stays(tmp_path, monkeypatch):
+    path = lbt.files.save_telemetry(tmp_path / "t.fits", full())
+    before = path.read_bytes()
+
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(lbt.errors.OutputError, match="No space left on device"):
+        lbt.files.save_telemetry(path, full(random=1))
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["t.fits"]

@@ -1,0 +1,146 @@
+"""The least worst residual over a band: saddle points, designs that stay above it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.limits import RATE, Anonymous, ar, budget, path
+from support.plants import lbt_axis_plant
+
+import lbt_synth as lbt
+from lbt_synth.loop.least_residuals import band_limit as band_module
+
+
+def test_band_of_the_example(config):
+    line = config.truth.vibrations[0]
+    limit = lbt.loop.least_worst_residual(
+        config.hardware, config.truth, band_hz=(16.5, 23.5), rms_nm=line.rms_nm
+    )
+    assert limit.rms_nm == pytest.approx(15.1088, abs=1e-4)
+    assert limit.rms_nm <= limit.achieved_nm < limit.rms_nm * (1 + 1e-8)
+    assert limit.weight.sum() == pytest.approx(1)
+    assert limit.weight.min() >= 0
+    assert 16.5 < limit.frequency_hz.min() < limit.frequency_hz.max() < 23.5
+
+
+def test_the_density_found_is_the_hardest(config):
+    """Its Wiener limit, as a table of its own, is the band limit; the flat one is below."""
+    hardware, still = config.hardware, replace(config.truth, vibrations=())
+    limit = lbt.loop.least_worst_residual(hardware, still, band_hz=(10.0, 40.0), rms_nm=5.0)
+    edges = np.linspace(10, 40, 61)
+    share = np.histogram(limit.frequency_hz, edges, weights=limit.weight)[0]
+    assert not np.allclose(share, 1 / 60, rtol=0.01)
+
+    def of_density(power):
+        def psd(f):
+            place = np.clip(np.searchsorted(edges, f, side="right") - 1, 0, 59)
+            inside = (f > 10) & (f < 40)
+            return still.turbulence.psd(f) + np.where(inside, power[place] * 5**2 / 0.5, 0)
+
+        spectrum = Anonymous(psd)
+        spectrum.breakpoints_hz = edges
+        one = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+        own = lbt.loop.least_residual(one, replace(still, turbulence=spectrum)).variance_nm2[0]
+        return np.sqrt(own + limit.variance_nm2[1])
+
+    hardest, flat = of_density(share), of_density(np.full(60, 1 / 60))
+    assert flat < hardest < limit.rms_nm * (1 + 1e-9)
+    assert hardest == pytest.approx(limit.rms_nm, rel=1e-3)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 2.7, 3])
+def test_designs_stay_above_the_band_limit(delay):
+    plant = lbt_axis_plant(delay_frames=delay, damping=0.05)
+    still = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
+    limit = lbt.loop.least_worst_residual(
+        plant.hardware, still, band_hz=(17, 23), rms_nm=500, direction=(1,)
+    )
+    assert limit.achieved_nm < limit.rms_nm * (1 + 1e-7)
+    for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.1, route="riccati")):
+        worst = max(
+            budget(
+                design,
+                replace(
+                    still,
+                    vibrations=(
+                        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=500, direction=(1,)),
+                    ),
+                ),
+            ).rms_nm
+            for f in (17, 18.5, 20, 21.5, 23)
+        )
+        assert worst > limit.rms_nm
+
+
+def test_narrow_bands_tend_to_the_known_frequency():
+    still = lbt.Truth(turbulence=ar(0.99), noise_nm=3.0)
+    known = lbt.loop.least_residual(path(), still).rms_nm
+    found = [
+        lbt.loop.least_worst_residual(
+            path(), still, band_hz=(20, 20 + width), rms_nm=100, direction=(1,)
+        ).rms_nm
+        for width in (10, 1, 1e-2, 1e-5)
+    ]
+    assert found[0] > found[1] > found[2] > found[3] > known
+    assert found[3] == pytest.approx(known, rel=1e-4)
+
+
+def test_band_without_noise():
+    still = lbt.Truth(turbulence=ar(0.99))
+    limit = lbt.loop.least_worst_residual(
+        path(), still, band_hz=(15, 25), rms_nm=100, direction=(1,)
+    )
+    assert lbt.loop.least_residual(path(), still).rms_nm < limit.rms_nm <= limit.achieved_nm
+    silent = lbt.loop.least_worst_residual(
+        path(), lbt.Truth(turbulence=None), band_hz=(15, 25), rms_nm=100, direction=(1,)
+    )
+    assert silent.rms_nm == 0.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"band_hz": (20,)}, "must be two frequencies"),
+        ({"band_hz": 20}, "must be two frequencies"),
+        ({"band_hz": (25, 20)}, "must increase"),
+        ({"band_hz": (20, 20)}, "For a known frequency"),
+        ({"band_hz": (20, 400)}, "below the Nyquist frequency 400"),
+        ({"band_hz": (0, 20)}, "above 0"),
+        ({"band_hz": (10, float("nan"))}, "finite"),
+        ({"rms_nm": -1}, "rms_nm must be above 0"),
+        ({"direction": (1, 0)}, "must have 1 components"),
+        ({"direction": (0,)}, "not zero"),
+    ],
+)
+def test_bad_bands(arguments, text):
+    good = {"band_hz": (15, 25), "rms_nm": 10, "direction": (1,)}
+    still = lbt.Truth(turbulence=ar(0.9), noise_nm=1.0)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.loop.least_worst_residual(path(), still, **(good | arguments))
+
+
+def test_a_search_that_does_not_settle(monkeypatch):
+    monkeypatch.setattr(band_module, "_ROUNDS", 1)
+    monkeypatch.setattr(band_module, "_LARGEST_GAP", 1e-6)
+    with pytest.raises(lbt.errors.NumericalError, match="a gap of .* is left") as caught:
+        lbt.loop.least_worst_residual(
+            path(3),
+            lbt.Truth(turbulence=ar(0.9), noise_nm=1.0),
+            band_hz=(1, 399),
+            rms_nm=50,
+            direction=(1,),
+        )
+    assert caught.value.residual > 0
+
+
+def test_a_band_may_be_very_narrow():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    truth = lbt.Truth(turbulence=slow, noise_nm=10.0)
+    known = lbt.loop.least_residual(path, truth).rms_nm
+    narrow = lbt.loop.least_worst_residual(
+        path, truth, band_hz=(20, 20 + 1e-9), rms_nm=100, direction=(1,)
+    )
+    assert known <= narrow.rms_nm < known * 1.01

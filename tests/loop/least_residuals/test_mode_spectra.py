@@ -1,0 +1,91 @@
+"""Modes that decouple after a rotation, and those that do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.limits import Anonymous, ar, path, variance
+from support.uneven_axes import LOOPS, QUICK, RATE, SLOW
+
+import lbt_synth as lbt
+
+
+@given(angle=st.floats(0, np.pi))
+def test_directions_can_be_turned(angle):
+    def turned(alpha):
+        lines = [
+            lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50, direction=d)
+            for f, d in (
+                (20, (np.cos(alpha), np.sin(alpha))),
+                (31, (-np.cos(alpha), -np.sin(alpha))),
+                (47, (-np.sin(alpha), np.cos(alpha))),
+            )
+        ]
+        truth = lbt.Truth(turbulence=ar(0.99), vibrations=lines, noise_nm=2.0)
+        return lbt.loop.least_residual(path(modes=2), truth)
+
+    limit = turned(angle)
+    assert np.sort(limit.variance_nm2) == pytest.approx(np.sort(turned(0.0).variance_nm2))
+    assert np.allclose(limit.directions @ limit.directions.T, np.eye(2))
+
+
+def test_more_measurements_than_modes():
+    """Two equal sensors of one mode halve the noise; a mixed sensor can be undone."""
+    model = {"turbulence": ar(0.99)}
+    double = path(sensor_matrix=[[1.0], [1.0]])
+    assert variance(double, **model, noise_nm=2.0) == pytest.approx(
+        variance(path(), **model, noise_nm=np.sqrt(2))
+    )
+    mixed = path(modes=2, sensor_matrix=[[2.0, 1.0], [1.0, 2.0]])  # noise of 1 and 1/3
+    assert variance(mixed, **model, noise_nm=3.0) == pytest.approx(
+        variance(path(), **model, noise_nm=3.0) + variance(path(), **model, noise_nm=1.0)
+    )
+
+
+def test_bad_loops():
+    calm = {"turbulence": ar(0.9), "noise_nm": 1.0}
+    with pytest.raises(
+        lbt.errors.ProblemError, match="the sensor must see every mode.*got rank 1 for 2"
+    ):
+        variance(path(sensor_matrix=[[1.0, 1.0]]), **calm)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="the mirror must reach every mode.*got rank 1"
+    ):
+        variance(path(influence_matrix=[[1.0], [1.0]]), **calm)
+    slanted = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=5, direction=(1, 1))
+    upright = lbt.Vibration(frequency_hz=30, damping=0.01, rms_nm=5, direction=(1, 0))
+    with pytest.raises(lbt.errors.ProblemError, match="modes that decouple.*Turn the directions"):
+        variance(path(modes=2), **calm, vibrations=(slanted, upright))
+    with pytest.raises(lbt.errors.ProblemError, match="along principal axes of the sensor's noise"):
+        variance(path(sensor_matrix=np.diag([1.0, 2.0])), **calm, vibrations=(slanted,))
+    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
+        variance(path(), **calm, vibrations=(upright,))
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)
+    with pytest.raises(lbt.errors.ProblemError, match="sampled at the loop's 800 Hz; got 500"):
+        variance(path(), turbulence=slow)
+
+
+def test_bad_spectra():
+    for psd in (lambda f: -np.ones(f.shape), lambda f: f * np.nan, lambda f: np.ones(3)):
+        with pytest.raises(lbt.errors.ProblemError, match=r"Anonymous.psd does not"):
+            variance(path(), turbulence=Anonymous(psd), noise_nm=1.0)
+    with pytest.raises(lbt.errors.ProblemError, match="set noise_nm to 0"):
+        variance(path(), turbulence=ar(0.9, driving=1e10), noise_nm=1e-155)
+
+
+def test_equal_models_may_be_turned_into_each_other():
+    """Two models of the same numbers are one turbulence: a vibration across them decouples."""
+    both, _ = LOOPS
+    again = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
+    line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 1))
+    one = lbt.loop.least_residual(both, lbt.Truth(turbulence=SLOW, vibrations=[line], noise_nm=5))
+    two = lbt.loop.least_residual(
+        both, lbt.Truth(turbulence=[SLOW, again], vibrations=[line], noise_nm=5)
+    )
+    assert two.rms_nm == pytest.approx(one.rms_nm, rel=1e-12)
+    with pytest.raises(lbt.errors.ProblemError, match="a limit needs modes that decouple"):
+        lbt.loop.least_residual(
+            both, lbt.Truth(turbulence=[SLOW, QUICK], vibrations=[line], noise_nm=5)
+        )

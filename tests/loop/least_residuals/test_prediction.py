@@ -1,0 +1,21 @@
+"""The prediction error by series and by weight."""
+
+from __future__ import annotations
+
+import pytest
+from support.limits import ar, path, variance
+
+from lbt_synth.loop.least_residuals.prediction import InnerFactor
+
+
+@pytest.mark.parametrize("delay", [2.75, 6.8])
+def test_both_ways_to_the_value_at_the_zero(delay, monkeypatch):
+    from lbt_synth.loop.least_residuals import prediction
+
+    truth = {"turbulence": ar(1.5, -0.8), "noise_nm": 0.4}
+    values = []
+    for few in (1e-300, 1.0):
+        monkeypatch.setattr(prediction, "_FEW_DIGITS", few)
+        assert InnerFactor.of(path(delay)).by_series is (few == 1.0)
+        values.append(variance(path(delay), **truth))
+    assert values[0] == pytest.approx(values[1], rel=1e-8)

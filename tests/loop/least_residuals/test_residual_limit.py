@@ -1,0 +1,257 @@
+"""The least residual against closed forms, Riccati equations and every stable design."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from support.limits import RATE, Anonymous, ar, budget, path, variance
+from support.plants import lbt_axis_plant
+
+import lbt_synth as lbt
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.studies.limits import model_limit
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 6, 20])
+@pytest.mark.parametrize("a", [-0.9, 0.0, 0.5, 0.999])
+def test_ar1_without_noise(delay, a):
+    expected = 4 * sum(a ** (2 * k) for k in range(delay))
+    assert variance(path(delay), turbulence=ar(a, driving=2.0)) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("delay", [1, 2, 4])
+def test_ar1_with_noise_to_the_last_digits(noise, delay):
+    """The scalar Riccati equation solved in 60 digits; the limit may be far below the noise."""
+    a = 0.99
+    with mpmath.workdps(60):
+        aa, q, r = mpmath.mpf(a), mpmath.mpf(1), mpmath.mpf(noise) ** 2
+        b = r * (1 - aa**2) - q  # p^2 + b p - q r = 0, p the error of one step ahead
+        p = (-b + mpmath.sqrt(b**2 + 4 * q * r)) / 2
+        for _ in range(delay - 1):
+            p = aa**2 * p + q
+        expected = float(p)
+    found = variance(path(delay), turbulence=ar(a), noise_nm=noise)
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_golden_ratio_of_the_random_walk():
+    """Equal steps and noise: an error of one step ahead of the golden ratio."""
+    found = variance(path(1), turbulence=ar(1 - 1e-9), noise_nm=1.0)
+    assert found == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-8)
+
+
+@pytest.mark.parametrize("delay", [1, 2.7, 5])
+def test_white_disturbance_cannot_be_corrected(delay):
+    assert variance(path(delay), turbulence=ar(0.0, driving=3.0), noise_nm=2) == pytest.approx(9)
+
+
+def test_nothing_to_correct():
+    assert variance(path(), turbulence=None, noise_nm=5.0) == 0.0
+
+
+def test_a_band_limited_process_without_noise_is_known_for_ever():
+    table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 50], density_nm2_hz=[3, 3])
+    assert variance(path(), turbulence=table) == 0.0
+    assert variance(path(), turbulence=table, noise_nm=1.0) > 0.1
+
+
+def test_a_noisy_ideal_low_pass_process():
+    """Phi is 1 + r below half of Nyquist and r above: all cosine integrals are known."""
+    r, edge = 0.3, 200.0
+    psd = Anonymous(lambda f: np.where(f < edge, 1 / 400.0, 0.0))
+    psd.breakpoints_hz = np.array([edge])
+    lift = np.log1p(1 / r)
+    sigma2 = r * np.exp(lift / 2)
+    f1 = lift * np.sin(np.pi / 2) / np.pi
+    found = variance(path(2), turbulence=psd, noise_nm=np.sqrt(r))
+    assert found == pytest.approx(sigma2 * (1 + f1**2) - r, rel=1e-9)
+
+
+@pytest.mark.parametrize("delay", [1.7, 2.51, 2.7, 3.9, 2.999, 6.6])
+@pytest.mark.parametrize("noise", [0.0, 0.4])
+def test_fractions_against_the_wiener_filter_on_a_grid(delay, noise):
+    """``E = int S - |[conj(Theta) S / conj(F)]_+|^2`` by FFT, the all-pass factor kept whole."""
+    model = ar(1.5, -0.8)
+    n = 4096
+    theta = 2 * np.pi * np.arange(n) / n
+    f = np.where(theta <= np.pi, theta, 2 * np.pi - theta) / np.pi * RATE / 2
+    S = model.psd(f) * RATE / 2
+    cepstrum = np.fft.ifft(np.log(S + noise**2)).real
+    fold = np.zeros(n)
+    fold[0], fold[1 : n // 2] = cepstrum[0] / 2, cepstrum[1 : n // 2]
+    fold[n // 2] = cepstrum[n // 2] / 2
+    F = np.exp(np.fft.fft(fold))  # in powers of z^-1 = exp(-j theta)
+    whole = int(np.floor(delay))
+    part = delay - whole
+    back = np.exp(-1j * theta)
+    inner = back**whole * ((1 - part) + part * back) / (part + (1 - part) * back)
+    g = np.fft.ifft(inner.conj() * S / F.conj())  # k-th coefficient of z^-k at place k
+    expected = S.mean() - np.sum(np.abs(g[: n // 2]) ** 2)
+    assert variance(path(delay), turbulence=model, noise_nm=noise) == pytest.approx(
+        expected, rel=1e-6
+    )
+
+
+def test_fractions_meet_the_whole_delays():
+    model = {"turbulence": ar(1.5, -0.8), "noise_nm": 0.4}
+    whole = [variance(path(d), **model) for d in (2, 3)]
+    for delay in (2.1, 2.5):
+        assert variance(path(delay), **model) == pytest.approx(whole[0], rel=1e-12)
+    assert variance(path(2.5 + 1e-9), **model) == pytest.approx(whole[0], rel=1e-7)
+    assert variance(path(3 - 1e-9), **model) == pytest.approx(whole[1], rel=1e-7)
+    rising = [variance(path(d), **model) for d in np.linspace(2.5, 3, 21)]
+    assert np.all(np.diff(rising) > 0)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(6))
+def test_kalman_filters_reach_the_limit(delay, seed):
+    rng = np.random.default_rng(seed)
+    roots = rng.uniform(0.1, 0.999, 3) * np.exp(1j * rng.uniform(0, np.pi, 3))
+    a = -np.poly(np.concatenate([roots, roots.conj()])).real[1:]
+    lines = [
+        lbt.Vibration(
+            frequency_hz=rng.uniform(5, 390),
+            damping=10 ** rng.uniform(-5, -1),
+            rms_nm=10 ** rng.uniform(0, 3),
+            direction=(1,),
+        )
+        for _ in range(2)
+    ]
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE,
+        turbulence=ar(*a, driving=10 ** rng.uniform(-1, 2)),
+        vibrations=lines,
+        noise_nm=10 ** rng.uniform(-2, 2),
+        delay_frames=delay,
+        modes=1,
+    )
+    limit = least_model_residual(plant)
+    assert lbt.kalman(plant).rms == pytest.approx(limit.rms_nm, rel=1e-8)
+    assert limit.change < 1e-6
+
+
+@pytest.mark.parametrize("delay", [1.3, 2.5, 2.7])
+def test_kalman_filters_of_fractional_delays_stay_above(delay):
+    plant = lbt_axis_plant(delay_frames=delay)
+    design = lbt.kalman(plant)
+    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
+    limit = lbt.loop.least_residual(plant.hardware, truth).rms_nm
+    assert limit < budget(design, truth).rms_nm < 1.08 * limit
+    found, above = model_limit(design)
+    assert found == pytest.approx(limit)
+    assert np.isnan(above)  # its estimation error is not its residual
+
+
+def test_kalman_of_the_example(config):
+    design = lbt.kalman(config.plant)
+    limit_nm, above = model_limit(design)
+    assert limit_nm == pytest.approx(192.619, abs=1e-3)
+    assert abs(above) < 1e-8
+    as_truth = lbt.Truth(
+        turbulence=config.plant.turbulence[0],
+        vibrations=config.plant.vibrations,
+        noise_nm=config.noise_nm,
+    )
+    assert lbt.loop.least_residual(config.hardware, as_truth).rms_nm == pytest.approx(limit_nm)
+
+
+def test_limit_of_the_example_and_a_filter_that_comes_close(config):
+    """A Kalman filter with a long AR model of the true spectrum, against 10.84 nm."""
+    limit = lbt.loop.least_residual(config.hardware, config.truth).rms_nm
+    assert limit == pytest.approx(10.8414, abs=1e-4)
+    still = replace(config.truth, vibrations=())
+    f = (np.arange(1 << 17) + 0.5) / (1 << 17) * RATE / 2
+    lags = np.arange(17)
+    # a little white noise makes the long model smooth
+    cosines = np.stack([np.cos(2 * np.pi * f / RATE * lag) for lag in lags])
+    covariance = cosines @ (still.turbulence.psd(f) + 0.2**2 / 400) * (RATE / 2 / f.size)
+    from scipy.linalg import solve_toeplitz
+
+    a = solve_toeplitz(covariance[:-1], covariance[1:])
+    driving = np.sqrt(covariance[0] - a @ covariance[1:])
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=ar(*a, driving=driving), noise_nm=config.noise_nm
+    )
+    assert limit < budget(lbt.kalman(plant), still).rms_nm < 1.05 * limit
+
+
+@given(
+    gain=st.floats(0.02, 0.9),
+    delay=st.sampled_from([1, 1.4, 2, 2.8, 3]),
+    noise=st.sampled_from([0.0, 0.01, 1.0, 100.0]),
+    seed=st.integers(0, 99),
+)
+def test_no_design_passes_the_limit(gain, delay, noise, seed):
+    rng = np.random.default_rng(seed)
+    line = lbt.Vibration(frequency_hz=rng.uniform(2, 380), damping=0.01, rms_nm=5.0, direction=(1,))
+    truth = lbt.Truth(
+        turbulence=ar(rng.uniform(-0.9, 0.99)),
+        vibrations=(line,),
+        noise_nm=noise,
+        sensor_gain=rng.uniform(0.5, 1.0),
+    )
+    hardware = path(delay)
+    limit = lbt.loop.least_residual(hardware, truth).rms_nm
+    by_hand = lbt.integrator(hardware, gain=gain * lbt.design.integrator_gain_limit(delay))
+    assert budget(by_hand, truth).rms_nm >= limit * (1 - 1e-9)
+    poles = np.diag(rng.uniform(-0.9, 0.9, 3))
+    parameter = lbt.Controller(
+        A=poles,
+        B=rng.standard_normal((3, 1)),
+        C=rng.standard_normal((1, 3)),
+        D=rng.standard_normal((1, 1)),
+        dt_s=1 / RATE,
+    )
+    loop = lbt.close_loop(
+        hardware, lbt.loop.youla_controller(hardware, parameter), sensor_gain=truth.sensor_gain
+    )
+    assume(loop.is_stable)
+    assert lbt.residual_budget(loop, truth).rms_nm >= limit * (1 - 1e-9)
+
+
+@given(noise=st.floats(0.01, 100), factor=st.floats(1.01, 10), gain=st.floats(0.2, 3))
+def test_noise_scale_and_sensor_gain(noise, factor, gain):
+    model = {"turbulence": ar(1.5, -0.8)}
+    base = variance(path(), **model, noise_nm=noise)
+    assert variance(path(), **model, noise_nm=noise * factor) > base
+    assert variance(path(3), **model, noise_nm=noise) > base
+    scaled = variance(path(), turbulence=ar(1.5, -0.8, driving=factor), noise_nm=noise * factor)
+    assert scaled == pytest.approx(factor**2 * base, rel=1e-9)
+    weak = variance(path(), **model, noise_nm=noise * gain, sensor_gain=gain)
+    assert weak == pytest.approx(base, rel=1e-9)
+    believed = variance(path(sensor_matrix=[[gain]]), **model, noise_nm=noise * gain)
+    assert believed == pytest.approx(base, rel=1e-9)
+
+
+def test_a_sinusoid_of_known_frequency_costs_nothing():
+    line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797, direction=(1,))
+    with_line = variance(path(), turbulence=ar(0.99), noise_nm=3.0, vibrations=(line,))
+    assert with_line == variance(path(), turbulence=ar(0.99), noise_nm=3.0)
+    narrow = [
+        variance(
+            path(),
+            turbulence=ar(0.99),
+            noise_nm=3.0,
+            vibrations=(lbt.Vibration(frequency_hz=20, damping=k, rms_nm=797, direction=(1,)),),
+        )
+        for k in (1e-2, 1e-6, 1e-10)
+    ]
+    assert narrow[0] > narrow[1] > narrow[2] > with_line
+    assert narrow[2] == pytest.approx(with_line, rel=1e-2)
+
+
+def test_kolmogorov_turbulence(air):
+    endless = replace(air, outer_scale_m=None)
+    hardware = path(modes=2)
+    one, other = (
+        lbt.loop.least_residual(hardware, lbt.Truth(turbulence=a, noise_nm=15.5)).rms_nm
+        for a in (air, endless)
+    )
+    assert one < other < 1.2 * one

@@ -1,0 +1,94 @@
+"""Random series against the spectra that they are drawn from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.uneven_axes import LOOPS, QUICK, SLOW, TABLE
+
+import lbt_synth as lbt
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
+
+
+def test_drawn_series_have_their_spectrum(air):
+    path = lbt.LoopHardware(frame_rate_hz=400, modes=1)
+    truth = lbt.Truth(turbulence=air)
+    series = draw_disturbance(truth, path, frames=8192, cases=200, rng=np.random.default_rng(0))[
+        ..., 0
+    ]
+    variance = np.mean(series**2, axis=1)
+    error = variance.std(ddof=1) / np.sqrt(len(variance))
+    assert abs(variance.mean() - air.tilt_rms_nm**2) < 4 * error
+    # increments see the high frequencies
+    step = np.mean((series[:, 4:] - series[:, :-4]) ** 2, axis=1)
+    f = np.geomspace(1e-5, 200, 50_001)
+    expected = np.trapezoid(2 * air.psd(f) * (1 - np.cos(2 * np.pi * f * 4 / 400)), f)
+    assert abs(step.mean() - expected) < 5 * step.std(ddof=1) / np.sqrt(len(step))
+
+
+@pytest.mark.parametrize("frames", [100, 1000])
+def test_power_is_drawn_whole_however_short_the_series(frames):
+    """A line between two bins, and a spectrum that rises towards zero, keep their variance."""
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    steep = lbt.Atmosphere(
+        seeing_arcsec=0.8, outer_scale_m=None, wind_speed_m_s=20, diameter_m=8.22
+    )
+    line = lbt.models.TabulatedSpectrum(
+        frequency_hz=[37.2, 37.23, 37.26], density_nm2_hz=[0, 100 / 0.03, 0]
+    )
+    for spectrum, rms in ((steep, steep.tilt_rms_nm), (line, 10.0)):
+        series = draw_disturbance(
+            lbt.Truth(turbulence=spectrum),
+            path,
+            frames=frames,
+            cases=3000,
+            rng=np.random.default_rng(2),
+        )
+        assert np.sqrt(np.mean(series**2)) == pytest.approx(rms, rel=0.05)
+
+
+def test_white_noise_is_drawn_white():
+    flat = lbt.models.TabulatedSpectrum(frequency_hz=[0, 400], density_nm2_hz=[1.0, 1.0])
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    series = draw_disturbance(
+        lbt.Truth(turbulence=flat), path, frames=8, cases=60_000, rng=np.random.default_rng(3)
+    )
+    assert np.mean(series**2) == pytest.approx(400, rel=0.01)
+
+
+def test_drawn_ar_series_are_stationary_from_the_first_frame():
+    line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=100, direction=(1,))
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    series = draw_disturbance(
+        lbt.Truth(turbulence=None, vibrations=(line,)),
+        path,
+        frames=40,
+        cases=6000,
+        rng=np.random.default_rng(1),
+    )[..., 0]
+    for frame in (0, 1, 20, 39):
+        assert series[:, frame].std() == pytest.approx(100, rel=0.05)
+    model = line.ar_model(800)
+    correlation = np.mean(series[:, 0] * series[:, 1]) / 100**2
+    a1, a2 = model.coefficients
+    assert correlation == pytest.approx(a1 / (1 - a2), abs=0.05)
+
+
+def test_a_mode_keeps_its_weather_when_the_other_changes():
+    both, _ = LOOPS
+    design = lbt.integrator(both, gain=0.4)
+    runs = [
+        lbt.simulate(
+            design.controller,
+            lbt.Truth(turbulence=[SLOW, other]),
+            hardware=both,
+            frames=50,
+            cases=2,
+            seed=1,
+        )
+        for other in (QUICK, TABLE, None)
+    ]
+    for run in runs[1:]:
+        np.testing.assert_array_equal(run.residual_nm[..., 0], runs[0].residual_nm[..., 0])
+        assert not np.array_equal(run.residual_nm[..., 1], runs[0].residual_nm[..., 1])
+    assert not np.any(runs[2].residual_nm[..., 1])

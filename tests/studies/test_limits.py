@@ -1,0 +1,94 @@
+"""The study of limits: designs against the least residuals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.limits import RATE, ar
+from support.plants import lbt_axis_plant
+
+import lbt_synth as lbt
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.studies.limits import model_limit
+
+
+def test_study(config):
+    designs = {
+        "kalman": lbt.kalman(config.plant),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
+    }
+    study = lbt.studies.limits(
+        designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5]
+    )
+    assert study.band_hz == (16.5, 23.5)
+    assert study.residual_nm.shape == (2, study.shift_hz.size)
+    for row, curve in zip(study.rows, study.residual_nm, strict=True):
+        assert row.stable
+        assert curve[study.shift_hz == 0] == pytest.approx(row.residual_nm)
+        assert row.worst_nm == pytest.approx(curve.max())
+        assert row.worst_nm == pytest.approx(
+            study.band.rms_nm * (1 + row.above_band_limit_percent / 100)
+        )
+    (axis,) = lbt.report.figures.limits_figure(study).axes
+    assert axis.get_xlabel() == "frequency of the true vibration [Hz]"
+    assert axis.get_ylabel() == "residual [nm rms]"
+    assert len({str(line.get_linestyle()) for line in axis.get_lines()[:2]}) == 2
+
+
+def test_study_of_an_unstable_design(config):
+    designs = {"low": lbt.hinf(config.plant, gamma_ratio=1.05, route="riccati")}
+    truth = replace(config.truth, sensor_gain=0.3)
+    study = lbt.studies.limits(designs, config.hardware, truth, config.imaging, errors_hz=[-1, 1])
+    (row,) = study.rows
+    assert not row.stable
+    assert np.isnan([row.residual_nm, row.strehl, row.worst_nm, row.above_limit_percent]).all()
+    lbt.report.figures.limits_figure(study)
+
+
+def test_bad_studies(config):
+    good = (config.hardware, config.truth, config.imaging)
+    with pytest.raises(lbt.errors.ProblemError, match="at least one design"):
+        lbt.studies.limits({}, *good)
+    designs = {"kalman": lbt.kalman(config.plant)}
+    with pytest.raises(lbt.errors.ProblemError, match="at least one error"):
+        lbt.studies.limits(designs, *good, errors_hz=[])
+    with pytest.raises(lbt.errors.ProblemError, match="must be above 0"):
+        lbt.studies.limits(designs, *good, errors_hz=[25.0])
+    still = lbt.studies.limits(designs, *good)
+    assert still.band is None
+    with pytest.raises(lbt.errors.ProblemError, match="a vibration that moves"):
+        lbt.report.figures.limits_figure(still)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 2.7])
+def test_plants_in_the_full_form(delay):
+    for plant in (lbt_axis_plant(delay_frames=delay), lbt_axis_plant(delay_frames=delay, modes=2)):
+        limit = least_model_residual(plant.full())
+        assert limit.rms_nm == pytest.approx(least_model_residual(plant).rms_nm, rel=1e-9)
+    found, above = model_limit(lbt.kalman(plant.full()))
+    assert found == pytest.approx(limit.rms_nm)
+    assert np.isnan(above) if delay == 2.7 else abs(above) < 1e-6
+
+
+def test_full_plants_that_do_not_decouple():
+    lines = [
+        lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50, direction=d)
+        for f, d in ((20, (1, 1)), (31, (1, 0)))
+    ]
+    parts = {"frame_rate_hz": RATE, "turbulence": ar(0.99, driving=10), "noise_nm": 5.0}
+    full = lbt.tip_tilt_plant(**parts, vibrations=lines).full()
+    with pytest.raises(lbt.errors.ProblemError, match="the disturbance across them"):
+        least_model_residual(full)
+    assert np.isnan(model_limit(lbt.kalman(full))).all()
+    plain = lbt.tip_tilt_plant(**parts, vibrations=lines[1:]).full()
+    entry = plain.D.copy()
+    entry[:, 0] = 1.0
+    with pytest.raises(lbt.errors.ProblemError, match="independent of the disturbance"):
+        least_model_residual(replace(plain, D=entry))
+    assert np.isnan(
+        model_limit(
+            lbt.kalman(lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0))
+        )
+    ).all()

@@ -1,0 +1,37 @@
+"""Designs, plants and random conditions for tests of many loops."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+import lbt_synth as lbt
+
+RATE = 800
+SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=RATE)
+AIR = lbt.Atmosphere(
+    seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22, obstruction=0.11
+)
+LINE = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=563.6)
+
+
+def plant(**changes):
+    lines = changes.pop("vibrations", [LINE, replace(LINE, direction=(0, 1))])
+    given = {"frame_rate_hz": RATE, "turbulence": SLOW, "noise_nm": 15.5, "vibrations": lines}
+    return lbt.tip_tilt_plant(**(given | changes))
+
+
+def weather(count, seed=0):
+    rng = np.random.default_rng(seed)
+    return {
+        "gains": rng.uniform(0.3, 1.2, count),
+        "delays": rng.choice([1.0, 1.7, 2.0, 2.2, 3.0], count),
+        "noise": rng.uniform(5, 30, count),
+        "seeing": rng.uniform(0.5, 1.5, count),
+        "wind": rng.uniform(8, 30, count),
+        "scale": rng.uniform(12, 60, count),
+        "frequency": rng.uniform(18, 22, count),
+        "rms": rng.uniform(300, 900, count),
+        "damping": rng.uniform(0.002, 0.02, count),
+    }

@@ -1,0 +1,34 @@
+"""Loops, processes and their least residuals for tests of the limits."""
+
+from __future__ import annotations
+
+import lbt_synth as lbt
+
+RATE = 800.0
+
+
+class Anonymous:
+    """A spectrum that hides what it is."""
+
+    def __init__(self, psd):
+        self.psd = psd
+
+
+def path(delay=2.0, modes=1, **extra):
+    return lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=modes, **extra)
+
+
+def ar(*coefficients, driving=1.0):
+    return lbt.models.ARModel(
+        coefficients=list(coefficients), driving_rms_nm=driving, frame_rate_hz=RATE
+    )
+
+
+def variance(hardware, **truth):
+    return float(lbt.loop.least_residual(hardware, lbt.Truth(**truth)).variance_nm2.sum())
+
+
+def budget(design, truth, hardware=None):
+    hardware = design.hardware if hardware is None else hardware
+    loop = lbt.close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    return lbt.residual_budget(loop, truth)

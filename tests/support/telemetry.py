@@ -1,0 +1,115 @@
+"""Telemetry with everything in it, any telemetry, and their comparison."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+import lbt_synth as lbt
+
+ENDINGS = ("fits", "npz")
+SHELL = lbt.models.PositionLoop.from_bandwidth(
+    natural_frequency_hz=50, damping=0.5, bandwidth_hz=150, sampling_hz=24_000, ramp_samples=3
+)
+
+
+def full(*, frames=6, with_slopes=True, random=0, **changes):
+    """Telemetry with everything in it: 2 modes, 2 commands, 8 slopes."""
+    rng = np.random.default_rng(random)
+    sensed = 8 if with_slopes else 2
+    fields = {
+        "frame_rate_hz": 800.0,
+        "delay_frames": 2.25,
+        "mirror": SHELL,
+        "commands": rng.standard_normal((frames, 2)),
+        "measurements": rng.standard_normal((frames, 2)),
+        "residual_nm": rng.standard_normal((frames, 2)),
+        "total_nm": rng.standard_normal((frames, 2)),
+        "slopes": rng.standard_normal((frames, sensed)) if with_slopes else None,
+        "interaction_matrix": rng.standard_normal((sensed, 2)),
+        "reconstructor": rng.standard_normal((2, sensed)),
+        "influence_matrix": rng.standard_normal((2, 2)),
+        "mode_maps": rng.standard_normal((2, 5, 4)),
+        "psf": rng.random((7, 9)),
+        "psf_pixel_mas": 13.5,
+        "imaging_wavelength_um": 2.2,
+        "strehl": 0.83,
+        "times_s": 1.7e9 + np.cumsum(rng.uniform(0.001, 0.002, frames)),
+        "subaperture_axes": 2,
+        "slope_unit": "pixel",
+        "sensor_gain": 0.358,
+        "controller": lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4).controller,
+        "controller_name": "integrator",
+        "controller_digest": "ab" * 32,
+        "integrator_gains": [0.4, 0.4],
+        "diameter_m": 8.22,
+        "obstruction": 0.11,
+        "seed": 7,
+        "name": "LBT, côté gauche",
+        "metadata": {"target": "HD 1'0\n", "airmass": 1.2, "binning": 1, "night": True, "é": ""},
+    }
+    return lbt.files.Telemetry(**{**fields, **changes})
+
+
+def same(one, other, *, but=(), rtol=0.0):
+    """Whether two telemetries hold the same, field by field."""
+    for field in dataclasses.fields(lbt.files.Telemetry):
+        if field.name in but:
+            continue
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(a, lbt.models.PositionLoop):
+            assert dataclasses.asdict(a) == dataclasses.asdict(b)
+        elif isinstance(a, lbt.Controller):
+            for name in "ABCD":
+                assert np.array_equal(getattr(a, name), getattr(b, name))
+            assert a.dt_s == b.dt_s
+        elif isinstance(a, np.ndarray):
+            assert a.shape == b.shape, field.name
+            assert np.allclose(a, b, rtol=rtol, atol=0), field.name
+            assert not b.flags.writeable
+        elif isinstance(a, float) and rtol:
+            assert b == pytest.approx(a, rel=rtol), field.name
+        else:
+            assert a == b, field.name
+            assert type(a) is type(b), field.name
+    return True
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
+words = st.text(max_size=30)
+
+
+@st.composite
+def telemetries(draw):
+    frames, m, q = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 3))
+
+    def series(columns):
+        values = draw(st.lists(finite, min_size=frames * columns, max_size=frames * columns))
+        return np.reshape(values, (frames, columns))
+
+    optional = {
+        "delay_frames": st.floats(0, 1000),
+        "strehl": st.floats(0, 1),
+        "sensor_gain": st.floats(1e-300, 1e300),
+        "seed": st.integers(0, 2**70),
+        "controller_name": words,
+        "diameter_m": st.floats(0.1, 50),
+    }
+    fields = {k: draw(s) for k, s in optional.items() if draw(st.booleans())}
+    metadata = st.dictionaries(
+        st.text(min_size=1, max_size=20),
+        st.one_of(words, st.booleans(), st.integers(-(2**70), 2**70), finite),
+        max_size=4,
+    )
+    return lbt.files.Telemetry(
+        frame_rate_hz=draw(st.floats(1e-3, 1e6)),
+        commands=series(m),
+        measurements=series(q),
+        total_nm=series(2) if draw(st.booleans()) else None,
+        name=draw(words),
+        metadata=draw(metadata),
+        **fields,
+    )
