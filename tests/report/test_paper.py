@@ -1,0 +1,36 @@
+"""Files of the paper's tables and figures."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.report.paper import write_paper
+from lbt_synth.studies.paper import tables as compute
+
+
+@pytest.fixture(scope="module")
+def table_iii():
+    return list(compute.table_iii())
+
+
+def test_written_files(tmp_path, table_iii):
+    result = write_paper(tmp_path, table_iii)
+    assert {p.name for p in result.files} == {
+        "table_ii.csv",
+        "table_iii.csv",
+        "parameters.csv",
+        "robustness.png",
+        "robustness.pdf",
+        "sigma.png",
+        "sigma.pdf",
+        "paper_kalman.fits",
+        "paper_hinf.fits",
+    }
+    with (tmp_path / "table_iii.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 30
+    assert float(rows[0]["paper_strehl_percent"]) == 22.4
+    assert lbt.load_gain(tmp_path / "paper_hinf.fits").recertify().passed
