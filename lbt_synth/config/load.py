@@ -20,9 +20,9 @@ from lbt_synth.config.plant_and_truth import (
     measurement_noise_nm,
     reference_gain,
 )
-from lbt_synth.config.required_sections import build_atmosphere, require_atmosphere
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
+from lbt_synth.config.telescope_and_atmosphere import build_atmosphere, require_atmosphere
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging

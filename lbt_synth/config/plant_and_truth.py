@@ -13,11 +13,6 @@ from lbt_synth.config.axes import (
     vibration_directions,
 )
 from lbt_synth.config.error_context import name_key
-from lbt_synth.config.required_sections import (
-    convert_mas_to_nm,
-    require_atmosphere,
-    require_telescope,
-)
 from lbt_synth.config.schema import (
     Ar1Section,
     Ar2Section,
@@ -27,6 +22,11 @@ from lbt_synth.config.schema import (
     LocalLoopSection,
     TrueVibrationSection,
     VibrationSection,
+)
+from lbt_synth.config.telescope_and_atmosphere import (
+    convert_mas_to_nm,
+    require_atmosphere,
+    require_telescope,
 )
 from lbt_synth.errors import ConfigError
 from lbt_synth.models import (

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 from lbt_synth.config.error_context import name_file, name_key
 from lbt_synth.config.load import Config
 from lbt_synth.config.plant_and_truth import vibration_rms_nm
-from lbt_synth.config.required_sections import require_atmosphere
 from lbt_synth.config.schema import RobustSection
+from lbt_synth.config.telescope_and_atmosphere import require_atmosphere
 from lbt_synth.design import ShapedDesign, robust
 from lbt_synth.design.shaped_design import noise_per_mode
 from lbt_synth.design.shaping import (

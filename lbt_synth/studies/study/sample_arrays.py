@@ -20,8 +20,8 @@ from lbt_synth.config.plant_and_truth import (
     spread_vibration,
     vibration_rms_nm,
 )
-from lbt_synth.config.required_sections import convert_mas_to_nm
 from lbt_synth.config.schema import SensorSection
+from lbt_synth.config.telescope_and_atmosphere import convert_mas_to_nm
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
 from lbt_synth.models import FrozenFlows, Vibration
 from lbt_synth.studies.study.config_paths import Keys
