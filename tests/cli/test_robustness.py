@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.plants import LBT_YAML
-from test_map import single
+from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
 
@@ -93,7 +93,7 @@ def test_command_with_gain_files(tmp_path, capsys, files, kalman, settings):
     assert len(rows) == 2 * 2 * 3 * 5
     row = rows[1 * 5 + 3]
     assert (row["file"], row["sensor_gain"], row["error_hz"]) == ("kalman", "0.75", "1.0")
-    expected = single(kalman, settings.truth, settings.imaging, 1.0, 0.75)
+    expected = evaluate_point(kalman, settings.truth, settings.imaging, 1.0, 0.75)
     assert (float(row["strehl"]), float(row["residual_nm"])) == pytest.approx(expected, rel=1e-6)
     assert {r["strehl"] for r in rows if r["stable"] == "False"} == {""}
 
@@ -124,7 +124,7 @@ def test_sensor_gains_of_the_command_are_real_ones(tmp_path, capsys):
     half = lbt.load_config(tmp_path / "half.yaml")
     gain = lbt.save_gain(tmp_path / "half.fits", lbt.kalman(half.plant))
     arguments = ("--errors-hz", 0, 1, 2, "--sensor-gains", 0.5, 0.9, 2, "--json")
-    expected = single(lbt.load_gain(gain), half.truth, half.imaging, 0.0, 1.0)[0]
+    expected = evaluate_point(lbt.load_gain(gain), half.truth, half.imaging, 0.0, 1.0)[0]
     for config in (tmp_path / "half.yaml", CONFIG):  # what the configuration assumes plays no part
         data = json.loads(run(capsys, "robustness", config, gain, *arguments)[1])
         found = data["maps"]["half"]

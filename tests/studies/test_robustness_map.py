@@ -1,4 +1,4 @@
-"""Maps over frequency error, sensor gain and delay error, against the evaluator of single points."""
+"""Maps over frequency error, sensor gain and delay error, against single points."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import j0
 from support.plants import LBT_YAML
+from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
-from lbt_synth.linear.quadrature import adaptive_integral, gauss_panels
-from lbt_synth.loop import residual_budget
-from lbt_synth.loop.ensemble.panels import graded_edges
-from lbt_synth.loop.strehl import annular_otf, jitter_strehls
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
+
+
 SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+
+
 DIAGONAL = (0.8, 0.6)
 
 
@@ -47,16 +47,6 @@ def robust(settings):
     return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
 
 
-def single(design, truth, imaging, error_hz, gain, delay_error=0.0):
-    """Strehl ratio and residual [nm] of one point, by the evaluator of single loops."""
-    lines = [replace(v, frequency_hz=v.frequency_hz - error_hz) for v in truth.vibrations]
-    met = replace(truth, sensor_gain=gain, vibrations=tuple(lines))
-    path = design.hardware
-    path = replace(path, delay_frames=path.delay_frames + delay_error)
-    budget = residual_budget(lbt.close_loop(path, design.controller, sensor_gain=gain), met)
-    return lbt.strehl(budget, imaging), budget.rms_nm
-
-
 def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
     found = lbt.studies.robustness_map(
         design, truth, imaging, errors_hz=errors, sensor_gains=gains, delay_errors_frames=delays
@@ -67,10 +57,10 @@ def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
             for k, error in enumerate(errors):
                 if not found.stable[i, j]:
                     with pytest.raises(lbt.errors.UnstableLoopError):
-                        single(design, truth, imaging, error, gain, delay)
+                        evaluate_point(design, truth, imaging, error, gain, delay)
                     continue
                 here = found.strehl[i, j, k], found.residual_nm[i, j, k]
-                expected = single(design, truth, imaging, error, gain, delay)
+                expected = evaluate_point(design, truth, imaging, error, gain, delay)
                 assert here == pytest.approx(expected, rel=1e-6), (delay, gain, error)
     return found
 
@@ -183,7 +173,7 @@ def test_turning_the_vibration_changes_nothing(kalman, air):
     assert mapped((1.0, 0.0)) == pytest.approx(mapped(DIAGONAL), rel=1e-6)
 
 
-def test_the_sign_of_the_error_is_that_of_the_sweep(kalman, settings):
+def test_the_sign_of_the_error_is_that_of_the_robustness_study(kalman, settings):
     """The design believes more than is true: the true line lies below."""
     moved = replace(
         settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
@@ -209,76 +199,6 @@ def test_counts_points_as_they_are_done(kalman, settings):
         advance=counts.append,
     )
     assert sum(counts) == 2 * 70 * 2
-
-
-def dense_strehl(covariance, lines, imaging):
-    """The rule of all nodes, whatever the jitter: 84 radii, 64 directions."""
-    eps = imaging.obstruction
-    edges = np.array(sorted({0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}))
-    radius, weight = gauss_panels(edges, 12)
-    weight = weight * radius * annular_otf(radius, eps)
-    angle = np.pi * np.arange(64) / 64
-    f = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))])
-    f = f * imaging.cycles_per_nm
-    factor = np.exp(-2 * np.pi**2 * np.einsum("irk,ij,jrk->rk", f, covariance, f))
-    for line in lines:
-        factor = factor * j0(2 * np.pi * np.abs(np.einsum("i,irk->rk", line, f)))
-    return imaging.other_modes * float(weight @ factor.mean(axis=1) / weight.sum())
-
-
-def test_fewer_directions_lose_nothing():
-    rng = np.random.default_rng(5)
-    count = 300
-    roots = 10 ** rng.uniform(0, 3, (count, 1, 1)) * rng.standard_normal((count, 2, 2))
-    roots[::2] = 10 ** rng.uniform(0, 3, (150, 1, 1)) * np.eye(2)  # the same in all directions
-    covariances = roots @ np.swapaxes(roots, 1, 2)
-    lines = 10 ** rng.uniform(-1, 2.8, (count, 2, 1)) * (
-        rng.standard_normal((count, 2, 2)) + 1j * rng.standard_normal((count, 2, 2))
-    )
-    covariances[7] = covariances[9]
-    small = np.sqrt(np.max(np.diagonal(covariances, axis1=1, axis2=2), axis=1))
-    small = (small + np.abs(lines).sum(axis=(1, 2))) * CAMERA.cycles_per_nm < 5
-    assert small.sum() > 200
-    covariances, lines = covariances[small], lines[small]
-    found = jitter_strehls(covariances, imaging=CAMERA, line_amplitudes_nm=lines)
-    for i in range(len(found)):
-        assert found[i] == pytest.approx(dense_strehl(covariances[i], lines[i], CAMERA), abs=1e-13)
-        alone = lbt.loop.jitter_strehl(covariances[i], imaging=CAMERA, line_amplitudes_nm=lines[i])
-        assert alone == pytest.approx(found[i], abs=1e-14)
-
-
-def test_many_jitters_of_wrong_sizes():
-    with pytest.raises(
-        lbt.errors.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"
-    ):
-        jitter_strehls(np.zeros((3, 2, 2)), imaging=CAMERA, line_amplitudes_nm=np.zeros((2, 1, 2)))
-    indefinite = np.stack([np.eye(2), np.diag([1, -1])])
-    with pytest.raises(lbt.errors.DefinitenessError, match="least eigenvalue of -1"):
-        jitter_strehls(indefinite, imaging=CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2)))
-
-
-def test_panels_are_short_where_a_pole_is_near():
-    poles = np.array([0.999 * np.exp(0.3j), 0.999 * np.exp(-0.3j), 1 - 1e-5, 0.2])
-    edges = graded_edges(poles)
-    assert edges[0] == 0
-    assert edges[-1] == 1
-    assert np.all(np.diff(edges) > 0)
-    inside = np.searchsorted(edges, 0.3 / np.pi)
-    assert edges[inside] - edges[inside - 1] <= 2 * 0.001 / np.pi
-    assert edges.size < 100
-
-
-def test_integrals_of_stacks():
-    """Each member gets its own accuracy, though the panels are shared."""
-
-    def peaks(x):
-        widths = np.array([1e-4, 1e-2])
-        return (1e-3 * widths / (widths**2 + (x[:, None] - 0.3) ** 2))[..., None, None]
-
-    found = adaptive_integral(peaks, np.array([0.0, 1.0]))
-    widths = np.array([1e-4, 1e-2])
-    expected = 1e-3 * (np.arctan(0.7 / widths) + np.arctan(0.3 / widths))
-    assert found[:, 0, 0] == pytest.approx(expected, rel=1e-7)
 
 
 WRONG = [
@@ -314,66 +234,3 @@ def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
     three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
     with pytest.raises(lbt.errors.DimensionError, match="got a loop of 3 modes"):
         lbt.studies.robustness_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
-
-
-# --------------------------------------------------------------------------
-# The figure.
-# --------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def maps(kalman, robust, settings):
-    axes = {"errors_hz": [2, 0, -2, 1], "sensor_gains": [1.5, 0.3, 0.8, 3.0]}
-    return {
-        name: lbt.studies.robustness_map(design, settings.truth, settings.imaging, **axes)
-        for name, design in (("Kalman", kalman), ("H-infinity", robust))
-    }
-
-
-def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
-    figure = lbt.report.figures.robustness_map_figure(maps)
-    left, right, bar = figure.axes
-    assert [left.get_title(), right.get_title()] == ["Kalman", "H-infinity"]
-    assert bar.get_ylabel() == "Strehl ratio [%]"
-    assert left.get_ylabel() == "sensor gain [-]"
-    assert figure.get_supxlabel() == "frequency in the design less the true one [Hz]"
-    unstable = [[t.get_text() for t in p.texts].count("unstable") for p in (left, right)]
-    assert unstable == [1, 2]  # the Kalman filter at 3, the other at 0.3 as well
-    assert left.collections[0].get_clim() == right.collections[0].get_clim()
-    figure.savefig(tmp_path / "map.png")
-
-
-def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
-    def mapped(design, gains, delays):
-        return lbt.studies.robustness_map(
-            design,
-            settings.truth,
-            settings.imaging,
-            errors_hz=[0],
-            sensor_gains=gains,
-            delay_errors_frames=delays,
-        )
-
-    figure = lbt.report.figures.robustness_map_figure(
-        {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
-    )
-    assert len(figure.axes) == 5
-    assert figure.axes[2].get_ylabel() == "delay error +0.1 frames\nsensor gain [-]"
-    figure.savefig(tmp_path / "a.png")
-    nowhere = lbt.report.figures.robustness_map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
-    nowhere.savefig(tmp_path / "b.pdf")
-
-
-def test_map_figures_that_are_refused(maps, kalman, settings):
-    with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
-        lbt.report.figures.robustness_map_figure({})
-    late = lbt.studies.robustness_map(
-        kalman,
-        settings.truth,
-        settings.imaging,
-        errors_hz=[0],
-        sensor_gains=[1],
-        delay_errors_frames=[0.1],
-    )
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"
-    ):
-        lbt.report.figures.robustness_map_figure({**maps, "late": late})

@@ -1,4 +1,4 @@
-"""Long studies, run by ``make study``."""
+"""Designs of many random plants, run by ``make study``."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_ten_thousand_random_plants_of_this_field(capsys):
         solution = lbt.solve_dare(*parts)
         worst, plain = max(worst, solution.residual), max(plain, plain_residual(plant, solution.X))
         radius = max(radius, float(np.max(np.abs(solution.poles))))
-        routes.add(solution.method)
+        routes.add(solution.route)
         try:
             X = scipy.linalg.solve_discrete_are(*parts)
             gain = np.linalg.solve(plant.R + plant.C @ X @ plant.C.T, plant.C @ X @ plant.A.T)

@@ -1,0 +1,83 @@
+"""The figure of robustness maps."""
+
+from __future__ import annotations
+
+import pytest
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return lbt.load_config(LBT_YAML)
+
+
+@pytest.fixture(scope="module")
+def kalman(settings):
+    return lbt.kalman(settings.plant)
+
+
+@pytest.fixture(scope="module")
+def robust(settings):
+    return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
+
+
+@pytest.fixture(scope="module")
+def maps(kalman, robust, settings):
+    axes = {"errors_hz": [2, 0, -2, 1], "sensor_gains": [1.5, 0.3, 0.8, 3.0]}
+    return {
+        name: lbt.studies.robustness_map(design, settings.truth, settings.imaging, **axes)
+        for name, design in (("Kalman", kalman), ("H-infinity", robust))
+    }
+
+
+def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
+    figure = lbt.report.figures.robustness_map_figure(maps)
+    left, right, bar = figure.axes
+    assert [left.get_title(), right.get_title()] == ["Kalman", "H-infinity"]
+    assert bar.get_ylabel() == "Strehl ratio [%]"
+    assert left.get_ylabel() == "sensor gain [-]"
+    assert figure.get_supxlabel() == "frequency in the design less the true one [Hz]"
+    unstable = [[t.get_text() for t in p.texts].count("unstable") for p in (left, right)]
+    assert unstable == [1, 2]  # the Kalman filter at 3, the other at 0.3 as well
+    assert left.collections[0].get_clim() == right.collections[0].get_clim()
+    figure.savefig(tmp_path / "map.png")
+
+
+def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
+    def mapped(design, gains, delays):
+        return lbt.studies.robustness_map(
+            design,
+            settings.truth,
+            settings.imaging,
+            errors_hz=[0],
+            sensor_gains=gains,
+            delay_errors_frames=delays,
+        )
+
+    figure = lbt.report.figures.robustness_map_figure(
+        {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
+    )
+    assert len(figure.axes) == 5
+    assert figure.axes[2].get_ylabel() == "delay error +0.1 frames\nsensor gain [-]"
+    figure.savefig(tmp_path / "a.png")
+    nowhere = lbt.report.figures.robustness_map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
+    nowhere.savefig(tmp_path / "b.pdf")
+
+
+def test_map_figures_that_are_refused(maps, kalman, settings):
+    with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
+        lbt.report.figures.robustness_map_figure({})
+    late = lbt.studies.robustness_map(
+        kalman,
+        settings.truth,
+        settings.imaging,
+        errors_hz=[0],
+        sensor_gains=[1],
+        delay_errors_frames=[0.1],
+    )
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"
+    ):
+        lbt.report.figures.robustness_map_figure({**maps, "late": late})
