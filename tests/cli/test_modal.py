@@ -95,10 +95,3 @@ def test_bad_input(capsys, arguments, words):
     status, out, error = run(capsys, "modal", LBT_YAML, *arguments)
     assert (status, out) == (2, "")
     assert words in error
-
-
-def test_bad_noise_is_refused():
-    with pytest.raises(lbt.errors.ProblemError, match="tilt_noise_nm"):
-        lbt.models.pyramid_modal_noise_nm(0, modes=3, modulation_lambda_over_d=4)
-    with pytest.raises(lbt.errors.ProblemError, match="modulation"):
-        lbt.models.pyramid_modal_noise_nm(1, modes=3, modulation_lambda_over_d=0)

@@ -23,7 +23,7 @@ def test_verification_that_fails_has_status_1(tmp_path, capsys, monkeypatch, gai
             checks=checks, gamma=found.gamma, rms_per_output=found.rms_per_output
         )
 
-    monkeypatch.setattr(type(design), "recertified", strict)
+    monkeypatch.setattr(type(design), "recertify", strict)
     status, text, _ = run(capsys, "verify", gains["kalman"])
     assert status == 1
     assert "NOT VERIFIED" in text

@@ -17,3 +17,10 @@ def test_pyramid_noise_of_the_lbt():
         diameter_m=8.22,
     )
     assert noise == pytest.approx(15.5, abs=0.05)
+
+
+def test_bad_modal_noise_is_refused():
+    with pytest.raises(lbt.errors.ProblemError, match="tilt_noise_nm"):
+        lbt.models.pyramid_modal_noise_nm(0, modes=3, modulation_lambda_over_d=4)
+    with pytest.raises(lbt.errors.ProblemError, match="modulation"):
+        lbt.models.pyramid_modal_noise_nm(1, modes=3, modulation_lambda_over_d=0)
