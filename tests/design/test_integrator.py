@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.predictions import a_plant, a_truth
+from support.uneven_axes import LOOPS, QUICK, RATE, SLOW
 
 import lbt_synth as lbt
 
@@ -80,3 +81,26 @@ def test_the_integrator_of_a_plant_is_that_of_its_truth():
     )
     assert own.gain == pytest.approx(other.gain, rel=1e-5)
     assert own.certificate.passed
+
+
+def test_truths_of_other_loops_are_refused():
+    both, single = LOOPS
+    two = lbt.Truth(turbulence=[SLOW, QUICK], noise_nm=5.0)
+    noisy = lbt.Truth(turbulence=SLOW, noise_nm=[5.0, 5.0])
+    design = lbt.integrator(single, gain=0.4)
+    loop = lbt.close_loop(single, design.controller)
+    for act in (
+        lambda truth: lbt.residual_budget(loop, truth),
+        lambda truth: lbt.loop.least_residual(single, truth),
+        lambda truth: lbt.simulate(design.controller, truth, hardware=single, frames=9, seed=0),
+        lambda truth: lbt.design.optimal_integrator(single, truth),
+    ):
+        with pytest.raises(lbt.errors.DimensionError, match=r"one a mode \(1\); got 2"):
+            act(two)
+        with pytest.raises(lbt.errors.DimensionError, match=r"one a measurement \(1\); got 2"):
+            act(noisy)
+    for wrong in ({"noise_nm": [1.0]}, {"noise_nm": 1.0, "sensor_gain": [1.0]}):
+        with pytest.raises(lbt.errors.DimensionError, match="measurement"):
+            lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, **wrong)
+    with pytest.raises(lbt.errors.ProblemError, match="the truth must disturb the loop"):
+        lbt.design.optimal_integrator(both, lbt.Truth(turbulence=[None, None], noise_nm=[0, 0]))

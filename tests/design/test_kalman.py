@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 from support.plants import lbt_axis_plant, random_problem
+from support.uneven_axes import QUICK, RATE, SLOW
 
 import lbt_synth as lbt
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 
 @pytest.mark.parametrize("modes", [1, 2])
@@ -40,3 +42,23 @@ def test_kalman_gains_with_correlated_noise():
     design = lbt.kalman(problem)
     assert np.allclose(design.gain_predictor, predictor, rtol=1e-8)
     assert np.allclose(design.gain_filter, P @ problem.C.T @ np.linalg.inv(innovation), rtol=1e-8)
+
+
+def test_the_plant_of_uneven_axes_is_two_plants():
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=[SLOW, QUICK], noise_nm=[15.5, 6.0], sensor_gain=[0.9, 0.7]
+    )
+    np.testing.assert_array_equal(plant.hardware.sensor, np.diag([0.9, 0.7]))
+    np.testing.assert_allclose(plant.R, np.diag([15.5, 6.0]) ** 2, rtol=1e-14)
+    both = lbt.kalman(plant)
+    alone = [
+        lbt.kalman(
+            lbt.tip_tilt_plant(
+                frame_rate_hz=RATE, turbulence=model, noise_nm=noise, sensor_gain=gain, modes=1
+            )
+        ).rms
+        for model, noise, gain in ((SLOW, 15.5, 0.9), (QUICK, 6.0, 0.7))
+    ]
+    assert both.rms == pytest.approx(np.hypot(*alone), rel=1e-9)
+    limit = least_model_residual(plant)
+    np.testing.assert_allclose(np.sqrt(limit.variance_nm2), alone, rtol=1e-6)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.special import j0
 
 import lbt_synth as lbt
-from lbt_synth.loop.strehl import annular_otf
+from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.loop.strehl import annular_otf, jitter_strehls
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
 
@@ -156,3 +157,58 @@ def test_a_camera_of_no_telescope():
     assert lbt.Imaging().diameter_m is None
     with pytest.raises(lbt.errors.ProblemError, match="diameter_m"):
         lbt.Imaging(diameter_m=0)
+
+
+DIMMER_CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
+
+
+def dense_strehl(covariance, lines, imaging):
+    """The rule of all nodes, whatever the jitter: 84 radii, 64 directions."""
+    eps = imaging.obstruction
+    edges = np.array(sorted({0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}))
+    radius, weight = gauss_panels(edges, 12)
+    weight = weight * radius * annular_otf(radius, eps)
+    angle = np.pi * np.arange(64) / 64
+    f = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))])
+    f = f * imaging.cycles_per_nm
+    factor = np.exp(-2 * np.pi**2 * np.einsum("irk,ij,jrk->rk", f, covariance, f))
+    for line in lines:
+        factor = factor * j0(2 * np.pi * np.abs(np.einsum("i,irk->rk", line, f)))
+    return imaging.other_modes * float(weight @ factor.mean(axis=1) / weight.sum())
+
+
+def test_fewer_directions_lose_nothing():
+    rng = np.random.default_rng(5)
+    count = 300
+    roots = 10 ** rng.uniform(0, 3, (count, 1, 1)) * rng.standard_normal((count, 2, 2))
+    roots[::2] = 10 ** rng.uniform(0, 3, (150, 1, 1)) * np.eye(2)  # the same in all directions
+    covariances = roots @ np.swapaxes(roots, 1, 2)
+    lines = 10 ** rng.uniform(-1, 2.8, (count, 2, 1)) * (
+        rng.standard_normal((count, 2, 2)) + 1j * rng.standard_normal((count, 2, 2))
+    )
+    covariances[7] = covariances[9]
+    small = np.sqrt(np.max(np.diagonal(covariances, axis1=1, axis2=2), axis=1))
+    small = (small + np.abs(lines).sum(axis=(1, 2))) * DIMMER_CAMERA.cycles_per_nm < 5
+    assert small.sum() > 200
+    covariances, lines = covariances[small], lines[small]
+    found = jitter_strehls(covariances, imaging=DIMMER_CAMERA, line_amplitudes_nm=lines)
+    for i in range(len(found)):
+        assert found[i] == pytest.approx(
+            dense_strehl(covariances[i], lines[i], DIMMER_CAMERA), abs=1e-13
+        )
+        alone = lbt.loop.jitter_strehl(
+            covariances[i], imaging=DIMMER_CAMERA, line_amplitudes_nm=lines[i]
+        )
+        assert alone == pytest.approx(found[i], abs=1e-14)
+
+
+def test_many_jitters_of_wrong_sizes():
+    with pytest.raises(
+        lbt.errors.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"
+    ):
+        jitter_strehls(
+            np.zeros((3, 2, 2)), imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 1, 2))
+        )
+    indefinite = np.stack([np.eye(2), np.diag([1, -1])])
+    with pytest.raises(lbt.errors.DefinitenessError, match="least eigenvalue of -1"):
+        jitter_strehls(indefinite, imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.uneven_axes import SLOW
 
 import lbt_synth as lbt
 
@@ -35,3 +36,24 @@ def test_impossible_values_are_refused(make, value):
 def test_a_truth_needs_a_spectrum():
     with pytest.raises(lbt.errors.ProblemError, match="psd"):
         lbt.Truth(turbulence=3.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "text"),
+    [
+        ({"turbulence": []}, lbt.errors.DimensionError, "got an empty sequence"),
+        ({"turbulence": [SLOW, 3.0]}, lbt.errors.ProblemError, "one a mode; got float"),
+        ({"turbulence": "slow"}, lbt.errors.ProblemError, "one a mode; got str"),
+        (
+            {"turbulence": None, "noise_nm": [[1.0]]},
+            lbt.errors.DimensionError,
+            r"got shape \(1, 1\)",
+        ),
+        ({"turbulence": None, "noise_nm": []}, lbt.errors.DimensionError, r"got shape \(0,\)"),
+        ({"turbulence": None, "noise_nm": [1.0, -1.0]}, lbt.errors.ProblemError, "noise_nm"),
+        ({"turbulence": None, "noise_nm": [1.0, np.nan]}, lbt.errors.ProblemError, "noise_nm"),
+    ],
+)
+def test_wrong_truths_are_refused(arguments, error, text):
+    with pytest.raises(error, match=text):
+        lbt.Truth(**arguments)
