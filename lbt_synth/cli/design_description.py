@@ -154,7 +154,7 @@ def _describe_shaping(design: ShapedDesign) -> tuple[Facts, Data]:
     return facts, {
         "states_per_mode": design.states_per_mode,
         "loss": design.loss,
-        "demands": [{"mode": m + 1, "demand": label} for m, label in design.demanded()],
+        "demands": [{"mode": m + 1, "demand": label} for m, label in design.demand_labels()],
         "limit_nm": limit_nm,
         "above_limit_percent": above,
         "objective_nm": design.objective_nm,

@@ -1,4 +1,4 @@
-"""The central H-infinity filters of a problem, by the norm that they achieve."""
+"""The central H-infinity filters of a problem, chosen by the norm that they achieve."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import brentq
 
-from lbt_synth.design.hinf import Gains, hinf, require_reachable
-from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.design.hinf import hinf, require_reachable
+from lbt_synth.design.result import FilterDesign, Gains, SolverReport, filter_design
 from lbt_synth.linear import EstimationProblem, hinf_norm
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.lyapunov import stationary_covariance
@@ -70,24 +70,16 @@ def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
 
 
 class CentralFilters:
-    """The central filters of a problem, from that of the least gamma to the Kalman filter.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem.
-    least : FilterDesign
-        Its filter of the least gamma.
-    """
+    """The central filters of a problem, from that of the least gamma to the Kalman filter."""
 
     def __init__(self, problem: EstimationProblem, least: FilterDesign) -> None:
         self.problem, self.least = problem, least
         self.start = kalman_riccati(problem)
 
     def member(self, measure: Callable[[float, float], float]) -> Gains:
-        """Gains of the member at which a rising measure of norm and deviation is zero.
+        """Return the filter at which a rising measure of norm and deviation is zero.
 
-        An end of the family where the measure does not change its sign.
+        Where the measure does not change its sign it is one end of the family.
         """
         gains: dict[float, Gains] = {0.0: self.least}
         found = {0.0: measure(self.least.gamma, self.least.rms)}
@@ -108,5 +100,5 @@ class CentralFilters:
         if value(_DECADES) <= 0:
             return self.start
         brentq(value, 0.0, _DECADES, xtol=1e-9)
-        # on the side of the lesser norm
+        # the closest on the side of smaller norms
         return gains[max(decades for decades, size in found.items() if size <= 0)]

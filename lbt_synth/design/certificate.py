@@ -1,4 +1,4 @@
-"""Certificates: checks of a design that know nothing of the solver that made it."""
+"""Certificates: checks of a design, computed from its matrices and not from its solver."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Check:
     name : str
         What was checked.
     value, limit : float
-        What was measured, and what it must stay below.
+        What was computed, and what it must stay below.
     computed_by : str
         How the value was computed.
     """
@@ -153,7 +153,7 @@ def certify_filter(
     >>> lbt.design.certify_filter(p, [[0.7]], least_variance=True).passed
     False
     """
-    certificate, norm, P = _examine(problem.error_system(gain_predictor))
+    certificate, norm, P = _examine_error(problem.error_system(gain_predictor))
     if norm is None or P is None:
         return certificate
     gain = np.asarray(gain_predictor)
@@ -185,48 +185,42 @@ def certify_filter(
 def certify_error(
     error: StateSpace, *, stability: str = "spectral radius of the filter"
 ) -> Certificate:
-    """Certificate of an estimation error: stability, its variance both ways, its norm both ways."""
-    return _examine(error, stability)[0]
+    """Certify an estimation error: stability, its variance both ways, its norm both ways."""
+    return _examine_error(error, stability)[0]
 
 
-def _examine(
+def _examine_error(
     error: StateSpace, stability: str = "spectral radius of the filter"
 ) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
-    """Certificate of an error, with its norm and covariance if it is stable."""
-    radius = error.spectral_radius
-    checks = [_stability_check(stability, radius)]
-    if not checks[0].passed:
+    """Return the certificate of an error, with its norm and covariance if it is stable."""
+    stable = _stability_check(stability, error.spectral_radius)
+    if not stable.passed:
         infinite = frozen_copy(np.full(len(error.C), np.inf))
-        return Certificate(checks=tuple(checks), gamma=np.inf, rms_per_output=infinite), None, None
+        return Certificate(checks=(stable,), gamma=np.inf, rms_per_output=infinite), None, None
     drive = error.B @ error.B.T
     P = stationary_covariance(error.A, drive)
-    checks.append(
+    variances = np.diag(error.C @ P @ error.C.T)
+    norm = hinf_norm(error)
+    grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
+    highest = float(np.max(largest_singular_values(error, grid)))
+    checks = (
+        stable,
         Check(
             name="residual of the Lyapunov equation",
             value=lyapunov_residual(error.A, drive, P),
             limit=RESIDUAL_TOLERANCE,
             computed_by="relative, 1-norm",
-        )
-    )
-    variances = np.diag(error.C @ P @ error.C.T)
-    checks.append(_adjoint_variance_check(error, float(variances.sum())))
-    norm = hinf_norm(error)
-    grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
-    excess = float(np.max(largest_singular_values(error, grid))) / max(norm.upper, 1e-300) - 1
-    checks.append(
+        ),
+        _adjoint_variance_check(error, float(variances.sum())),
         Check(
             name="singular values above the norm",
-            value=excess,
+            value=highest / max(norm.upper, 1e-300) - 1,
             limit=NORM_TOLERANCE,
             computed_by=f"{_GRID} frequencies against level sets",
-        )
+        ),
     )
-    certificate = Certificate(
-        checks=tuple(checks),
-        gamma=norm.value,
-        rms_per_output=frozen_copy(np.sqrt(np.maximum(variances, 0))),
-    )
-    return certificate, norm, P
+    rms = frozen_copy(np.sqrt(np.maximum(variances, 0)))
+    return Certificate(checks=checks, gamma=norm.value, rms_per_output=rms), norm, P
 
 
 def _adjoint_variance_check(error: StateSpace, variance: float) -> Check:
@@ -244,6 +238,9 @@ def _adjoint_variance_check(error: StateSpace, variance: float) -> Check:
 
 def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
     """Check that a witness proves what is claimed of it: no filter below a level of gamma.
+
+    The covariance of the Kalman filter, by the Riccati equation, enters only as the price of what
+    rounding took from the proof, and as the space in which an estimation error can lie.
 
     Parameters
     ----------
@@ -326,8 +323,9 @@ def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
     ... ).passed
     False
     """
-    radius = close_loop(hardware, controller).spectral_radius
-    return _stability_check("spectral radius of the closed loop", radius)
+    return _stability_check(
+        "spectral radius of the closed loop", close_loop(hardware, controller).spectral_radius
+    )
 
 
 def _stability_check(name: str, radius: float) -> Check:
@@ -335,10 +333,7 @@ def _stability_check(name: str, radius: float) -> Check:
 
 
 def controller_difference(one: Controller, other: Controller) -> float:
-    """Largest difference of two controllers' matrices, over the largest entry of each.
-
-    Infinite where their sizes differ.
-    """
+    """Largest relative difference of two controllers' matrices; infinite where sizes differ."""
     worst = 0.0
     for name in "ABCD":
         a, b = getattr(one, name), getattr(other, name)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from lbt_synth.design.kalman import error_scale
-from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.design.result import FilterDesign, SolvedGains, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_level
 from lbt_synth.linear.estimation_problem import require_problem
@@ -19,32 +18,10 @@ from lbt_synth.validation import FloatArray, choice, frozen_copy, number
 
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9
-_CONTRADICTION = 1e-9  # what rounding may take from a proof
-_LARGEST_LMI = 20  # states
+_CONTRADICTION = 1e-9  # relative, what rounding may take from a proof
+_LARGEST_LMI = 20  # states; the inequality takes minutes beyond
 _GREATEST = 1e100
 _GREATEST_RATIO = 1e6
-
-
-class Gains(Protocol):
-    """The two gains of a filter, whatever holds them."""
-
-    @property
-    def gain_predictor(self) -> FloatArray:
-        """Gain of the time-and-measurement update."""
-
-    @property
-    def gain_filter(self) -> FloatArray:
-        """Gain of the measurement update alone."""
-
-
-class _RouteSolution(Gains, Protocol):
-    """What both routes return."""
-
-    @property
-    def status(self) -> str: ...
-
-    @property
-    def iterations(self) -> int: ...
 
 
 def hinf(
@@ -128,16 +105,12 @@ def hinf(
     problem = problem.ahead(horizon)
     start = kalman_riccati(problem)
     synthesis = _LmiRoute(problem, start) if route == "lmi" else _RiccatiRoute(problem, start)
-    gains, witness = synthesis.least()
+    gains, witness = synthesis.least_gamma()
     least, infeasible = _verified_bracket(problem, start, gains, witness)
-    requested = least
-    if gamma_ratio is not None:
-        requested = least * gamma_ratio
-    if gamma is not None:
-        requested = gamma
+    requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
     if requested > least * (1 + _AT_LEAST):
-        gains = synthesis.at(requested)
+        gains = synthesis.central(requested)
     design = filter_design(
         problem,
         gains.gain_predictor,
@@ -166,7 +139,7 @@ def require_reachable(gamma: float, least: float) -> None:
 
 
 class _RiccatiRoute:
-    """Levels by the gamma-Riccati equation, in units in which the Kalman errors are of size one."""
+    """Filters by the gamma-Riccati equation, in units in which the Kalman errors have size one."""
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
         spread = np.sqrt(np.diag(start.P))
@@ -174,28 +147,16 @@ class _RiccatiRoute:
         # powers of two: the change of units rounds nothing
         self.units = np.exp2(np.round(np.log2(np.where(usable, spread, 1.0))))[:, None]
         self.problem = scale_states(problem, self.units)
-        self.start = self._scaled(start, 1 / self.units)
+        self.start = self._rescale(start, 1 / self.units)
 
-    def least(self) -> tuple[_RouteSolution, Witness]:
+    def least_gamma(self) -> tuple[SolvedGains, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)
         _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
         witness = worst_invisible_disturbance(self.problem, best.P, level, self.start.P)
         states = frozen_copy(self.units * witness.states)
-        return self._scaled(best, self.units), replace(witness, states=states)
+        return self._rescale(best, self.units), replace(witness, states=states)
 
-    def at(self, gamma: float) -> _RouteSolution:
-        return self._scaled(self._at(gamma), self.units)
-
-    @staticmethod
-    def _scaled(solution: FilterRiccati, units: FloatArray) -> FilterRiccati:
-        return replace(
-            solution,
-            P=frozen_copy(units * solution.P * units.T),
-            gain_predictor=frozen_copy(units * solution.gain_predictor),
-            gain_filter=frozen_copy(units * solution.gain_filter),
-        )
-
-    def _at(self, gamma: float) -> FilterRiccati:
+    def central(self, gamma: float) -> SolvedGains:
         solution = gamma_riccati(self.problem, gamma, start=self.start)
         if solution is None:
             raise InfeasibleError(
@@ -203,31 +164,40 @@ class _RiccatiRoute:
                 "Try a larger gamma.",
                 gamma=gamma,
             )
-        return solution
+        return self._rescale(solution, self.units)
+
+    @staticmethod
+    def _rescale(solution: FilterRiccati, units: FloatArray) -> FilterRiccati:
+        return replace(
+            solution,
+            P=frozen_copy(units * solution.P * units.T),
+            gain_predictor=frozen_copy(units * solution.gain_predictor),
+            gain_filter=frozen_copy(units * solution.gain_filter),
+        )
 
 
 class _LmiRoute:
-    """Levels by linear matrix inequalities, in the Kalman filter's coordinates."""
+    """Filters by linear matrix inequalities, in the coordinates of the Kalman filter."""
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
         self.problem, self.start = problem, start
         self.scale = _kalman_bracket(problem, start)[1]
 
-    def least(self) -> tuple[_RouteSolution, Witness]:
+    def least_gamma(self) -> tuple[SolvedGains, Witness]:
         from lbt_synth.linear.lmi.hinf import least_gamma_lmi
 
         solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
         assert solution.witness is not None  # the least gamma has a dual solution
         return solution, solution.witness
 
-    def at(self, gamma: float) -> _RouteSolution:
+    def central(self, gamma: float) -> SolvedGains:
         from lbt_synth.linear.lmi.hinf import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 
 
 def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:
-    """Problem with the states divided by units (n, 1)."""
+    """Return the problem with its states divided by units (n, 1)."""
     return EstimationProblem(
         A=problem.A * units.T / units,
         B=problem.B / units,
@@ -239,9 +209,9 @@ def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationPro
 
 
 def _verified_bracket(
-    problem: EstimationProblem, start: FilterRiccati, gains: _RouteSolution, witness: Witness
+    problem: EstimationProblem, start: FilterRiccati, gains: SolvedGains, witness: Witness
 ) -> tuple[float, float]:
-    """Least gamma from both sides: the norm of a filter, and a level that a witness refutes."""
+    """Bounds of the least gamma: the norm of a filter, and a level that a witness refutes."""
     error = problem.error_system(gains.gain_predictor)
     if not error.spectral_radius < 1:
         raise NumericalError(
@@ -265,7 +235,7 @@ def _contradiction_error(infeasible: float, achieved: float) -> NumericalError:
 
 
 def _kalman_bracket(problem: EstimationProblem, start: FilterRiccati) -> tuple[float, float]:
-    """Bounds of the least gamma: the Kalman error's deviation, and its norm."""
+    """Bounds of the least gamma: the deviation of the Kalman error, and its norm."""
     if not np.any(problem.L @ start.P @ problem.L.T > 0):
         raise ProblemError(
             "z = L x must have an estimation error; got one that is known exactly. "

@@ -1,4 +1,4 @@
-"""The classical integrator, its limit, and its best gain (paper, section III-C, erratum 4)."""
+"""The classical integrator, its gain limit and its best gain (paper, III-C, erratum 4)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.design.certificate import certify_loop
-from lbt_synth.design.result import IntegratorDesign, SolverReport, loop_certificate
+from lbt_synth.design.result import (
+    UNCERTIFIED,
+    IntegratorDesign,
+    SolverReport,
+    with_certificate,
+)
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
@@ -23,7 +27,7 @@ from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.validation import frozen_copy, number, require_instance
 
 _TRIALS = 32
-TRIED_GAINS = 1e-4, 0.999  # parts of the limit between which the best gain is looked for
+TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as parts of the limit
 
 
 def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
@@ -55,21 +59,24 @@ def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
     >>> bool(max(abs(lbt.integrator(path, gain=0.25).poles)) < 1)
     True
     """
-    return _certify(hardware, number(gain, "gain", above=0), route="closed form", status="given")
+    return _design_with_gain(
+        hardware, number(gain, "gain", above=0), route="closed form", status="given"
+    )
 
 
-def _certify(hardware: LoopHardware, gain: float, *, route: str, status: str) -> IntegratorDesign:
-    controller = _integrator_controller(hardware, gain)
-    return IntegratorDesign(
+def _design_with_gain(
+    hardware: LoopHardware, gain: float, *, route: str, status: str
+) -> IntegratorDesign:
+    """Make the design of a gain and certify it."""
+    design = IntegratorDesign(
         method="integrator",
-        controller=controller,
-        certificate=loop_certificate(certify_loop(hardware, controller)).require(
-            f"Lower the gain {gain:.6g}."
-        ),
+        controller=_integrator_controller(hardware, gain),
+        certificate=UNCERTIFIED,
         solver=SolverReport(route=route, status=status, iterations=0),
         loop_hardware=hardware,
         gain=gain,
     )
+    return with_certificate(design, f"Lower the gain {gain:.6g}.")
 
 
 def integrator_gain_limit(delay_frames: float) -> float:
@@ -108,7 +115,7 @@ def integrator_gain_limit(delay_frames: float) -> float:
 
 
 def hardware_gain_limit(hardware: LoopHardware) -> float:
-    """Gain at which an integrator becomes unstable, whatever the mirror."""
+    """Gain at which an integrator becomes unstable, with the dynamics of the mirror."""
     if hardware.mirror is None:
         return integrator_gain_limit(hardware.delay_frames)
     single = LoopHardware(
@@ -118,7 +125,7 @@ def hardware_gain_limit(hardware: LoopHardware) -> float:
         mirror=hardware.mirror,
     )
     taps = single.mirror_taps
-    start = 0.5 / (1 + float(np.abs(np.arange(taps.size) @ taps)))  # over the mean delay
+    start = 0.5 / (1 + float(np.abs(np.arange(taps.size) @ taps)))  # half over the mean delay
     while not close_loop(single, _integrator_controller(single, start)).is_stable:
         start /= 2
     return start * stable_sensor_gains(single, _integrator_controller(single, start))[1]
@@ -198,6 +205,7 @@ def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
 def _least_residual(
     hardware: LoopHardware, budget: Callable[[ClosedLoop], ResidualBudget], sensor_gain: float
 ) -> IntegratorDesign:
+    """Return the design of least residual: trials on a grid of gains, the best of them refined."""
     limit = hardware_gain_limit(hardware) / max(1.0, sensor_gain)
 
     def variance(log_gain: float) -> float:
@@ -215,7 +223,7 @@ def _least_residual(
     found = minimize_scalar(variance, bounds=bracket, method="bounded", options={"xatol": 1e-7})
     limited = best == _TRIALS - 1
     status = "limited by stability at unit sensor gain" if limited else "least residual"
-    return _certify(hardware, float(np.exp(found.x)), route="search", status=status)
+    return _design_with_gain(hardware, float(np.exp(found.x)), route="search", status=status)
 
 
 def _integrator_controller(hardware: LoopHardware, gain: float) -> Controller:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.design.result import FilterDesign, SolvedGains, SolverReport, filter_design
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.riccati.filtering import kalman_riccati
@@ -51,30 +51,22 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     choice(route, "route", ("riccati", "sdp"))
     problem = problem.ahead(horizon)
     solution = kalman_riccati(problem)
-    if route == "riccati":
-        return filter_design(
-            problem,
-            solution.gain_predictor,
-            solution.gain_filter,
-            method="kalman",
-            solver=SolverReport(
-                route="riccati", status=solution.status, iterations=solution.iterations
-            ),
-        )
-    from lbt_synth.linear.lmi.kalman import kalman_sdp
+    gains: SolvedGains = solution
+    if route == "sdp":
+        from lbt_synth.linear.lmi.kalman import kalman_sdp
 
-    scale = error_scale(problem, solution.P)
-    programme = kalman_sdp(problem, coordinates=solution.P, scale=scale)
+        scale = error_scale(problem, solution.P)
+        gains = kalman_sdp(problem, coordinates=solution.P, scale=scale)
     return filter_design(
         problem,
-        programme.gain_predictor,
-        programme.gain_filter,
+        gains.gain_predictor,
+        gains.gain_filter,
         method="kalman",
-        solver=SolverReport(route="sdp", status=programme.status, iterations=programme.iterations),
+        solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
     )
 
 
 def error_scale(problem: EstimationProblem, P: np.ndarray) -> float:
-    """Return the estimation error's deviation in its worst direction; 1 if there is none."""
+    """Deviation of the estimation error in its worst direction; 1 if the error is zero."""
     worst = float(np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[-1])
     return float(np.sqrt(worst)) if worst > 0 else 1.0

@@ -1,15 +1,12 @@
-"""Shaping of the closed loop: the best controller of a specification, and few states for it."""
+"""Loop shaping: the best controller for a specification, reduced to few states."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from lbt_synth.design.certificate import Certificate
-from lbt_synth.design.result import SolverReport
+from lbt_synth.design.result import UNCERTIFIED, SolverReport, with_certificate
 from lbt_synth.design.shaped_design import (
     ShapedDesign,
     controller_from_parameters,
@@ -17,7 +14,7 @@ from lbt_synth.design.shaped_design import (
 )
 from lbt_synth.design.shaping.basis import laguerre_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
+from lbt_synth.design.shaping.reduction import reduce_poles, solve_mode
 from lbt_synth.design.shaping.single_mode_loop import mode_hardware
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
@@ -113,17 +110,17 @@ def shape(
     for spec in specifications:
         spec.require_fitting(hardware.frame_rate_hz)
 
-    made: dict[int, _ModeDesign] = {}
+    designs: dict[int, _ModeDesign] = {}  # equal modes share a specification
     for spec in specifications:
-        if id(spec) not in made:
+        if id(spec) not in designs:
             channel = Channel(hardware=single, basis=laguerre_basis(size, common, dt_s=single.dt_s))
-            made[id(spec)] = _design_mode(spec, channel, order, tolerance)
-    modes = [made[id(spec)] for spec in specifications]
+            designs[id(spec)] = _design_mode(spec, channel, order, tolerance)
+    modes = [designs[id(spec)] for spec in specifications]
     parameters = tuple(mode.parameter for mode in modes)
     design = ShapedDesign(
         method="shaped",
         controller=controller_from_parameters(hardware, parameters),
-        certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
+        certificate=UNCERTIFIED,
         solver=SolverReport(
             route="youla",
             status=modes[0].status,
@@ -136,12 +133,13 @@ def shape(
         long_objective_nm=tuple(mode.long_objective_nm for mode in modes),
         long_functions=size,
     )
-    certificate = design.recertify().require("Try more functions, or looser demands.")
-    return replace(design, certificate=certificate)
+    return with_certificate(design, "Try more functions, or looser demands.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _ModeDesign:
+    """Youla parameter of one mode, with its objective and that of the long parameter."""
+
     parameter: Controller
     objective_nm: float
     long_objective_nm: float
@@ -170,17 +168,14 @@ def _specification_per_mode(
 def _design_mode(
     spec: Specification, channel: Channel, order: int | None, tolerance: float
 ) -> _ModeDesign:
-    long = solve_mode(spec, channel)
-    if order is None or order >= channel.basis.size:
-        return _mode(long, long)
-    return _mode(reduce_poles(spec, long, order, tolerance), long)
-
-
-def _mode(result: ModeSolution, long: ModeSolution) -> _ModeDesign:
+    """Solve for a long parameter, and reduce it where it has more states than allowed."""
+    chosen = long = solve_mode(spec, channel)
+    if order is not None and order < channel.basis.size:
+        chosen = reduce_poles(spec, long, order, tolerance)
     return _ModeDesign(
-        parameter=result.parameter,
-        objective_nm=result.objective_nm * (1 + _ROUNDED),
+        parameter=chosen.parameter,
+        objective_nm=chosen.objective_nm * (1 + _ROUNDED),
         long_objective_nm=long.objective_nm,
-        status=result.sequence.status,
+        status=chosen.sequence.status,
         programmes=long.sequence.programmes,
     )

@@ -14,14 +14,12 @@ one mode, ``v = (N u)_i`` and the target ``z(k) = l x(k+1)``, which is phi_tot(k
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from lbt_synth.design.certificate import Certificate
 from lbt_synth.design.lqg_design import LqgDesign, estimation_plant, lqg_controller
-from lbt_synth.design.result import SolverReport
+from lbt_synth.design.result import UNCERTIFIED, SolverReport, with_certificate
 from lbt_synth.errors import DimensionError, InfeasibleError, ProblemError
 from lbt_synth.linear import solve_dare
 from lbt_synth.linear.lyapunov import stationary_covariance
@@ -124,7 +122,7 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     design = LqgDesign(
         method="lqg",
         controller=lqg_controller(plant, solution.gain_predictor, gains, regulator.gain_mirror),
-        certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
+        certificate=UNCERTIFIED,
         solver=SolverReport(
             route="riccati",
             status=f"{solution.status}; mirror: {regulator.status}",
@@ -137,10 +135,9 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         command_weight=rho,
         objective_nm=float(np.sqrt(max(float(cost), 0.0))),
     )
-    certificate = design.recertify().require(
-        "Try a small command_weight, such as 1e-4, or states of similar sizes."
+    return with_certificate(
+        design, "Try a small command_weight, such as 1e-4, or states of similar sizes."
     )
-    return replace(design, certificate=certificate)
 
 
 def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regulator:
@@ -165,7 +162,7 @@ def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regu
         )
     if rho > 0 or np.any(zeros > 1):  # otherwise the mirror's inverse is stable and costs nothing
         solved = solve_dare(F, G[:, None], np.outer(h, h), [[weight]], d * h[:, None])
-        X, status, iterations = solved.X, solved.method, solved.iterations
+        X, status, iterations = solved.X, solved.route, solved.iterations
     total = float(weight + G @ X @ G)
     gain_mirror = (G @ X @ F + d * h) / total
     closed = F - np.outer(G, gain_mirror)

@@ -1,4 +1,4 @@
-"""What an LQG design is, and its certificate."""
+"""The LQG design: filter, regulator and controller, and their certificate."""
 
 from __future__ import annotations
 
@@ -123,13 +123,7 @@ class LqgDesign(EstimatorDesign):
         return StateSpace(A=A, B=B, C=C, D=D, dt_s=own.dt_s)
 
     def recertify(self) -> Certificate:
-        """Compute the certificate anew from the matrices.
-
-        Returns
-        -------
-        Certificate
-            Passed or not.
-        """
+        """Compute the certificate again from the matrices."""
         certificate = certify_error(
             self.error_system(), stability="spectral radius of model, filter and mirror"
         )
@@ -137,30 +131,25 @@ class LqgDesign(EstimatorDesign):
         if checks[0].passed:
             own = certify_filter(self.estimation, self.gain_predictor, least_variance=True)
             checks += [c for c in own.checks if c.name.startswith("distance")]
-            checks.append(self._regulated())
-        checks.append(
+            checks.append(self._regulator_check())
+        rebuilt = lqg_controller(
+            self.problem, self.gain_predictor, self.gain_state, self.gain_mirror
+        )
+        checks += [
             Check(
                 name="controller against its gains",
-                value=controller_difference(
-                    self.controller,
-                    lqg_controller(
-                        self.problem, self.gain_predictor, self.gain_state, self.gain_mirror
-                    ),
-                ),
+                value=controller_difference(self.controller, rebuilt),
                 limit=_SAME,
-                computed_by="matrices assembled anew",
-            )
-        )
-        checks.append(certify_loop(self.problem.hardware, self.controller))
+                computed_by="matrices assembled again",
+            ),
+            certify_loop(self.problem.hardware, self.controller),
+        ]
         if checks[-1].passed:
-            checks += self._costs(certificate.rms)
+            checks += self._cost_checks(certificate.rms)
         return replace(certificate, checks=tuple(checks))
 
-    def _regulated(self) -> Check:
-        """Check that one step of policy iteration leaves the regulator as it is.
-
-        The cost of the law as it stands, by linear equations, has no better law.
-        """
+    def _regulator_check(self) -> Check:
+        """Check that a step of policy iteration from the cost of this law finds no better law."""
         core, rho = self.problem.hardware.mirror_system.core, self.command_weight
         own = self.estimation
         n, c = own.n_states, core.n_states
@@ -185,8 +174,8 @@ class LqgDesign(EstimatorDesign):
             computed_by="gains recomputed from a Lyapunov equation",
         )
 
-    def _costs(self, rms: float) -> list[Check]:
-        """Compare the real loop's cost, by a Lyapunov equation, with what is claimed."""
+    def _cost_checks(self, rms: float) -> list[Check]:
+        """Compare the cost of the real loop, by a Lyapunov equation, with the claimed one."""
         residual, commands = loop_variances(self.problem, self.estimation, self.controller)
         cost = residual + self.command_weight * commands
         pairs = (
@@ -239,7 +228,7 @@ def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:
 def loop_variances(
     plant: TipTiltPlant, model: TipTiltPlant, controller: Controller
 ) -> tuple[float, float]:
-    """Variances of residual and command (as a wavefront) of the loop, the model as the truth."""
+    """Variances of residual and command (as a wavefront) where the model is the truth."""
     hardware = plant.hardware
     loop = close_loop(hardware, controller).system
     n, m, states = hardware.modes, hardware.n_commands, model.n_states

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from lbt_synth.design.central_filters import CentralFilters
-from lbt_synth.design.hinf import Gains, hinf, require_reachable
+from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
-from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.design.result import FilterDesign, Gains, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import (
     EstimationProblem,
@@ -28,16 +28,16 @@ from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 if TYPE_CHECKING:
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
-_Answer: TypeAlias = tuple[FloatArray, float, str]  # taps, level, the solver's word
+_Answer: TypeAlias = tuple[FloatArray, float, str]  # taps, level, what the solver said
 
 _ROUNDS = 20
 _FIRST_GRID = 48
 _FINE_GRID = 1024
 _EXCESS = 4e-7  # by which the norm may exceed its bound; the certificate allows 1e-6
-_ROOM = 2e-7  # by which the bound at the frequencies is drawn in
+_ROOM = 2e-7  # by which the bound at the frequencies is tightened
 _SAME = 1e-9
 _MOST_TAPS = 64
-_EDGE = 1e-5  # so close to the least gamma the filter of the least gamma is returned
+_EDGE = 1e-5  # this close to the least gamma, its own filter is returned
 
 
 def mixed(
@@ -129,7 +129,7 @@ def mixed(
             return bound - deviation
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.least_level((bound * (1 - _ROOM)) ** 2, grid)
+            return programme.minimize_level((bound * (1 - _ROOM)) ** 2, grid)
     else:
         if gamma_ratio is not None:
             gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
@@ -144,15 +144,15 @@ def mixed(
             return norm - bound
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.least_variance(bound * (1 - _ROOM), grid)
+            return programme.minimize_variance(bound * (1 - _ROOM), grid)
 
     base = CentralFilters(problem, least).member(measure)
-    made = _complete_base(problem, base, length, solve)
-    return _mixed_design(problem, base, made, least, gamma=gamma, rms=rms)
+    response = _complete_base(problem, base, length, solve)
+    return _mixed_design(problem, base, response, least, gamma=gamma, rms=rms)
 
 
 def require_taps(taps: int) -> int:
-    """Return a length of the impulse response that is fit for use."""
+    """Return the length of the impulse response, checked."""
     length = integer(taps, "taps", at_least=1)
     if length > _MOST_TAPS:
         raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {length}.")
@@ -161,7 +161,7 @@ def require_taps(taps: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _ImpulseResponse:
-    """An impulse response on the innovations of a base."""
+    """Impulse response on the innovations of a base filter, and how it was found."""
 
     taps: FloatArray
     status: str
@@ -174,11 +174,12 @@ def _complete_base(
     length: int,
     solve: Callable[[InnovationProgramme, FloatArray], _Answer],
 ) -> _ImpulseResponse:
-    """Solve on a set of frequencies, and add to it until the norm holds between them."""
+    """Solve on a set of frequencies, and add to it until the norm holds between them, too."""
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
-    programme = InnovationProgramme.of(problem, base.gain_predictor, taps=length)
-    grid = _first_grid(programme.error)
+    programme = InnovationProgramme.from_predictor(problem, base.gain_predictor, taps=length)
+    even = np.linspace(0, 0.5 / problem.dt_s, _FIRST_GRID)
+    grid = np.unique(np.concatenate([even, _frequencies_near_poles(programme.error)]))
     excess = np.inf
     for rounds in range(1, _ROUNDS + 1):
         taps, level, status = solve(programme, grid)
@@ -204,14 +205,15 @@ def _complete_base(
 def _mixed_design(
     problem: EstimationProblem,
     base: Gains,
-    made: _ImpulseResponse,
+    response: _ImpulseResponse,
     least: FilterDesign,
     *,
     gamma: float | None,
     rms: float | None,
 ) -> FilterDesign:
-    extended = problem.with_memory(made.taps)
-    size, q = made.taps.shape[1], base.gain_predictor.shape[1]
+    """Make the design of a completed base and certify it."""
+    extended = problem.with_memory(response.taps)
+    size, q = response.taps.shape[1], base.gain_predictor.shape[1]
     gain = _extend_gain(base.gain_predictor, size // q)
     assert least.witness is not None
     assert least.gamma_infeasible is not None
@@ -227,7 +229,7 @@ def _mixed_design(
         gain,
         innovation_gain,
         method="mixed",
-        solver=SolverReport(route="youla", status=made.status, iterations=made.rounds),
+        solver=SolverReport(route="youla", status=response.status, iterations=response.rounds),
         gamma_requested=gamma,
         rms_requested=rms,
         gamma_least=least.gamma_least,
@@ -237,14 +239,9 @@ def _mixed_design(
 
 
 def _extend_gain(gain_predictor: FloatArray, length: int) -> FloatArray:
-    """Gain that feeds the innovations into the memory as well."""
+    """Return the gain that feeds the innovations into the memory, too."""
     q = gain_predictor.shape[1]
     return frozen_copy(np.vstack([gain_predictor, np.eye(q), np.zeros(((length - 1) * q, q))]))
-
-
-def _first_grid(error: StateSpace) -> FloatArray:
-    even = np.linspace(0, 0.5 / error.dt_s, _FIRST_GRID)
-    return np.unique(np.concatenate([even, _frequencies_near_poles(error)]))
 
 
 def _frequencies_near_poles(error: StateSpace) -> FloatArray:

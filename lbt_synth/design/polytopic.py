@@ -1,4 +1,4 @@
-"""One filter for all plants of an interval of vibration frequencies."""
+"""The polytopic filter: one for all vibration frequencies of an interval."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ from lbt_synth.design.certificate import (
     certify_loop,
     controller_difference,
 )
-from lbt_synth.design.result import EstimatorDesign, SolverReport
+from lbt_synth.design.result import (
+    UNCERTIFIED,
+    EstimatorDesign,
+    SolverReport,
+    with_certificate,
+)
 from lbt_synth.design.worst_case import bound_worst_error, error_size, search_worst_error
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.riccati.filtering import kalman_riccati
@@ -51,7 +56,7 @@ class PolytopicDesign(EstimatorDesign):
     worst_frequency_hz : float
         Frequency at which it was found [Hz].
     bound_programme : float
-        The bound that the semidefinite programme gave; the solver's word, no evidence.
+        The bound that the semidefinite programme gave; what the solver said, no evidence.
     """
 
     problem: TipTiltPlant
@@ -89,13 +94,7 @@ class PolytopicDesign(EstimatorDesign):
         return error_system(problem or self.problem, self.predictor)
 
     def recertify(self) -> Certificate:
-        """Compute the certificate anew from the matrices.
-
-        Returns
-        -------
-        Certificate
-            Passed or not.
-        """
+        """Compute the certificate again from the matrices."""
         return _certify(self)
 
 
@@ -106,7 +105,7 @@ def polytopic(
 
     The filter has the order of the plant. Its bound over the whole interval is made least by
     linear matrix inequalities with Lyapunov matrices that follow the frequency, and then
-    proved anew, without a solver. The frequency is unknown and constant; the decay rate
+    proved again, without a solver. The frequency is unknown and constant; the decay rate
     (damping times frequency) and the driving noise are those of the plant.
 
     Parameters
@@ -169,7 +168,7 @@ def polytopic_design(
     design = PolytopicDesign(
         method=f"polytopic-{norm}",
         controller=_controller(plant, predictor),
-        certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
+        certificate=UNCERTIFIED,
         solver=solver,
         problem=plant,
         predictor=predictor,
@@ -180,17 +179,18 @@ def polytopic_design(
         worst_frequency_hz=where,
         bound_programme=bound_programme,
     )
-    certificate = design.recertify().require("Try a narrower interval.")
-    return replace(design, certificate=certificate)
+    return with_certificate(design, "Try a narrower interval.")
 
 
 def _controller(plant: TipTiltPlant, predictor: Controller) -> Controller:
+    """Return the controller that commands the estimate of a predictor."""
     to_command = plant.hardware.projector @ predictor.C
     D = np.zeros((len(to_command), predictor.B.shape[1]))
     return youla_controller(plant.hardware, replace(predictor, C=to_command, D=D))
 
 
 def _certify(design: PolytopicDesign) -> Certificate:
+    """Check the error at the centre, the bound and the worst error over the interval, the loop."""
     interval, norm, predictor = design.interval, design.norm, design.predictor
     certificate = certify_error(
         design.error_system(), stability="spectral radius of plant and filter"
@@ -201,7 +201,7 @@ def _certify(design: PolytopicDesign) -> Certificate:
     a1 = interval.coefficient(design.worst_frequency_hz)
     there = error_size(interval.error_system(a1, predictor), norm)
     outside = abs(design.worst_frequency_hz - interval.plant.vibrations[0].frequency_hz)
-    made = _controller(interval.plant, predictor)
+    controller = _controller(interval.plant, predictor)
     search = "grid of frequencies, refined"
     checks = [
         Check(
@@ -238,7 +238,7 @@ def _certify(design: PolytopicDesign) -> Certificate:
         ),
         Check(
             name="controller, against the one made of the filter",
-            value=controller_difference(design.controller, made),
+            value=controller_difference(design.controller, controller),
             limit=NORM_TOLERANCE,
             computed_by="relative, largest entry",
         ),
@@ -248,7 +248,7 @@ def _certify(design: PolytopicDesign) -> Certificate:
 
 
 def _synthesise(interval: FrequencyInterval, norm: str) -> tuple[Controller, float, SolverReport]:
-    """Filter of all axes; those that nothing couples are designed one by one."""
+    """Synthesise the filter of all axes; those that nothing couples are designed one by one."""
     from lbt_synth.linear.lmi.polytopic import SegmentFilter, segment_filter
 
     plant = interval.plant
@@ -329,7 +329,7 @@ def _equal_plants(one: TipTiltPlant, other: TipTiltPlant) -> bool:
 def _expected_error(
     plant: TipTiltPlant, half_width_hz: float, norm: str
 ) -> tuple[FloatArray, float]:
-    """Covariance and size of the error to expect: of a line as wide as the interval."""
+    """Covariance and size of the Kalman error for a line as wide as the interval: a guess."""
     if plant.vibrations:
         hw = plant.hardware
         plant = tip_tilt_plant(

@@ -1,10 +1,10 @@
-"""What a design is."""
+"""Designs: the controller, its certificate, and how it was computed."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict, Unpack
+from typing import Any, Protocol, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class SolverReport:
     route : str
         "riccati", "sdp", "lmi" or "closed form".
     status : str
-        What the method said of itself.
+        What the solver said of itself.
     iterations : int
         Iterations it took.
     """
@@ -85,7 +85,13 @@ class Design:
         return self.controller.to_statespace().to_control()
 
     def recertify(self) -> Certificate:
-        """Compute the certificate anew from the matrices."""
+        """Compute the certificate again from the matrices.
+
+        Returns
+        -------
+        Certificate
+            Passed or not.
+        """
         return self.certificate
 
 
@@ -142,9 +148,9 @@ class FilterDesign(EstimatorDesign):
     gain_filter : (n, q) ndarray
         ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
     gamma_requested : float or None
-        Bound that the H-infinity design was asked for.
+        Bound that the H-infinity design was given.
     rms_requested : float or None
-        Bound on the standard deviation that the design was asked for.
+        Bound on the standard deviation that the design was given.
     gamma_least : float or None
         Norm that a filter of the problem achieves, with the least gamma.
     gamma_infeasible : float or None
@@ -187,13 +193,7 @@ class FilterDesign(EstimatorDesign):
         return self.error_system().poles
 
     def recertify(self) -> Certificate:
-        """Compute the certificate anew from the matrices.
-
-        Returns
-        -------
-        Certificate
-            Passed or not.
-        """
+        """Compute the certificate again from the matrices."""
         return certify_design(self)
 
 
@@ -223,23 +223,45 @@ class IntegratorDesign(Design):
         return close_loop(self.loop_hardware, self.controller).system.poles
 
     def recertify(self) -> Certificate:
-        """Compute the certificate anew from the matrices.
-
-        Returns
-        -------
-        Certificate
-            Passed or not.
-        """
-        return loop_certificate(certify_loop(self.loop_hardware, self.controller))
+        """Compute the certificate again from the matrices."""
+        return replace(UNCERTIFIED, checks=(certify_loop(self.loop_hardware, self.controller),))
 
 
-def loop_certificate(check: Check) -> Certificate:
-    """Certificate of a controller that estimates nothing."""
-    return Certificate(checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0))
+UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))
+AnyDesign = TypeVar("AnyDesign", bound=Design)
+
+
+def with_certificate(design: AnyDesign, hint: str) -> AnyDesign:
+    """Return a design with its certificate; raise CertificateError with a hint if it fails."""
+    return replace(design, certificate=design.recertify().require(hint))
+
+
+class Gains(Protocol):
+    """The two gains of a filter, as :class:`FilterDesign` has them."""
+
+    @property
+    def gain_predictor(self) -> FloatArray:
+        """Gain of the time-and-measurement update."""
+
+    @property
+    def gain_filter(self) -> FloatArray:
+        """Gain of the measurement update alone."""
+
+
+class SolvedGains(Gains, Protocol):
+    """Gains, with what the solver said."""
+
+    @property
+    def status(self) -> str:
+        """What the solver said."""
+
+    @property
+    def iterations(self) -> int:
+        """Iterations it took."""
 
 
 class FilterClaims(TypedDict, total=False):
-    """What a filter design was asked for, and what is claimed of its problem."""
+    """Bounds that a filter design was given, and claims about its problem."""
 
     gamma_requested: float | None
     rms_requested: float | None
@@ -249,7 +271,7 @@ class FilterClaims(TypedDict, total=False):
 
 
 def certify_design(design: FilterDesign) -> Certificate:
-    """Certificate of a filter and its claims, and of its closed loop where it is of a plant."""
+    """Certify a filter, its claims, and its closed loop where its problem is a plant."""
     problem = design.problem
     certificate = certify_filter(
         problem,
@@ -276,7 +298,7 @@ def certify_design(design: FilterDesign) -> Certificate:
                 computed_by="level sets on the symplectic pencil",
             )
         )
-        # a claim without a proof is not believed
+        # a claim without a witness is not believed
         proof = design.witness or Witness(
             states=np.zeros((problem.n_states, 1)),
             disturbances=np.zeros((problem.B.shape[1], 1)),
@@ -294,20 +316,17 @@ def filter_design(
     *,
     method: str,
     solver: SolverReport,
-    **demands: Unpack[FilterClaims],
+    **claims: Unpack[FilterClaims],
 ) -> FilterDesign:
     """Make a design and certify it; raise CertificateError if it fails."""
     design = FilterDesign(
         method=method,
         controller=problem.controller(gain_predictor),
-        certificate=Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
+        certificate=UNCERTIFIED,
         solver=solver,
         problem=problem,
         gain_predictor=gain_predictor,
         gain_filter=gain_filter,
-        **demands,
+        **claims,
     )
-    certificate = design.recertify().require(
-        "Try the other route, or scale the states to similar sizes."
-    )
-    return replace(design, certificate=certificate)
+    return with_certificate(design, "Try the other route, or scale the states to similar sizes.")

@@ -1,4 +1,4 @@
-"""The ready-made robust problem: vibrations in bands, an unknown sensor gain, a margin."""
+"""The robust design: vibrations anywhere in bands, an uncertain sensor gain, a margin."""
 
 from __future__ import annotations
 
@@ -101,12 +101,12 @@ def robust(
     if (low, high) != (1, 1):
         fixed.append(SensorGainRange(low=low, high=high))
     deviations = noise_per_mode(plant.hardware, plant.R)
-    made: dict[tuple[str, int], Specification] = {}
+    by_mode: dict[tuple[str, int], Specification] = {}
     specifications = []
     for noise_nm, model in zip(deviations, plant.turbulence, strict=True):
         # equal modes share one specification, and are solved once
         key = f"{noise_nm:.9g}", 0 if turbulence is not None else id(model)
-        if key not in made:
+        if key not in by_mode:
             spectrum = model if turbulence is None else turbulence
             terms: list[Term] = []
             for gain in gains:
@@ -116,10 +116,10 @@ def robust(
                     )
                 )
                 terms += [replace(line, sensor_gain=gain) for line in lines]
-            made[key] = Specification(
+            by_mode[key] = Specification(
                 objective=Total(terms=tuple(terms)), demands=(*fixed, *further)
             )
-        specifications.append(made[key])
+        specifications.append(by_mode[key])
     design = shape(
         plant.hardware, specifications, functions=functions, pole=pole, states=states, loss=loss
     )

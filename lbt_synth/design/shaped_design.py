@@ -1,4 +1,4 @@
-"""What a shaped design is, and its certificate."""
+"""The shaped design: a controller mode by mode, and its certificate."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate, Check, certify_loop, controller_difference
-from lbt_synth.design.result import Design
+from lbt_synth.design.result import UNCERTIFIED, Design
 from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.design.shaping.specification import Specification
@@ -15,7 +15,7 @@ from lbt_synth.errors import DimensionError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
+from lbt_synth.validation import ComplexArray, FloatArray
 
 _SAME = 1e-9
 _RMS_TOLERANCE = 1e-6
@@ -31,7 +31,7 @@ class ShapedDesign(Design):
     loop_hardware : LoopHardware
         The loop.
     specifications : tuple of Specification
-        One a mode.
+        One per mode.
     parameters : tuple of Controller
         Youla parameter of each mode, from its pseudo-open-loop measurement to its command.
     objective_nm : tuple of float
@@ -76,7 +76,7 @@ class ShapedDesign(Design):
         """Whether the parameters have fewer poles than the long one."""
         return any(p.n_states < self.long_functions for p in self.parameters)
 
-    def demanded(self) -> tuple[tuple[int, str], ...]:
+    def demand_labels(self) -> tuple[tuple[int, str], ...]:
         """Demands in words: mode, demand."""
         return tuple(
             (mode, demand.label)
@@ -106,25 +106,18 @@ class ShapedDesign(Design):
         return tuple(out)
 
     def recertify(self) -> Certificate:
-        """Compute the certificate anew from the matrices.
-
-        Returns
-        -------
-        Certificate
-            Passed or not.
-        """
+        """Compute the certificate again from the matrices."""
         hardware = self.loop_hardware
         checks: list[Check] = []
-        seen: list[tuple[Specification, Controller, float]] = []
+        examined: list[tuple[Specification, Controller, float]] = []
         for mode, (spec, parameter) in enumerate(
             zip(self.specifications, self.parameters, strict=True)
         ):
             claimed = self.objective_nm[mode]
-            if any(spec is s and parameter is p and claimed == c for s, p, c in seen):
+            if any(spec is s and parameter is p and claimed == c for s, p, c in examined):
                 continue
-            seen.append((spec, parameter, claimed))
-            one_of_many = len(self.specifications) > 1
-            prefix = f"mode {mode + 1}: " if one_of_many else ""
+            examined.append((spec, parameter, claimed))
+            prefix = f"mode {mode + 1}: " if len(self.specifications) > 1 else ""
             checks += [
                 replace(check, name=prefix + check.name)
                 for check in _mode_checks(hardware, spec, parameter, claimed)
@@ -135,17 +128,15 @@ class ShapedDesign(Design):
                 name="controller against its parameters",
                 value=controller_difference(self.controller, whole),
                 limit=_SAME,
-                computed_by="matrices assembled anew",
+                computed_by="matrices assembled again",
             ),
             certify_loop(hardware, self.controller),
         ]
         if checks[-1].passed:
-            checks.append(self._decoupled())
-        return Certificate(
-            checks=tuple(checks), gamma=np.nan, rms_per_output=frozen_copy(np.zeros(0))
-        )
+            checks.append(self._decoupling_check())
+        return replace(UNCERTIFIED, checks=tuple(checks))
 
-    def _decoupled(self) -> Check:
+    def _decoupling_check(self) -> Check:
         """Check that the whole loop rejects what the loops of the single modes reject."""
         f = np.array(_TEST_HZ) * self.loop_hardware.frame_rate_hz
         whole = close_loop(self.loop_hardware, self.controller).sensitivity(f)
@@ -164,11 +155,11 @@ class ShapedDesign(Design):
 def _mode_checks(
     hardware: LoopHardware, spec: Specification, parameter: Controller, objective_nm: float
 ) -> list[Check]:
-    radius = parameter.to_statespace().spectral_radius
+    """Check the parameter of one mode: stable, its demands met, its objective as claimed."""
     checks = [
         Check(
             name="spectral radius of the parameter",
-            value=radius,
+            value=parameter.to_statespace().spectral_radius,
             limit=1 - 1e-9,
             computed_by="eigenvalues",
         )
@@ -209,7 +200,7 @@ def require_separable(hardware: LoopHardware) -> None:
 def controller_from_parameters(
     hardware: LoopHardware, parameters: tuple[Controller, ...]
 ) -> Controller:
-    """Return the controller of the whole loop: the modes' parameters side by side."""
+    """Join the Youla parameters of all modes in the controller of the whole loop."""
     back = np.linalg.pinv(hardware.sensor)
     sizes = [p.n_states for p in parameters]
     n, modes = sum(sizes), len(parameters)

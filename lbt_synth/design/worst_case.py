@@ -1,9 +1,9 @@
-"""The worst error of a fixed estimator over an interval of frequencies: found, and guaranteed.
+"""The worst error of an estimator over an interval of frequencies: searched for, and bounded.
 
-Two computations that share no more than the error system. The one searches the interval and
-can only be too low. The other can only be too high: for the norm it is exact, by the envelope
-of all plants (:meth:`FrequencyInterval.envelope`); for the variance it is a branch and bound
-with a bound on the curvature.
+The two share no more than the error system. The search can only be too low. The bound can only
+be too high: for the norm it is exact, by the envelope of all plants
+(:meth:`FrequencyInterval.envelope`); for the variance it is a branch and bound with a bound on
+the curvature.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lbt_synth.linear.norms import band_norm
 from lbt_synth.models.plant.frequency_interval import FrequencyInterval
 
 _GRID = 33
-_GAP = 1e-4  # of the variance, between what is guaranteed and what was found
+_GAP = 1e-4  # relative, between the bound of the variance and one that occurs
 _MOST_PARTS = 20_000
 
 
@@ -35,7 +35,7 @@ def error_size(error: StateSpace, norm: str) -> float:
 def search_worst_error(
     interval: FrequencyInterval, estimator: Controller, norm: str
 ) -> tuple[float, float]:
-    """Worst error on a grid of frequencies, refined, and where it is [Hz]."""
+    """Return the worst error on a grid of frequencies, refined, and where it is [Hz]."""
 
     def size(frequency_hz: float) -> float:
         a1 = interval.coefficient(frequency_hz)
@@ -56,7 +56,7 @@ def search_worst_error(
 
 
 def bound_worst_error(interval: FrequencyInterval, estimator: Controller, norm: str) -> float:
-    """Bound of the error on all of the interval."""
+    """Return a bound of the error on all of the interval."""
     if norm == "hinf":
         ends = [hinf_norm(interval.error_system(a, estimator)) for a in interval.coefficients]
         system, low_hz, high_hz = interval.envelope(estimator)

@@ -95,9 +95,9 @@ def test_truths_of_other_loops_are_refused():
         lambda truth: lbt.simulate(design.controller, truth, hardware=single, frames=9, seed=0),
         lambda truth: lbt.design.optimal_integrator(single, truth),
     ):
-        with pytest.raises(lbt.errors.DimensionError, match=r"one a mode \(1\); got 2"):
+        with pytest.raises(lbt.errors.DimensionError, match=r"one per mode \(1\); got 2"):
             act(two)
-        with pytest.raises(lbt.errors.DimensionError, match=r"one a measurement \(1\); got 2"):
+        with pytest.raises(lbt.errors.DimensionError, match=r"one per measurement \(1\); got 2"):
             act(noisy)
     for wrong in ({"noise_nm": [1.0]}, {"noise_nm": 1.0, "sensor_gain": [1.0]}):
         with pytest.raises(lbt.errors.DimensionError, match="measurement"):

@@ -183,7 +183,10 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
         ),
         (lambda: lbt.design.shaping.Total(terms=()), "at least one term"),
         (lambda: lbt.design.shaping.Total(terms=(3,)), "an objective is made of"),
-        (lambda: lbt.design.shaping.Worst(terms=(BASIC,), weights=(1, 2)), "one a term, 1; got 2"),
+        (
+            lambda: lbt.design.shaping.Worst(terms=(BASIC,), weights=(1, 2)),
+            "one per term, 1; got 2",
+        ),
         (lambda: lbt.design.shaping.ModulusMargin(at_least=1), "at_least must be below 1"),
         (lambda: lbt.design.shaping.NoisePeak(at_most=0), "at_most must be above 0"),
         (

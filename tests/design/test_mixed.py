@@ -134,7 +134,7 @@ def test_a_mixed_filter_is_a_design_like_any_other(tmp_path, plant):
         ({"rms": 140.0, "taps": 65}, lbt.errors.ProblemError, "taps must be at most 64"),
     ],
 )
-def test_wrong_demands(plant, arguments, error, text):
+def test_wrong_bounds_are_refused(plant, arguments, error, text):
     with pytest.raises(error, match=text):
         lbt.mixed(plant, **arguments)
 
@@ -153,7 +153,7 @@ def test_a_plant_with_its_commands_as_states(plant):
     assert lbt.close_loop(design.hardware, design.controller).is_stable
 
 
-def test_a_plant_with_memory_is_not_assembled_anew(plant):
+def test_a_plant_with_memory_is_not_assembled_again(plant):
     design = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
     for again in (
         lambda: design.problem.ahead(2),

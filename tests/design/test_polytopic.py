@@ -27,7 +27,7 @@ def made():
 
 
 @pytest.mark.parametrize("norm", ["hinf", "h2"])
-def test_the_bar(made, norm):
+def test_bound_and_worst_error_are_close(made, norm):
     design = made[norm, 1.0]
     assert design.method == f"polytopic-{norm}"
     assert design.certificate.passed
@@ -136,7 +136,7 @@ def test_another_horizon_is_another_delay(plant):
     assert design.bound_guaranteed > lbt.hinf(plant, horizon=2, route="riccati").gamma_least
 
 
-def test_wrong_demands(plant):
+def test_wrong_arguments_are_refused(plant):
     lines = [plant.vibrations[0], plant.vibrations[0].retuned(30, frame_rate_hz=RATE)]
     common = {
         "frame_rate_hz": RATE,

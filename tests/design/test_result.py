@@ -35,8 +35,8 @@ def test_an_unstable_optimal_filter_does_not_leave_the_library(monkeypatch, axis
     module = sys.modules["lbt_synth.design.hinf"]
 
     class Liar(module._RiccatiRoute):
-        def at(self, gamma):
-            return dataclasses.replace(super().at(gamma), gain_predictor=np.full((4, 1), 5.0))
+        def central(self, gamma):
+            return dataclasses.replace(super().central(gamma), gain_predictor=np.full((4, 1), 5.0))
 
     monkeypatch.setattr(module, "_RiccatiRoute", Liar)
     with pytest.raises(lbt.errors.CertificateError, match="spectral radius of the filter"):

@@ -1,4 +1,4 @@
-"""Banks: many small controllers of the same size, worked on at once."""
+"""Banks: many small controllers of the same size, computed together."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from lbt_synth.validation import FloatArray, float_array
 class Bank:
     """Controllers in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``."""
 
-    modes: np.ndarray  # (N, w): modes that each controller measures and commands, w of them
-    # A, B, C, D (N, s, s): the controllers
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
+    modes: np.ndarray  # (N, w), modes that each controller measures and commands
+    A: FloatArray  # (N, s, s)
+    B: FloatArray  # (N, s, w)
+    C: FloatArray  # (N, w, s)
+    D: FloatArray  # (N, w, w)
 
     @property
     def width(self) -> int:

@@ -1,4 +1,4 @@
-"""Closed loops of banks of controllers, and the variances that they leave."""
+"""Closed loops of many controllers, and the variances that they leave."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from lbt_synth.validation import FloatArray
 class LoopBlock:
     """Closed loops of one bank, from ``[phi_tot, noise]`` to ``[phi_res, u]``."""
 
-    modes: np.ndarray  # (N, w): modes of each loop
-    # A, B, C, D (N, s, s): the loops
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
+    modes: np.ndarray  # (N, w), modes of each loop
+    A: FloatArray  # (N, s, s)
+    B: FloatArray  # (N, s, 2 w)
+    C: FloatArray  # (N, 2 w, s)
+    D: FloatArray  # (N, 2 w, 2 w)
 
 
 def close_bank(bank: Bank, sensor_gain: FloatArray, mirror: Response) -> LoopBlock:

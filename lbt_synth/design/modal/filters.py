@@ -1,4 +1,4 @@
-"""A Kalman filter for every mode, all of them designed and certified in one call."""
+"""Kalman filters of all modes, designed and certified in one call."""
 
 from __future__ import annotations
 
@@ -209,10 +209,10 @@ def modal_filters(
     )
     lines = lines_per_mode(vibrations, n)
     response = hardware.mirror_system.whole
-    stacks = plant_batches(
+    batches = plant_batches(
         air, lines, noise_nm=noise, delay_frames=hardware.delay_frames, sensor_gain=gain
     )
-    s = max(stack.A.shape[-1] for stack in stacks)
+    s = max(batch.A.shape[-1] for batch in batches)
     c = s + response.n_states
     parts = {
         "gain_predictor": np.zeros((n, s)),
@@ -223,12 +223,12 @@ def modal_filters(
     }
     poles = np.zeros((n, s), dtype=np.complex128)
     states = np.zeros(n, dtype=np.int64)
-    examined = ModalChecks(n)
-    for stack in stacks:
-        modes, size = stack.modes, stack.A.shape[-1]
-        solution = _solve_filters(stack)
+    checks = ModalChecks(n)
+    for batch in batches:
+        modes, size = batch.modes, batch.A.shape[-1]
+        solution = _solve_filters(batch)
         gains = np.array(transpose(solution.gain_feedback))
-        A, B, C, D = stack.controllers(gains, response)
+        A, B, C, D = batch.controllers(gains, response)
         used = A.shape[-1]
         states[modes], poles[modes, :size] = size, solution.poles
         parts["gain_predictor"][modes, :size] = gains[..., 0]
@@ -236,13 +236,15 @@ def modal_filters(
         parts["C"][modes, :, :used], parts["D"][modes] = C, D
         bank = Bank(modes=modes[:, None], A=A, B=B, C=C, D=D)
         block = close_bank(bank, gain, response)
-        examined.filters(stack, gains, solution)
-        examined.loops(modes, spectral_radii(block.A), *block_variances(block, air, lines, noise))
+        checks.add_filters(batch, gains, solution)
+        checks.add_loops(modes, spectral_radii(block.A), *block_variances(block, air, lines, noise))
     whole = hardware.delay_frames >= 2 and hardware.delay_frames == int(hardware.delay_frames)
-    certificate = examined.certificate(applied=whole and mirror is None).require(
+    certificate = checks.certificate(applied=whole and mirror is None).require(
         "Scale the noise or the turbulence of these modes to sizes that occur."
     )
-    poles.setflags(write=False)
+    controller_states = states + response.n_states
+    for array in (poles, states, controller_states):
+        array.setflags(write=False)
     return ModalFilters(
         turbulence=air,
         vibrations=lines,
@@ -250,27 +252,22 @@ def modal_filters(
         sensor_gain=gain,
         delay_frames=hardware.delay_frames,
         mirror=mirror,
-        states=_read_only(states),
-        controller_states=_read_only(states + response.n_states),
+        states=states,
+        controller_states=controller_states,
         poles=poles,
-        rms_nm=frozen_copy(np.sqrt(examined.residual)),
+        rms_nm=frozen_copy(np.sqrt(checks.residual)),
         certificate=certificate,
         **{name: frozen_copy(part) for name, part in parts.items()},
     )
 
 
-def _solve_filters(stack: PlantBatch) -> DareSolution:
-    """Solve the filter equations of a stack."""
+def _solve_filters(batch: PlantBatch) -> DareSolution:
+    """Solve the filter equations of a batch."""
     try:
-        return solve_dare(transpose(stack.A), transpose(stack.C), stack.Q, stack.R)
+        return solve_dare(transpose(batch.A), transpose(batch.C), batch.Q, batch.R)
     except (DetectabilityError, NumericalError) as error:
         raise NumericalError(
-            f"the filters of {name_modes(stack.modes)} were not all found (their equations are "
+            f"the filters of {name_modes(batch.modes)} were not all found (their equations are "
             f"counted from 0 in this order): {error}",
             status="riccati",
         ) from error
-
-
-def _read_only(array: IntArray) -> IntArray:
-    array.setflags(write=False)
-    return array

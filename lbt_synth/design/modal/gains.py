@@ -1,4 +1,4 @@
-"""Optimised modal gains: for every mode the integrator gain of least residual.
+"""Optimised modal gains: the integrator gain of least residual for every mode.
 
 E. Gendron, P. Lena, Astron. Astrophys. 291, 337 (1994). All modes see the same delay, so with
 the loop gain ``h = sensor_gain * gain`` they have the same transfer functions: the residual of
@@ -33,14 +33,14 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_cop
 Density = Callable[[FloatArray], FloatArray]
 
 _GRID = 161  # loop gains
-_HIGHEST = 0.9999  # of the stability limit: end of the grid
-_RESONANT = (0.3, 0.6, 0.8, 0.9, 0.97, 0.99, 0.999)  # of the limit: resonances that are resolved
-_WINDOW = 10  # points of a polynomial
+_HIGHEST = 0.9999  # end of the grid, as a part of the stability limit
+_RESONANT = (0.3, 0.6, 0.8, 0.9, 0.97, 0.99, 0.999)  # parts of it whose resonance is resolved
+_WINDOW = 10  # points that a polynomial interpolates
 _GOLDEN = (np.sqrt(5) - 1) / 2
-_STEPS = 45  # golden sections: 1e-9 of the bracket
-_NODES = 6  # a panel
+_STEPS = 45  # golden sections, to 1e-9 of the bracket
+_NODES = 6  # per panel
 _HALVINGS = 8
-_SETTLED = 1e-6  # change of variances by the last halving
+_SETTLED = 1e-6  # relative change of variances by the last halving
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -166,7 +166,7 @@ def _densities(spectra: ModalTurbulence | Sequence[Spectrum], rate: float) -> tu
     each = tuple(spectra) if isinstance(spectra, Sequence) else ()
     if not each or not all(isinstance(spectrum, Spectrum) for spectrum in each):
         raise ProblemError(
-            "spectra must be ModalTurbulence, or a list with one spectrum a mode (objects with "
+            "spectra must be ModalTurbulence, or a list with one spectrum per mode (objects with "
             f"psd(frequency_hz)); got {type(spectra).__name__}."
         )
     for spectrum in each:
@@ -175,11 +175,11 @@ def _densities(spectra: ModalTurbulence | Sequence[Spectrum], rate: float) -> tu
 
     distinct = {id(spectrum): spectrum for spectrum in each}
 
-    def evaluated(frequency: FloatArray) -> FloatArray:
+    def evaluate(frequency: FloatArray) -> FloatArray:
         known = {i: np.asarray(one.psd(frequency), np.float64) for i, one in distinct.items()}
         return np.stack([known[id(one)] for one in each])
 
-    return evaluated, len(each)
+    return evaluate, len(each)
 
 
 def _require_rate(own: float, rate: float) -> None:
@@ -192,7 +192,7 @@ def _require_rate(own: float, rate: float) -> None:
 def _own_edges(
     spectra: ModalTurbulence | Sequence[Spectrum], lines: Lines, rate: float
 ) -> FloatArray:
-    """Edges of panels where spectra have peaks or kinks, in units of the Nyquist frequency."""
+    """Return panel edges where spectra have peaks or kinks, over the Nyquist frequency."""
     models = [line.ar_model(rate) for own in lines for line in own]
     if isinstance(spectra, ModalTurbulence):
         edges = [pole_edges(_distinct_poles(np.linalg.eigvals(spectra.companions).ravel()))]
@@ -206,9 +206,9 @@ def _own_edges(
 
 
 def _distinct_poles(poles: Any) -> ComplexArray:
-    """Leave out poles that have the place and the distance from the circle of another one.
+    """Leave out poles so close to another one that the same panels fit both peaks.
 
-    Both to a quarter of that distance, which is the width of the peak: panels fit all of them.
+    Their angles and distances from the circle agree to a quarter of the width of the peak.
     """
     inside = poles[np.abs(poles) < 1]
     steps = np.round(np.log(1 - np.abs(inside)) * 4)
@@ -227,7 +227,7 @@ def find_gains(
     margin: float,
     differenced: bool = False,
 ) -> ModalGains:
-    """Find the gains on finer and finer panels, until residuals and gains stand still.
+    """Find the gains on finer and finer panels, until residuals and gains no longer change.
 
     Shapes: own_edges (e,), noise, gain (n,).
     """
@@ -294,7 +294,7 @@ def find_gains(
 
 
 def _is_settled(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> bool:
-    """Whether gains and variances are the same to what is asked."""
+    """Whether gains and variances no longer change."""
     variance = np.max(np.abs(one[1] / other[1] - 1))
     return bool(variance < _SETTLED and np.max(np.abs(one[0] / other[0] - 1)) < 1e-4)
 
@@ -312,7 +312,7 @@ def _transfers(
 ) -> tuple[FloatArray, FloatArray]:
     """Squared moduli (gains, f) of phase and of noise over sensor gain to the residual.
 
-    The phase is replaced by its difference of two frames, if that is wanted.
+    ``differenced``: the phase is its difference of two frames.
     """
     delay = np.exp(-2j * np.pi * turns)
     mirror: ComplexArray = np.polynomial.polynomial.polyval(delay, np.asarray(taps))
@@ -325,7 +325,7 @@ def _transfers(
 def _minimise(
     loop_gains: FloatArray, variances: FloatArray, limit: float, highest: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Loop gain of least variance of each mode, up to the highest one, and that variance."""
+    """Return the loop gain of least variance of each mode, up to the highest, and that variance."""
     count = len(variances)
     step = np.log(loop_gains[1] / loop_gains[0])
     top = np.log(highest / loop_gains[0]) / step  # place on the grid, a fraction

@@ -1,9 +1,6 @@
-"""The loop closed around the controllers of many modes: exact residuals, and long series.
+"""Closed loops of many modes: exact residuals, and long series.
 
-The frames are those of :class:`LoopHardware` with a unit sensor and mirror. A noise that
-comes before a sensor of gain g is like a phase: with ``r'(k) = phi_res(k) + noise(k+1) / g``
-and ``phi'(k) = phi_tot(k) + noise(k+1) / g`` the loop has the one input phi', the one output r',
-and measures ``y(k) = g r'(k-1)``. The series are therefore filtered once, not twice.
+The frames are those of :class:`LoopHardware` with a unit sensor and mirror.
 """
 
 from __future__ import annotations
@@ -25,6 +22,7 @@ from lbt_synth.design.modal.filters import ModalFilters
 from lbt_synth.design.modal.mixed_controller import MixedController
 from lbt_synth.design.modal.plants import as_modal_turbulence, lines_per_mode, number_per_mode
 from lbt_synth.design.modal.reconstructor import name_modes
+from lbt_synth.design.modal.series import filter_phase, residual_system
 from lbt_synth.errors import (
     DimensionError,
     NonFiniteError,
@@ -47,7 +45,7 @@ class ModalRun:
     residual_nm : (n, frames) ndarray
         Residual phase [nm].
     commands, measurements : (n, frames) ndarray or None
-        Commands u(k) and measurements y(k) [nm], where they were asked for.
+        Commands u(k) and measurements y(k) [nm], with ``all_series``.
     rms_nm : (n,) ndarray
         Residual of each mode [nm rms].
     """
@@ -232,49 +230,26 @@ class ModalLoop:
             )
         scaled = noise if np.all(self.sensor_gain == 1) else noise / self.sensor_gain[:, None]
         with np.errstate(all="ignore"):  # what is not finite is refused below
-            residual, commands = self._filtered(total, scaled, with_commands=all_series)
-        measurements = None
-        if all_series:
-            measurements = noise.copy()
+            residual, commands = filter_phase(
+                self.blocks, self.systems, total, scaled, with_commands=all_series
+            )
+        measurements = noise.copy() if all_series else None
+        if measurements is not None:
             measurements[:, 1:] += self.sensor_gain[:, None] * residual[:, :-1]
         kept = residual[:, settle:]
         rms = np.sqrt(np.einsum("mf,mf->m", kept, kept) / kept.shape[1])
         if not np.isfinite(residual[:, -1]).all() or not np.isfinite(rms).all():
             real_array(total, "total_nm"), real_array(noise, "noise_nm")
             raise NonFiniteError("the residual must be finite; its numbers ran out of range.")
+        for series in (residual, commands, measurements):
+            if series is not None:
+                series.setflags(write=False)
         return ModalRun(
-            residual_nm=_read_only(kept),
-            commands=None if commands is None else _read_only(commands[:, settle:]),
-            measurements=None if measurements is None else _read_only(measurements[:, settle:]),
+            residual_nm=residual[:, settle:],
+            commands=None if commands is None else commands[:, settle:],
+            measurements=None if measurements is None else measurements[:, settle:],
             rms_nm=frozen_copy(rms),
         )
-
-    def _filtered(
-        self, total: FloatArray, scaled: FloatArray, *, with_commands: bool
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Residual, and commands if they are wanted, of all modes."""
-        if len(self.blocks) == 1 and not with_commands:
-            modes = self.blocks[0].modes
-            if modes.shape[1] == 1 and isinstance(_index(modes[:, 0]), slice):
-                # all modes in their order: no other array is needed
-                joined = _joined(self.blocks[0], total, scaled)
-                only = self.systems[0].filter(joined, in_place=True)[:, 1:, 0]
-                only[:, :-1] -= scaled[:, 1:]
-                return only, None
-        residual = np.empty(total.shape)
-        commands = np.empty(total.shape) if with_commands else None
-        for block, system in zip(self.blocks, self.systems, strict=True):
-            w = block.modes.shape[1]
-            if with_commands:
-                system = BatchedSystems(block.A, block.B[..., :w], block.C, block.D[..., :w])
-            out = system.filter(_joined(block, total, scaled))[:, 1:]
-            for i in range(w):
-                which = _index(block.modes[:, i])
-                residual[which] = out[..., i]
-                residual[which, :-1] -= scaled[which, 1:]
-                if commands is not None:
-                    commands[which] = out[..., w + i]
-        return residual, commands
 
 
 def modal_loop(
@@ -340,20 +315,19 @@ def modal_loop(
     hardware, rate = _path(controller, delay_frames, mirror, frame_rate_hz)
     n = controller.n_modes
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
+    mirror_response = hardware.mirror_system.whole
+    blocks = tuple(close_bank(bank, gain, mirror_response) for bank in controller.banks())
     radii = np.zeros(n)
-    blocks = []
-    for bank in controller.banks():
-        block = close_bank(bank, gain, hardware.mirror_system.whole)
+    for block in blocks:
         radii[block.modes] = spectral_radii(block.A)[:, None]
-        blocks.append(block)
     return ModalLoop(
         delay_frames=hardware.delay_frames,
         frame_rate_hz=rate,
         mirror=hardware.mirror,
         sensor_gain=gain,
         spectral_radii=frozen_copy(radii),
-        blocks=tuple(blocks),
-        systems=tuple(_residual_systems(block) for block in blocks),
+        blocks=blocks,
+        systems=tuple(residual_system(block) for block in blocks),
     )
 
 
@@ -363,7 +337,7 @@ def _path(
     mirror: PositionLoop | None,
     frame_rate_hz: float | None,
 ) -> tuple[LoopHardware, float | None]:
-    """Return the path of one mode, from what is given and what the controller is for; its rate."""
+    """Return the hardware of one mode, from what is given or else designed for, and its rate."""
     period, designed = controller.dt_s, controller.hardware
     rate = None if period is None else 1 / period
     if frame_rate_hz is not None:
@@ -385,33 +359,3 @@ def _path(
         mirror=mirror,
     )
     return path, rate
-
-
-def _residual_systems(block: LoopBlock) -> BatchedSystems:
-    w = block.modes.shape[1]
-    return BatchedSystems(block.A, block.B[..., :w], block.C[:, :w], block.D[:, :w, :w])
-
-
-def _joined(block: LoopBlock, total: FloatArray, scaled: FloatArray) -> FloatArray:
-    """Return phi' of a block's modes, (N, frames + 1, w), of the frames -1, 0, ..."""
-    count, w = block.modes.shape
-    out = np.empty((count, total.shape[1] + 1, w))
-    for i in range(w):
-        which = _index(block.modes[:, i])
-        noise, entry = scaled[which], out[:, :, i]
-        entry[:, 0] = noise[:, 0]
-        np.add(total[which, :-1], noise[:, 1:], out=entry[:, 1:-1])
-        entry[:, -1] = total[which, -1]
-    return out
-
-
-def _index(modes: np.ndarray) -> Any:
-    """Return a slice where the modes are consecutive: no copies are made then."""
-    first, last = int(modes[0]), int(modes[-1])
-    consecutive = last - first + 1 == modes.size and np.all(np.diff(modes) == 1)
-    return slice(first, last + 1) if consecutive else modes
-
-
-def _read_only(array: FloatArray) -> FloatArray:
-    array.setflags(write=False)
-    return array

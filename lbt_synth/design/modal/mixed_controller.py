@@ -1,4 +1,4 @@
-"""Mixed modal control: a filter for some modes, an integrator for each of the others.
+"""The mixed controller: a filter for some modes, an integrator for each of the others.
 
 Agapito et al. (2008), section III: tip and tilt, where telescopes shake, go to an optimal
 filter; every other mode keeps the integrator of classical modal control.
@@ -82,12 +82,14 @@ class MixedController:
         gains = real_array(self.gains, "gains")
         if gains.ndim != 1 or gains.size == 0:
             raise DimensionError(
-                f"gains must be a list, one number a mode; got shape {gains.shape}."
+                f"gains must be a list, one number per mode; got shape {gains.shape}."
             )
         n = gains.size
         leak = real_array(self.leak, "leak")
         if leak.shape not in ((), (n,)):
-            raise DimensionError(f"leak must be one number, or one a mode ({n}); got {leak.shape}.")
+            raise DimensionError(
+                f"leak must be one number, or one per mode ({n}); got {leak.shape}."
+            )
         if np.any(gains < 0):
             raise ProblemError(f"gains must be at least 0; got {gains.min():.6g}.")
         if np.any(leak < 0) or np.any(leak > 1):
@@ -98,8 +100,8 @@ class MixedController:
             require_instance(self.reconstructor, Reconstructor)
             if self.reconstructor.n_modes != n:
                 raise DimensionError(
-                    f"gains must be one a mode of the reconstructor, {self.reconstructor.n_modes}; "
-                    f"got {n}."
+                    "gains must be one per mode of the reconstructor, "
+                    f"{self.reconstructor.n_modes}; got {n}."
                 )
         self.gains, self.leak = gains, frozen_copy(np.broadcast_to(leak, (n,)))
         self._gain, self._leak = np.array(self.gains), np.array(self.leak)
@@ -216,7 +218,7 @@ class MixedController:
             own = float_array(self._running.step(measured[self._modes]), "the filter's commands")
             if own.shape != self._modes.shape:
                 raise DimensionError(
-                    f"the filter's commands must have shape {self._modes.shape}, one a filtered "
+                    f"the filter's commands must have shape {self._modes.shape}, one per filtered "
                     f"mode; got {own.shape}."
                 )
             if not np.isfinite(own).all():
@@ -266,7 +268,7 @@ class MixedController:
         Returns
         -------
         Controller
-            From y to u, its states those of the filter and one an integrator.
+            From y to u, its states those of the filter and one per integrator.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Stacks of plants, one mode each: what :func:`tip_tilt_plant` assembles for a single mode."""
+"""Plants of many modes: what :func:`tip_tilt_plant` makes for one, in arrays."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Lines = tuple[tuple[Vibration, ...], ...]
 def number_per_mode(
     value: Any, name: str, modes: int, *, zero: bool = False, at_most: float = np.inf
 ) -> FloatArray:
-    """Return one positive number a mode, (n,), from one for all or one each."""
+    """Return one positive number per mode, (n,), from one for all or one each."""
     given = real_array(value, name)
     if given.shape not in ((), (modes,)):
         raise DimensionError(
-            f"{name} must be one number, or one a mode ({modes}); got shape {given.shape}."
+            f"{name} must be one number, or one per mode ({modes}); got shape {given.shape}."
         )
     low = float(np.min(given, initial=np.inf))
     if low < 0 or (low == 0 and not zero):
@@ -74,21 +74,18 @@ def lines_per_mode(
 class Disturbances:
     """Total phase of some modes as linear systems: ``x+ = A x + B v``, ``phi_tot = row x``."""
 
-    A: FloatArray  # (N, k, k): state matrices: vibrations now and before, turbulence
-    B: FloatArray  # (N, k, p + 1): from white noise of unit variance
-    row: FloatArray  # (N, k): to the newest sample of the phase
+    A: FloatArray  # (N, k, k); states: vibrations now and before, turbulence
+    B: FloatArray  # (N, k, p + 1), from white noise of unit variance
+    row: FloatArray  # (N, k), to the newest sample of the phase
 
 
 def disturbances(turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray) -> Disturbances:
-    """Systems of some modes, all of the size of the one with the most vibrations."""
+    """Return the systems of some modes, all of the size of the one with most vibrations."""
     count, order = len(modes), turbulence.order
     p = max((len(lines[i]) for i in modes), default=0)
     size = 2 * p + order
-    A, B, row = (
-        np.zeros((count, size, size)),
-        np.zeros((count, size, p + 1)),
-        np.zeros((count, size)),
-    )
+    A, row = np.zeros((count, size, size)), np.zeros((count, size))
+    B = np.zeros((count, size, p + 1))
     now, before, tur = np.arange(p), np.arange(p, 2 * p), 2 * p
     each = [(i, j, line) for i, mode in enumerate(modes) for j, line in enumerate(lines[mode])]
     if each:
@@ -109,14 +106,12 @@ def disturbances(turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray) -
 class PlantBatch:
     """Estimation problems of modes that have the same number of states."""
 
-    modes: np.ndarray  # (N,): numbers of the modes
-    # A, Q (N, s, s): state matrices and covariances of the process noise
-    A: FloatArray
-    Q: FloatArray
-    # C, L (N, 1, s): to the measurement, and to the signal that is estimated
-    C: FloatArray
-    L: FloatArray
-    R: FloatArray  # (N, 1, 1): variance of the measurement noise
+    modes: np.ndarray  # (N,)
+    A: FloatArray  # (N, s, s)
+    Q: FloatArray  # (N, s, s), covariances of the process noise
+    C: FloatArray  # (N, 1, s), to the measurement
+    L: FloatArray  # (N, 1, s), to the signal that is estimated
+    R: FloatArray  # (N, 1, 1), variances of the measurement noise
 
     def controllers(self, gains: FloatArray, mirror: Response) -> tuple[FloatArray, ...]:
         """Return controllers ``A, B, C, D`` of predictor gains (N, s, 1), in new-state form.
@@ -126,11 +121,7 @@ class PlantBatch:
         count, s = self.A.shape[:2]
         size = s + mirror.n_states
         sensor = self.C[:, :, -1:]  # the measurement is of the oldest phase
-        A, C, L = (
-            np.zeros((count, size, size)),
-            np.zeros((count, 1, size)),
-            np.zeros((count, 1, size)),
-        )
+        A, (C, L) = np.zeros((count, size, size)), np.zeros((2, count, 1, size))
         A[:, :s, :s], C[..., :s], L[..., :s] = self.A, self.C, self.L
         A[:, s:, s:], C[..., s:] = mirror.A, -sensor * mirror.C
         B, known = np.zeros((2, count, size, 1))
@@ -139,8 +130,8 @@ class PlantBatch:
         A += (known + mirror.D * B * sensor) @ L - B @ C
         return A, B, L, np.zeros((count, 1, 1))
 
-    def errors(self, gains: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """State matrices and driving covariances of the estimation errors."""
+    def error_systems(self, gains: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the state matrices and driving covariances of the estimation errors."""
         A = self.A - gains @ self.C
         return A, self.Q + gains @ self.R @ transpose(gains)
 
@@ -153,11 +144,11 @@ def plant_batches(
     delay_frames: float,
     sensor_gain: FloatArray,
 ) -> list[PlantBatch]:
-    """Plants of all modes, one stack for each number of vibrations."""
+    """Return the plants of all modes, one batch for each number of vibrations."""
     counts = np.array([len(each) for each in lines])
     steps = max(int(np.ceil(delay_frames)), 2)
     late, chain = steps - delay_frames, steps - 1
-    stacks = []
+    batches = []
     for lines_each in np.unique(counts):
         modes = np.flatnonzero(counts == lines_each)
         d = disturbances(turbulence, lines, modes)
@@ -171,5 +162,5 @@ def plant_batches(
         C[:, 0, -1] = sensor_gain[modes]
         L[:, 0, :k], L[:, 0, k] = (1 - late) * d.row, late
         R = noise_nm[modes, None, None] ** 2
-        stacks.append(PlantBatch(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
-    return stacks
+        batches.append(PlantBatch(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
+    return batches

@@ -1,4 +1,4 @@
-"""From slopes to modes: the generalised inverse of an interaction matrix, and a cleaner basis."""
+"""Reconstructors from slopes to modes, and modes made orthogonal to others."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def reconstructor(
     Parameters
     ----------
     interaction_matrix : (q, n) array_like
-        Slopes that a unit of each mode gives, one column a mode.
+        Slopes that a unit of each mode gives, one column per mode.
     condition : float, optional
         Greatest condition number: singular values below the largest over this are left out.
     kept : int, optional
@@ -207,7 +207,8 @@ def project_out(
         w = real_array(weights, "weights")
         if w.shape != (len(phase),):
             raise DimensionError(
-                f"weights must have shape ({len(phase)},), one a point of the pupil; got {w.shape}."
+                f"weights must have shape ({len(phase)},), one per point of the pupil; got "
+                f"{w.shape}."
             )
         if np.any(w < 0) or not np.any(w):
             raise ProblemError(f"weights must be at least 0, and not all 0; got {np.min(w):.6g}.")

@@ -23,7 +23,7 @@ from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import FloatArray, integer, real_array
 
-_QUIET = 0.4  # of the frame rate: the noise is found above
+_QUIET = 0.4  # of the frame rate, above which the noise is found
 
 
 def modal_gains_from_telemetry(
@@ -47,7 +47,7 @@ def modal_gains_from_telemetry(
     Parameters
     ----------
     measurements, commands : (frames, n) array_like
-        Modal measurements y(k) and commands u(k) [nm], a row a frame as in telemetry.
+        Modal measurements y(k) and commands u(k) [nm], one row per frame as in telemetry.
     frame_rate_hz : float
         Frame rate [Hz].
     noise_nm : float or (n,) array_like, optional

@@ -1,4 +1,4 @@
-"""A band of frequencies."""
+"""The band of frequencies from which terms and demands derive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lbt_synth.validation import number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Band:
-    """Band from ``low_hz`` to ``high_hz``, both included; what terms and demands derive from.
+    """Band from ``low_hz`` to ``high_hz``, both included.
 
     Raises
     ------

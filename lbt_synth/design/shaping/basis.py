@@ -23,9 +23,9 @@ from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 class Basis:
     """Orthonormal functions ``Phi(z) = z (z I - A)^-1 B``, ``A A' + B B' = I``."""
 
-    A: FloatArray  # (n, n): state matrix
-    B: FloatArray  # (n, 1): input matrix
-    dt_s: float  # Sampling period [s]
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n, 1)
+    dt_s: float
 
     @property
     def size(self) -> int:
@@ -50,9 +50,7 @@ class Basis:
 
 
 def orthonormal_basis(poles: ComplexArray, *, dt_s: float) -> Basis:
-    """Return the orthonormal functions with given poles.
-
-    Shapes: poles (n,).
+    """Return the orthonormal functions with given poles, (n,).
 
     Examples
     --------

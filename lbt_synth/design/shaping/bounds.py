@@ -1,7 +1,7 @@
-"""Bounds on the closed loop: margin, noise, rejection, commands.
+"""Demands that bound the closed loop: margin, noise, rejection, commands.
 
-Each demand turns into convex constraints at given frequencies, drawn in by a little room,
-and into checks of the real loop over all frequencies that know nothing of the programme.
+Each demand gives convex constraints at given frequencies, slightly tightened, and checks of
+the real loop over all frequencies, which know nothing of the programme.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One mode of the loop, as responses that are affine in the coefficients of its parameter.
+"""One mode of the loop: responses that are affine in the coefficients of its parameter.
 
 With ``u = Q ybar`` and ``Q = sum c_i Phi_i``, at unit sensor gain::
 
@@ -23,8 +23,8 @@ from lbt_synth.validation import ComplexArray, FloatArray
 class Channel:
     """One mode: the delay of the loop, and a basis of parameters."""
 
-    hardware: LoopHardware  # Loop of one mode, with unit sensor and mirror
-    basis: Basis  # Coordinates of the parameter
+    hardware: LoopHardware  # of one mode, with unit sensor and mirror
+    basis: Basis  # coordinates of the parameter
     _responses: dict[bytes, ComplexArray] = field(default_factory=dict)
 
     @property
@@ -35,7 +35,7 @@ class Channel:
     def command_rows(self, frequency_hz: FloatArray) -> ComplexArray:
         """Slopes of Q, (f, n)."""
         key = frequency_hz.tobytes()
-        if key not in self._responses:  # several terms and demands ask for the same frequencies
+        if key not in self._responses:  # terms and demands share their frequencies
             self._responses[key] = self.basis.response(frequency_hz)
         return self._responses[key]
 

@@ -1,4 +1,4 @@
-"""All that a shaped loop may be asked to keep to."""
+"""The kinds of demands on a shaped loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds at single frequencies, drawn in for what lies between them."""
+"""Bounds at single frequencies, tightened for what lies between them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from lbt_synth.linear.convex_functions import Discs
 from lbt_synth.validation import ComplexArray, FloatArray
 
-ROOM = 1e-3  # part of a bound that the programme leaves unused, for what lies between its points
+ROOM = 1e-3  # part of a bound that the programme leaves for what lies between its points
 LEVEL_SETS = "level sets, all frequencies"
 
 

@@ -1,4 +1,4 @@
-"""Frequencies at which a specification becomes a finite programme."""
+"""Frequencies at which a specification is imposed: quadrature nodes and points of bounds."""
 
 from __future__ import annotations
 
@@ -18,16 +18,14 @@ _MOST_EDGES = 400
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Grid:
-    """Nodes of the variances' quadrature, and points of the bounds."""
+    """Nodes of the quadrature for variances, and points at which bounds are imposed."""
 
-    # nodes_hz, weights_hz (F,): quadrature over 0 to the Nyquist frequency
-    nodes_hz: FloatArray
-    weights_hz: FloatArray
-    # (P,): where bounds over frequency are imposed; added to until they hold between
-    points_hz: FloatArray
+    nodes_hz: FloatArray  # (F,), from 0 to the Nyquist frequency
+    weights_hz: FloatArray  # (F,)
+    points_hz: FloatArray  # (P,), more are added until the bounds hold between them
 
     def within(self, low_hz: float, high_hz: float) -> FloatArray:
-        """Points of a band, its ends and some more included."""
+        """Points of a band, with its ends and some more."""
         inside = self.points_hz[(self.points_hz > low_hz) & (self.points_hz < high_hz)]
         return np.unique(np.concatenate([inside, np.linspace(low_hz, high_hz, _BAND_POINTS)]))
 
@@ -44,17 +42,14 @@ def first_grid(
     breakpoints_hz: FloatArray,
     fineness: int = 1,
 ) -> Grid:
-    """Panels that are geometric at low frequencies, finer in the bands and at slow poles.
-
-    Shapes: bands_hz list of (low, high), poles (n,), breakpoints_hz (b,).
-    """
+    """Lay panels: geometric at low frequencies, finer in the bands and at slow poles (n,)."""
     nyquist = frame_rate_hz / 2
     edges = [
         np.array([0.0]),
         np.geomspace(6e-5, 0.01, 13 * fineness + 1) * frame_rate_hz,
         np.geomspace(0.0125, 0.5, 24 * fineness + 1) * frame_rate_hz,
+        breakpoints_hz,
     ]
-    edges.append(breakpoints_hz)
     for low, high in bands_hz:
         width = high - low
         edges.append(
@@ -73,7 +68,7 @@ def first_grid(
 
 
 def fine_frequencies(frame_rate_hz: float, poles: ComplexArray, count: int) -> FloatArray:
-    """Frequencies at which the bounds are watched between the points [Hz]."""
+    """Frequencies at which the bounds are checked between the points [Hz]."""
     even = np.linspace(0, 0.5, count)
     low = np.geomspace(1e-5, 0.1, count // 2)
     centres, widths = np.abs(np.angle(poles)) / (2 * np.pi), (1 - np.abs(poles)) / (2 * np.pi)
@@ -96,7 +91,7 @@ def spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
 
 
 def thin_spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
-    """Return these edges, but not more than a programme can carry: the highest of many [Hz]."""
+    """Return these edges, of many only as many as a programme can carry: the highest [Hz]."""
     edges = spectrum_edges(spectrum, nyquist_hz)
     if spectrum is None or edges.size <= _MOST_EDGES:
         return edges

@@ -29,7 +29,7 @@ _KINDS: dict[str, type[Any]] = {
 
 
 def to_metadata(value: Any) -> Any:
-    """Return a specification, or a part of it, as what JSON knows."""
+    """Return a specification, or a part of it, as plain values for JSON."""
     name = type(value).__name__
     if name in _KINDS:
         return {
@@ -44,7 +44,7 @@ def to_metadata(value: Any) -> Any:
 
 
 def from_metadata(data: Any) -> Any:
-    """Rebuild what :func:`to_metadata` wrote; an unknown kind raises KeyError, a bad value its own."""
+    """Rebuild what :func:`to_metadata` wrote; an unknown kind raises KeyError."""
     if isinstance(data, dict):
         values = dict(data)
         kind = _KINDS[values.pop("kind")]

@@ -166,7 +166,9 @@ class VibrationBand(Band):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _CombinedTerms:
-    largest: ClassVar[bool] = False  # of the terms, instead of their sum
+    """Weighted terms, of which the sum or the largest counts."""
+
+    largest: ClassVar[bool] = False  # the largest term instead of the sum
 
     terms: tuple[Term, ...]
     weights: tuple[float, ...] | None = None
@@ -179,7 +181,7 @@ class _CombinedTerms:
             raise ProblemError("an objective needs at least one term; got none.")
         given = (1.0,) * len(terms) if self.weights is None else sequence(self.weights, "weights")
         if len(given) != len(terms):
-            raise ProblemError(f"weights must be one a term, {len(terms)}; got {len(given)}.")
+            raise ProblemError(f"weights must be one per term, {len(terms)}; got {len(given)}.")
         object.__setattr__(self, "terms", terms)
         object.__setattr__(self, "weights", tuple(number(w, "weights", above=0) for w in given))
 
@@ -280,7 +282,7 @@ def require_term(term: object) -> None:
 
 
 def leaves(term: Term) -> tuple[Leaf, ...]:
-    """Variances and vibrations of an objective, in order."""
+    """Return the variances and vibrations of an objective, in order."""
     if isinstance(term, _CombinedTerms):
         return tuple(leaf for part in term.terms for leaf in leaves(part))
     return (term,)
@@ -291,7 +293,7 @@ def _steering(complementary: ComplexArray, sensor_gain: float) -> ComplexArray |
 
 
 def frequency_costs(term: Term, frequency_hz: FloatArray) -> FloatArray:
-    """How much an error of T costs at each frequency, up to a factor: spectra and bands."""
+    """Cost of an error of T at each frequency, up to a factor: spectra and bands."""
     cost = np.zeros(frequency_hz.size)
     for leaf in leaves(term):
         if isinstance(leaf, VibrationBand):

@@ -1,9 +1,8 @@
-"""Few poles that stand for a long parameter: a fit of its response, the cost as the weight.
+"""Few poles for the response of a long parameter, by weighted least squares.
 
-The response of a long parameter is fitted, in weighted least squares over frequency, by
-functions with few poles; the coefficients are eliminated, so that the poles alone are
-searched (variable projection: G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10, 413 (1973),
-doi:10.1137/0710036).
+Functions with few poles fit the response over frequency, with the cost as the weight; their
+coefficients are eliminated, so that only the poles are searched (variable projection: G. H. Golub,
+V. Pereyra, SIAM J. Numer. Anal. 10, 413 (1973), doi:10.1137/0710036).
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from scipy.optimize import least_squares
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _EVALUATIONS = 60
-_STEEPEST = 9.0  # of the logarithm that stands for a modulus: 1 - 1e-4
+_STEEPEST = 9.0  # largest log(r / (1 - r)) of a modulus r: 1 - 1e-4
 
 
 def fit_poles(
     angles: FloatArray, target: ComplexArray, weight: FloatArray, start: ComplexArray
 ) -> tuple[ComplexArray, float]:
-    """Poles of the functions ``z (z I - A)^-1 B`` that fit a response best.
+    """Fit the poles (n,) of functions ``z (z I - A)^-1 B`` to a response, and its misfit.
 
-    Shapes: angles (f,), target (f,), weight (f,), start (n,) -> poles (n,).
+    Shapes: angles, target, weight (f,), start (n,).
     """
     z = np.exp(1j * angles)
     pairs = start[start.imag > 0]
@@ -60,10 +59,7 @@ def fit_poles(
 def starting_poles(
     count: int, *, bands: tuple[tuple[float, float], ...], noise_rad: float
 ) -> ComplexArray:
-    """Poles to start the fit from: some in each band, some below and above.
-
-    Shapes: bands list of (low, high).
-    """
+    """Poles to start the fit from: some in each band (low, high), some below and above."""
     pairs: list[complex] = [
         (1 - 0.8 * noise_rad) * np.exp(1j * noise_rad),
         0.62 * np.exp(0.5j),
@@ -83,7 +79,7 @@ def starting_poles(
 
 
 def drop_cheapest_pair(poles: ComplexArray, costs: FloatArray) -> ComplexArray:
-    """Return the poles without the pair of the least cost of leaving out."""
+    """Return the poles without the pair that costs least to drop."""
     upper = poles[poles.imag > 0]
     kept = np.delete(upper, int(np.argmin(costs)))
     return np.concatenate([kept, kept.conj(), poles[poles.imag == 0]])
@@ -92,23 +88,16 @@ def drop_cheapest_pair(poles: ComplexArray, costs: FloatArray) -> ComplexArray:
 def misfit_without_each_pair(
     angles: FloatArray, target: ComplexArray, weight: FloatArray, poles: ComplexArray
 ) -> FloatArray:
-    """Misfit of the response when each pair of poles is left out, (pairs,)."""
+    """Misfit of the response when each pair of poles is dropped, (pairs,)."""
     z = np.exp(1j * angles)
     upper, single = poles[poles.imag > 0], poles[poles.imag == 0].real
     goal = weight * target
-    out = [
-        float(
-            np.linalg.norm(
-                _fit_residual(goal, weight, _basis_responses(z, np.delete(upper, i), single))
-            )
-        )
-        for i in range(upper.size)
-    ]
-    return np.array(out)
+    functions = (_basis_responses(z, np.delete(upper, i), single) for i in range(upper.size))
+    return np.array([np.linalg.norm(_fit_residual(goal, weight, each)) for each in functions])
 
 
 def _fit_residual(goal: ComplexArray, weight: FloatArray, functions: ComplexArray) -> FloatArray:
-    """Return what real multiples of weighted functions leave of a goal, real parts first."""
+    """Rest of a goal beside real multiples of weighted functions, real parts first."""
     columns = weight[:, None] * functions
     q, _ = np.linalg.qr(np.vstack([columns.real, columns.imag]))
     stacked = np.concatenate([goal.real, goal.imag])

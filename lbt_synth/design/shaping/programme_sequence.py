@@ -28,22 +28,21 @@ _STEPS = 24
 _DECREASE = 2e-3  # of the objective, below which a step is the last
 _FINE = 2048
 _WORST = 2e-3  # by which a worst case may exceed that of the programme's own frequencies
-_CLOSE = 0.98  # of a bound: the neighbourhood is looked at more closely
+_CLOSE = 0.98  # of a bound, beyond which the neighbourhood is checked more finely
 _BETWEEN = 33
 _RELAXED = 1e-6  # relaxations below this are none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SequenceSolution:
-    """Coefficients of one basis, and how they were found."""
+    """Coefficients in one basis, and how they were found."""
 
-    channel: Channel  # Mode and basis
-    grid: Grid  # Frequencies of the last programme
-    coefficients: FloatArray  # (n,): the coefficients
-    # Objective at the optimum for unit gain, and after each programme from there on [nm^2]
-    objectives_nm2: tuple[float, ...]
-    programmes: int  # Number of programmes
-    status: str  # The solver's word on the last programme
+    channel: Channel
+    grid: Grid  # of the last programme
+    coefficients: FloatArray  # (n,)
+    objectives_nm2: tuple[float, ...]  # at the optimum for unit gain, and after each programme
+    programmes: int  # number of them
+    status: str  # what the solver said of the last programme
 
     @property
     def objective_nm2(self) -> float:
@@ -63,17 +62,18 @@ def solve_sequence(
     A convex specification takes one programme, and another for each time that a bound is exceeded
     between its frequencies. One with terms at other sensor gains is solved for unit gain first,
     until the demands hold at all frequencies, and goes on with upper bounds that touch the
-    objective; none of these steps makes it larger or leaves the demands. Shapes: start (n,).
+    objective; none of these steps makes it larger or leaves the demands. ``start`` is (n,).
     """
     from lbt_synth.linear.lmi.conic_program import minimize
 
     grid = specification.grid(channel, fineness=fineness)
-    watch = _FineGrid.of(specification, channel, grid, _FINE * fineness)
-    function, groups = specification.compiled(channel, grid)
+    points = fine_frequencies(channel.hardware.frame_rate_hz, channel.basis.poles, _FINE * fineness)
+    fine = _FineGrid.build(specification, channel, grid, points)
+    function, groups = specification.compile(channel, grid)
     convex = is_convex(function)
     scale = _objective_scale(specification, function, channel.basis.size)
     # the upper bounds need coefficients whose loops are stable at all sensor gains
-    c = start if start is not None and watch.is_stable(start) else None
+    c = start if start is not None and fine.is_stable(start) else None
     aware = convex or c is not None
     values: list[float] = []
     for programmes in range(1, _STEPS + 1):
@@ -84,7 +84,7 @@ def solve_sequence(
             raise _infeasibility_error(specification, groups, channel.basis.size, solution.status)
         c = solution.coefficients
         values.append(function.value(c))
-        excess = watch.excess(function, c)
+        excess = fine.excess(function, c)
         settled = convex or (len(values) > 1 and values[-2] - values[-1] <= _DECREASE * values[-1])
         if not aware:
             aware, settled, values = excess.size == 0, False, values[-1:]
@@ -99,7 +99,7 @@ def solve_sequence(
             )
         if excess.size:
             grid = grid.with_points(excess)
-            function, groups = specification.compiled(channel, grid)
+            function, groups = specification.compile(channel, grid)
     raise NumericalError(
         f"the shaped loop exceeds its bounds between the {grid.points_hz.size} frequencies of its "
         f"programme, or does not settle, after {_STEPS} programmes. Try fewer functions, or "
@@ -110,13 +110,13 @@ def solve_sequence(
 
 
 def _objective_scale(specification: Specification, function: Function, size: int) -> float:
-    """Size of the objective in the end, within a few powers of ten [nm^2]."""
+    """Guess the final size of the objective, within a few powers of ten [nm^2]."""
     return max(4 * noise_level(specification.objective) ** 2, 1e-4 * function.value(np.zeros(size)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _FineGrid:
-    """Bounds and worst cases between the frequencies of the programme."""
+    """Bounds and worst cases at frequencies between those of the programme."""
 
     specification: Specification
     channel: Channel
@@ -125,18 +125,11 @@ class _FineGrid:
     constraints: tuple[Constraint, ...]
 
     @classmethod
-    def of(
-        cls, specification: Specification, channel: Channel, grid: Grid, count: int
-    ) -> _FineGrid:
-        rate, poles = channel.hardware.frame_rate_hz, channel.basis.poles
-        return cls._on(specification, channel, grid, fine_frequencies(rate, poles, count))
-
-    @classmethod
-    def _on(
+    def build(
         cls, specification: Specification, channel: Channel, grid: Grid, points_hz: FloatArray
     ) -> _FineGrid:
         fine = replace(grid, points_hz=points_hz)
-        function, groups = specification.compiled(channel, fine)
+        function, groups = specification.compile(channel, fine)
         return cls(
             specification=specification,
             channel=channel,
@@ -146,7 +139,7 @@ class _FineGrid:
         )
 
     def is_stable(self, c: FloatArray) -> bool:
-        """Whether the half-planes of the sensor gains hold, but for the room."""
+        """Whether the half-planes of the sensor gains hold, without the room."""
         planes = [x for x in self.constraints if isinstance(x, HalfPlanes)]
         return all(float(np.max(plane.use(c))) * (1 - ROOM) < 1 for plane in planes)
 
@@ -156,18 +149,18 @@ class _FineGrid:
             leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf
             for leaf in leaf_fractions(function)
         )
-        found = self._above(limits, c, 1 + ROOM / 2)
+        found = self._peaks_above(limits, c, 1 + ROOM / 2)
         if found.size:
             return found[:, 1]
         # between the neighbours of what comes close
-        close = self._above(limits, c, _CLOSE)
+        close = self._peaks_above(limits, c, _CLOSE)
         if not close.size:
             return np.zeros(0)
         points = np.unique(np.linspace(close[:, 0], close[:, 2], _BETWEEN))
-        finer = self._on(self.specification, self.channel, self.grid, points)
-        return finer._above(limits, c, 1 + ROOM / 2)[:, 1]
+        finer = self.build(self.specification, self.channel, self.grid, points)
+        return finer._peaks_above(limits, c, 1 + ROOM / 2)[:, 1]
 
-    def _above(self, limits: tuple[float, ...], c: FloatArray, level: float) -> FloatArray:
+    def _peaks_above(self, limits: tuple[float, ...], c: FloatArray, level: float) -> FloatArray:
         """Local peaks above a level of their limits, each between its neighbours, (k, 3)."""
         bounds = [
             _local_peaks(constraint.frequency_hz, constraint.use(c), level)

@@ -1,4 +1,4 @@
-"""From a long Youla parameter to one of few poles, with the programme solved anew."""
+"""Reduction of a long Youla parameter to few poles, with its programme solved again."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _SLOW_HZ = (0.002, 0.004, 0.008)  # where turbulence meets the noise, of the fra
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModeSolution:
-    """A solved specification in one basis."""
+    """A specification solved in one basis."""
 
-    sequence: SequenceSolution  # How it was solved
-    objective_nm: float  # Root of the objective in the real loop [nm]
+    sequence: SequenceSolution
+    objective_nm: float  # root of the objective in the real loop
 
     @property
     def parameter(self) -> Controller:
@@ -43,7 +43,7 @@ class ModeSolution:
 def solve_mode(
     spec: Specification, channel: Channel, *, start: FloatArray | None = None
 ) -> ModeSolution:
-    """Solve in a basis, on a grid that is fine enough for the objective."""
+    """Solve a specification in a basis, on a grid that is fine enough for its objective."""
     miss = np.inf
     for fineness in (1, 2, 4):
         sequence = solve_sequence(spec, channel, start=start, fineness=fineness)
@@ -64,7 +64,7 @@ def solve_mode(
 def reduce_poles(
     spec: Specification, long: ModeSolution, order: int, tolerance: float, *, fewest: bool = True
 ) -> ModeSolution:
-    """Fewest poles whose programme keeps the objective within a tolerance."""
+    """Find the fewest poles whose programme keeps the objective within a tolerance."""
     sequence = long.sequence
     hardware, f = sequence.channel.hardware, sequence.grid.nodes_hz
     angles = 2 * np.pi * f * hardware.dt_s
@@ -103,7 +103,7 @@ def reduce_poles(
             f"(root of the whole objective): {best}. Allow more states or a larger loss."
         )
     kept, failed = 0, len(candidates)
-    while failed - kept > 1:  # fewer poles lose more: halve what is not decided
+    while failed - kept > 1:  # fewer poles lose more: bisection
         middle = (kept + failed) // 2
         found, loss = attempt(middle)
         if found is not None and loss <= tolerance:
@@ -120,7 +120,7 @@ def _solve_with_poles(
     target: ComplexArray,
     weight: FloatArray,
 ) -> ModeSolution | None:
-    """Solve the specification with given poles; None if that cannot be done."""
+    """Solve the specification with given poles; None if that fails."""
     hardware = long.channel.hardware
     channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
     # start from the fit of the long response

@@ -1,4 +1,4 @@
-"""One mode's closed loops at any sensor gain, for the exact evaluation of terms and demands."""
+"""The real closed loop of one mode, on which terms and demands are evaluated exactly."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from lbt_synth.validation import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SingleModeLoop:
-    """A controller of one mode in its loop."""
+    """A controller of one mode in its loop, at any sensor gain."""
 
-    hardware: LoopHardware  # Loop of one mode
-    controller: Controller  # The controller of this mode
+    hardware: LoopHardware
+    controller: Controller
     _loops: dict[float, ClosedLoop] = field(default_factory=dict)
 
     def at(self, sensor_gain: float) -> ClosedLoop:
@@ -54,13 +54,13 @@ class SingleModeLoop:
 
 
 def mode_loop(hardware: LoopHardware, parameter: Controller) -> SingleModeLoop:
-    """Return the loop of one mode, of the delay of a whole loop, around its parameter."""
+    """Close the loop of one mode around its Youla parameter."""
     single = mode_hardware(hardware)
     return SingleModeLoop(hardware=single, controller=youla_controller(single, parameter))
 
 
 def mode_hardware(hardware: LoopHardware) -> LoopHardware:
-    """Return the loop of one mode, with unit sensor and mirror."""
+    """Return the hardware of one mode, with unit sensor and mirror."""
     return LoopHardware(
         frame_rate_hz=hardware.frame_rate_hz,
         delay_frames=hardware.delay_frames,
@@ -69,7 +69,7 @@ def mode_hardware(hardware: LoopHardware) -> LoopHardware:
     )
 
 
-def through_taps(system: StateSpace, taps: FloatArray) -> StateSpace:
+def append_taps(system: StateSpace, taps: FloatArray) -> StateSpace:
     """Return a system of one output followed by ``taps[0] + taps[1] z^-1 + ...``."""
     n, m = system.B.shape
     late = len(taps) - 1

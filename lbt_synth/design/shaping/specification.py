@@ -1,4 +1,4 @@
-"""A specification: one objective and any number of demands, for one mode of the loop."""
+"""The specification of one mode of the loop: one objective and any number of demands."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Specification:
             fineness=fineness,
         )
 
-    def compiled(
+    def compile(
         self, channel: Channel, grid: Grid
     ) -> tuple[Function, tuple[tuple[Constraint, ...], ...]]:
         """Return the objective, and the constraints of each demand, over a grid."""

@@ -1,4 +1,4 @@
-"""Stability against what is not known: sensor gain, delay, mirror."""
+"""Demands that the loop stays stable where sensor gain, delay or mirror are uncertain."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lbt_synth.design.shaping.band import Band
 from lbt_synth.design.shaping.channel import Channel
 from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, discs
 from lbt_synth.design.shaping.frequency_grid import Grid
-from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, through_taps
+from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, append_taps
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
@@ -59,7 +59,7 @@ class SensorGainRange:
         return f"stability for sensor gains {self.low:g} to {self.high:g}"
 
     def _bounds(self) -> tuple[tuple[float, float], ...]:
-        """Signs and bounds of the real part of T."""
+        """Return signs and bounds of the real part of T."""
         ends = ((1.0, 1 - self.low), (-1.0, self.high - 1))
         return tuple((sign, 1 / change) for sign, change in ends if change > 0)
 
@@ -127,7 +127,7 @@ class DelayError:
         return f"stability for delay errors up to {self.frames:g} frames"
 
     def _differences(self, hardware: LoopHardware) -> list[tuple[float, FloatArray]]:
-        """Delays that stand for all, and the taps of ``M_(d+e) - M_d``."""
+        """Return the delays that stand for all of them, each with the taps of ``M_(d+e) - M_d``."""
         if hardware.mirror is not None:
             raise ProblemError(
                 "a bound for all delay errors needs a mirror that settles at once, whose response "
@@ -162,7 +162,7 @@ class DelayError:
         return tuple(
             Check(
                 name=f"loop change by a delay of {other:g} frames",
-                value=hinf_norm(through_taps(loop.parameter, taps)).upper,
+                value=hinf_norm(append_taps(loop.parameter, taps)).upper,
                 limit=1.0,
                 computed_by=LEVEL_SETS,
             )

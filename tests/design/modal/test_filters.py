@@ -117,7 +117,7 @@ def test_bad_filters_are_refused():
     air = some_air(3)
     for arguments, error, words in (
         ({"noise_nm": 0.0}, lbt.errors.ProblemError, "noise_nm must be above 0"),
-        ({"noise_nm": [1.0, 2.0]}, lbt.errors.DimensionError, "one a mode .3."),
+        ({"noise_nm": [1.0, 2.0]}, lbt.errors.DimensionError, "one per mode .3."),
         ({"noise_nm": np.nan}, lbt.errors.NonFiniteError, "noise_nm"),
         ({"noise_nm": 1, "delay_frames": 0.5}, lbt.errors.ProblemError, "delay_frames"),
         (

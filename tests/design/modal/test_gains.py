@@ -191,7 +191,7 @@ def test_bad_input_is_refused(air):
 
     for spectra, arguments, error, words in (
         ([ar1], {"noise_nm": -1}, lbt.errors.ProblemError, "noise_nm must be at least 0"),
-        ([ar1], {"noise_nm": [1, 2]}, lbt.errors.DimensionError, "one a mode"),
+        ([ar1], {"noise_nm": [1, 2]}, lbt.errors.DimensionError, "one per mode"),
         ([ar1], {"noise_nm": 1, "margin": 0}, lbt.errors.ProblemError, "margin must be at least"),
         ([ar1], {"noise_nm": 1, "margin": 0.9999}, lbt.errors.ProblemError, "leave room"),
         ([ar1], {"noise_nm": 1, "sensor_gain": 1e-6}, lbt.errors.ProblemError, "leave room"),
