@@ -19,14 +19,14 @@ LBT = LBT_TEXT.replace("kind: ar1", "kind: {kind}")
 FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
 
 
-TOLD = "{told: {design: kalman, for: sample}}"
+OWN = "{own: {design: kalman, for: sample}}"
 
 
-BOTH = "{kalman: {design: kalman}, told: {design: kalman, for: sample}}"
+BOTH = "{kalman: {design: kalman}, own: {design: kalman, for: sample}}"
 
 
 def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
-    """Hold each column against the evaluation point by point; return the results."""
+    """Hold each column against the evaluation one by one; return the results."""
     study = lbt.studies.load_study(
         study_file(tmp_path, base=base, controllers=controllers, parameters=parameters, **more)
     )
@@ -41,7 +41,7 @@ def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
 
 
 def counted(monkeypatch):
-    """Count the samples that are evaluated point by point."""
+    """Count the samples that are evaluated one by one."""
     rows = []
     real = reference.evaluate_row
 
@@ -72,9 +72,9 @@ def test_the_telescope_of_the_paper(tmp_path, kind):
     agree(tmp_path, base=LBT.replace("{kind}", kind), controllers=FIXED, parameters=WEATHER)
 
 
-def test_filters_told_their_samples(tmp_path, monkeypatch):
+def test_filters_for_their_own_samples(tmp_path, monkeypatch):
     study = lbt.studies.load_study(
-        study_file(tmp_path, base=LBT_TEXT, controllers=TOLD, parameters=WEATHER)
+        study_file(tmp_path, base=LBT_TEXT, controllers=OWN, parameters=WEATHER)
     )
     single = reference.evaluate_rows(study, study.values(0, 6), 0)
     rows = counted(monkeypatch)
@@ -82,11 +82,11 @@ def test_filters_told_their_samples(tmp_path, monkeypatch):
     assert rows == [3]  # all of them at once, and one by itself
     for name, expected in single.columns.items():
         assert found.columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
-    strehl = found.columns["told.strehl"]
+    strehl = found.columns["own.strehl"]
     assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
 
 
-def test_the_sensor_gain_that_designs_believe_in(tmp_path, monkeypatch):
+def test_the_sensor_gain_that_designs_assume(tmp_path, monkeypatch):
     """A fixed controller does not notice; a filter for the sample does, and so does the loop not."""
     parameters = """{
       model.sensor_gain: {uniform: [0.6, 1.2]},
@@ -152,7 +152,7 @@ def test_a_mirror_with_dynamics(tmp_path):
 
 
 def test_a_diagonal_vibration(tmp_path):
-    """No filter an axis at a time: designed point by point, evaluated all the same."""
+    """No filter per axis: designed one by one, but evaluated together."""
     base = LBT_TEXT.replace("axis: tip,", "direction_deg: 30,").replace(
         "axis: both,", "direction_deg: 30,"
     )
@@ -174,10 +174,10 @@ def test_a_diagonal_vibration(tmp_path):
     ],
 )
 def test_samples_whose_axes_are_no_longer_independent(tmp_path, old, new, path, values):
-    """The configuration as it stands has filters of single axes, some of its samples have not."""
+    """The configuration has a filter per axis, and some of its samples do not."""
     assert old in LBT_TEXT
     parameters = f"{{'{path}': {{list: {values}}}, truth.sensor_gain: {{uniform: [0.5, 1]}}}}"
-    agree(tmp_path, base=LBT_TEXT.replace(old, new), controllers=TOLD, parameters=parameters)
+    agree(tmp_path, base=LBT_TEXT.replace(old, new), controllers=OWN, parameters=parameters)
 
 
 def test_an_image_that_is_gone(tmp_path):
@@ -193,7 +193,7 @@ def test_an_image_that_is_gone(tmp_path):
     assert (found.columns["slow.stable"] == 1).all()
 
 
-def test_the_delay_that_designs_are_told(tmp_path):
+def test_the_delay_that_designs_assume(tmp_path):
     parameters = "{loop.delay_frames: {list: [1, 2, 2.5]}, truth.sensor_gain: {uniform: [0.4, 1]}}"
     agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=12)
 
@@ -239,12 +239,12 @@ def test_a_filter_that_cannot_be_designed(tmp_path):
       sensor.noise_nm: {uniform: [5, 30]},
       'model.vibrations[0].rms_nm': {uniform: [100, 900]}
     }"""
-    study, _ = agree(tmp_path, base=BASE, controllers=TOLD, parameters=parameters)
+    study, _ = agree(tmp_path, base=BASE, controllers=OWN, parameters=parameters)
     values = study.values(0, COUNT)
     values[3, 1] = 1e170  # its variance overflows
     found = lbt.studies.evaluate_samples(study, values, 0)
     assert {f.row for f in found.failures} == {3}
-    assert np.isfinite(found.columns["told.strehl"]).sum() == COUNT - 1
+    assert np.isfinite(found.columns["own.strehl"]).sum() == COUNT - 1
 
 
 def test_simulations_are_done_one_by_one(tmp_path):

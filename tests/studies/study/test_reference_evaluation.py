@@ -18,7 +18,7 @@ def test_a_point_is_what_the_library_says(tmp_path):
     study = load_small_study(
         tmp_path,
         samples="4",
-        controllers="{fixed: {design: kalman}, told: {design: kalman, for: sample}, "
+        controllers="{fixed: {design: kalman}, own: {design: kalman, for: sample}, "
         "wild: {design: integrator, gain: 0.9}}",
         parameters="{'truth.vibrations[0].frequency_hz': {uniform: [18, 22], also: "
         "['model.vibrations[0].frequency_hz']}, error.delay_frames: {uniform: [0.2, 0.4]}, "
@@ -50,7 +50,7 @@ def test_a_point_is_what_the_library_says(tmp_path):
             noise_nm=22.5,
             sensor_gain=0.7,
         )
-        for name, design in (("fixed", fixed), ("told", lbt.kalman(plant))):
+        for name, design in (("fixed", fixed), ("own", lbt.kalman(plant))):
             loop = lbt.close_loop(hardware, design.controller, sensor_gain=0.7)
             budget = lbt.residual_budget(loop, truth)
             for column in ("residual_nm", "turbulence_nm", "vibration_nm", "noise_nm"):
@@ -59,7 +59,7 @@ def test_a_point_is_what_the_library_says(tmp_path):
             expected = lbt.strehl(budget, config.imaging)
             assert batch.columns[f"{name}.strehl"][i] == pytest.approx(expected, rel=1e-9)
             assert batch.columns[f"{name}.stable"][i] == 1
-    assert np.all(batch.columns["told.residual_nm"] < 1.05 * batch.columns["fixed.residual_nm"])
+    assert np.all(batch.columns["own.residual_nm"] < 1.05 * batch.columns["fixed.residual_nm"])
 
 
 def test_unstable_loops_and_samples_that_fail(tmp_path):

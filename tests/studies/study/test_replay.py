@@ -22,14 +22,14 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
         base=base,
         evaluation=evaluation,
         samples="4",
-        controllers="{a: {design: integrator, gain: 0.4}, told: {design: kalman, for: sample}}",
+        controllers="{a: {design: integrator, gain: 0.4}, own: {design: kalman, for: sample}}",
         parameters="{atmosphere.seeing_arcsec: {uniform: [0.6, 1]}, error.delay_frames: {uniform: "
         "[0.1, 0.3]}, error.noise_factor: {uniform: [1.2, 1.6]}, truth.sensor_gain: 0.8}",
     )
     folder = make_folder(tmp_path)
     lbt.studies.run_study(study, folder)
     again = lbt.studies.replay_row(study, folder, 2)
-    assert [path.name for path in again.files] == ["row_2.yaml", "row_2_told.fits"]
+    assert [path.name for path in again.files] == ["row_2.yaml", "row_2_own.fits"]
     assert set(again.fresh) == set(again.stored) == set(study.result_columns)
     for name, value in again.stored.items():
         assert again.fresh[name] == pytest.approx(value, rel=1e-6)
@@ -38,7 +38,7 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
     text = (folder / "row_2.yaml").read_text()
     assert "designs assume 2 (error.delay_frames)" in text
     assert "(error.noise_factor)" in text
-    for name, path in (("a", folder / "a.fits"), ("told", folder / "row_2_told.fits")):
+    for name, path in (("a", folder / "a.fits"), ("own", folder / "row_2_own.fits")):
         design = lbt.load_gain(path)
         loop = lbt.close_loop(real.hardware, design.controller, sensor_gain=real.truth.sensor_gain)
         if evaluation == "exact":

@@ -30,11 +30,13 @@ def test_a_sample_is_a_configuration(tmp_path):
         assert settings.sensor.pyramid.subapertures_across in (20, 30)
         rms = named["truth.vibrations[0].rms_mas"]
         assert settings.model.vibrations[0].rms_mas == settings.truth.vibrations[0].rms_mas == rms
-        told = sample.config
+        assumed = sample.config
         assert sample.truth.sensor_gain == 0.8
-        assert told.hardware.delay_frames == 2.0
+        assert assumed.hardware.delay_frames == 2.0
         assert sample.hardware.delay_frames == 2.0 + named["error.delay_frames"]
-        assert sample.truth.noise_nm == pytest.approx(told.noise_nm * named["error.noise_factor"])
+        assert sample.truth.noise_nm == pytest.approx(
+            assumed.noise_nm * named["error.noise_factor"]
+        )
         # the same from a file: the independent way
         content = text.replace(
             "seeing_arcsec: 0.8", f"seeing_arcsec: {settings.atmosphere.seeing_arcsec!r}"
@@ -46,7 +48,7 @@ def test_a_sample_is_a_configuration(tmp_path):
         )
         (tmp_path / "same.yaml").write_text(content)
         same = lbt.load_config(tmp_path / "same.yaml")
-        np.testing.assert_array_equal(same.plant.A, told.plant.A)
-        np.testing.assert_array_equal(same.plant.B, told.plant.B)
-        assert same.truth.noise_nm == told.truth.noise_nm
+        np.testing.assert_array_equal(same.plant.A, assumed.plant.A)
+        np.testing.assert_array_equal(same.plant.B, assumed.plant.B)
+        assert same.truth.noise_nm == assumed.truth.noise_nm
     assert study.config.settings.atmosphere.seeing_arcsec == 0.8  # the base is as it was

@@ -8,7 +8,7 @@ from lbt_synth.studies.study.sample_arrays import changes_assumptions_only, chan
 FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
 
 
-def test_which_parameters_are_numbers_of_the_meeting(tmp_path):
+def test_which_parameters_only_change_numbers(tmp_path):
     study = lbt.studies.load_study(
         study_file(
             tmp_path, base=LBT_TEXT, controllers=FIXED, parameters="{truth.sensor_gain: 1.0}"
