@@ -69,17 +69,17 @@ def identify_axis(
     sensor_gain : float, optional
         Sensor gain, if it is known; found from the data of a closed loop otherwise.
     sensor_gain_error : float, optional
-        Standard error of a gain that is given: it is in the errors of all that it moves.
+        Standard error of a given gain; it enters the errors of all that depends on the gain.
     assumed_gain : float, optional
-        What to take where it can not be found.
+        Sensor gain to take where it cannot be found.
     announced : sequence of (frequency, error), optional
         Frequencies of lines that are known beforehand, with their standard errors [Hz].
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
-        Number of resonances above it, at most.
+        Most resonances above it.
     start : IdentifiedAxis, optional
-        A result to begin with, for instance that of a moment ago.
+        A result to start from, for instance that of a moment ago.
 
     Returns
     -------

@@ -62,23 +62,23 @@ def identify(
         What the loop recorded, in closed or open loop, or spectra; the delay must be known in
         closed loop.
     frame_rate_hz : float, optional
-        Frame rate of the loop to come [Hz], where the record is of spectra and does not tell it.
+        Frame rate of the loop to come [Hz], for a record of spectra that does not have it.
     delay_frames : float, optional
-        Total delay of the loop to come [frames], where the record does not tell it; 2 by default.
-    sensor_gain : float or one an axis, optional
+        Total delay of the loop to come [frames], if the record does not have it; 2 by default.
+    sensor_gain : float or one per axis, optional
         Sensor gain, if it is known.
     assumed_gain : float, optional
-        What to take where the data do not tell.
+        Sensor gain to take where the data do not show it.
     announced : sequence of LinePrior, optional
         Lines that are known beforehand, from accelerometers for instance.
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
-        Number of resonances above it, for an axis at most.
+        Most resonances above it per axis.
     stretches : sequence of (start, stop), optional
         Frames to use; all that are usable by default.
     start : IdentifiedModel, optional
-        A result to begin with.
+        A model to start from.
     progress : callable, optional
         Called with the number of fits done and their total.
 

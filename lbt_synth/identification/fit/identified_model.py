@@ -1,4 +1,4 @@
-"""What the identification found, with standard errors."""
+"""The identified model of a loop: its axes, turbulence and lines, with standard errors."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class IdentifiedAxis:
     parts : tuple of IdentifiedLine
         All other resonances, by frequency.
     noise_nm, noise_error_nm : float
-        Measurement noise per frame, as it is on y, and its standard error [nm]; at least a
+        Measurement noise per frame on y, and its standard error [nm]; at least a
         hundredth of the innovations' deviation.
     sensor_gain : float
         Sensor gain: found, given or assumed.
@@ -139,8 +139,10 @@ class IdentifiedAxis:
         Frame rate [Hz].
     resolution_hz : float
         Resolution of the periodogram [Hz].
-    grown : Grown
-        The fit itself, for another one to begin with.
+    fitted_model : FittedModel
+        The fit itself, to start another one from.
+    data : LoopPeriodogram
+        The periodogram that was fitted.
     """
 
     turbulence: ARModel
@@ -181,7 +183,7 @@ class IdentifiedModel:
     Attributes
     ----------
     axes : tuple of IdentifiedAxis
-        One an axis: tip, or tip and tilt.
+        One per axis: tip, or tip and tilt.
     frame_rate_hz : float
         Frame rate [Hz].
     delay_frames : float
@@ -189,7 +191,7 @@ class IdentifiedModel:
     mirror : PositionLoop or None
         Dynamics of the mirror.
     notes : tuple of str
-        What the user has to know.
+        Warnings and decisions that the user should know.
     """
 
     axes: tuple[IdentifiedAxis, ...]

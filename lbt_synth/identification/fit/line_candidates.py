@@ -1,4 +1,4 @@
-"""Where a spectrum has more power than a model: candidates for lines."""
+"""Candidates for lines: bands in which a spectrum has more power than a model."""
 
 from __future__ import annotations
 
@@ -17,21 +17,19 @@ _WIDEST = 0.3  # of a frequency
 class Candidate:
     """An excess of power in a band."""
 
-    frequency_hz: float  # Its highest place [Hz]
-    half_width_hz: float  # Half width at half height [Hz]
-    variance_nm2: float  # Of a resonance of that height and width [nm^2]
-    # What a model that fits the mean of the band would add to the logarithm of the likelihood
-    gain: float
+    frequency_hz: float  # where it is highest
+    half_width_hz: float  # at half height
+    variance_nm2: float  # of a resonance of that height and width
+    gain: float  # log-likelihood that a model with the mean of the band would add
 
 
 def find_candidates(
     data: LoopPeriodogram, power: FloatArray, model: FloatArray, *, least: float, most: int
 ) -> list[Candidate]:
-    """Bands with the most significant excess of power over a model.
+    """Find the bands with the most significant excess of power over a model.
 
     Bands of 1, 2, 4, ... bins are tried everywhere, at steps of a quarter of their width. A band of
-    n values with the mean ratio R of power to model would gain ``n (R - 1 - log R)``. Shapes:
-    power, model (f,).
+    n values with the mean ratio R of power to model would gain ``n (R - 1 - log R)``.
     """
     f, step = data.frequency_hz, float(np.median(np.diff(data.frequency_hz)))
     ratio = np.concatenate([[0.0], np.cumsum(power / model)])
@@ -72,19 +70,18 @@ def measure_excess(
     stop: int,
     gain: float = 0.0,
 ) -> Candidate:
-    """Place, half width and variance of the highest excess between two bins."""
+    """Measure place, half width and variance of the highest excess between two bins."""
     f, step = data.frequency_hz, float(np.median(np.diff(data.frequency_hz)))
     excess = power[start:stop] - model[start:stop]
     best = -np.inf
-    place = half = 0.0
-    height = 0.0
+    place = half = height = 0.0
     span = 1
-    # the smoothing that shows the peak clearest: its height against its scatter
+    # choose the smoothing at which the peak is highest over its scatter
     while span <= max(1, (stop - start) // 2):
         kernel = np.ones(span) / span
         smooth = np.convolve(excess, kernel, mode="same")
         i = int(np.argmax(smooth))
-        # area under a resonance of that width, as the box sees it
+        # the scatter falls with the root of the span
         score = float(smooth[i]) * np.sqrt(span)
         if score > best:
             best, height, place = score, float(smooth[i]), float(f[start + i])
@@ -102,10 +99,7 @@ def measure_excess(
 def smooth_background(
     power: FloatArray, frequency_hz: FloatArray, count: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Medians of a density over bands of equal ratio: a background without its lines.
-
-    Shapes: returns frequency_hz, density, weight (b,).
-    """
+    """Return a background without its lines: frequencies, medians over bands, weights, (b,)."""
     from scipy.special import gammaincinv
 
     low, high = frequency_hz[0], frequency_hz[-1]

@@ -138,7 +138,7 @@ class Layout:
         return np.array([np.log(frequency_hz * self.angle), odds, np.log(variance)])
 
     def starting_corner(self) -> float:
-        """Return the parameter of a corner to begin with."""
+        """Return the parameter of a corner to start from."""
         return float(_CORNER[0] + np.log(self.angle))
 
     def priors(self, theta: FloatArray, parts: tuple[Part, ...]) -> Priors:

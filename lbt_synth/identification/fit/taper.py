@@ -1,4 +1,4 @@
-"""What a finite record makes of a narrow line: its spectrum smeared by the taper.
+"""The taper of a segment, and how it smears a narrow line.
 
 A resonance that decays slower than the record lasts is narrower than the record can show. The
 expected periodogram of a line of half width g and distance d from its centre, both in units of
@@ -20,11 +20,11 @@ import numpy as np
 from lbt_synth.validation import FloatArray, IntArray
 
 TAPER = 0.1  # of a segment, both ends together
-WIDE = 30.0  # half widths above are shown as they are
-FAR = 400.0  # distances beyond see the line as it is
+WIDE = 30.0  # half width above which a line is not smeared
+FAR = 400.0  # distance beyond which a line is not smeared
 _NARROWEST = 1e-9
 _WIDTHS = 72
-_LOBES = 64.0  # distances up to which single lobes are told apart
+_LOBES = 64.0  # distance up to which single lobes are resolved
 _STEP = 0.1
 _GROWTH = 1.03  # of the steps beyond, where lobes are averaged
 _SAMPLES = 4096  # of the taper
@@ -32,7 +32,7 @@ _PADDED = 1 << 17
 
 
 def tukey(length: int) -> FloatArray:
-    """Taper of a segment: a cosine at either end."""
+    """Return the taper of a segment, a cosine at either end."""
     from scipy.signal.windows import tukey as window
 
     return np.asarray(window(length, TAPER))
@@ -40,7 +40,7 @@ def tukey(length: int) -> FloatArray:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Any, FloatArray]:
-    """Spline over log g of log K on a grid of distances, and the grid."""
+    """Return a spline over log g of log K on a grid of distances, and the grid."""
     from scipy.interpolate import CubicSpline
 
     h = tukey(_SAMPLES)
@@ -73,9 +73,9 @@ def _table() -> tuple[Any, FloatArray]:
 def log_smearing(
     half_width: float, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Logarithm of the smeared line over the line itself, with derivatives.
+    """Return the logarithm of the smeared line over the line itself, (f,).
 
-    Shapes: distance (f,) -> value, by_log_width, by_distance (f,).
+    Its derivatives by the logarithm of the width and by the distance follow.
     """
     spline, grid = _table()
     log_width = np.log(max(half_width, _NARROWEST))
@@ -98,7 +98,7 @@ def log_smearing(
 
 
 def _between(row: FloatArray, left: IntArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cubic between the points of a row, and its derivative, at ``left + x``."""
+    """Return a cubic between the values of a row, and its derivative, at ``left + x``."""
     slope = np.gradient(row)
     y0, m0, m1 = row[left], slope[left], slope[left + 1]
     rise = row[left + 1] - y0

@@ -1,4 +1,4 @@
-"""Tests whether the innovations of a fitted spectrum are white."""
+"""Tests of whiteness of the innovations of a fitted spectrum."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.validation import FloatArray, frozen_copy
 
 LAGS = 100
-_LOWEST = 3  # bins, in which the ends of the taper show
+_LOWEST = 3  # bins in which the ends of the taper show
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,7 +53,7 @@ class Whiteness:
 
 
 def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Whiteness:
-    """Test the innovations of a model. Shapes: power, model (f,)."""
+    """Test whether power and model (f,) differ as white innovations do."""
     from scipy.special import chdtrc, kolmogorov
 
     ratio = power / model

@@ -28,7 +28,7 @@ from lbt_synth.validation import BoolArray, FloatArray
 
 GAIN, NOISE, CORNER, _FIRST = 0, 1, 2, 3  # places in the vector of parameters
 FREQUENCY, DAMPING, VARIANCE = 0, 1, 2  # places among the parameters of a component
-_LEAST = 0.05  # damping ratio of turbulence: what is narrower is a line
+_LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
 _JUST_ABOVE = 1e-3
 _DIFFERENCE = 1e-4  # of a logarithm
 _FARTHEST = 60.0  # of a logarithm: exp stays finite

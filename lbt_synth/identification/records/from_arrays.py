@@ -81,7 +81,7 @@ def loop_record(
     Returns
     -------
     LoopRecord
-        Series in nm on the regular grid, and what was found.
+        Series in nm on the regular grid, and the faults that were found.
 
     Raises
     ------

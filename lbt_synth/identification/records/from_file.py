@@ -61,8 +61,8 @@ def load_record(
 
     Telemetry of this package and of the AOT standard is recognised. In other files, series are
     found by the names of columns, arrays and HDUs, rates and units by names and headers, as
-    the page on records lists them. What the file does not tell has to be given; what was taken
-    for what is in the notes of ``health``.
+    the page on records lists them. What the file does not tell has to be given; the notes of
+    ``health`` say how the file was read.
 
     Parameters
     ----------

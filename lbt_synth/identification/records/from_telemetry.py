@@ -62,7 +62,7 @@ def record_from_telemetry(
     Returns
     -------
     LoopRecord
-        Series in nm, and what was found in them.
+        Series in nm, and the faults that were found.
 
     Raises
     ------
@@ -151,11 +151,9 @@ def _modal_measurements(
     response = seen.interaction_matrix
     if seen.slopes is not None and response is not None:
         response = None if seen.reconstructor is None else seen.reconstructor @ response
-    if response is None:
-        if q != n:
-            raise ProblemError(_slopes_message(q, n))
-        return y[:, chosen], _choose_unit(seen.measurement_unit, unit, "measurements")
-    if np.array_equal(response, np.eye(n)):
+    if response is None and q != n:
+        raise ProblemError(_slopes_message(q, n))
+    if response is None or np.array_equal(response, np.eye(n)):
         return y[:, chosen], _choose_unit(seen.measurement_unit, unit, "measurements")
     if q > n > 2:
         raise ProblemError(_slopes_message(q, n))
@@ -187,14 +185,12 @@ def _modal_commands(
     """Return the commands of the chosen modes, and their unit."""
     u, n, m = seen.commands, seen.modes, seen.commands.shape[1]
     influence = seen.influence_matrix
-    if influence is None:
-        if m != n:
-            raise ProblemError(
-                f"this telemetry has {m} commands of {n} modes, and no influence matrix; give it "
-                "to Telemetry(influence_matrix=...), (modes, commands)."
-            )
-        return u[:, chosen], _choose_unit(seen.command_unit, unit, "commands")
-    if np.array_equal(influence, np.eye(n, m)) and m == n:
+    if influence is None and m != n:
+        raise ProblemError(
+            f"this telemetry has {m} commands of {n} modes, and no influence matrix; give it "
+            "to Telemetry(influence_matrix=...), (modes, commands)."
+        )
+    if influence is None or np.array_equal(influence, np.eye(n)):
         return u[:, chosen], _choose_unit(seen.command_unit, unit, "commands")
     notes.append("commands: the influence matrix times what was recorded")
     own = "nm" if unit_name(seen.command_unit) or _FOREIGN not in seen.metadata else ""

@@ -55,7 +55,7 @@ class RecordHealth:
     findings : tuple of Finding
         The faults; empty for a clean record.
     notes : tuple of str
-        What was taken for what, what was repaired, what changes with time.
+        How a file was read, what was repaired, what changes with time.
     bridged : int
         Frames that were interpolated.
 

@@ -18,6 +18,11 @@ _MOST_AXES = 2
 _BRIDGED_FRAMES = 3
 _BRIDGED_FRACTION = 0.01
 NOT_KNOWN = "correction not known"
+_LIMITS: dict[str, dict[str, Any]] = {
+    "delay_frames": {"at_least": 1, "at_most": 100},
+    "diameter_m": {"above": 0},
+    "obstruction": {"at_least": 0, "below": 1},
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,8 +33,8 @@ class LoopRecord:
 
         y(k) = gain (phi_tot(k-1) - c(k)) + w(k),   c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...
 
-    :func:`loop_record`, :func:`record_of` and :func:`load_record` make records and find their
-    faults; here what is given is taken as it is.
+    :func:`loop_record`, :func:`record_from_telemetry` and :func:`load_record` make records and
+    find their faults; this class takes its arguments unchanged.
 
     Parameters
     ----------
@@ -104,7 +109,9 @@ class LoopRecord:
             u = matrix(self.commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
             self._set("commands", u)
         self._set("frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0))
-        self._check_numbers()
+        for name, limits in _LIMITS.items():
+            if (value := getattr(self, name)) is not None:
+                self._set(name, number(value, name, **limits))
         if self.mirror is not None:
             require_instance(self.mirror, PositionLoop)
         for name in ("usable", "measured", "commanded"):
@@ -112,14 +119,6 @@ class LoopRecord:
                 self._set(name, _check_flags(flags, name, len(y)))
         if self.delay_frames is not None:
             _ = self.mirror_taps  # a mirror that does not fit the rate is refused
-
-    def _check_numbers(self) -> None:
-        if (delay := self.delay_frames) is not None:
-            self._set("delay_frames", number(delay, "delay_frames", at_least=1, at_most=100))
-        if (diameter := self.diameter_m) is not None:
-            self._set("diameter_m", number(diameter, "diameter_m", above=0))
-        if (part := self.obstruction) is not None:
-            self._set("obstruction", number(part, "obstruction", at_least=0, below=1))
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)

@@ -42,7 +42,8 @@ def require_length(
     Raises
     ------
     ProblemError
-        That says what is there, what is needed, and what was found in the record.
+        If there are too few frames; it says how many there are and are needed, and which faults
+        were found.
 
     Examples
     --------
