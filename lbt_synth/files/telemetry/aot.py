@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.errors import OutputError, TelemetryError
+from lbt_synth.errors import FileError, OutputError, TelemetryError
 from lbt_synth.files.telemetry.native_layout import check_taps
 from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
@@ -49,18 +49,13 @@ def lost_fields(telemetry: Telemetry) -> tuple[str, ...]:
     return tuple(name for name in without if getattr(telemetry, name) is not None)
 
 
-def _aotpy() -> Any:
-    import aotpy
-
-    return aotpy
-
-
-def require_aotpy(target: Path) -> Any:
-    """Return the module; refuse to write a file where it is missing."""
+def require_aotpy(path: Path, error: type[FileError] = OutputError, verb: str = "write") -> Any:
+    """Return the module; refuse to write or read a file where it is missing."""
     try:
-        return _aotpy()
-    except ImportError as error:
-        raise OutputError(f"cannot write {target}: {_INSTALL}.", path=target) from error
+        import aotpy
+    except ImportError as missing:
+        raise error(f"cannot {verb} {path}: {_INSTALL}.", path=path) from missing
+    return aotpy
 
 
 def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
@@ -232,10 +227,7 @@ def _to_ascii(text: str) -> str:
 
 def from_bytes(content: bytes, source: Path) -> Telemetry:
     """Read the first control loop that has series, and what describes it."""
-    try:
-        aotpy = _aotpy()
-    except ImportError as error:
-        raise TelemetryError(f"cannot read {source}: {_INSTALL}.", path=source) from error
+    aotpy = require_aotpy(source, TelemetryError, "read")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # foreign files deviate in many small ways
         try:

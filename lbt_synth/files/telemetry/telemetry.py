@@ -35,6 +35,14 @@ _BOUNDED: dict[str, dict[str, Any]] = {
     "diameter_m": {"above": 0},
     "obstruction": {"at_least": 0, "below": 1},
 }
+_MODE_AXES = {
+    "residual_nm": 1,
+    "total_nm": 1,
+    "interaction_matrix": 1,
+    "reconstructor": 0,
+    "influence_matrix": 0,
+    "mode_maps": 0,
+}
 _UNITS = ("command_unit", "measurement_unit", "slope_unit")
 _LENGTHS = ("pm", "um", "mm", "m")
 _LONGEST_UNIT = 24
@@ -240,30 +248,24 @@ class Telemetry:
                         f"{name} must be {ndim}-D and not empty; got shape {image.shape}."
                     )
                 self._set(name, image)
-        counts = {name: count for name, count in self._counts().items() if count is not None}
+        counts = self._mode_counts()
         if len(set(counts.values())) > 1:
             found = ", ".join(f"{count} in {name}" for name, count in counts.items())
             raise DimensionError(f"the number of modes must be the same everywhere; got {found}.")
         if 0 in counts.values():
             raise DimensionError("there must be one mode at least; got none.")
 
-    def _counts(self) -> dict[str, int | None]:
+    def _mode_counts(self) -> dict[str, int]:
         """Return the number of modes according to each field that has it."""
-
-        def along(array: FloatArray | None, axis: int) -> int | None:
-            return None if array is None else int(array.shape[axis])
-
-        return {
-            "residual_nm": along(self.residual_nm, 1),
-            "total_nm": along(self.total_nm, 1),
-            "interaction_matrix": along(self.interaction_matrix, 1),
-            "reconstructor": along(self.reconstructor, 0),
-            "influence_matrix": along(self.influence_matrix, 0),
-            "mode_maps": along(self.mode_maps, 0),
-            "measurements, of which there are slopes": (
-                None if self.slopes is None else along(self.measurements, 1)
-            ),
+        arrays = {name: getattr(self, name) for name in _MODE_AXES}
+        counts = {
+            name: int(array.shape[_MODE_AXES[name]])
+            for name, array in arrays.items()
+            if array is not None
         }
+        if self.slopes is not None:
+            counts["measurements, of which there are slopes"] = int(self.measurements.shape[1])
+        return counts
 
     def _check_words(self) -> None:
         for name in _UNITS:
@@ -299,7 +301,7 @@ class Telemetry:
             gains = real_array(self.integrator_gains, "integrator_gains")
             if gains.shape != (m,):
                 raise DimensionError(
-                    f"integrator_gains must have shape ({m},), one a command; got {gains.shape}."
+                    f"integrator_gains must have shape ({m},), one per command; got {gains.shape}."
                 )
             self._set("integrator_gains", gains)
         k = self.controller
@@ -326,8 +328,7 @@ class Telemetry:
     @property
     def modes(self) -> int:
         """Number of modes n; that of the measurements, where no field gives it."""
-        known = [count for count in self._counts().values() if count is not None]
-        return known[0] if known else int(self.measurements.shape[1])
+        return next(iter(self._mode_counts().values()), int(self.measurements.shape[1]))
 
     @property
     def sensed(self) -> FloatArray:

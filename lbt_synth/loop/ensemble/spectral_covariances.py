@@ -32,7 +32,7 @@ _COVERED = 1e-6  # fraction of Nyquist above which there are geometric panels in
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SampledResponses:
+class _SampledResponses:
     """Responses of a subloop's elements at the f frequencies of a quadrature."""
 
     frequency_hz: FloatArray
@@ -43,13 +43,13 @@ class SampledResponses:
     controller: ComplexArray  # (f, m, q), or (k, f, m, q) with one per loop
 
 
-def sample_responses(
+def _sample_responses(
     subloop: Subloop,
     group: DelayGroup,
     poles: ComplexArray,
     spectra: list[Turbulence],
     frame_rate_hz: float,
-) -> SampledResponses:
+) -> _SampledResponses:
     """Choose frequencies for the poles of a batch of loops, and evaluate a subloop there."""
     nyquist = frame_rate_hz / 2
     edges = [graded_edges(poles.ravel()) * nyquist]
@@ -63,7 +63,7 @@ def sample_responses(
         controller = _response(A[0], B[0], C[0], D[0], z)
     else:
         controller = batched_response(A, B, C, D, z)
-    return SampledResponses(
+    return _SampledResponses(
         frequency_hz=frequency,
         weight_hz=weight,
         delay=1 / z,
@@ -144,8 +144,8 @@ def _panel_integrals(spectrum: Turbulence, low: FloatArray, high: FloatArray) ->
 def spectral_covariances(
     subloop: Subloop,
     group: DelayGroup,
+    poles: ComplexArray,
     sensor_gains: FloatArray,
-    samples: SampledResponses,
     turbulence: list[tuple[Turbulence, list[int]]],
     noise_nm: FloatArray,
     frame_rate_hz: float,
@@ -155,12 +155,14 @@ def spectral_covariances(
     ``turbulence`` pairs each spectrum with its modes of the subloop.
     """
     evaluate = _scalar_covariances if subloop.is_scalar else _matrix_covariances
+    spectra = [spectrum for spectrum, _ in turbulence]
+    samples = _sample_responses(subloop, group, poles, spectra, frame_rate_hz)
     densities = [(_weighted_density(spectrum, samples), modes) for spectrum, modes in turbulence]
     white = 2 / frame_rate_hz * samples.weight_hz
     return evaluate(subloop, group, sensor_gains, samples, densities, noise_nm, white)
 
 
-def _weighted_density(spectrum: Turbulence, samples: SampledResponses) -> FloatArray:
+def _weighted_density(spectrum: Turbulence, samples: _SampledResponses) -> FloatArray:
     """Spectrum times the weights, (f,) or (k, f)."""
     density = spectrum.psd(samples.frequency_hz)
     return np.asarray(density[0] if len(density) == 1 else density) * samples.weight_hz
@@ -170,18 +172,14 @@ def _scalar_covariances(
     subloop: Subloop,
     group: DelayGroup,
     gains: FloatArray,
-    samples: SampledResponses,
+    samples: _SampledResponses,
     densities: list[tuple[FloatArray, list[int]]],
     noise_nm: FloatArray,
     white: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """One mode, in real numbers: ``|S|^2 = 1 / |1 + g L|^2`` with the loop L at unit gain."""
-    unit = (
-        subloop.influence[0, 0]
-        * subloop.sensor[0, 0]
-        * samples.controller[..., 0, 0]
-        * samples.delay
-    )
+    size = subloop.influence[0, 0] * subloop.sensor[0, 0]
+    unit = size * samples.controller[..., 0, 0] * samples.delay
     first, second = unit * samples.first, unit * samples.second
     real, imaginary = first.real, first.imag
     if group.fraction.any():
@@ -210,7 +208,7 @@ def _matrix_covariances(
     subloop: Subloop,
     group: DelayGroup,
     gains: FloatArray,
-    samples: SampledResponses,
+    samples: _SampledResponses,
     densities: list[tuple[FloatArray, list[int]]],
     noise_nm: FloatArray,
     white: FloatArray,

@@ -7,7 +7,7 @@ import numpy as np
 from lbt_synth.loop.ensemble.ar_covariances import PROCESSES, add_process
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
 from lbt_synth.loop.ensemble.loop_ensemble import Turbulence, turbulence_rows
-from lbt_synth.loop.ensemble.spectral_covariances import sample_responses, spectral_covariances
+from lbt_synth.loop.ensemble.spectral_covariances import spectral_covariances
 from lbt_synth.validation import FloatArray
 
 
@@ -34,14 +34,11 @@ def turbulence_and_noise_covariances(
                 rows = batch.mirrors.rows
                 at = (rows[:, None, None], *np.ix_(subloop.modes, subloop.modes))
                 spectra = [(turbulence_rows(spectrum, rows), own) for spectrum, own in smooth]
-                samples = sample_responses(
-                    subloop, batch.mirrors, batch.poles, [s for s, _ in spectra], rate
-                )
                 turbulence_nm2[at], noise_nm2[at] = spectral_covariances(
                     subloop,
                     batch.mirrors,
+                    batch.poles,
                     loops.sensor_gains[rows],
-                    samples,
                     spectra,
                     noise_nm[rows][:, subloop.measurements],
                     rate,
