@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_are
 
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.linear.lmi.balanced_coordinates import balanced
+from lbt_synth.linear.lmi.balanced_coordinates import balance
 from lbt_synth.linear.lmi.hinf import hinf_lmi, least_gamma_lmi
 from lbt_synth.linear.lmi.kalman import kalman_sdp
 from lbt_synth.linear.lmi.solver import solve
@@ -113,7 +113,7 @@ def eliminated() -> None:
         middle = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            status, gamma = whole_lmi(balanced(p, start.P, scale).problem)
+            status, gamma = whole_lmi(balance(p, start.P, scale).problem)
         end = time.perf_counter()
         print(
             f"LMI, {len(p.A):2d} states: eliminated {middle - began:.2f} s, gamma off by "

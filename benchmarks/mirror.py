@@ -15,7 +15,7 @@ from lbt_synth.report.figures.style import save_figure
 CONFIG = lbt.load_config("examples/lbt.yaml")
 SHELL = {"natural_frequency_hz": 20.0, "damping": 0.5}
 MIRRORS = {"settled": None} | {
-    f"{hz} Hz": lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=hz)
+    f"{hz} Hz": lbt.models.PositionLoop.from_bandwidth(**SHELL, bandwidth_hz=hz)
     for hz in (500, 250, 150, 100, 60)
 }
 
@@ -84,7 +84,7 @@ def stable_to(hardware: lbt.LoopHardware, design: lbt.Design, low: float, high: 
     """
 
     def is_stable(bandwidth: float) -> bool:
-        mirror = lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=bandwidth)
+        mirror = lbt.models.PositionLoop.from_bandwidth(**SHELL, bandwidth_hz=bandwidth)
         real = replace(hardware, mirror=mirror)
         return lbt.close_loop(real, design.controller).is_stable
 
@@ -100,7 +100,7 @@ def errors() -> None:
     """How wrong the mirror may be: ends of stability, residual with a wrong bandwidth."""
     settled = lbt.kalman(CONFIG.plant)
     edge = stable_to(CONFIG.hardware, settled, 500, 250)
-    mirror = lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=edge)
+    mirror = lbt.models.PositionLoop.from_bandwidth(**SHELL, bandwidth_hz=edge)
     real = replace(CONFIG.hardware, mirror=mirror)
     poles = lbt.close_loop(real, settled.controller).system.poles
     fails_hz = abs(np.angle(poles[np.argmax(np.abs(poles))])) * real.frame_rate_hz / (2 * np.pi)
@@ -122,7 +122,7 @@ def errors() -> None:
             f"modulus {margins.modulus:.3f}, delay margin {margins.delay_frames:.2f} frames"
         )
         for factor in (0.9, 0.95, 1.05, 1.1):
-            real = lbt.models.PositionLoop.of_bandwidth(**SHELL, bandwidth_hz=believed * factor)
+            real = lbt.models.PositionLoop.from_bandwidth(**SHELL, bandwidth_hz=believed * factor)
             loop = lbt.close_loop(replace(here.hardware, mirror=real), design.controller)
             budget = lbt.residual_budget(loop, CONFIG.truth) if loop.is_stable else None
             text = "unstable" if budget is None else f"{budget.rms_nm:.2f} nm"

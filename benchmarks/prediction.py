@@ -44,7 +44,7 @@ def open_loop(y, u, path: lbt.LoopHardware):
 
 
 def identity() -> None:
-    shell = lbt.models.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.from_bandwidth(
         natural_frequency_hz=20, damping=0.5, bandwidth_hz=300
     )
     truth = lbt.Truth(turbulence=SWELL, vibrations=(LINE, SIDE), noise_nm=15.5)

@@ -202,6 +202,12 @@ def sequence(value: Any, name: str) -> tuple[Any, ...]:
     return tuple(value)
 
 
+def set_fields(target: object, **values: Any) -> None:
+    """Set fields of a frozen dataclass while it is being initialised."""
+    for name, value in values.items():
+        object.__setattr__(target, name, value)
+
+
 def require_instance(value: object, kind: type[Any]) -> None:
     """Refuse anything that is not an instance of a class."""
     if not isinstance(value, kind):

@@ -8,7 +8,7 @@ import numpy as np
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
 from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
-from lbt_synth.validation import FloatArray, definite, frozen_copy, integer, matrix
+from lbt_synth.validation import FloatArray, definite, frozen_copy, integer, matrix, set_fields
 
 LONGEST_HORIZON = 100  # samples
 
@@ -70,7 +70,7 @@ class EstimationProblem(LinearSystem):
     def __post_init__(self) -> None:
         LinearSystem.__post_init__(self)
         L = matrix(self.L, "L", cols=(self.n_states, f"to match A {self.A.shape}"))
-        object.__setattr__(self, "L", L)
+        set_fields(self, L=L)
         try:
             definite(self.D @ self.D.T, "D D'")
         except DefinitenessError as error:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.validation import FloatArray, matrix
+from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
 _STRAYED = 1e-9  # share of the successors that may lie where no filter has an error
@@ -44,8 +44,7 @@ class Witness:
         states = matrix(self.states, "states")
         columns = (states.shape[1], f"to match the states {states.shape}")
         disturbances = matrix(self.disturbances, "disturbances", cols=columns)
-        object.__setattr__(self, "states", states)
-        object.__setattr__(self, "disturbances", disturbances)
+        set_fields(self, states=states, disturbances=disturbances)
 
 
 def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: FloatArray) -> float:

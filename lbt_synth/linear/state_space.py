@@ -14,7 +14,15 @@ import numpy as np
 from scipy.linalg import matrix_balance, schur
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.validation import ComplexArray, FloatArray, matrix, number, real_array, square
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    matrix,
+    number,
+    real_array,
+    set_fields,
+    square,
+)
 
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
 
@@ -36,9 +44,7 @@ class LinearSystem:
         C = matrix(self.C, "C", cols=(len(A), why))
         rows, cols = (len(C), f"to match C {C.shape}"), (B.shape[1], f"to match B {B.shape}")
         D = matrix(self.D, "D", rows=rows, cols=cols)
-        for name, value in (("A", A), ("B", B), ("C", C), ("D", D)):
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "dt_s", number(self.dt_s, "dt_s", above=0))
+        set_fields(self, A=A, B=B, C=C, D=D, dt_s=number(self.dt_s, "dt_s", above=0))
 
     @property
     def n_states(self) -> int:

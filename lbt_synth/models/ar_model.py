@@ -1,4 +1,4 @@
-"""Auto-regressive processes of any order, with their spectrum and variance."""
+"""Auto-regressive (AR) processes of any order, with their spectrum and variance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.validation import FloatArray, frozen_copy, number, real_array
+from lbt_synth.validation import FloatArray, frozen_copy, number, real_array, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,13 +47,9 @@ class ARModel:
             raise DimensionError(
                 f"coefficients must be a list of at least one number; got shape {a.shape}."
             )
-        object.__setattr__(self, "coefficients", frozen_copy(a))
-        object.__setattr__(
-            self, "driving_rms_nm", number(self.driving_rms_nm, "driving_rms_nm", above=0)
-        )
-        object.__setattr__(
-            self, "frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0)
-        )
+        driving = number(self.driving_rms_nm, "driving_rms_nm", above=0)
+        rate = number(self.frame_rate_hz, "frame_rate_hz", above=0)
+        set_fields(self, coefficients=frozen_copy(a), driving_rms_nm=driving, frame_rate_hz=rate)
         radius = float(np.max(np.abs(np.linalg.eigvals(self.companion))))
         if not radius < 1:
             raise ProblemError(
@@ -119,9 +115,9 @@ def variance_ratio(coefficients: FloatArray) -> float:
 def variance_ratios(coefficients: FloatArray) -> FloatArray:
     """Variance over that of the driving noise, for processes (..., order), (...).
 
-    By Levinson's recursion stepped down: with the reflection coefficients r the
-    ratio is ``1 / prod(1 - r^2)``. Loses fewer digits than a Lyapunov equation
-    when the poles crowd at the unit circle.
+    By stepping down Levinson's recursion: with the reflection coefficients r the ratio is
+    ``1 / prod(1 - r^2)``. This loses fewer digits than a Lyapunov equation when the poles
+    crowd at the unit circle.
     """
     a = np.array(coefficients, dtype=np.float64)
     ratio = np.ones(a.shape[:-1])

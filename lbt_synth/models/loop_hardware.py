@@ -9,7 +9,14 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, instant_mirror, lifted_mirror
 from lbt_synth.models.mirror.position_loop import PositionLoop
-from lbt_synth.validation import FloatArray, frozen_copy, matrix, number, require_instance
+from lbt_synth.validation import (
+    FloatArray,
+    frozen_copy,
+    matrix,
+    number,
+    require_instance,
+    set_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,7 +56,7 @@ class LoopHardware:
     ------
     ProblemError
         If a value is not finite, out of range, or the sizes clash; or if the local loop does
-        not run a whole number of samples a frame.
+        not run a whole number of samples per frame.
 
     Examples
     --------
@@ -86,20 +93,13 @@ class LoopHardware:
         for name, value in (("sensor_matrix", sensor), ("influence_matrix", influence)):
             if value is not None and not np.any(value):
                 raise ProblemError(f"{name} must respond to something; got only zeros.")
-        object.__setattr__(self, "modes", n)
-        object.__setattr__(
-            self, "sensor_matrix", frozen_copy(np.eye(n)) if sensor is None else sensor
-        )
-        object.__setattr__(
-            self, "influence_matrix", frozen_copy(np.eye(n)) if influence is None else influence
-        )
-        object.__setattr__(
-            self, "frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0)
-        )
-        object.__setattr__(
+        set_fields(
             self,
-            "delay_frames",
-            number(
+            modes=n,
+            sensor_matrix=frozen_copy(np.eye(n)) if sensor is None else sensor,
+            influence_matrix=frozen_copy(np.eye(n)) if influence is None else influence,
+            frame_rate_hz=number(self.frame_rate_hz, "frame_rate_hz", above=0),
+            delay_frames=number(
                 self.delay_frames,
                 "delay_frames",
                 at_least=1,
@@ -164,7 +164,7 @@ def have_same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
 
 
 def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
-    """Say in what the loop that a design was made for differs from the one it is run in."""
+    """Say how the loop that a design was made for differs from the loop that it runs in."""
     notes = []
     if own.delay_frames != here.delay_frames:
         notes.append(
@@ -190,8 +190,8 @@ def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
 def past_corrections(taps: FloatArray, commands: FloatArray) -> FloatArray:
     """Return ``c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...``, which measurement k sees.
 
-    Commands before the first row count as zero: the first ``len(taps)`` rows are not known. Shapes:
-    taps (t,), commands (frames, m) -> (frames, m).
+    Commands (frames, m) before the first row count as zero, so the first ``len(taps)`` rows of
+    the answer (frames, m) are not known.
     """
     frames = len(commands)
     out = np.zeros(commands.shape)

@@ -1,4 +1,4 @@
-"""Power spectra of sampled resonances, with their derivatives.
+"""Power spectra of sampled resonances, and their derivatives.
 
 A second-order process of natural frequency f, damping ratio zeta and variance P, sampled at
 f_s, is ``x(k+1) = a1 x(k) + a2 x(k-1) + v(k)``. With ``q = -a2``, ``b = 1 - a1 - a2`` and
@@ -8,7 +8,7 @@ f_s, is ``x(k+1) = a1 x(k) + a2 x(k-1) + v(k)``. With ``q = -a2``, ``b = 1 - a1 
     var v / P                 = (1 - q) b (2 (1 + q) - b) / (1 + q)
 
 Both are sums and products without cancellation, down to any frequency and damping. A damping
-ratio above 1 is two real poles; the formulas pass through 1 smoothly.
+ratio above 1 means two real poles; the formulas are smooth at 1.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PARAMETERS = 3  # of a component: log frequency, log damping, log variance
 
 
 def recursion(frequency: float, damping: float) -> tuple[float, float, FloatArray]:
-    """Return b, 1 - q and their derivatives. Shapes: returns jacobian (2, 2)."""
+    """Return b, 1 - q and their Jacobian (2, 2) by the logarithms of frequency and damping."""
     w, decay = frequency, damping * frequency
     rho = np.exp(-decay)
     p = -np.expm1(-2 * decay)
@@ -60,10 +60,7 @@ def coefficients(frequency: float, damping: float) -> tuple[float, float, float]
 
 
 def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
-    """Coefficients a1 and a2 of many sampled resonances, (p, 2).
-
-    Shapes: frequency (p,), damping (p,).
-    """
+    """Coefficients a1 and a2 of p sampled resonances, (p, 2)."""
     decay = np.exp(-damping * frequency)
     turn = frequency * np.sqrt((1 - damping) * (1 + damping))
     return np.stack([2 * decay * np.cos(turn), -(decay**2)], axis=-1)
@@ -72,10 +69,7 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
 def log_density(
     frequency: float, damping: float, s: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Logarithm of the spectrum of unit variance, and its derivatives.
-
-    Shapes: s (f,) -> value, by_frequency, by_damping (f,).
-    """
+    """Logarithm of the spectrum of unit variance, and its derivatives; all are (f,) as s is."""
     b, p, jacobian = recursion(frequency, damping)
     q = 1 - p
     near = b - (1 + q) / 2 * s
@@ -94,10 +88,7 @@ def log_density(
 
 
 def log_roll_off(corner: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Logarithm of a first-order low pass's power response, and its derivative.
-
-    Shapes: s (f,) -> value, by_corner (f,).
-    """
+    """Logarithm of the power response of a first-order low pass, and its derivative, (f,)."""
     gap, pole = -np.expm1(-corner), np.exp(-corner)
     size = gap**2 + pole * s
     return np.log(gap**2 / size), corner * pole * (2 / gap - (2 * gap - s) / size)

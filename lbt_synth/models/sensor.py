@@ -1,4 +1,4 @@
-"""Measurement noise of a modulated pyramid sensor: of tip and tilt, and assumed of more modes."""
+"""Measurement noise of a modulated pyramid sensor, in tip and tilt and in higher modes."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def pyramid_modal_noise_nm(
     A modulated pyramid measures slopes at spatial frequencies below its modulation and phase
     above. A mode of radial order n has about ``(n + 1) / 2`` periods over the pupil, so its
     noise is taken as that of the tilt times ``2 / (n + 1)``, and not less than one over the
-    modulation. A model of convenience: a measured interaction matrix tells the noise of its
+    modulation. This is a convenient model; a measured interaction matrix gives the noise of its
     modes (:class:`Reconstructor`).
 
     Parameters

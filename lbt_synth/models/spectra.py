@@ -1,4 +1,4 @@
-"""Power spectra: what they all have in common, tables and sums."""
+"""Power spectra: their interface, tables, and sums of several."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
-from lbt_synth.validation import FloatArray, frozen_copy, real_array, sequence
+from lbt_synth.validation import FloatArray, frozen_copy, real_array, sequence, set_fields
 
 
 @runtime_checkable
@@ -60,8 +60,7 @@ class TabulatedSpectrum:
             raise ProblemError("frequency_hz must increase from at least 0; it does not.")
         if np.any(s < 0):
             raise ProblemError(f"density_nm2_hz must be at least 0; got {np.min(s):.6g}.")
-        object.__setattr__(self, "frequency_hz", f)
-        object.__setattr__(self, "density_nm2_hz", s)
+        set_fields(self, frequency_hz=f, density_nm2_hz=s)
 
     @property
     def breakpoints_hz(self) -> FloatArray:
@@ -81,7 +80,7 @@ class SumSpectrum:
     Parameters
     ----------
     parts : sequence of Spectrum
-        Their spectra, at least one; spectra that are sums themselves are taken apart.
+        Their spectra, at least one; sums among them are taken apart.
 
     Raises
     ------
@@ -113,7 +112,7 @@ class SumSpectrum:
         flat: list[Spectrum] = []
         for part in given:
             flat += part.parts if isinstance(part, SumSpectrum) else (part,)
-        object.__setattr__(self, "parts", tuple(flat))
+        set_fields(self, parts=tuple(flat))
 
     @property
     def breakpoints_hz(self) -> FloatArray:
@@ -128,13 +127,13 @@ class SumSpectrum:
 
 
 def breakpoints_below(spectrum: Spectrum, limit_hz: float) -> FloatArray:
-    """Frequencies in (0, limit) at which a spectrum says that it has kinks [Hz]."""
+    """Frequencies in (0, limit) at which a spectrum declares kinks [Hz]."""
     points = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)
     return points[(points > 0) & (points < limit_hz)]
 
 
 def spectrum_key(spectrum: Spectrum | None) -> object:
-    """Return what two equal spectra share: the numbers of an AR model, else which object it is."""
+    """Return a key that equal spectra share: the numbers of an AR model, else its identity."""
     if isinstance(spectrum, ARModel):
         return (
             spectrum.coefficients.tobytes(),

@@ -1,4 +1,4 @@
-"""What the telescope really does, apart from what the design believes."""
+"""The truth of a simulation: what the telescope really does, whatever the design assumes."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
 from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.models.vibration.sinusoid import SinusoidalVibration
-from lbt_synth.validation import FloatArray, frozen_copy, number, real_array
+from lbt_synth.validation import FloatArray, frozen_copy, number, real_array, set_fields
 
 TrueVibration: TypeAlias = Vibration | SinusoidalVibration | DriftingVibration
 
 
 def checked_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
-    """Return the direction (n,) of a vibration that fits a loop."""
+    """Return the direction (n,) of a vibration, which must fit the loop."""
     if isinstance(vibration, DriftingVibration):
         frequency_hz = vibration.highest_hz
     else:
         frequency_hz = vibration.frequency_hz
     if len(vibration.direction) != hardware.modes:
         raise DimensionError(
-            f"the direction of a vibration must have {hardware.modes} components, one a mode; "
+            f"the direction of a vibration must have {hardware.modes} components, one per mode; "
             f"got {len(vibration.direction)} at {frequency_hz:.6g} Hz."
         )
     nyquist = hardware.frame_rate_hz / 2
@@ -42,7 +42,7 @@ def checked_direction(vibration: TrueVibration, hardware: LoopHardware) -> Float
 def stationary_vibrations(
     vibrations: Iterable[TrueVibration],
 ) -> tuple[Vibration | SinusoidalVibration, ...]:
-    """Return vibrations, none of which drifts."""
+    """Return the vibrations; refuse one that drifts."""
     still = []
     for vibration in vibrations:
         if isinstance(vibration, DriftingVibration):
@@ -62,13 +62,13 @@ class Truth:
     Parameters
     ----------
     turbulence : Spectrum, sequence of (Spectrum or None), or None
-        Spectrum of each mode, the modes independent: one for all of them, or one a mode; None
+        Spectrum of each mode, the modes independent: one for all of them, or one per mode; None
         for no turbulence.
     vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration, optional
-        The vibrations that are really there. One that drifts can be simulated only.
+        The vibrations that are really there. One that drifts can only be simulated.
     noise_nm : float or (q,) array_like, optional
         Standard deviation of the noise on each measurement, per frame [nm]: one for all of
-        them, or one a measurement.
+        them, or one per measurement.
     sensor_gain : float, optional
         Real sensor (optical) gain relative to the sensor matrix:
         ``y = sensor_gain D phi_res + noise``. Gains that differ between the axes belong into
@@ -106,30 +106,30 @@ class Truth:
     def __post_init__(self) -> None:
         given = self.turbulence
         if isinstance(given, Sequence):
-            object.__setattr__(self, "turbulence", tuple(given))
+            set_fields(self, turbulence=tuple(given))
             if len(given) == 0:
                 raise DimensionError(
-                    "turbulence must be one spectrum, or one a mode; got an empty sequence. For "
+                    "turbulence must be one spectrum, or one per mode; got an empty sequence. For "
                     "no turbulence give None."
                 )
         for part in self._per_mode or (self.turbulence,):
             if part is not None and not isinstance(part, Spectrum):
                 raise ProblemError(
                     "turbulence must have a method psd(frequency_hz), or be None, or a sequence "
-                    f"of these, one a mode; got {type(part).__name__}."
+                    f"of these, one per mode; got {type(part).__name__}."
                 )
-        object.__setattr__(self, "vibrations", tuple(self.vibrations))
-        object.__setattr__(self, "noise_nm", _deviations(self.noise_nm))
-        object.__setattr__(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+        gain = number(self.sensor_gain, "sensor_gain", above=0)
+        noise = _deviations(self.noise_nm)
+        set_fields(self, vibrations=tuple(self.vibrations), noise_nm=noise, sensor_gain=gain)
 
     @property
     def drifts(self) -> bool:
-        """Whether a vibration drifts: then it can be simulated, and nothing else."""
+        """Whether a vibration drifts, so that the truth can only be simulated."""
         return any(isinstance(line, DriftingVibration) for line in self.vibrations)
 
     @property
     def _per_mode(self) -> tuple[Spectrum | None, ...] | None:
-        """Spectra one a mode, None where one serves all modes."""
+        """Spectra of each mode, None if one serves all modes."""
         return self.turbulence if isinstance(self.turbulence, tuple) else None
 
     @property
@@ -148,7 +148,7 @@ class Truth:
         Returns
         -------
         tuple of Spectrum or None
-            One a mode.
+            Of each mode.
 
         Raises
         ------
@@ -160,7 +160,7 @@ class Truth:
             return (self.turbulence,) * modes  # type: ignore[return-value]
         if len(given) != modes:
             raise DimensionError(
-                f"turbulence must be one spectrum, or one a mode ({modes}); got {len(given)}."
+                f"turbulence must be one spectrum, or one per mode ({modes}); got {len(given)}."
             )
         return given
 
@@ -199,7 +199,7 @@ class Truth:
         Returns
         -------
         (q,) ndarray
-            One a measurement.
+            Of each measurement.
 
         Raises
         ------
@@ -208,20 +208,20 @@ class Truth:
         """
         if np.ndim(self.noise_nm) and np.size(self.noise_nm) != measurements:
             raise DimensionError(
-                f"noise_nm must be one number, or one a measurement ({measurements}); "
+                f"noise_nm must be one number, or one per measurement ({measurements}); "
                 f"got {np.size(self.noise_nm)}."
             )
         return frozen_copy(np.broadcast_to(self.noise_nm, (measurements,)))
 
 
 def _deviations(noise_nm: Any) -> float | FloatArray:
-    """Return one deviation for all measurements, or one a measurement."""
+    """Return one deviation for all measurements, or one per measurement."""
     if np.ndim(noise_nm) == 0:
         return number(noise_nm, "noise_nm", at_least=0)
     out = real_array(noise_nm, "noise_nm")
     if out.ndim != 1 or out.size == 0:
         raise DimensionError(
-            f"noise_nm must be one number, or a list of one a measurement; got shape {out.shape}."
+            f"noise_nm must be one number, or a list of one per measurement; got shape {out.shape}."
         )
     for value in out:
         number(value, "noise_nm", at_least=0)

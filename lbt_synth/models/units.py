@@ -1,4 +1,4 @@
-"""Units of tip/tilt: milliarcseconds on the sky and nanometres of wavefront."""
+"""Convert tip and tilt between milliarcseconds on the sky and nanometres of wavefront."""
 
 from __future__ import annotations
 

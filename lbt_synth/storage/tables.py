@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lbt_synth.errors import DimensionError
-from lbt_synth.validation import choice
+from lbt_synth.validation import choice, set_fields
 
 TONES = ("plain", "good", "bad", "note")
 
@@ -35,8 +35,7 @@ class Table:
     words: tuple[int, ...] = ()  # columns set flush left, besides the first
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "headings", tuple(self.headings))
-        object.__setattr__(self, "rows", tuple(tuple(row) for row in self.rows))
+        set_fields(self, headings=tuple(self.headings), rows=tuple(map(tuple, self.rows)))
         for row in self.rows:
             if len(row) not in (1, len(self.headings)):
                 raise DimensionError(

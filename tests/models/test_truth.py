@@ -42,8 +42,8 @@ def test_a_truth_needs_a_spectrum():
     ("arguments", "error", "text"),
     [
         ({"turbulence": []}, lbt.errors.DimensionError, "got an empty sequence"),
-        ({"turbulence": [SLOW, 3.0]}, lbt.errors.ProblemError, "one a mode; got float"),
-        ({"turbulence": "slow"}, lbt.errors.ProblemError, "one a mode; got str"),
+        ({"turbulence": [SLOW, 3.0]}, lbt.errors.ProblemError, "one per mode; got float"),
+        ({"turbulence": "slow"}, lbt.errors.ProblemError, "one per mode; got str"),
         (
             {"turbulence": None, "noise_nm": [[1.0]]},
             lbt.errors.DimensionError,

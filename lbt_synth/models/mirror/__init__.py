@@ -1,1 +1,1 @@
-"""The mirror in its local position loop."""
+"""The mirror: its local position loop, and its response at the frame rate."""

@@ -1,46 +1,45 @@
-"""The mirror at the frame rate: exposure-averaged position, driven by the frames' commands.
+"""The mirror at the frame rate: from the command of each frame to the mean position over it.
 
-Commands arrive once a frame, ``delay_frames - 1`` frames after the exposure that follows
-their computation has begun; an exposure averages the position over one frame. A settled
-mirror shows the commands of at most two frames within an exposure. One with dynamics is
-lifted: its local loop runs a whole number of samples between two commands, and the integral
-of its position over either part of an exposure is a linear function of its state and of the
-command (discretisation of hybrid adaptive-optics loops: C. Correia, H.-F. Raynaud,
+Commands arrive once per frame, ``delay_frames - 1`` frames after the exposure that follows
+their computation has begun; an exposure averages the position over one frame. A mirror that
+settles at once shows the commands of at most two frames within an exposure. A mirror with
+dynamics is lifted: its local loop runs a whole number of samples between two commands, and the
+integral of its position over either part of an exposure is a linear function of its state and
+of the command (discretisation of hybrid adaptive-optics loops: C. Correia, H.-F. Raynaud,
 C. Kulcsar, J.-M. Conan, J. Opt. Soc. Am. A 27, 333 (2010), doi:10.1364/JOSAA.27.000333).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.state_space import balancing_scales
 from lbt_synth.models.mirror.position_loop import PositionLoop
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, set_fields
 
-_WHOLE = 1e-9  # by which the ratio of the rates may miss an integer, relative
-_NOTHING = 1e-14  # a leading tap of at most this is none
-_TAIL = 1e-15  # what is left of the step response where the taps end
+_WHOLE = 1e-9  # relative amount by which the ratio of the rates may miss an integer
+_NOTHING = 1e-14  # a leading tap of at most this counts as zero
+_TAIL = 1e-15  # the taps end where at most this is left of the step response
 _MOST_TAPS = 4000
-_MOST_SAMPLES = 100_000  # of the local loop, a frame; they are run one by one
+_MOST_SAMPLES = 100_000  # of the local loop per frame; they are run one by one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Response:
     """A system of one input and one output, which may have no state at all."""
 
-    A: FloatArray  # (n, n): state matrix
-    # B, C (n,): input and output vectors
-    B: FloatArray
-    C: FloatArray
-    D: float  # Feedthrough
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n,)
+    C: FloatArray  # (n,)
+    D: float
 
-    def __post_init__(self) -> None:
-        for name in "ABC":  # systems are kept, and shared
-            object.__setattr__(self, name, frozen_copy(getattr(self, name)))
+    def __post_init__(self) -> None:  # cached systems are shared, so they must not change
+        set_fields(self, **{name: frozen_copy(getattr(self, name)) for name in "ABC"})
 
     @property
     def n_states(self) -> int:
@@ -65,22 +64,18 @@ class Response:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MirrorSystem:
-    """What an exposure sees of the commands."""
+    """The response of an exposure to the commands."""
 
-    whole: Response  # From u(k) to the position averaged over exposure k
-    # The same, ``lead`` frames earlier; its feedthrough is not zero. Its states are the first ones
-    # of ``whole``.
+    whole: Response  # from u(k) to the position averaged over exposure k
+    # the same, ``lead`` frames earlier; has a feedthrough, and the first states of ``whole``
     core: Response
-    lead: int  # Frames in which a command does nothing
-    taps: FloatArray  # (t,): impulse response of ``whole``, to rounding; the sum is 1
+    lead: int  # frames in which a command does nothing
+    taps: FloatArray  # (t,): impulse response of ``whole``, to rounding, with the sum 1
 
 
 @lru_cache(maxsize=64)
 def instant_mirror(delay_frames: float) -> MirrorSystem:
-    """Return the system of a mirror that takes its position at once.
-
-    Its states are the past commands, the newest first.
-    """
+    """System of a mirror that settles at once; its states are past commands, newest first."""
     lead = int(np.floor(delay_frames - 1))
     fraction = delay_frames - 1 - lead
     taps = np.zeros(lead + (2 if fraction > 0 else 1))
@@ -96,53 +91,25 @@ def instant_mirror(delay_frames: float) -> MirrorSystem:
 
 
 def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float) -> MirrorSystem:
-    """Return the system of a mirror in its local loop, exactly.
+    """Exact system of a mirror in its local loop.
 
     The samples of the local loop are counted from the arrival of each command; the edges of
     an exposure may lie between them.
     """
-    return _lift(
-        loop.natural_frequency_hz,
-        loop.damping,
-        loop.proportional_per_s2,
-        loop.derivative_per_s,
-        loop.feed_forward,
-        loop.sampling_hz,
-        loop.delay_samples,
-        loop.ramp_samples,
-        frame_rate_hz,
-        delay_frames,
-    )
+    return _lift(tuple(asdict(loop).items()), frame_rate_hz, delay_frames)
 
 
 @lru_cache(maxsize=64)
 def _lift(
-    natural_frequency_hz: float,
-    damping: float,
-    proportional_per_s2: float,
-    derivative_per_s: float,
-    feed_forward: float,
-    sampling_hz: float,
-    delay_samples: int,
-    ramp_samples: int,
-    frame_rate_hz: float,
-    delay_frames: float,
+    loop_fields: tuple[tuple[str, Any], ...], frame_rate_hz: float, delay_frames: float
 ) -> MirrorSystem:
-    loop = PositionLoop(
-        natural_frequency_hz=natural_frequency_hz,
-        damping=damping,
-        proportional_per_s2=proportional_per_s2,
-        derivative_per_s=derivative_per_s,
-        feed_forward=feed_forward,
-        sampling_hz=sampling_hz,
-        delay_samples=delay_samples,
-        ramp_samples=ramp_samples,
-    )
+    """Lift a loop, given by its fields so that equal loops share one answer."""
+    loop = PositionLoop(**dict(loop_fields))
     samples = samples_per_frame(loop, frame_rate_hz)
     lead = int(np.floor(delay_frames - 1))
     fraction = delay_frames - 1 - lead
     core = _one_frame(loop, samples, (1 - fraction) * samples)
-    while abs(core.D) <= _NOTHING:  # the mirror has not moved yet: one frame of delay more
+    while abs(core.D) <= _NOTHING:  # the mirror has not moved yet: one more frame of delay
         core = Response(A=core.A, B=core.B, C=core.C @ core.A, D=float(core.C @ core.B))
         lead += 1
     core = _balance(core)
@@ -155,11 +122,11 @@ def _lift(
 
 
 def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
-    """Return the samples of a local loop in a frame."""
+    """Count the samples of a local loop per frame, which must be a whole number."""
     ratio = loop.sampling_hz / frame_rate_hz
     if not ratio <= _MOST_SAMPLES:
         raise ProblemError(
-            f"the local loop of the mirror must run at most {_MOST_SAMPLES} samples a frame; got "
+            f"the local loop of the mirror must run at most {_MOST_SAMPLES} samples per frame; got "
             f"{loop.sampling_hz:.9g} Hz over {frame_rate_hz:.9g} Hz = {ratio:.9g}. Lower "
             f"sampling_hz to {_MOST_SAMPLES * frame_rate_hz:.9g} Hz or less, or raise the frame "
             "rate; a mirror that settles within a few samples of so slow a loop needs no local "
@@ -170,7 +137,7 @@ def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
         low, high = int(np.floor(ratio)), int(np.floor(ratio)) + 1
         fitting = [loop.sampling_hz / n for n in (high, low) if n > 0]
         raise ProblemError(
-            "the local loop of the mirror must run a whole number of samples a frame; got "
+            "the local loop of the mirror must run a whole number of samples per frame; got "
             f"{loop.sampling_hz:.9g} Hz over {frame_rate_hz:.9g} Hz = {ratio:.9g}. Frame rates "
             f"that fit are {' and '.join(f'{rate:.9g}' for rate in fitting)} Hz."
         )
@@ -183,9 +150,9 @@ def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
 
 
 def _one_frame(loop: PositionLoop, samples: int, split: float) -> Response:
-    """One frame after the arrival of a command, seen by the two exposures that it lies in.
+    """System of one frame after the arrival of a command, as two exposures see it.
 
-    ``split`` samples of it belong to the exposure under way, the rest to the next one.
+    The first ``split`` samples belong to the exposure under way, the others to the next one.
     """
     local = loop.closed_loop()
     n, ramped, late = local.n_states, loop.ramp_samples > 1, split < samples
@@ -220,13 +187,13 @@ def _one_frame(loop: PositionLoop, samples: int, split: float) -> Response:
 
 
 def _taps(core: Response) -> FloatArray:
-    """Impulse response until what is left of the step response is rounding."""
+    """Impulse response until the rest of the step response is rounding."""
     radius = float(np.max(np.abs(np.linalg.eigvals(core.A))))
     frames = 2 * core.n_states + 2 + int(np.ceil(np.log(1e-18) / np.log(max(radius, 1e-9))))
     if not radius < 1 or frames > _MOST_TAPS:
         raise ProblemError(
             f"the mirror must settle within {_MOST_TAPS} frames; got one that decays by a factor "
-            f"of {radius:.9g} a frame. Raise the bandwidth or the damping of its local loop."
+            f"of {radius:.9g} per frame. Raise the bandwidth or the damping of its local loop."
         )
     taps = core.impulse(frames)
     left = np.cumsum(np.abs(taps[::-1]))[::-1]
@@ -235,19 +202,19 @@ def _taps(core: Response) -> FloatArray:
 
 
 def _delay(core: Response, lead: int) -> Response:
-    """Put the output of a core through a delay."""
+    """Delay the output of a core by ``lead`` frames."""
+    if not lead:
+        return core
     n = core.n_states
     A, B, C = np.eye(n + lead, k=-1), np.zeros(n + lead), np.zeros(n + lead)
     A[: n + 1], B[:n] = 0.0, core.B
     A[:n, :n] = core.A
-    if not lead:
-        return core
     A[n, :n], B[n], C[-1] = core.C, core.D, 1.0
     return Response(A=A, B=B, C=C, D=0.0)
 
 
 def tapped_mirror(taps: FloatArray) -> Response:
-    """Return a mirror by its impulse response; its states are the past commands."""
+    """System with an impulse response; its states are the past commands."""
     n = len(taps) - 1
     B = np.zeros(n)
     B[:1] = 1.0
@@ -255,7 +222,7 @@ def tapped_mirror(taps: FloatArray) -> Response:
 
 
 def _balance(core: Response) -> Response:
-    """Put the states into units, powers of two, that balance the system."""
+    """Scale the states by powers of two so that the system is balanced."""
     n = core.n_states
     scaling = balancing_scales(core.A, np.abs(core.B), np.abs(core.C))
     units = scaling[:n] / scaling[n]

@@ -1,17 +1,18 @@
-"""The local position loop of an adaptive secondary mirror: one mode of its thin shell.
+"""The local position loop of an adaptive secondary mirror, for one mode of its thin shell.
 
 The shell floats on a film of air in front of voice coils and capacitive sensors; each
 position is held by a sampled proportional-derivative feedback and a feed-forward force
 proportional to the commanded position (A. Riccardi et al., "Adaptive secondary mirrors for
 the Large Binocular Telescope", Proc. SPIE 5169, 721 (2003), doi:10.1117/12.511374; Agapito
-et al. 2008, section II). Here is one mode of it, with force over modal mass as an
-acceleration, all sampling exact by matrix exponentials.
+et al. 2008, section II). This is one mode, with force over modal mass as an acceleration,
+and exact sampling by matrix exponentials.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -19,11 +20,11 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number, set_fields
 
 _STABLE = 1 - 1e-9
 _MOST_SAMPLES = 500_000
-_POINTS = 8  # of a step response, a sample
+_POINTS = 8  # of a step response per sample
 _LONGEST_DELAY = 64  # samples
 _BLOCK = 64  # samples of a step response that are computed at once
 
@@ -87,7 +88,7 @@ class PositionLoop:
     delay_samples : int, optional
         Computing delay of the local loop [samples].
     ramp_samples : int, optional
-        The command is reached in so many equal steps, one a sample; 1 for a plain step.
+        The command is reached in so many equal steps, one per sample; 1 for a plain step.
 
     Raises
     ------
@@ -115,22 +116,18 @@ class PositionLoop:
     ramp_samples: int = 1
 
     def __post_init__(self) -> None:
-        checked = {
-            "natural_frequency_hz": number(
-                self.natural_frequency_hz, "natural_frequency_hz", above=0
-            ),
-            "damping": number(self.damping, "damping", at_least=0),
-            "proportional_per_s2": number(
-                self.proportional_per_s2, "proportional_per_s2", at_least=0
-            ),
-            "derivative_per_s": number(self.derivative_per_s, "derivative_per_s", at_least=0),
-            "feed_forward": number(self.feed_forward, "feed_forward", at_least=0, at_most=10),
-            "sampling_hz": number(self.sampling_hz, "sampling_hz", above=0),
-            "delay_samples": integer(self.delay_samples, "delay_samples", at_least=0),
-            "ramp_samples": integer(self.ramp_samples, "ramp_samples", at_least=1),
+        bounds: dict[str, dict[str, Any]] = {
+            "natural_frequency_hz": {"above": 0},
+            "damping": {"at_least": 0},
+            "proportional_per_s2": {"at_least": 0},
+            "derivative_per_s": {"at_least": 0},
+            "feed_forward": {"at_least": 0, "at_most": 10},
+            "sampling_hz": {"above": 0},
         }
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        set_fields(self, **{n: number(getattr(self, n), n, **bounds[n]) for n in bounds})
+        delay = integer(self.delay_samples, "delay_samples", at_least=0)
+        ramp = integer(self.ramp_samples, "ramp_samples", at_least=1)
+        set_fields(self, delay_samples=delay, ramp_samples=ramp)
         if self.delay_samples > _LONGEST_DELAY:
             raise ProblemError(
                 f"delay_samples must be at most {_LONGEST_DELAY}; got {self.delay_samples}."
@@ -149,7 +146,7 @@ class PositionLoop:
         if not radius < _STABLE:
             raise ProblemError(
                 "the local loop of the mirror must be stable; got a spectral radius of "
-                f"{radius:.9g} a sample, with a proportional gain of "
+                f"{radius:.9g} per sample, with a proportional gain of "
                 f"{self.proportional_per_s2:.6g} 1/s^2, a derivative gain of "
                 f"{self.derivative_per_s:.6g} 1/s and a delay of {self.delay_samples} samples at "
                 f"{self.sampling_hz:.6g} Hz. Lower the bandwidth, raise the damping, or sample "
@@ -197,16 +194,13 @@ class PositionLoop:
         """
         own = 2 * np.pi * number(natural_frequency_hz, "natural_frequency_hz", above=0)
         air = number(damping, "damping", at_least=0)
-        wanted = (
-            2
-            * np.pi
-            * number(
-                bandwidth_hz,
-                "bandwidth_hz",
-                at_least=float(natural_frequency_hz),
-                hint="The local loop makes the mode stiffer; its natural frequency is the least.",
-            )
+        bandwidth = number(
+            bandwidth_hz,
+            "bandwidth_hz",
+            at_least=float(natural_frequency_hz),
+            hint="The local loop makes the mode stiffer; its natural frequency is the least.",
         )
+        wanted = 2 * np.pi * bandwidth
         ratio = number(
             bandwidth_damping,
             "bandwidth_damping",
@@ -237,7 +231,7 @@ class PositionLoop:
         Returns
         -------
         StateSpace
-            States: position, velocity [positions a sample], last position, and the
+            States: position, velocity [positions per sample], last position, and the
             accelerations under way; before calibration.
         """
         end = self._motion(1.0)
@@ -269,7 +263,7 @@ class PositionLoop:
         return np.asarray(self._motion(samples)[2])
 
     def step_response(self, tolerance: float = 0.1) -> StepResponse:
-        """Answer to a unit step of the command, at rest before.
+        """Compute the response from rest to a unit step of the command.
 
         Parameters
         ----------
@@ -279,7 +273,7 @@ class PositionLoop:
         Returns
         -------
         StepResponse
-            Eight exact points a sample, until the mode has decayed to 1e-6, with rise,
+            Eight exact points per sample, until the mode has decayed to 1e-6, with rise,
             overshoot and settling time.
 
         Raises
@@ -328,7 +322,7 @@ class PositionLoop:
         return float(brentq(excess, grid[below[0] - 1], grid[below[0]]))
 
     def _law(self) -> FloatArray:
-        """Acceleration [positions a sample^2] that is computed, over states and command."""
+        """Acceleration [positions per sample^2] that the loop computes, over states and command."""
         dt = 1 / self.sampling_hz
         kp, kd = self.proportional_per_s2 * dt**2, self.derivative_per_s * dt
         forward = self.feed_forward * (2 * np.pi * self.natural_frequency_hz * dt) ** 2
@@ -337,9 +331,9 @@ class PositionLoop:
         return row
 
     def _motion(self, part: float) -> FloatArray:
-        """Position, velocity and travelled position after a part of a sample.
+        """Position, velocity and integral of the position after a part of a sample, (3, n + 1).
 
-        (3, n + 1), over the states at the sample's beginning and the command.
+        The columns are the states at the beginning of the sample, and the command.
         """
         moved = _exponential(
             2 * np.pi * self.natural_frequency_hz / self.sampling_hz, self.damping, float(part)
@@ -355,7 +349,7 @@ class PositionLoop:
 
 
 def _driven_states(loop: StateSpace, command: FloatArray) -> FloatArray:
-    """States at each sample from rest, (samples, n), many samples at once."""
+    """States at each sample, (samples, n), starting from rest; many samples at once."""
     n, blocks = loop.n_states, -(-command.size // _BLOCK)
     powers = [np.eye(n)]
     for _ in range(_BLOCK):

@@ -1,1 +1,1 @@
-"""Plants: the estimation problems that filters are designed for."""
+"""Plants: turbulence, vibrations and mirror as estimation problems for filter design."""

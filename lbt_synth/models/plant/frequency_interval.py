@@ -1,7 +1,7 @@
-"""A plant whose vibration has an unknown frequency within an interval.
+"""Plants whose vibration has an unknown frequency within an interval.
 
-At a fixed decay rate the coefficient a2 of an AR2 process is fixed, and a1 falls with the
-frequency: the plants of an interval are a segment, their state matrix is affine in a1.
+At a fixed decay rate the coefficient a2 of an AR2 process is fixed, and a1 falls as the
+frequency rises. The state matrix is affine in a1, so the plants of an interval are a segment.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.models.plant.tip_tilt import TipTiltPlant, require_no_memory
 from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import FloatArray, number, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrequencyInterval:
-    """The plants of an interval of frequencies, the driving noise held."""
+    """The plants of an interval of frequencies, all with the same driving noise."""
 
-    plant: TipTiltPlant  # The plant at the centre. Its vibrations share frequency and damping.
-    half_width_hz: float  # Half width of the interval [Hz]; 0 for the plant alone
+    plant: TipTiltPlant  # at the centre; its vibrations share frequency and damping
+    half_width_hz: float  # [Hz]; 0 for the plant alone
 
     def __post_init__(self) -> None:
         plant = self.plant
@@ -49,7 +49,7 @@ class FrequencyInterval:
                     "them (without spread_hz in a configuration), or kalman with spread_plant."
                 )
         half = number(self.half_width_hz, "half_width_hz", at_least=0)
-        object.__setattr__(self, "half_width_hz", half)
+        set_fields(self, half_width_hz=half)
         for end in (self.low_hz, self.high_hz):
             first.at_frequency(end).ar_model(plant.hardware.frame_rate_hz)
 
@@ -65,7 +65,7 @@ class FrequencyInterval:
 
     @property
     def retention(self) -> float:
-        """``-a2``: what the square of two frames' decay leaves, below 1."""
+        """``-a2``, the factor of decay over two frames, below 1."""
         return -float(self._line.ar_model(self.plant.hardware.frame_rate_hz).coefficients[1])
 
     @property
@@ -101,11 +101,11 @@ class FrequencyInterval:
         an a1 of the interval this one is the worst, with ``2 / ((1 + a2) |z^2 - 1|)``, the response
         of an oscillator with poles at 1 and -1. Elsewhere an end of the interval is the worst.
         """
-        p, kept = len(self.plant.vibrations), self.retention
+        p, retained = len(self.plant.vibrations), self.retention
         B = self.plant.B.copy()
-        B[:p] *= 2 / (1 - kept)
+        B[:p] *= 2 / (1 - retained)
         system = error_system(self.plant, estimator, A=self._with_block(0.0, 1.0), B=B)
-        angles = np.arccos(np.array(self.coefficients) / (1 + kept))
+        angles = np.arccos(np.array(self.coefficients) / (1 + retained))
         high, low = angles / (2 * np.pi * self.plant.dt_s)
         return system, float(low), float(high)
 

@@ -1,4 +1,4 @@
-"""Vibrations whose frequency is known as a discrete distribution: several lines for one."""
+"""Vibrations whose frequency has a distribution, as several lines with a share each."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def spread_plant(
     Returns
     -------
     TipTiltPlant
-        With as many vibrations for each one.
+        The plant, with as many vibrations for each one.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def line_frequencies(
 def spread_lines(
     line: Vibration, frequencies_hz: Sequence[float] | FloatArray, weights: Any = None
 ) -> list[Vibration]:
-    """One vibration as several: of its direction, decay rate and total variance."""
+    """Split a vibration into several of its direction, decay rate and total variance."""
     count = len(frequencies_hz)
     share = np.ones(count) if weights is None else np.atleast_1d(real_array(weights, "weights"))
     if share.shape != (count,) or not np.all(share > 0):

@@ -1,4 +1,4 @@
-"""The plant with its past commands as states, as the paper writes it."""
+"""The plant with its past commands as states, as the paper (Agapito et al. 2008) writes it."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class FullStatePlant(EstimationProblem):
         return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
 
     def ahead(self, frames: int) -> EstimationProblem:
-        """Refuse any horizon but one: the reduced plant has them all.
+        """Refuse any horizon but one; the reduced plant has the others.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Checks of the parts that a plant is assembled from."""
+"""Check the parts that a plant is assembled from."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from lbt_synth.validation import FloatArray, definite, frozen_copy, number, real
 def checked_turbulence(
     turbulence: ARModel | Sequence[ARModel], hardware: LoopHardware
 ) -> tuple[ARModel, ...]:
-    """Return one turbulence model a mode."""
+    """Return one turbulence model per mode."""
     n = hardware.modes
     models = (turbulence,) * n if isinstance(turbulence, ARModel) else tuple(turbulence)
     if len(models) != n:
         raise DimensionError(
-            f"turbulence must be one ARModel, or one a mode ({n}); got {len(models)}."
+            f"turbulence must be one ARModel, or one per mode ({n}); got {len(models)}."
         )
     for model in models:
         if not np.isclose(model.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
@@ -36,7 +36,7 @@ def checked_turbulence(
 def checked_vibrations(
     vibrations: Sequence[Vibration] | None, hardware: LoopHardware
 ) -> tuple[Vibration, ...]:
-    """Return the vibrations, each with a direction that fits."""
+    """Return the vibrations, whose directions must fit the modes."""
     if vibrations is None:
         return ()
     lines = tuple(vibrations)
@@ -48,8 +48,8 @@ def checked_vibrations(
     for line in lines:
         if len(line.direction) != hardware.modes:
             raise DimensionError(
-                f"the direction of a vibration must have {hardware.modes} components, one a mode; "
-                f"got {len(line.direction)} at {line.frequency_hz:.6g} Hz."
+                f"the direction of a vibration must have {hardware.modes} components, one per "
+                f"mode; got {len(line.direction)} at {line.frequency_hz:.6g} Hz."
             )
     return lines
 
@@ -62,7 +62,7 @@ def noise_factor(noise_nm: Any, q: int) -> FloatArray:
         deviations = real_array(noise_nm, "noise_nm")
         if deviations.size != q:
             raise DimensionError(
-                f"noise_nm must have one deviation a measurement ({q}); got {deviations.size}."
+                f"noise_nm must have one deviation per measurement ({q}); got {deviations.size}."
             )
         return frozen_copy(np.diag([number(value, "noise_nm", above=0) for value in deviations]))
     covariance = definite(noise_nm, "noise_nm", size=(q, "to match the measurements"))
@@ -76,7 +76,8 @@ def measurement_gains(sensor_gain: Any, q: int) -> FloatArray:
     gains = real_array(sensor_gain, "sensor_gain")
     if gains.shape != (q,):
         raise DimensionError(
-            f"sensor_gain must be one number, or one a measurement ({q}); got shape {gains.shape}."
+            f"sensor_gain must be one number, or one per measurement ({q}); got shape "
+            f"{gains.shape}."
         )
     for gain in gains:
         number(gain, "sensor_gain", above=0)

@@ -1,4 +1,4 @@
-"""State-space model of tip/tilt for filter design (Agapito et al. 2008, eqs. 5-8).
+"""The plant of tip and tilt that filters are designed for (Agapito et al. 2008, eqs. 5-8).
 
 The paper's state, for n modes, p vibrations and m commands::
 
@@ -7,14 +7,14 @@ The paper's state, for n modes, p vibrations and m commands::
 with the errata corrected: the vibration row holds ``A1, -A2``, the estimated
 signal is ``z = L x`` with ``L = [E 0 I 0 0]`` predicted one frame ahead, and
 E (n, p) embeds the vibrations into the modes. Turbulence of order r has r
-such blocks, a longer delay has a chain of past totals. The reduced form drops
+such blocks; a longer delay has a chain of past totals. The reduced form drops
 the known input u, whose estimation error is zero.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,7 @@ class TipTiltPlant(EstimationProblem):
     hardware : LoopHardware
         The loop, with the sensor gain that the design assumes in its sensor matrix.
     turbulence : tuple of ARModel
-        One model a mode.
+        One model per mode.
     vibrations : tuple of Vibration
         The vibrations, possibly none.
     """
@@ -58,7 +58,7 @@ class TipTiltPlant(EstimationProblem):
     vibrations: tuple[Vibration, ...]
 
     def full(self) -> FullStatePlant:
-        """Return the same plant with the mirror's states: the past commands, if it settles.
+        """Return the same plant with the mirror's states, which are past commands if it settles.
 
         Returns
         -------
@@ -182,19 +182,10 @@ class TipTiltPlant(EstimationProblem):
                 f"{steps}, which makes {delay:g}. For an estimate without a loop, make an "
                 "EstimationProblem of the plant's matrices."
             )
-        return tip_tilt_plant(
-            frame_rate_hz=hw.frame_rate_hz,
-            turbulence=self.turbulence,
-            noise_nm=self.R,
-            vibrations=self.vibrations or None,
-            delay_frames=delay,
-            sensor_matrix=hw.sensor,
-            influence_matrix=hw.influence,
-            mirror=hw.mirror,
-        )
+        return _assemble_again(self, self.vibrations, delay)
 
     def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
-        """Gain over the full state: the known input has an error of zero, and no gain."""
+        """Gain over the full state; the known input has no error and needs no gain."""
         gain = self._checked_gain(gain_predictor)
         padded = np.zeros((full.A.shape[0], gain.shape[1]))
         padded[: gain.shape[0]] = gain
@@ -224,7 +215,7 @@ def tip_tilt_plant(
         Turbulence of each mode; one model serves all modes.
     noise_nm : float, (q,) or (q, q) array_like
         Standard deviation of the measurement noise per frame, one for all measurements or one
-        a measurement [nm], or its covariance [nm^2].
+        per measurement [nm], or its covariance [nm^2].
     vibrations : sequence of Vibration, optional
         The vibrations; None for a plant without any.
     delay_frames : float, optional
@@ -236,7 +227,7 @@ def tip_tilt_plant(
         Mirror response; the identity by default.
     sensor_gain : float or (q,) array_like, optional
         Sensor (optical) gain that the design assumes; multiplies the sensor matrix, row by
-        row where there is one a measurement.
+        row where there is one per measurement.
     modes : int, optional
         Number of modes n when no matrix gives it.
     mirror : PositionLoop, optional
@@ -274,13 +265,7 @@ def tip_tilt_plant(
     )
     gains = measurement_gains(sensor_gain, hardware.n_measurements)
     if np.any(gains != 1):
-        hardware = LoopHardware(
-            frame_rate_hz=hardware.frame_rate_hz,
-            delay_frames=hardware.delay_frames,
-            sensor_matrix=gains[:, None] * hardware.sensor,
-            influence_matrix=hardware.influence,
-            mirror=hardware.mirror,
-        )
+        hardware = replace(hardware, sensor_matrix=gains[:, None] * hardware.sensor)
     models = checked_turbulence(turbulence, hardware)
     lines = checked_vibrations(vibrations, hardware)
     factor = noise_factor(noise_nm, hardware.n_measurements)
@@ -334,14 +319,14 @@ def tip_tilt_plant(
 
 
 def require_no_memory(plant: TipTiltPlant) -> None:
-    """Refuse a plant that holds the past innovations of a filter: it cannot be assembled anew."""
+    """Refuse a plant with the past innovations of a filter, which cannot be assembled again."""
     hw = plant.hardware
     order = max(model.order for model in plant.turbulence)
     chain = max(int(np.ceil(hw.delay_frames)), 2) - 1
     if plant.n_states != 2 * len(plant.vibrations) + (order + chain) * hw.modes:
         raise ProblemError(
-            "this plant holds the memory of a mixed filter, and cannot be assembled anew; take the "
-            "plant that the filter was designed for."
+            "this plant holds the memory of a mixed filter, and cannot be assembled again; take "
+            "the plant that the filter was designed for."
         )
 
 
@@ -392,13 +377,19 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
 def with_vibrations(plant: TipTiltPlant, vibrations: Sequence[Vibration]) -> TipTiltPlant:
     """Return a plant with other vibrations, all else being the same."""
     require_no_memory(plant)
+    return _assemble_again(plant, vibrations, plant.hardware.delay_frames)
+
+
+def _assemble_again(
+    plant: TipTiltPlant, vibrations: Sequence[Vibration], delay_frames: float
+) -> TipTiltPlant:
     hw = plant.hardware
     return tip_tilt_plant(
         frame_rate_hz=hw.frame_rate_hz,
         turbulence=plant.turbulence,
         noise_nm=plant.R,
         vibrations=vibrations or None,
-        delay_frames=hw.delay_frames,
+        delay_frames=delay_frames,
         sensor_matrix=hw.sensor,
         influence_matrix=hw.influence,
         mirror=hw.mirror,

@@ -1,1 +1,1 @@
-"""Turbulence: its spectra, and auto-regressive models of them."""
+"""Turbulence: its spectra, and auto-regressive models of it."""

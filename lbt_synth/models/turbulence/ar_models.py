@@ -1,9 +1,9 @@
-"""Auto-regressive models of the turbulence's tip and tilt.
+"""Auto-regressive models of tip and tilt by turbulence, of order one and two.
 
 AR1: B. Le Roux et al., J. Opt. Soc. Am. A 21, 1261 (2004),
 doi:10.1364/JOSAA.21.001261. AR2: fitted here by the Whittle likelihood
 (P. Whittle, Ark. Mat. 2, 423 (1953), doi:10.1007/BF02590998) of the measured
-series, turbulence plus white noise: what lies below the noise does not count.
+series, turbulence plus white noise, so that frequencies below the noise do not count.
 """
 
 from __future__ import annotations
@@ -106,9 +106,7 @@ def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
 
 
 def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """AR1 models of many frozen flows, as :func:`ar1_turbulence` makes them one by one.
-
-    Shapes: returns coefficients (p, 1), driving_rms_nm (p,).
+    """Coefficients (p, 1) and driving noise (p,) [nm] of the AR1 models of p frozen flows.
 
     Examples
     --------
@@ -174,7 +172,7 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     s = 4 * np.sin(np.pi * frequency / rate) ** 2
 
     def unpack(p: np.ndarray) -> tuple[float, float]:
-        """Log frequency and log damping/(1 - damping) -> angle a frame, damping."""
+        """Turn log frequency and log damping / (1 - damping) into angle per frame and damping."""
         return 2 * np.pi * float(np.exp(p[0])) / rate, float(1 / (1 + np.exp(-p[1])))
 
     def contrast(p: np.ndarray) -> float:

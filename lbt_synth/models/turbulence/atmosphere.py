@@ -1,4 +1,4 @@
-"""Tip/tilt of a von Karman turbulence layer that the wind carries along.
+"""Tip and tilt of a von Karman turbulence layer that the wind carries along.
 
 Sources: R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976), doi:10.1364/JOSA.66.000207
 (Zernike filter functions); J.-M. Conan, G. Rousset, P.-Y. Madec, J. Opt. Soc.
@@ -17,10 +17,10 @@ from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.validation import FloatArray, number, real_array
+from lbt_synth.validation import FloatArray, number, real_array, set_fields
 
 ARCSEC_RAD = np.pi / 180 / 3600
-LOWEST = 1e-4  # frequency below which spectra are taken to be constant, in units of V / D
+LOWEST = 1e-4  # spectra are constant below this frequency, in units of V / D
 _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
 
 
@@ -68,15 +68,11 @@ class Atmosphere:
     seeing_wavelength_um: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("seeing_arcsec", "wind_speed_m_s", "diameter_m", "seeing_wavelength_um"):
-            object.__setattr__(self, name, number(getattr(self, name), name, above=0))
+        positive = ["seeing_arcsec", "wind_speed_m_s", "diameter_m", "seeing_wavelength_um"]
         if self.outer_scale_m is not None:
-            object.__setattr__(
-                self, "outer_scale_m", number(self.outer_scale_m, "outer_scale_m", above=0)
-            )
-        object.__setattr__(
-            self, "obstruction", number(self.obstruction, "obstruction", at_least=0, below=1)
-        )
+            positive.append("outer_scale_m")
+        set_fields(self, **{name: number(getattr(self, name), name, above=0) for name in positive})
+        set_fields(self, obstruction=number(self.obstruction, "obstruction", at_least=0, below=1))
 
     @property
     def fried_parameter_m(self) -> float:
@@ -151,8 +147,8 @@ def tilt_strength_nm2(air: Atmosphere) -> float:
 def _filtered_spectrum(scale_ratio: float, eps: float, f: FloatArray) -> FloatArray:
     """Spatial phase spectrum times the tilt filter, mean over directions.
 
-    Of unit Kolmogorov constant, with f in cycles a diameter. The filter is Noll's for a disc,
-    and for an annulus the transform of the annular tilt of unit rms.
+    For a unit Kolmogorov constant, with f in cycles per diameter. The filter is Noll's for a
+    disc, and the transform of the annular tilt of unit rms for an annulus.
     """
     argument = np.pi * f
     edge = _bessel_j2(argument)
@@ -164,7 +160,7 @@ def _filtered_spectrum(scale_ratio: float, eps: float, f: FloatArray) -> FloatAr
 
 
 def _bessel_j2(x: FloatArray) -> FloatArray:
-    """J_2, by its recurrence where that loses no digits (several times faster)."""
+    """J_2, by its recurrence where that loses no digits, which is several times faster."""
     out = np.empty_like(x)
     large = x > 1
     out[large] = 2 * j1(x[large]) / x[large] - j0(x[large])
@@ -181,16 +177,16 @@ def _spatial_panels() -> tuple[FloatArray, FloatArray]:
 
 @lru_cache(maxsize=128)
 def tilt_variance(scale_ratio: float, obstruction: float) -> float:
-    """Variance of one axis, of unit strength."""
+    """Variance of one axis for a unit strength."""
     f, w = _spatial_panels()
     return float(np.sum(2 * np.pi * f * w * _filtered_spectrum(scale_ratio, obstruction, f)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LogSpline:
-    """Logarithm of a tilt spectrum over the logarithm of frequency, a cubic spline.
+    """Logarithm of a tilt spectrum over the logarithm of frequency, as a cubic spline.
 
-    Constant below its first knot; beyond the last the power law f^(-17/3) of tilt.
+    It is constant below its first knot, and the power law f^(-17/3) of tilt beyond the last.
     """
 
     spline: Any  # a PPoly of scipy
@@ -204,7 +200,7 @@ class LogSpline:
 
 @lru_cache(maxsize=128)
 def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
-    """Temporal spectrum of one axis, of unit strength, over frequency in units of V / D.
+    """Temporal spectrum of one axis for a unit strength, over frequency in units of V / D.
 
     ``S(f) = (4 / V) int_0^inf Phi(f/V, f_y) df_y`` (one-sided).
     """

@@ -1,8 +1,8 @@
-"""Frozen flows of many seeings, wind speeds and outer scales, over one telescope.
+"""Frozen flows of many seeings, wind speeds and outer scales over one telescope.
 
-The spectrum scales with ``seeing^(5/3)``, and is a function of ``f D / V``: only the outer scale
-needs tables of its own. Over an octave of it the logarithm of the spectrum is interpolated by a
-polynomial.
+The spectrum scales with ``seeing^(5/3)`` and is a function of ``f D / V``, so only each outer
+scale needs a table. Over an octave of the outer scale, a polynomial interpolates the logarithm
+of the spectrum.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from lbt_synth.models.turbulence.atmosphere import (
     tilt_strength_nm2,
     tilt_variance,
 )
-from lbt_synth.validation import FloatArray, IntArray, real_array, require_instance
+from lbt_synth.validation import FloatArray, IntArray, real_array, require_instance, set_fields
 
 _TERMS = 12  # of the polynomial over an octave of the outer scale
-_FEW_SCALES = 16  # outer scales that have a table each
+_FEW_SCALES = 16  # up to so many outer scales have a table each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrozenFlows:
-    """Frozen von Karman layers, one a loop, over the telescope of one atmosphere.
+    """Frozen von Karman layers, one per loop, over the telescope of one atmosphere.
 
     Parameters
     ----------
@@ -82,9 +82,8 @@ class FrozenFlows:
                 f"seeing, wind and outer scale must be lists of the same length; got {shapes}."
             ) from error
         if arrays[0].ndim != 1:
-            raise DimensionError(f"they must be lists, one number a loop; got {arrays[0].shape}.")
-        for name, value in zip(given, arrays, strict=True):
-            object.__setattr__(self, name, value)
+            raise DimensionError(f"they must be lists, one number per loop; got {arrays[0].shape}.")
+        set_fields(self, **dict(zip(given, arrays, strict=True)))
 
     def __len__(self) -> int:
         """Return the number of loops p."""
@@ -177,9 +176,9 @@ def _interpolate_over_scales(
 
 @lru_cache(maxsize=16)
 def _octave_splines(octave: int, obstruction: float) -> tuple[FloatArray, FloatArray]:
-    """Knots, and coefficients of the splines as polynomials in the logarithm of the outer scale.
+    """Knots, and spline coefficients (4, intervals, terms), over one octave of outer scales.
 
-    They are (4, intervals, terms), over one octave of the diameter over the outer scale.
+    The coefficients are polynomials in the logarithm of the diameter over the outer scale.
     """
     nodes = chebyshev.chebpts1(_TERMS)
     ratios = 2.0 ** (octave + (nodes + 1) / 2)

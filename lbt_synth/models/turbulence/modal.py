@@ -1,4 +1,4 @@
-"""Turbulence of many modes: an auto-regressive process each, as arrays."""
+"""Turbulence of many modes, with an auto-regressive process for each, as arrays."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ from lbt_synth.validation import (
     real_array,
     require_instance,
     sequence,
+    set_fields,
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModalTurbulence:
-    """Independent stationary processes, one a mode: ``x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)``.
+    """Independent stationary processes ``x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)``, one per mode.
 
     Parameters
     ----------
@@ -71,11 +72,8 @@ class ModalTurbulence:
             )
         if np.any(driving <= 0):
             raise ProblemError(f"driving_rms_nm must be above 0; got {driving.min():.6g}.")
-        object.__setattr__(self, "coefficients", a)
-        object.__setattr__(self, "driving_rms_nm", driving)
-        object.__setattr__(
-            self, "frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0)
-        )
+        rate = number(self.frame_rate_hz, "frame_rate_hz", above=0)
+        set_fields(self, coefficients=a, driving_rms_nm=driving, frame_rate_hz=rate)
         radii = np.abs(np.linalg.eigvals(self.companions)).max(axis=1)
         if not np.all(radii < 1):
             worst = int(np.argmax(radii))
@@ -91,7 +89,7 @@ class ModalTurbulence:
         Parameters
         ----------
         models : ARModel or sequence of ARModel
-            One model a mode.
+            One model per mode.
 
         Returns
         -------
@@ -188,7 +186,7 @@ class ModalTurbulence:
         Returns
         -------
         (n, f) ndarray
-            One spectrum a mode, each as :meth:`ARModel.psd`.
+            One spectrum per mode, each as :meth:`ARModel.psd`.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Zernike modes: their order after Noll, and their variance in von Karman turbulence.
+"""Zernike modes in Noll's order, and their variances in von Karman turbulence.
 
 R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976), doi:10.1364/JOSA.66.000207.
 """
@@ -14,7 +14,7 @@ from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models.turbulence.atmosphere import Atmosphere, kolmogorov_constant_nm2
 from lbt_synth.validation import FloatArray, IntArray, frozen_copy, integer
 
-_FURTHEST = 30  # times the order plus 2: where the integral goes over to its tail
+_FURTHEST = 30  # the tail of the integral begins at this multiple of the order plus 2
 
 
 def noll_orders(modes: int) -> tuple[IntArray, IntArray]:
@@ -59,7 +59,7 @@ def noll_orders(modes: int) -> tuple[IntArray, IntArray]:
 def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
     """Variance of a Zernike mode of each radial order 1 to ``highest``, (highest,) [nm^2].
 
-    The same for all azimuthal orders, on a disc without obstruction::
+    They are the same for all azimuthal orders, on a disc without obstruction::
 
         2 pi (n + 1) int 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) (2 J_n+1(pi D f) / (pi D f))^2 f df
 
@@ -78,13 +78,13 @@ def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
     per_x = np.pi * atmosphere.diameter_m  # x = pi D f
     out = np.empty(top)
     for n in range(1, top + 1):
-        # octaves where nothing oscillates, then half periods of the Bessel function squared
+        # octaves before anything oscillates, then half periods of the squared Bessel function
         end = _FURTHEST * (n + 2)
         edges = np.concatenate([np.geomspace(1e-24, 0.5, 160), np.arange(1.0, end, np.pi / 2)])
         x, w = gauss_panels(edges, 8)
         spectrum = ((x / per_x) ** 2 + inner) ** (-11 / 6)
         integral = float(np.sum(w * spectrum * jv(n + 1, x) ** 2 / x))
-        # beyond, J^2 is 1 / (pi x) in the mean, and the outer scale is not felt
+        # in the tail J^2 is 1 / (pi x) on average, and the outer scale does not matter
         integral += per_x ** (11 / 3) * edges[-1] ** (-14 / 3) * 3 / (14 * np.pi)
         out[n - 1] = 8 * np.pi * (n + 1) / per_x**2 * integral
     return frozen_copy(kolmogorov_constant_nm2(atmosphere) * out)

@@ -1,1 +1,1 @@
-"""Vibrations: one module for each kind."""
+"""Vibrations, with one module for each kind."""

@@ -1,4 +1,4 @@
-"""A vibration whose frequency moves while one looks."""
+"""A vibration whose frequency drifts: a sinusoid or a resonance."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar_model import variance_ratios
 from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, number, real_array
+from lbt_synth.validation import FloatArray, number, real_array, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,9 +19,9 @@ class DriftingVibration:
 
     Without a damping it is a sinusoid whose phase is the integral of its frequency. With one it
     is a resonance with a constant decay rate, damping times frequency, and a constant rms: an
-    AR2 process with a coefficient a1 that follows the frequency, and a driving noise that keeps
-    the variance exactly what it is. Only simulations know what to do with it; whatever needs a
-    stationary truth refuses it.
+    AR2 process whose coefficient a1 follows the frequency, with a driving noise that keeps
+    the variance exactly constant. Only simulations accept it; whatever needs a stationary
+    truth refuses it.
 
     Parameters
     ----------
@@ -58,8 +58,8 @@ class DriftingVibration:
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name in ("start_hz", "end_hz", "duration_s"):
-            object.__setattr__(self, name, number(getattr(self, name), name, above=0))
+        positive = ("start_hz", "end_hz", "duration_s")
+        set_fields(self, **{name: number(getattr(self, name), name, above=0) for name in positive})
         line = Vibration(
             frequency_hz=self.start_hz,
             damping=0.5 if self.damping is None else self.damping,
@@ -67,10 +67,9 @@ class DriftingVibration:
             direction=self.direction,
         )
         if self.damping is not None:
-            object.__setattr__(self, "damping", line.damping)
+            set_fields(self, damping=line.damping)
             line.at_frequency(self.end_hz)
-        object.__setattr__(self, "rms_nm", line.rms_nm)
-        object.__setattr__(self, "direction", line.direction)
+        set_fields(self, rms_nm=line.rms_nm, direction=line.direction)
 
     @property
     def highest_hz(self) -> float:
@@ -163,11 +162,11 @@ class DriftingVibration:
 
         if self.damping is None:
             raise ProblemError("a sinusoid has no AR2 process; got one that drifts.")
-        decay = 2 * np.pi * self.damping * self.start_hz / frame_rate_hz  # a frame
+        decay = 2 * np.pi * self.damping * self.start_hz / frame_rate_hz  # per frame
         natural = 2 * np.pi * self.frequency_hz_at(time_s) / frame_rate_hz
         a1 = 2 * np.exp(-decay) * np.cos(np.sqrt(natural**2 - decay**2))
         a2 = -float(np.exp(-2 * decay))
-        # E x(k-1) x(k-2), over the variance, less what it is where a1 does not move: a1 / (1-a2)
+        # E x(k-1) x(k-2) over the variance, less its value at a constant a1, a1 / (1 - a2)
         step = np.diff(a1, prepend=a1[:1]) / (1 - a2)
         late = lfilter([-a2], [1.0, -a2], step)
         behind = np.concatenate([[0.0], late[:-1]]) - step

@@ -1,4 +1,4 @@
-"""Structural vibrations as AR2 processes (Agapito et al. 2008, eq. 4, errata 1 and 7)."""
+"""A vibration that is a damped resonance (Agapito et al. 2008, eq. 4, errata 1 and 7)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar_model import ARModel, variance_ratios
 from lbt_synth.models.resonance_spectrum import coefficient_rows
-from lbt_synth.validation import FloatArray, choice, number, real_array
+from lbt_synth.validation import FloatArray, choice, number, real_array, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,16 +46,17 @@ class Vibration:
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frequency_hz", number(self.frequency_hz, "frequency_hz", above=0))
-        object.__setattr__(self, "damping", number(self.damping, "damping", above=0, below=1))
-        object.__setattr__(self, "rms_nm", number(self.rms_nm, "rms_nm", above=0))
+        frequency = number(self.frequency_hz, "frequency_hz", above=0)
+        damping = number(self.damping, "damping", above=0, below=1)
+        rms = number(self.rms_nm, "rms_nm", above=0)
         vector = np.atleast_1d(real_array(self.direction, "direction"))
         length = float(np.linalg.norm(vector))
         if vector.ndim != 1 or length == 0:
             raise ProblemError(
                 f"direction must be a vector over the modes, not zero; got {self.direction!r}."
             )
-        object.__setattr__(self, "direction", tuple(float(v) for v in vector / length))
+        unit = tuple(float(v) for v in vector / length)
+        set_fields(self, frequency_hz=frequency, damping=damping, rms_nm=rms, direction=unit)
 
     def ar_model(self, frame_rate_hz: float) -> ARModel:
         """Return the AR2 process sampled at a frame rate.
@@ -129,7 +130,7 @@ class Vibration:
         """Return this vibration at another frequency, with the same rms and the same decay.
 
         The decay rate is damping times frequency, so the coefficient a2 of the AR2 process
-        stays what it is.
+        stays the same.
 
         Parameters
         ----------
@@ -144,7 +145,7 @@ class Vibration:
         Raises
         ------
         ProblemError
-            If the frequency is not above the decay rate (an oscillation no more).
+            If the frequency is not above the decay rate, so that nothing oscillates.
 
         Examples
         --------
@@ -166,10 +167,7 @@ class Vibration:
 def sampled_lines(
     frequency_hz: FloatArray, damping: FloatArray, rms_nm: FloatArray | float, frame_rate_hz: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Coefficients (p, 2) and driving noise (p,) [nm] of many vibrations at a frame rate.
-
-    Shapes: frequency_hz, damping, rms_nm (p,).
-    """
+    """Coefficients (p, 2) and driving noise (p,) [nm] of p vibrations at a frame rate."""
     highest = float(np.max(frequency_hz, initial=0.0))
     if not highest < frame_rate_hz / 2:
         raise ProblemError(
@@ -177,5 +175,5 @@ def sampled_lines(
             f"got {highest:.6g} Hz. Give the frequency it is aliased to."
         )
     a = coefficient_rows(2 * np.pi * frequency_hz / frame_rate_hz, damping)
-    # of the coefficients as they are rounded: the process has this rms exactly
+    # by the rounded coefficients, so that the process has exactly this rms
     return a, np.asarray(rms_nm / np.sqrt(variance_ratios(a)))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.models.vibration.resonance import Vibration
+from lbt_synth.validation import set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,15 +40,15 @@ class SinusoidalVibration:
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        # a line has the same frequency, rms and direction; its damping plays no part
+        # checked as those of a resonance, whose damping plays no part
         line = Vibration(
             frequency_hz=self.frequency_hz,
             damping=0.5,
             rms_nm=self.rms_nm,
             direction=self.direction,
         )
-        for name in ("frequency_hz", "rms_nm", "direction"):
-            object.__setattr__(self, name, getattr(line, name))
+        names = ("frequency_hz", "rms_nm", "direction")
+        set_fields(self, **{name: getattr(line, name) for name in names})
 
     @property
     def amplitude_nm(self) -> float:

@@ -17,7 +17,7 @@ import lbt_synth as lbt
         ({"mirror": 3}, "expected a PositionLoop; got int"),
         ({"delay_frames": None}, "needs delay_frames"),
         ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
-        ({"frame_rate_hz": 790.0, "controller": None}, "whole number of samples a frame"),
+        ({"frame_rate_hz": 790.0, "controller": None}, "whole number of samples per frame"),
     ],
 )
 def test_a_mirror_that_does_not_fit_is_refused(changes, text):

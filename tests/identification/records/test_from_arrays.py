@@ -151,7 +151,7 @@ def test_arrays_that_are_refused(change, words):
 
 def test_a_mirror_that_does_not_fit_the_rate_is_refused():
     y = np.random.default_rng(0).standard_normal((30, 1))
-    with pytest.raises(lbt.errors.ProblemError, match="whole number of samples a frame"):
+    with pytest.raises(lbt.errors.ProblemError, match="whole number of samples per frame"):
         lbt.identification.loop_record(
             y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm"
         )

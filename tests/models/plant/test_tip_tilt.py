@@ -89,7 +89,7 @@ def test_retuning_moves_only_the_vibration():
         ({"sensor_gain": 0}, "sensor_gain must be above 0"),
         ({"sensor_matrix": np.eye(3), "influence_matrix": np.eye(2)}, "to match sensor_matrix"),
         ({"sensor_matrix": [[np.nan, 0], [0, 1]]}, "sensor_matrix must be finite"),
-        ({"turbulence": [slow()] * 3}, r"one a mode \(2\); got 3"),
+        ({"turbulence": [slow()] * 3}, r"one per mode \(2\); got 3"),
         (
             {
                 "turbulence": lbt.models.ARModel(

@@ -59,7 +59,7 @@ def test_kolmogorov_flows():
             lbt.errors.DimensionError,
             "same length",
         ),
-        ({"wind_speed_m_s": [[1.0]]}, lbt.errors.DimensionError, "lists, one number a loop"),
+        ({"wind_speed_m_s": [[1.0]]}, lbt.errors.DimensionError, "lists, one number per loop"),
     ],
 )
 def test_what_is_no_flow(given, kind, message):
