@@ -143,7 +143,7 @@ class _Search(ModelFitter):
         for c in found:
             line = c.frequency_hz >= self.rules.lowest_line_hz
             damping = np.clip(c.half_width_hz / c.frequency_hz, 1e-4, 0.3) if line else 0.3
-            theta.append(self.layout.component(c.frequency_hz, float(damping), c.variance_nm2))
+            theta.append(self.layout.new_component(c.frequency_hz, float(damping), c.variance_nm2))
             parts.append(Part(line=line))
         whole = np.concatenate(theta)
         for i in range(len(model.parts), len(parts)):
@@ -172,7 +172,7 @@ class _Search(ModelFitter):
                 parts[near[0]] = Part(line=True, frequency=known)
                 continue
             level = float(np.interp(f, self.data.frequency_hz, density))
-            theta.append(self.layout.component(f, 0.01, level * max(0.01 * f, step)))
+            theta.append(self.layout.new_component(f, 0.01, level * max(0.01 * f, step)))
             parts.append(Part(line=True, frequency=known))
         made = self.try_fit(np.concatenate(theta), tuple(parts))
         return model if made is None else self.prune(made)
@@ -251,7 +251,7 @@ class _Search(ModelFitter):
         if abs(seen.frequency_hz - centre) > 0.5 * half + step:
             damping = min(seen.half_width_hz / seen.frequency_hz, 0.5)
             again = theta.copy()
-            component(again, i)[:] = self.layout.component(
+            component(again, i)[:] = self.layout.new_component(
                 seen.frequency_hz, damping, seen.variance_nm2
             )
             moves.append((again, model.parts))

@@ -132,7 +132,7 @@ class Layout:
         ratio = damping_ratio(damping, first=i == 0)
         return centre, max(centre * ratio, self.step)
 
-    def component(self, frequency_hz: float, damping: float, variance: float) -> FloatArray:
+    def new_component(self, frequency_hz: float, damping: float, variance: float) -> FloatArray:
         """Return the parameters of a component that is not the first."""
         odds = damping_parameter(damping, first=False)
         return np.array([np.log(frequency_hz * self.angle), odds, np.log(variance)])

@@ -15,7 +15,15 @@ from lbt_synth.identification.records.columns import parse_column
 from lbt_synth.identification.records.contents import read_contents
 from lbt_synth.identification.records.csv_file import read_csv
 from lbt_synth.identification.records.units import hz_per
-from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, integer, number, real_array
+from lbt_synth.validation import (
+    BoolArray,
+    FloatArray,
+    frozen_copy,
+    integer,
+    number,
+    real_array,
+    set_fields,
+)
 
 _FEWEST_AVERAGES = 8
 _AVERAGES = 32  # segments that a record is cut into
@@ -67,8 +75,7 @@ class LinePrior:
     def __post_init__(self) -> None:
         frequency = number(self.frequency_hz, "frequency_hz", above=0)
         error = number(self.frequency_error_hz, "frequency_error_hz", at_least=0)
-        object.__setattr__(self, "frequency_hz", frequency)
-        object.__setattr__(self, "frequency_error_hz", error)
+        set_fields(self, frequency_hz=frequency, frequency_error_hz=error)
         if not isinstance(self.source, str):
             raise ProblemError(f"source must be a text; got {self.source!r}.")
 

@@ -12,7 +12,15 @@ from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.health import Finding, RecordHealth, finding_in, merge_notes
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
-from lbt_synth.validation import BoolArray, FloatArray, integer, matrix, number, require_instance
+from lbt_synth.validation import (
+    BoolArray,
+    FloatArray,
+    integer,
+    matrix,
+    number,
+    require_instance,
+    set_fields,
+)
 
 _MOST_AXES = 2
 _BRIDGED_FRAMES = 3
@@ -103,25 +111,22 @@ class LoopRecord:
             raise DimensionError(
                 f"measurements must be (frames, axes) of one or two axes; got {y.shape}."
             )
-        self._set("measurements", y)
+        set_fields(self, measurements=y)
         if self.commands is not None:
             why = f"to match measurements {y.shape}"
             u = matrix(self.commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
-            self._set("commands", u)
-        self._set("frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0))
+            set_fields(self, commands=u)
+        set_fields(self, frame_rate_hz=number(self.frame_rate_hz, "frame_rate_hz", above=0))
         for name, limits in _LIMITS.items():
             if (value := getattr(self, name)) is not None:
-                self._set(name, number(value, name, **limits))
+                set_fields(self, **{name: number(value, name, **limits)})
         if self.mirror is not None:
             require_instance(self.mirror, PositionLoop)
         for name in ("usable", "measured", "commanded"):
             if (flags := getattr(self, name)) is not None:
-                self._set(name, _check_flags(flags, name, len(y)))
+                set_fields(self, **{name: _check_flags(flags, name, len(y))})
         if self.delay_frames is not None:
-            _ = self.mirror_taps  # a mirror that does not fit the rate is refused
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
+            _ = self.mirror_taps  # refuses a mirror that does not fit the rate
 
     @property
     def frames(self) -> int:

@@ -9,7 +9,15 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import TabulatedSpectrum
-from lbt_synth.validation import FloatArray, frozen_copy, integer, matrix, number, real_array
+from lbt_synth.validation import (
+    FloatArray,
+    frozen_copy,
+    integer,
+    matrix,
+    number,
+    real_array,
+    set_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,21 +77,19 @@ class SpectrumRecord:
             )
         for column in density.T:
             TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=column)
-        object.__setattr__(self, "frequency_hz", frequency)
-        object.__setattr__(self, "density_nm2_hz", density)
+        set_fields(self, frequency_hz=frequency, density_nm2_hz=density)
         if self.frame_rate_hz is not None:
             rate = number(self.frame_rate_hz, "frame_rate_hz", above=0)
-            object.__setattr__(self, "frame_rate_hz", rate)
+            set_fields(self, frame_rate_hz=rate)
             if frequency[-1] > rate / 2 * (1 + 1e-9):
                 raise ProblemError(
                     f"frequencies must lie below half the frame rate, {rate / 2:.6g} Hz; got "
                     f"{frequency[-1]:.6g} Hz."
                 )
         if self.averages is not None:
-            object.__setattr__(self, "averages", integer(self.averages, "averages", at_least=1))
+            set_fields(self, averages=integer(self.averages, "averages", at_least=1))
         if self.diameter_m is not None:
-            diameter = number(self.diameter_m, "diameter_m", above=0)
-            object.__setattr__(self, "diameter_m", diameter)
+            set_fields(self, diameter_m=number(self.diameter_m, "diameter_m", above=0))
 
     @property
     def axes(self) -> int:

@@ -19,8 +19,8 @@ _RESOLUTION = 2.0  # bins from the top of a line to the first zero of a Hann win
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Search:
-    """Where a line is looked for."""
+class LineSearch:
+    """The bins in which a line is searched for, and what they hold."""
 
     line: Vibration  # as it was found last
     bins: BoolArray  # (k,): frequencies where it may be
@@ -41,14 +41,14 @@ class LineFit:
         self._grid, self._length_s, self._rate = grid_hz, length_s, frame_rate_hz
         self._least_width = _WIDTH_BESIDE if beside else _WIDTH
 
-    def fit_alone(self, search: Search) -> float | None:
+    def fit_alone(self, search: LineSearch) -> float | None:
         """Return the frequency of a line without neighbours [Hz]; None if it is not there."""
         at, grid = search.bins, self._grid[search.bins]
         peak = float(grid[np.argmax(search.power[at] / search.rest[at])])
         found = self._fit_line(search, search.rest, (peak, 0.0))
         return None if found is None or not self._is_there(search, search.rest, found) else found[0]
 
-    def fit_together(self, searches: list[Search], shared: FloatArray) -> list[float] | None:
+    def fit_together(self, searches: list[LineSearch], shared: FloatArray) -> list[float] | None:
         """Return the frequencies of neighbouring lines, in the order that they had [Hz].
 
         Each is fitted beside the others in turn, from the highest peaks and from where they were
@@ -81,7 +81,7 @@ class LineFit:
         # a line narrower than the window's resolution is seen as wide as that
         return max(line.damping * line.frequency_hz, self._least_width / self._length_s)
 
-    def _bounds(self, search: Search) -> tuple[float, float]:
+    def _bounds(self, search: LineSearch) -> tuple[float, float]:
         grid = self._grid[search.bins]
         return max(float(grid[0]), 1.01 * self._width_hz(search.line)), float(grid[-1])
 
@@ -95,7 +95,7 @@ class LineFit:
         )
         return there.ar_model(self._rate).psd(self._grid[bins])
 
-    def _start_at(self, search: Search, frequency_hz: float) -> tuple[float, float]:
+    def _start_at(self, search: LineSearch, frequency_hz: float) -> tuple[float, float]:
         """Return the start of a fit: a line as high as the periodogram there."""
         low, high = self._bounds(search)
         frequency = float(np.clip(frequency_hz, low, max(low, high)))
@@ -106,7 +106,7 @@ class LineFit:
         )
         return frequency, float(np.clip(0.5 * np.log(max(seen, 1e-6)), -9, 9))
 
-    def _peaks(self, searches: list[Search]) -> list[float] | None:
+    def _peaks(self, searches: list[LineSearch]) -> list[float] | None:
         """Return the frequencies of as many peaks as there are lines; None if there are fewer."""
         ratio = np.max([np.where(s.bins, s.power / s.rest, 0.0) for s in searches], axis=0)
         found: list[float] = []
@@ -121,7 +121,7 @@ class LineFit:
         return sorted(found)
 
     def _spectrum_beside(
-        self, searches: list[Search], shared: FloatArray, at: list[tuple[float, float]], i: int
+        self, searches: list[LineSearch], shared: FloatArray, at: list[tuple[float, float]], i: int
     ) -> FloatArray:
         """Return the spectrum of everything but line i, along it."""
         bins, rest = searches[i].bins, searches[i].rest.copy()
@@ -131,7 +131,11 @@ class LineFit:
         return rest
 
     def _fit_in_turn(
-        self, searches: list[Search], shared: FloatArray, at: list[tuple[float, float]], most: int
+        self,
+        searches: list[LineSearch],
+        shared: FloatArray,
+        at: list[tuple[float, float]],
+        most: int,
     ) -> list[tuple[float, float]] | None:
         """Fit each line beside the others until they stay."""
         at = list(at)
@@ -150,7 +154,7 @@ class LineFit:
         return at
 
     def _contrast(
-        self, searches: list[Search], shared: FloatArray, at: list[tuple[float, float]]
+        self, searches: list[LineSearch], shared: FloatArray, at: list[tuple[float, float]]
     ) -> float:
         total = 0.0
         for i, search in enumerate(searches):
@@ -160,7 +164,7 @@ class LineFit:
         return total
 
     def _fit_line(
-        self, search: Search, rest: FloatArray, start: tuple[float, float]
+        self, search: LineSearch, rest: FloatArray, start: tuple[float, float]
     ) -> tuple[float, float] | None:
         """Return frequency and logarithm of the rms over the last; None if no fit settles."""
         low, high = self._bounds(search)
@@ -182,7 +186,7 @@ class LineFit:
         )
         return (float(fit.x[0]), float(fit.x[1])) if fit.success and np.isfinite(fit.fun) else None
 
-    def _is_there(self, search: Search, rest: FloatArray, found: tuple[float, float]) -> bool:
+    def _is_there(self, search: LineSearch, rest: FloatArray, found: tuple[float, float]) -> bool:
         """Whether a line makes the data likelier by enough."""
         power, known = search.power[search.bins], rest[search.bins]
         model = known + self._spectrum(search.line, found, search.bins)

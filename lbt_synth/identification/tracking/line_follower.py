@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.tracking.line_fit import LineFit, Search
+from lbt_synth.identification.tracking.line_fit import LineFit, LineSearch
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.plant.tip_tilt import require_no_memory, with_vibrations
 from lbt_synth.validation import FloatArray, number, require_instance
@@ -102,7 +102,7 @@ class LineFollower:
                 if np.count_nonzero(bins) < _LEAST_BINS:
                     return None
                 rest = self._background(group, i, grid)
-                searches.append(Search(line=line, bins=bins, power=powers[:, i], rest=rest))
+                searches.append(LineSearch(line=line, bins=bins, power=powers[:, i], rest=rest))
             fit = LineFit(grid, length_s=frames / rate, frame_rate_hz=rate, beside=len(group) > 1)
             if len(group) == 1:
                 alone = fit.fit_alone(searches[0])
