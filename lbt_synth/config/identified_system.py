@@ -13,10 +13,10 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
-from lbt_synth.models import ARModel
 from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")
+_KIND_COMMENTS = {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}
 
 
 def identified_config(
@@ -92,10 +92,17 @@ def identified_config(
         "delay_frames": number(model.delay_frames, "delay_frames", at_least=1),
     }
     lines = _vibration_sections(axes, comments)
-    content["model"] = {"turbulence": [_turbulence_section(axis.turbulence) for axis in axes]}
-    for index, axis in enumerate(axes):
-        rms = f"rms {axis.turbulence.rms_nm:.4g} nm"
-        comments[f"model.turbulence[{index}]"] = f"{_AXES[index]}, {rms}"
+    content["model"] = {"turbulence": []}
+    for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
+        turbulence = axis.turbulence
+        content["model"]["turbulence"].append(
+            {
+                "kind": "ar",
+                "coefficients": turbulence.coefficients.tolist(),
+                "driving_rms_nm": turbulence.driving_rms_nm,
+            }
+        )
+        comments[f"model.turbulence[{index}]"] = f"{name}, rms {turbulence.rms_nm:.4g} nm"
     content["truth"] = {"turbulence": "model"}
     if lines:
         content["model"]["vibrations"] = lines
@@ -118,14 +125,6 @@ def identified_config(
     return settings, {key: text for key, text in comments.items() if text}
 
 
-def _turbulence_section(model: ARModel) -> dict[str, Any]:
-    return {
-        "kind": "ar",
-        "coefficients": model.coefficients.tolist(),
-        "driving_rms_nm": model.driving_rms_nm,
-    }
-
-
 def _vibration_sections(
     axes: Sequence[IdentifiedAxis], comments: dict[str, str]
 ) -> list[dict[str, Any]]:
@@ -134,26 +133,15 @@ def _vibration_sections(
     for name, axis in zip(_AXES, axes, strict=False):
         for line in axis.parts:
             path = f"model.vibrations[{len(out)}]"
-            comments[f"{path}.frequency_hz"] = _kind_comment(line.kind) + _error_comment(
-                "Hz", [line.frequency_error_hz]
-            )
+            frequency_error = _error_comment("Hz", [line.frequency_error_hz])
+            comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[line.kind] + frequency_error
             comments[f"{path}.damping"] = _error_comment("", [line.damping_error])
             comments[f"{path}.rms_nm"] = _error_comment("nm", [line.rms_error_nm])
             entry: dict[str, Any] = {} if len(axes) == 1 else {"axis": name}
-            out.append(
-                entry
-                | {
-                    "frequency_hz": float(line.frequency_hz),
-                    "damping": float(line.damping),
-                    "rms_nm": float(line.rms_nm),
-                }
-            )
+            for key in ("frequency_hz", "damping", "rms_nm"):
+                entry[key] = float(getattr(line, key))
+            out.append(entry)
     return out
-
-
-def _kind_comment(kind: str) -> str:
-    """Return the comment on a resonance that is no narrow line."""
-    return {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}[kind]
 
 
 def _error_comment(unit: str, errors: Sequence[float]) -> str:

@@ -54,11 +54,8 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
     """Return the noise per frame [nm], of all measurements or of each."""
     sensor = settings.sensor
     if isinstance(sensor.noise_nm, list):
-        return frozen_copy(
-            require_length(
-                sensor.noise_nm, count_measurements(settings), "sensor.noise_nm", "measurement"
-            )
-        )
+        count = count_measurements(settings)
+        return frozen_copy(require_length(sensor.noise_nm, count, "sensor.noise_nm", "measurement"))
     if sensor.noise_nm is not None:
         return sensor.noise_nm
     if sensor.noise_mas is not None:
@@ -69,12 +66,9 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
         settings, "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm"
     )
     return pyramid_tilt_noise_nm(
-        photons=pyramid.photons,
-        read_noise_electrons=pyramid.read_noise_electrons,
-        modulation_lambda_over_d=pyramid.modulation_lambda_over_d,
         subapertures=illuminated_subapertures(pyramid.subapertures_across, telescope.obstruction),
-        wavelength_um=pyramid.wavelength_um,
         diameter_m=telescope.diameter_m,
+        **pyramid.model_dump(exclude={"subapertures_across"}),
     )
 
 
@@ -235,12 +229,10 @@ def build_truth(
 def _build_true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVibration, ...]:
     if not isinstance(settings.truth.vibrations, list):
         return plant.vibrations
-    lines: list[TrueVibration] = []
+    rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
     for i, section in enumerate(settings.truth.vibrations):
         key = f"truth.vibrations[{i}]"
-        _require_below_nyquist(
-            section.frequency_hz, settings.loop.frame_rate_hz, f"{key}.frequency_hz"
-        )
+        _require_below_nyquist(section.frequency_hz, rate, f"{key}.frequency_hz")
         for direction in vibration_directions(section, count_axes(settings), key):
             size: dict[str, Any] = {
                 "frequency_hz": section.frequency_hz,
@@ -248,9 +240,7 @@ def _build_true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[
                 "direction": direction,
             }
             if section.kind == "drift":
-                lines.append(
-                    _build_drifting_vibration(section, size, settings.loop.frame_rate_hz, key)
-                )
+                lines.append(_build_drifting_vibration(section, size, rate, key))
             elif section.damping is None:
                 lines.append(SinusoidalVibration(**size))
             else:
