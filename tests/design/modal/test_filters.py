@@ -87,7 +87,7 @@ def test_filters_know_the_mirror_as_kalman_does(delay, bandwidth):
 def test_a_failing_mode_is_named():
     air = some_air(4)
     filters = lbt.design.modal.modal_filters(air, noise_nm=10.0)
-    (stack,) = plant_batches(
+    (batch,) = plant_batches(
         air,
         filters.vibrations,
         noise_nm=filters.noise_nm,
@@ -95,22 +95,22 @@ def test_a_failing_mode_is_named():
         sensor_gain=filters.sensor_gain,
     )
     solution = lbt.solve_dare(
-        np.swapaxes(stack.A, 1, 2), np.swapaxes(stack.C, 1, 2), stack.Q, stack.R
+        np.swapaxes(batch.A, 1, 2), np.swapaxes(batch.C, 1, 2), batch.Q, batch.R
     )
     gains = np.array(filters.gain_predictor)[..., None]
     gains[2] *= 1.001
-    examined = certificates.ModalChecks(4)
-    examined.filters(stack, gains, solution)
+    found = certificates.ModalChecks(4)
+    found.add_filters(batch, gains, solution)
     zero = np.zeros(4)
-    examined.loops(stack.modes, np.full(4, 0.5), filters.rms_nm[:, None] ** 2, zero, zero)
-    checks = examined.certificate(applied=False)
+    found.add_loops(batch.modes, np.full(4, 0.5), filters.rms_nm[:, None] ** 2, zero, zero)
+    checks = found.certificate(applied=False)
     assert not checks.passed
     with pytest.raises(lbt.errors.CertificateError, match="least-variance gain .mode 2."):
         checks.require()
     gains[:] = 5.0
-    examined.filters(stack, gains, solution)
+    found.add_filters(batch, gains, solution)
     with pytest.raises(lbt.errors.CertificateError, match="modes 0, 1, 2 and 3"):
-        examined.certificate(applied=False).require()
+        found.certificate(applied=False).require()
 
 
 def test_bad_filters_are_refused():

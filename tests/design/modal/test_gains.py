@@ -196,9 +196,9 @@ def test_bad_input_is_refused(air):
         ([ar1], {"noise_nm": 1, "margin": 0.9999}, lbt.errors.ProblemError, "leave room"),
         ([ar1], {"noise_nm": 1, "sensor_gain": 1e-6}, lbt.errors.ProblemError, "leave room"),
         ([ar1], {"noise_nm": 1, "delay_frames": 0}, lbt.errors.ProblemError, "delay_frames"),
-        ([], {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum a mode"),
-        (ar1, {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum a mode"),
-        ([ar1, 3], {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum a mode"),
+        ([], {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum per mode"),
+        (ar1, {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum per mode"),
+        ([ar1, 3], {"noise_nm": 1}, lbt.errors.ProblemError, "one spectrum per mode"),
         ([ar1, Odd()], {"noise_nm": 1}, lbt.errors.ProblemError, "that of mode 1 is not"),
         ([Lines()], {"noise_nm": 0}, lbt.errors.NumericalError, "did not settle"),
         (

@@ -168,7 +168,7 @@ def test_bad_mixed_controllers_are_refused():
         (
             {"filter": None, "gains": [1, 1], "reconstructor": inverse},
             lbt.errors.DimensionError,
-            "a mode of",
+            "per mode of",
         ),
         (
             {"filter": None, "gains": gains, "reconstructor": 1},
