@@ -32,14 +32,14 @@ def line_styles() -> Iterator[dict[str, Any]]:
 
 
 def colour(look: int | None) -> str:
-    """Colour of a look, as #rrggbb."""
+    """Colour of a look, as #rrggbb; None is grey."""
     return GREY if look is None else COLOURS[look % len(COLOURS)]
 
 
 def dashes(look: int | None) -> tuple[float, ...]:
     """Strokes and gaps of a look [widths of the line]; () is solid.
 
-    Where the colours begin anew, they meet other dashes.
+    Where the colours repeat, the dashes differ.
     """
     if look is None:
         return ()
@@ -47,7 +47,7 @@ def dashes(look: int | None) -> tuple[float, ...]:
 
 
 def marker_name(marker: str, look: int | None) -> str:
-    """Name of a marker; "own" is that of the look."""
+    """Name of a marker; "own" stands for that of the look."""
     if marker != "own":
         return marker
     return (

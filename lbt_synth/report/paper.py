@@ -23,13 +23,11 @@ from lbt_synth.studies.paper.tables import TableEntry, compare_with_paper, paper
 class PaperResult:
     """What :func:`write_paper` computed and wrote."""
 
-    # table_ii, table_iii: Entries, ours beside the paper's
-    table_ii: list[TableEntry]
+    table_ii: list[TableEntry]  # Ours beside the paper's
     table_iii: list[TableEntry]
-    # kalman, hinf: The two filters at the true frequency
-    kalman: FilterDesign
+    kalman: FilterDesign  # At the true frequency
     hinf: FilterDesign
-    files: list[Path]  # Files written
+    files: list[Path]  # The files that were written
 
 
 def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) -> PaperResult:

@@ -1,4 +1,4 @@
-"""When, by what and from which files a page was made."""
+"""When a page was made, by which programs, and from which files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class SourceFile:
 
 
 def read_source(path: str | os.PathLike[str], role: str) -> tuple[SourceFile, bytes]:
-    """Read a file and return what names it, and its bytes."""
+    """Read a file, and return its name and digest with its bytes."""
     source = Path(path)
     require_letters(source.name, f"name of the {role}")
     try:
@@ -74,12 +74,12 @@ def time_text(moment: datetime) -> str:
 
 
 def creator_name() -> str:
-    """Program and version."""
+    """Return the name and version of this program."""
     return f"lbt_synth {lbt_synth.__version__}"
 
 
 def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
-    """Return name and version of what makes a page; of ``extra`` distributions, too."""
+    """Return name and version of the programs that make a page, and of ``extra`` ones."""
     found = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
     for name in (*_DISTRIBUTIONS, *extra):
         try:

@@ -1,4 +1,4 @@
-"""One design in the loop of a configuration: all that is exact about it."""
+"""The exact numbers of one design in the loop of a configuration."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _GAINS = np.geomspace(0.01, 100.0, 400)  # where stable intervals are looked for
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopDesign(Design):
-    """A design in another loop than its own: that of a configuration."""
+    """A design in the loop of a configuration instead of its own."""
 
     loop_hardware: LoopHardware  # The loop
 
@@ -55,7 +55,7 @@ class DesignAssessment:
     design : Design
         The design.
     notes : tuple of str
-        In what it was made for another loop.
+        How the loop that it was made for differs from this one.
     stable : bool
         Whether the loop is stable at the real sensor gain.
     spectral_radius : float
@@ -63,7 +63,7 @@ class DesignAssessment:
     loop_poles, controller_poles : (n,) complex ndarray
         Poles of the closed loop, and of the controller alone.
     gamma, estimation_rms : float
-        Norm and standard deviation of the estimation error of its own model; nan for a design
+        Norm and standard deviation of the estimation error in its own model; nan for a design
         that estimates nothing.
     budget : ResidualBudget or None
         Exact residual; None where the loop is unstable.
@@ -75,7 +75,7 @@ class DesignAssessment:
         Intervals of real sensor gains for which the loop is stable, relative to the sensor
         matrix of the configuration; searched for between 0.01 and 100 times the assumed one.
     checks : tuple of Check
-        The certificate, computed anew.
+        The certificate, recomputed.
     certificate_error : str
         Why it could not be; empty if it could.
     cost : FrameCost
@@ -85,9 +85,9 @@ class DesignAssessment:
     rejection, noise_transfer : (f,) ndarray or None
         Those of the loop, from phase to residual and from noise to residual; None where the
         loop is unstable.
-    curve : StrehlMap
+    curve : RobustnessMap
         Strehl ratio over the frequency error at the real sensor gain.
-    map : StrehlMap
+    map : RobustnessMap
         The same over frequency error and real sensor gain.
     """
 
@@ -115,7 +115,7 @@ class DesignAssessment:
 
     @property
     def certified(self) -> bool:
-        """Whether the certificate could be computed anew, and every check passed."""
+        """Whether the certificate could be recomputed, and every check passed."""
         return not self.certificate_error and all(check.passed for check in self.checks)
 
     @property
@@ -136,7 +136,7 @@ def assess_design(
     sensor_gains: Sequence[float] | FloatArray,
     assumed_gain: float,
 ) -> DesignAssessment:
-    """Assess a design. Shapes: frequency_hz (f,)."""
+    """Assess a design; its transfer functions are taken at frequency_hz (f,)."""
     require_compatible(name, design, hardware)
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     budget = residual_budget(loop, truth) if loop.is_stable else None
@@ -219,8 +219,8 @@ def stable_intervals(
 ) -> list[tuple[float, float]]:
     """Intervals of sensor gains for which a loop is stable, in increasing order.
 
-    The one around the loop's own gain is that of its margins; others are looked for at 400 gains
-    from 0.01 to 100.
+    The interval around the loop's own gain comes from its margins; others are looked for at 400
+    gains from 0.01 to 100.
     """
     found = []
     if margins is not None:
@@ -237,7 +237,7 @@ def stable_intervals(
 
 
 def _recertify(design: Design) -> tuple[tuple[Check, ...], str]:
-    """Return the checks of the certificate computed anew, or why that failed."""
+    """Return the checks of the recomputed certificate, or why that failed."""
     try:
         return design.recertify().checks, ""
     except (LbtSynthError, ArithmeticError) as error:

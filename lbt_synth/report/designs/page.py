@@ -83,16 +83,14 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     count = len(report.assessments)
     names = listing_text([one.name for one in report.assessments])
     sections = [
-        Section(key="summary", title="Summary", blocks=tuple(_summary(report))),
-        Section(
-            key="transfer",
-            title="Transfer functions",
-            blocks=tuple(_transfer(report)),
-        ),
+        Section(key="summary", title="Summary", blocks=tuple(_summary_blocks(report))),
+        Section(key="transfer", title="Transfer functions", blocks=tuple(_transfer_blocks(report))),
         Section(key="errors", title="Robustness", blocks=tuple(robustness_charts(report))),
         Section(key="dynamics", title="Dynamics", blocks=tuple(pole_and_step_charts(report))),
-        Section(key="simulation", title="Simulation", blocks=tuple(_simulation(report))),
-        Section(key="certificates", title="Certificates", blocks=tuple(_certificates(report))),
+        Section(key="simulation", title="Simulation", blocks=tuple(_simulation_blocks(report))),
+        Section(
+            key="certificates", title="Certificates", blocks=tuple(_certificate_blocks(report))
+        ),
         Section(
             key="sources",
             title="Configuration and versions",
@@ -112,7 +110,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     )
 
 
-def _summary(report: DesignReport) -> list[Block]:
+def _summary_blocks(report: DesignReport) -> list[Block]:
     blocks: list[Block] = []
     for one in report.assessments:
         if not one.stable:
@@ -133,22 +131,22 @@ def _summary(report: DesignReport) -> list[Block]:
             blocks.append(Notice(text=f"The certificate of {one.name} fails: {why}", tone="bad"))
     blocks.append(Paragraph(text=verdict(report)))
     blocks.append(summary_table(report))
-    blocks.append(Paragraph(text=_situation(report)))
+    blocks.append(Paragraph(text=_situation_text(report)))
     blocks += [
         Notice(text=f"{one.name} was {note}") for one in report.assessments for note in one.notes
     ]
     return blocks
 
 
-def _situation(report: DesignReport) -> str:
-    """Return what the loop is and what it meets."""
+def _situation_text(report: DesignReport) -> str:
+    """Return the paragraph about the loop and its disturbances."""
     hardware, truth = report.config.hardware, report.config.truth
     lines = [
         f"a {'sinusoid' if isinstance(line, SinusoidalVibration) else 'resonance'} of "
         f"{number_text(line.rms_nm)} nm rms at {number_text(line.frequency_hz)} Hz"
         for line in stationary_vibrations(truth.vibrations)
     ]
-    noise = listing_text([number_text(float(v), 3) for v in _distinct(report)])
+    noise = listing_text([number_text(float(v), 3) for v in _noise_levels(report)])
     axes = "1 axis" if hardware.modes == 1 else f"{hardware.modes} axes"
     turbulence = report.config.settings.true_turbulence.replace("_", " ")
     return (
@@ -162,8 +160,8 @@ def _situation(report: DesignReport) -> str:
     )
 
 
-def _transfer(report: DesignReport) -> list[Block]:
-    """Return the transfer functions; those of a loop need a stable one."""
+def _transfer_blocks(report: DesignReport) -> list[Block]:
+    """Return the charts of transfer functions, and say so if no loop is stable."""
     charts: list[Block] = [*transfer_charts(report)]
     if report.stable:
         return charts
@@ -173,12 +171,12 @@ def _transfer(report: DesignReport) -> list[Block]:
     ]
 
 
-def _distinct(report: DesignReport) -> list[float]:
+def _noise_levels(report: DesignReport) -> list[float]:
     noise = report.config.truth.noise_per_measurement(report.config.hardware.n_measurements)
     return sorted({float(value) for value in noise})
 
 
-def _simulation(report: DesignReport) -> list[Block]:
+def _simulation_blocks(report: DesignReport) -> list[Block]:
     settings = report.config.settings.simulation
     charts = simulation_charts(report)
     if not charts:
@@ -189,7 +187,7 @@ def _simulation(report: DesignReport) -> list[Block]:
     return [Paragraph(text=text), *charts]
 
 
-def _certificates(report: DesignReport) -> list[Block]:
+def _certificate_blocks(report: DesignReport) -> list[Block]:
     blocks: list[Block] = [
         Paragraph(
             text="Every check was computed anew from the matrices of the gain file, by other means "

@@ -1,4 +1,4 @@
-"""Designs side by side in the loop of a configuration: all numbers of a report."""
+"""The numbers of a report: designs side by side in the loop of a configuration."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from lbt_synth.report.provenance import (
 from lbt_synth.studies import LimitRow, LimitStudy
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
-_SOLVED = ("sdp", "lmi")  # routes of designs that a convex solver made
+_CONVEX_ROUTES = ("sdp", "lmi")
 _MOST_FRAMES = 8192  # of a simulated run
-_MOST_DESIGNS = 36  # that lines can be told apart of
+_MOST_DESIGNS = 36  # more lines cannot be distinguished
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,7 +44,7 @@ class DesignReport:
     config_text : str
         Its file as it was read.
     assessments : tuple of DesignAssessment
-        One a design, exact.
+        One per design, exact.
     simulations : mapping of str to DesignSimulation
         Of the designs whose loop is stable.
     limits : LimitStudy
@@ -98,7 +98,7 @@ def design_report(
     """Examine designs in the loop of a configuration.
 
     Each controller is closed with the configuration's loop as it is, whatever it was designed
-    for. Certificates are computed anew.
+    for. Certificates are recomputed.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def design_report(
             settle_frames=settle,
         )
         count(1)
-    solved = any(design.solver.route in _SOLVED for design in designs.values())
+    solved = any(design.solver.route in _CONVEX_ROUTES for design in designs.values())
     return DesignReport(
         config=config,
         config_text=content.decode("utf-8", errors="replace"),
@@ -203,15 +203,15 @@ def design_report(
 
 
 def count_steps(designs: int) -> int:
-    """Return how many steps a report of so many designs counts, at most."""
+    """Return the number of steps that a report of so many designs counts at most."""
     return 2 * designs + 1
 
 
 def frequency_errors(config: Config) -> FloatArray:
-    """Frequency errors of the configuration, with three more between any two, and with 0.
+    """Frequency errors of the configuration and 0, with three more between any two.
 
-    Those are left out that would move a true vibration to 0 or to the Nyquist frequency. Without
-    vibrations there is only 0.
+    Errors that would move a true vibration to 0 or to the Nyquist frequency are left out.
+    Without vibrations there is only 0.
     """
     lines = [line.frequency_hz for line in stationary_vibrations(config.truth.vibrations)]
     if not lines:

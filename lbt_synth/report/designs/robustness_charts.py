@@ -152,7 +152,7 @@ def _map_text(one: DesignAssessment) -> str:
 
 
 def _sensor_gain_chart(report: DesignReport) -> Chart:
-    """Strehl ratio over the sensor gain, for a truth without vibrations."""
+    """Strehl ratio over the sensor gain, drawn for a truth without vibrations."""
     words = [_map_text(one) for one in report.assessments]
     curves = [
         design_curve(report, one, one.map.sensor_gains, 100 * one.map.strehl[0, :, 0])

@@ -1,4 +1,4 @@
-"""Designs in the time domain: the same weather for all, and spectra beside the exact ones."""
+"""Designs in a simulated loop: the same weather for all, and spectra beside the exact ones."""
 
 from __future__ import annotations
 
@@ -23,23 +23,20 @@ _STEP_FRAMES = 120
 class DesignSimulation:
     """One design in a simulated loop."""
 
-    # strehl, residual_nm: Mean Strehl ratio of the runs, and residual over all of them [nm rms]
-    strehl: float
-    residual_nm: float
+    strehl: float  # Mean Strehl ratio of the runs
+    residual_nm: float  # Residual over all runs [nm rms]
     scatter: float  # Standard deviation of the Strehl ratio between runs; nan for a single one
     frames: int  # Frames of a run
     time_s: FloatArray  # (t,): times of the excerpt, from its first frame [s]
     series_nm: FloatArray  # (t, n): residual of the first run
     frequency_hz: FloatArray  # (f,): frequencies of the spectra
-    # open_nm2_hz, residual_nm2_hz (f,): spectra by Welch's method, sums over the axes, before and
-    # after the correction
-    open_nm2_hz: FloatArray
-    residual_nm2_hz: FloatArray
+    # (f,): spectra by Welch's method, sums over the axes
+    open_nm2_hz: FloatArray  # before the correction
+    residual_nm2_hz: FloatArray  # after it
     # (f,): residual's spectrum by the transfer functions, with the window's image of each sinusoid
     exact_nm2_hz: FloatArray
     step_time_s: FloatArray  # (s,): times after a step of the disturbance [s]
-    # step_residual_nm, step_command_nm (s,): answer of the first axis to a step of ``STEP_NM``,
-    # without other disturbances
+    # (s,): answer of the first axis to a step of ``STEP_NM`` without other disturbances
     step_residual_nm: FloatArray
     step_command_nm: FloatArray
 
@@ -94,7 +91,7 @@ def simulate_design(
 
 
 def common_settling(designs: list[Design], hardware: LoopHardware, truth: Truth, least: int) -> int:
-    """Frames that all loops need to settle, so that one seed is one weather for all."""
+    """Frames in which all loops settle, so that one seed is the same weather for all."""
     radii = [
         close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain).spectral_radius
         for design in designs
@@ -117,7 +114,7 @@ def exact_spectrum(
 ) -> FloatArray:
     """One-sided spectrum of the residual, summed over the axes [nm^2/Hz], (f,).
 
-    What is random is the sum of ``|transfer|^2 spectrum``. A sinusoid of amplitude a at f0 is what
+    Random disturbances add ``|transfer|^2 spectrum``. A sinusoid of amplitude a at f0 adds what
     Welch's method makes of it with a Hann window w of that length:
     ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the window's Fourier transform.
     """

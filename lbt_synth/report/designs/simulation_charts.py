@@ -11,6 +11,7 @@ from lbt_synth.report.designs.design_curves import (
     split_by_sheets,
 )
 from lbt_synth.report.designs.report import DesignReport
+from lbt_synth.report.designs.simulation import DesignSimulation
 from lbt_synth.report.number_text import fixed_text, listing_text
 from lbt_synth.report.page.charts import Axis, Chart, Curve, Panel
 
@@ -50,39 +51,7 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
             for one, run in rows
         ),
     )
-    panels = tuple(
-        Panel(
-            title=one.name,
-            x=FREQUENCY,
-            y=Axis(label="power spectrum", unit="nm²/Hz", log=True),
-            marks=(
-                Curve(
-                    name="before the correction",
-                    x=run.frequency_hz,
-                    y=run.open_nm2_hz,
-                    look=None,
-                    width=0.8,
-                ),
-                Curve(
-                    name="residual, simulated",
-                    x=run.frequency_hz,
-                    y=run.residual_nm2_hz,
-                    look=5,
-                    width=1.6,
-                    dashed=False,
-                ),
-                Curve(
-                    name="residual, exact",
-                    x=run.frequency_hz,
-                    y=run.exact_nm2_hz,
-                    look=1,
-                    width=1.4,
-                ),
-            ),
-            height_in=2.2,
-        )
-        for one, run in rows
-    )
+    panels = tuple(_spectra_panel(one.name, run) for one, run in rows)
     spectra = Chart(
         key="spectra",
         title="Spectra, simulated and exact",
@@ -94,3 +63,17 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
         columns=count_columns(len(panels)),
     )
     return [*split_by_sheets(series), *split_by_sheets(spectra)]
+
+
+def _spectra_panel(name: str, run: DesignSimulation) -> Panel:
+    f = run.frequency_hz
+    exact = Curve(name="residual, exact", x=f, y=run.exact_nm2_hz, look=1, width=1.4)
+    before = Curve(name="before the correction", x=f, y=run.open_nm2_hz, look=None, width=0.8)
+    simulated = Curve(name="residual, simulated", x=f, y=run.residual_nm2_hz, look=5, dashed=False)
+    return Panel(
+        title=name,
+        x=FREQUENCY,
+        y=Axis(label="power spectrum", unit="nm²/Hz", log=True),
+        marks=(before, simulated, exact),
+        height_in=2.2,
+    )

@@ -28,16 +28,16 @@ def summary_table(report: DesignReport) -> Table:
             lambda one, _: number_text(one.gamma, 5),
         ),
         ("error in its own model [nm rms]", lambda one, _: fixed_text(one.estimation_rms, 1)),
-        ("certificate, computed anew", lambda one, _: _certificate(one)),
+        ("certificate, computed anew", lambda one, _: _certificate_cell(one)),
         "In the loop of the configuration",
-        ("closed loop", lambda one, _: _stable(one)),
+        ("closed loop", lambda one, _: _stability_cell(one)),
         ("largest modulus of its poles", lambda one, _: number_text(one.spectral_radius, 6)),
         ("residual, exact [nm rms]", lambda one, _: fixed_text(one.residual_nm, 1)),
-        ("of that turbulence [nm rms]", lambda one, _: _part(one, "turbulence_nm")),
-        ("of that vibration [nm rms]", lambda one, _: _part(one, "vibration_nm")),
-        ("of that noise [nm rms]", lambda one, _: _part(one, "noise_nm")),
+        ("of that turbulence [nm rms]", lambda one, _: _part_text(one, "turbulence_nm")),
+        ("of that vibration [nm rms]", lambda one, _: _part_text(one, "vibration_nm")),
+        ("of that noise [nm rms]", lambda one, _: _part_text(one, "noise_nm")),
         ("Strehl ratio, exact [%]", lambda one, _: fixed_text(100 * one.strehl, 2)),
-        ("Strehl ratio, simulated [%]", lambda one, _: _simulated(report, one)),
+        ("Strehl ratio, simulated [%]", lambda one, _: _simulated_text(report, one)),
     ]
     if report.limits.limit is not None and report.limits.limit.rms_nm > 0:
         rows += [
@@ -53,7 +53,7 @@ def summary_table(report: DesignReport) -> Table:
         rows += [
             f"Over frequency errors of {ends} Hz",
             ("worst residual [nm rms]", lambda _, row: fixed_text(row.worst_nm, 1)),
-            ("worst Strehl ratio [%]", lambda one, _: fixed_text(_worst(one), 2)),
+            ("worst Strehl ratio [%]", lambda one, _: fixed_text(_worst_percent(one), 2)),
         ]
         if report.limits.band is not None and report.limits.band.rms_nm > 0:
             rows.append(
@@ -65,12 +65,12 @@ def summary_table(report: DesignReport) -> Table:
             )
     rows += [
         "Margins at the real sensor gain",
-        ("modulus margin", lambda one, _: _margin(one, "modulus", 3)),
-        ("gain margin, factors", lambda one, _: _gain_margin(one)),
-        ("phase margin [deg]", lambda one, _: _margin(one, "phase_deg", 3)),
-        ("delay margin [frames]", lambda one, _: _margin(one, "delay_frames", 3)),
-        ("highest crossover [Hz]", lambda one, _: _margin(one, "crossover_hz", 3)),
-        ("stable real sensor gains", lambda one, _: _gains(one)),
+        ("modulus margin", lambda one, _: _margin_text(one, "modulus", 3)),
+        ("gain margin, factors", lambda one, _: _gain_margin_text(one)),
+        ("phase margin [deg]", lambda one, _: _margin_text(one, "phase_deg", 3)),
+        ("delay margin [frames]", lambda one, _: _margin_text(one, "delay_frames", 3)),
+        ("highest crossover [Hz]", lambda one, _: _margin_text(one, "crossover_hz", 3)),
+        ("stable real sensor gains", lambda one, _: _stable_gains_text(one)),
     ]
     return Table(
         caption=f"Summary at a real sensor gain of {number_text(report.real_gain)}",
@@ -92,8 +92,10 @@ def certificate_table(one: DesignAssessment) -> Table:
         rows=tuple(
             (
                 check.name,
-                _measured(check.value),
-                _measured(check.limit) if not 0.999 < check.limit < 1 else f"1 {MINUS} 1e{MINUS}9",
+                _measured_text(check.value),
+                _measured_text(check.limit)
+                if not 0.999 < check.limit < 1
+                else f"1 {MINUS} 1e{MINUS}9",
                 Cell(text="passed", tone="good")
                 if check.passed
                 else Cell(text="FAILED", tone="bad"),
@@ -105,12 +107,12 @@ def certificate_table(one: DesignAssessment) -> Table:
     )
 
 
-def _measured(value: float) -> str:
-    """Return six digits of a number, three of one that is all but 0."""
+def _measured_text(value: float) -> str:
+    """Return six digits of a number, or three if it is close to 0."""
     return number_text(value, 6 if abs(value) >= 1e-4 else 3)
 
 
-def _certificate(one: DesignAssessment) -> Cell:
+def _certificate_cell(one: DesignAssessment) -> Cell:
     if one.certified:
         count = len(one.checks)
         return Cell(text=f"passed, {count} check{'s' if count > 1 else ''}", tone="good")
@@ -119,15 +121,15 @@ def _certificate(one: DesignAssessment) -> Cell:
     return Cell(text=text, tone="bad")
 
 
-def _stable(one: DesignAssessment) -> Cell:
+def _stability_cell(one: DesignAssessment) -> Cell:
     return Cell(text="stable", tone="good") if one.stable else Cell(text="UNSTABLE", tone="bad")
 
 
-def _part(one: DesignAssessment, name: str) -> str:
+def _part_text(one: DesignAssessment, name: str) -> str:
     return DASH if one.budget is None else fixed_text(getattr(one.budget, name), 1)
 
 
-def _simulated(report: DesignReport, one: DesignAssessment) -> str:
+def _simulated_text(report: DesignReport, one: DesignAssessment) -> str:
     run = report.simulations.get(one.name)
     if run is None:
         return DASH
@@ -135,21 +137,21 @@ def _simulated(report: DesignReport, one: DesignAssessment) -> str:
     return f"{fixed_text(100 * run.strehl, 2)}{scatter}"
 
 
-def _worst(one: DesignAssessment) -> float:
+def _worst_percent(one: DesignAssessment) -> float:
     return 100 * float(np.min(one.curve.strehl)) if one.stable else float("nan")
 
 
-def _margin(one: DesignAssessment, name: str, digits: int) -> str:
+def _margin_text(one: DesignAssessment, name: str, digits: int) -> str:
     return DASH if one.margins is None else number_text(getattr(one.margins, name), digits)
 
 
-def _gain_margin(one: DesignAssessment) -> str:
+def _gain_margin_text(one: DesignAssessment) -> str:
     if one.margins is None:
         return DASH
     return interval_text(one.margins.gain_low, one.margins.gain_high, 3)
 
 
-def _gains(one: DesignAssessment) -> str | Cell:
+def _stable_gains_text(one: DesignAssessment) -> str | Cell:
     if not one.sensor_gains:
         return Cell(text="none found", tone="bad")
     return ", ".join(interval_text(low, high, 4) for low, high in one.sensor_gains)

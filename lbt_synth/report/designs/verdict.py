@@ -1,4 +1,4 @@
-"""What the numbers of a report say, in sentences made of these numbers alone."""
+"""The verdict of a report: what its numbers say, in sentences."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
 class GoodRange:
     """Frequency errors around its best over which a design keeps most of its Strehl ratio."""
 
-    # low_hz, high_hz: The range [Hz], on the grid of the report
-    low_hz: float
-    high_hz: float
-    whole: bool  # Whether it is the whole range that was looked at
+    low_hz: float  # Lower end [Hz], on the grid of the report
+    high_hz: float  # Upper end [Hz]
+    whole: bool  # Whether it is the whole range of the report
 
 
 def good_range(one: DesignAssessment) -> GoodRange | None:
@@ -49,28 +48,28 @@ def good_range(one: DesignAssessment) -> GoodRange | None:
 
 
 def verdict(report: DesignReport) -> str:
-    """Return one paragraph: who leaves least, who bears errors, what is proved."""
+    """Return one paragraph: which design leaves least, which bears errors, what is proved."""
     stable = report.stable
     sentences = []
     if stable:
-        sentences.append(_least(report))
+        sentences.append(_least_sentence(report))
         if report.errors_hz.size > 1:
-            sentences += _tolerance(report)
-        sentences.append(_gains(report))
+            sentences += _error_sentences(report)
+        sentences.append(_gain_sentence(report))
     unstable = [one.name for one in report.assessments if not one.stable]
     if unstable:
         verb = "is" if len(unstable) == 1 else "are"
         sentences.append(f"{listing_text(unstable)} {verb} UNSTABLE in this loop.")
-    sentences.append(_certificates(report))
+    sentences.append(_certificate_sentence(report))
     # a number stays in one line with its unit
     return re.sub(r"(?<=\d) (?=%|nm|Hz)", NO_BREAK, " ".join(sentences))
 
 
-def _least(report: DesignReport) -> str:
+def _least_sentence(report: DesignReport) -> str:
     stable = report.stable
     best = min(stable, key=lambda one: one.residual_nm)
     least = fixed_text(best.residual_nm, 1)
-    # who cannot be told from the best by the number that is read is as good
+    # designs that show the same number as the best are as good
     equal = [one.name for one in stable if fixed_text(one.residual_nm, 1) == least]
     several = len(stable) > 1
     where = " if the vibrations are where the configuration has them"
@@ -86,7 +85,7 @@ def _least(report: DesignReport) -> str:
     return f"{sentence}; no linear controller leaves less than {fixed_text(limit.rms_nm, 1)} nm."
 
 
-def _tolerance(report: DesignReport) -> list[str]:
+def _error_sentences(report: DesignReport) -> list[str]:
     errors = report.errors_hz
     over = f"{signed_text(float(errors[0]))} to {signed_text(float(errors[-1]))} Hz"
     worst = {one.name: float(np.min(one.curve.strehl)) for one in report.stable}
@@ -95,30 +94,26 @@ def _tolerance(report: DesignReport) -> list[str]:
     sentences = [
         f"Over frequency errors of {over} the worst Strehl ratio is "
         + listing_text([f"{fixed_text(100 * v, 1)} % for {name}" for name, v in worst.items()])
-        + (f": {_best(tough, len(worst))}." if len(worst) > 1 else ".")
+        + (f": {_best_words(tough, len(worst))}." if len(worst) > 1 else ".")
     ]
     parts = []
     for one in report.stable:
         found = good_range(one)
         assert found is not None  # it is stable
-        if found.whole:
-            parts.append(f"{one.name} over all of these errors")
-        else:
-            parts.append(
-                f"{one.name} from {signed_text(found.low_hz)} to {signed_text(found.high_hz)} Hz"
-            )
+        ends = f"from {signed_text(found.low_hz)} to {signed_text(found.high_hz)} Hz"
+        parts.append(f"{one.name} {'over all of these errors' if found.whole else ends}")
     sentences.append(f"Within 10 % of its own best Strehl ratio stays {listing_text(parts)}.")
     return sentences
 
 
-def _best(tough: list[str], of: int) -> str:
-    """Return who bears errors best; equals are told as such."""
+def _best_words(tough: list[str], of: int) -> str:
+    """Return which designs bear errors best, or that all bear them alike."""
     if len(tough) == of:
         return "they bear them alike"
     return f"{listing_text(tough)} {'bear' if len(tough) > 1 else 'bears'} them best"
 
 
-def _gains(report: DesignReport) -> str:
+def _gain_sentence(report: DesignReport) -> str:
     parts = []
     for one in report.stable:
         low, high = next(
@@ -129,15 +124,12 @@ def _gains(report: DesignReport) -> str:
     return f"Around the real sensor gain the loop is stable with {listing_text(parts)}."
 
 
-def _certificates(report: DesignReport) -> str:
+def _certificate_sentence(report: DesignReport) -> str:
     failed = [one.name for one in report.assessments if not one.certified]
     checks = sum(len(one.checks) for one in report.assessments)
     if not failed:
-        # nobody shall take a proof about another loop for one about this
-        about = (
-            ""
-            if len(report.stable) == len(report.assessments)
-            else ("; they are about the loops that the designs were made for, not about this one")
-        )
+        # a proof about another loop must not be taken for one about this loop
+        about = "; they are about the loops that the designs were made for, not about this one"
+        about = "" if len(report.stable) == len(report.assessments) else about
         return f"All {checks} checks of the certificates were computed anew and passed{about}."
     return f"The certificate of {listing_text(failed)} does NOT hold."

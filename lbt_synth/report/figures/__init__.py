@@ -1,7 +1,7 @@
 """Figures of designs, loops and studies, drawn by matplotlib.
 
 Each function returns a matplotlib figure.
-Curves differ in colour, dash and marker, so that they can be told apart in grey.
+Curves differ in colour, dash and marker, so that a reader can distinguish them in grey.
 Axes carry units.
 """
 

@@ -16,18 +16,18 @@ from lbt_synth.report.figures.style import house_style, new_figure, number_ticks
 from lbt_synth.report.line_styles import COLOURS, LINES
 from lbt_synth.validation import FloatArray, require_instance
 
-_BANDS = 240  # of the smoothed density
-_REFUSED = 1.6276  # of Kolmogorov's statistic at 1 %
+_BANDS = 240  # of equal ratio over which the periodogram is averaged
+_KOLMOGOROV = 1.6276  # Kolmogorov's statistic at 1 %
 _NAMES = ("tip", "tilt")
-_LABEL = 0.045  # width of a label, of that of the plot
-_FEW_DECADES = 40.0  # an axis of less has plain numbers
+_LABEL = 0.045  # width of a label, as a part of that of the plot
+_FEW_DECADES = 40.0  # the ratio of the ends of an axis below which it has plain numbers
 _FEW_CURVES = 2
 
 
 def identification_figure(
     model: IdentifiedModel, *, designs: Mapping[str, Controller | Design] | None = None
 ) -> Any:
-    """Draw what was identified: an axis a column.
+    """Draw what was identified, one column per axis.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def identification_figure(
     3
     """
     require_instance(model, IdentifiedModel)
-    residuals = _residuals(model, designs or {})
+    residuals = _predicted_residuals(model, designs or {})
     columns = len(model.axes)
     with house_style():
         figure = new_figure(max(4.6, 4.1 * columns), 7.4)
@@ -72,13 +72,13 @@ def identification_figure(
         )
         for i, axis in enumerate(model.axes):
             spectrum, cumulative, white = grid[:, i]
-            _draw_spectrum(spectrum, axis, title=_title(axis, i, columns))
+            _draw_spectrum(spectrum, axis, title=_panel_title(axis, i, columns))
             _draw_cumulative(cumulative, axis, {k: v[i] for k, v in residuals.items()})
             _draw_innovations(white, axis)
             white.set_xlabel("frequency [Hz]")
             if axis.frequency_hz[-1] / axis.frequency_hz[0] < _FEW_DECADES:
                 number_ticks(white.xaxis)
-        _scale_spectra(grid[0, 0], model)
+        _set_spectrum_limits(grid[0, 0], model)
         grid[0, 0].set_ylabel("density [nm$^2$/Hz]")
         grid[1, 0].set_ylabel("rms up to the frequency [nm]")
         grid[2, 0].set_ylabel("innovations:\ncumulative\npower - white")
@@ -89,7 +89,7 @@ def identification_figure(
     return figure
 
 
-def _title(axis: IdentifiedAxis, i: int, columns: int) -> str:
+def _panel_title(axis: IdentifiedAxis, i: int, columns: int) -> str:
     name = f"{_NAMES[i]}: " if columns == len(_NAMES) else ""
     noise = f"noise {axis.noise_nm:.3g} nm a frame"
     if axis.sensor_gain_error is None:
@@ -97,10 +97,10 @@ def _title(axis: IdentifiedAxis, i: int, columns: int) -> str:
     return f"{name}{noise}, sensor gain {axis.sensor_gain:.3f} $\\pm$ {axis.sensor_gain_error:.3f}"
 
 
-def _residuals(
+def _predicted_residuals(
     model: IdentifiedModel, designs: Mapping[str, Controller | Design]
 ) -> dict[str, list[FloatArray]]:
-    """Density of the residual of each axis that each design would leave."""
+    """Densities of the residual that each design would leave on each axis, (f,) each."""
     out: dict[str, list[FloatArray]] = {}
     for name, thing in designs.items():
         controller = thing.controller if isinstance(thing, Design) else thing
@@ -117,7 +117,7 @@ def _residuals(
             passed = np.abs(loop.noise_transfer(f)[:, i]) ** 2
             density = np.zeros(f.size)
             for j, other in enumerate(model.axes):
-                white = _white(other)
+                white = _noise_density(other)
                 phase = np.interp(f, other.frequency_hz, other.fitted_nm2_hz) - white
                 density += rejected[:, j] * phase
                 density += passed[:, j] * white * other.sensor_gain**2
@@ -126,14 +126,14 @@ def _residuals(
     return out
 
 
-def _white(axis: IdentifiedAxis) -> float:
-    """Density of the noise, in units of the phase."""
+def _noise_density(axis: IdentifiedAxis) -> float:
+    """Density of the noise, in units of the phase [nm^2/Hz]."""
     return 2 / axis.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
 
 
 def _draw_spectrum(plot: Any, axis: IdentifiedAxis, *, title: str) -> None:
     f = axis.frequency_hz
-    centres, smooth, least, most = _banded(f, axis.density_nm2_hz)
+    centres, smooth, least, most = _average_bands(f, axis.density_nm2_hz)
     plot.fill_between(centres, least, most, color="0.88", linewidth=0, label="periodogram: range")
     plot.loglog(centres, smooth, color="0.45", linewidth=1, label="periodogram: mean")
     plot.loglog(f, axis.fitted_nm2_hz, color=COLOURS[0], linewidth=1.3, label="fit")
@@ -149,7 +149,7 @@ def _draw_spectrum(plot: Any, axis: IdentifiedAxis, *, title: str) -> None:
     plot.set_title(title)
     span = float(np.log(f[-1] / f[0]))
     peaks = [line.frequency_hz for line in axis.lines]
-    places = f[0] * np.exp(span * _apart([float(np.log(x / f[0])) / span for x in peaks]))
+    places = f[0] * np.exp(span * _spread_labels([float(np.log(x / f[0])) / span for x in peaks]))
     for line, place in zip(axis.lines, places, strict=True):
         height = float(np.interp(line.frequency_hz, f, axis.fitted_nm2_hz))
         plot.annotate(
@@ -173,8 +173,8 @@ def _draw_spectrum(plot: Any, axis: IdentifiedAxis, *, title: str) -> None:
         )
 
 
-def _apart(places: Sequence[float]) -> FloatArray:
-    """Places of labels in (0, 1) near increasing ones, so that none lies upon another."""
+def _spread_labels(places: Sequence[float]) -> FloatArray:
+    """Return places in (0, 1) for labels near increasing ones, so that none overlap."""
     if not places:
         return np.zeros(0)
     gap = min(_LABEL, 1 / len(places))
@@ -187,9 +187,9 @@ def _apart(places: Sequence[float]) -> FloatArray:
     return np.asarray(left)
 
 
-def _scale_spectra(plot: Any, model: IdentifiedModel) -> None:
-    """Limits for all axes, with room for the labels of lines."""
-    smooth = [_banded(axis.frequency_hz, axis.density_nm2_hz)[1] for axis in model.axes]
+def _set_spectrum_limits(plot: Any, model: IdentifiedModel) -> None:
+    """Set the limits for all axes, with room for the labels of lines."""
+    smooth = [_average_bands(axis.frequency_hz, axis.density_nm2_hz)[1] for axis in model.axes]
     top = max(float(np.max(values)) for values in smooth)
     for axis in model.axes:
         peaks = [line.frequency_hz for line in axis.lines]
@@ -200,7 +200,7 @@ def _scale_spectra(plot: Any, model: IdentifiedModel) -> None:
     plot.set_ylim(low, top * (top / low) ** (0.45 if labelled else 0.1))
 
 
-def _banded(
+def _average_bands(
     f: FloatArray, density: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Mean frequency, mean, least and most of a density in bands of equal ratio."""
@@ -216,7 +216,7 @@ def _banded(
 
 
 def _draw_cumulative(plot: Any, axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -> None:
-    f, white = axis.frequency_hz, _white(axis)
+    f, white = axis.frequency_hz, _noise_density(axis)
     step = np.gradient(f)
 
     def rms(density: FloatArray) -> FloatArray:
@@ -255,6 +255,6 @@ def _draw_cumulative(plot: Any, axis: IdentifiedAxis, residuals: dict[str, Float
 def _draw_innovations(plot: Any, axis: IdentifiedAxis) -> None:
     test = axis.whiteness
     even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
-    bound = _REFUSED / np.sqrt(test.effective)
+    bound = _KOLMOGOROV / np.sqrt(test.effective)
     plot.axhspan(-bound, bound, color="0.9", label="99 % of white noise")
     plot.plot(test.frequency_hz, test.cumulative - even, color=COLOURS[0], linewidth=1)

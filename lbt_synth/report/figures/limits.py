@@ -18,7 +18,7 @@ def limits_figure(study: LimitStudy) -> Any:
     Parameters
     ----------
     study : LimitStudy
-        Result of :func:`limit_study`, of a truth with a vibration and a range of errors.
+        Result of :func:`limits`, of a truth with a vibration and a range of errors.
 
     Returns
     -------
@@ -61,24 +61,13 @@ def limits_figure(study: LimitStudy) -> Any:
                 axis.plot(x, curve, label=label, **style)
             else:
                 axis.plot([], [], label=f"{label}: unstable", **style)
+        lines: dict[str, Any] = {"color": "0.25", "linewidth": 1.2, "zorder": 1.5}
         if study.band is not None:
-            axis.axhline(
-                study.band.rms_nm,
-                color="0.25",
-                linewidth=1.2,
-                linestyle=(0, (7, 2)),
-                zorder=1.5,
-                label="limit, frequency anywhere in this range",
-            )
+            label = "limit, frequency anywhere in this range"
+            axis.axhline(study.band.rms_nm, linestyle=(0, (7, 2)), label=label, **lines)
         if study.limit is not None and study.limit.rms_nm > 0:
-            axis.axhline(
-                study.limit.rms_nm,
-                color="0.25",
-                linewidth=1.2,
-                linestyle=(0, (1, 1.5)),
-                zorder=1.5,
-                label="limit, frequency known",
-            )
+            label = "limit, frequency known"
+            axis.axhline(study.limit.rms_nm, linestyle=(0, (1, 1.5)), label=label, **lines)
         axis.set_yscale("log")
         number_ticks(axis.yaxis)
         axis.set_xlim(float(x[0]), float(x[-1]))
@@ -86,11 +75,7 @@ def limits_figure(study: LimitStudy) -> Any:
         drawn = study.residual_nm[np.isfinite(study.residual_nm)]
         top = float(np.max(drawn)) if drawn.size else high
         axis.set_ylim(low, top * (top / low) ** 0.05)
-        axis.set_xlabel(
-            "frequency of the true vibration [Hz]"
-            if single
-            else "shift of the true vibrations [Hz]"
-        )
-        axis.set_ylabel("residual [nm rms]")
+        word = "frequency of the true vibration" if single else "shift of the true vibrations"
+        axis.set(xlabel=f"{word} [Hz]", ylabel="residual [nm rms]")
         figure.legend(loc="outside upper center", ncols=3)
     return figure

@@ -13,7 +13,7 @@ from lbt_synth.report.line_styles import COLOURS
 from lbt_synth.validation import require_instance
 
 _MOST_POINTS = 4000
-_SHOWN = 5e-3  # taps beyond the last one of this size are not drawn
+_SHOWN = 5e-3  # taps after the last one of this size are not drawn
 
 
 def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:

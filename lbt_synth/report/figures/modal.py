@@ -49,10 +49,10 @@ def modal_figure(
 
     if not residuals_nm:
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
-    curves = {name: _curve(values, name) for name, values in residuals_nm.items()}
+    curves = {name: _check_curve(values, name) for name, values in residuals_nm.items()}
     count = len(next(iter(curves.values())))
     others = {
-        name: _curve(values, name)
+        name: _check_curve(values, name)
         for name, values in (("gains", gains), ("turbulence_nm", turbulence_nm))
         if values is not None
     }
@@ -87,13 +87,12 @@ def modal_figure(
         number_ticks(axis.yaxis)
         axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_xlim(1, max(count, 2))
-        axis.set_xlabel("mode, in Noll's order from tip on")
-        axis.set_ylabel("residual [nm rms]")
+        axis.set(xlabel="mode, in Noll's order from tip on", ylabel="residual [nm rms]")
         figure.legend(loc="outside upper center", ncols=min(4, len(curves) + 1))
     return figure
 
 
-def _curve(values: Any, name: str) -> FloatArray:
+def _check_curve(values: Any, name: str) -> FloatArray:
     curve = real_array(values, name)
     if curve.ndim != 1 or curve.size == 0:
         raise DimensionError(f"{name} must be a list, one number a mode; got shape {curve.shape}.")

@@ -20,7 +20,7 @@ def robustness_figure(
     Parameters
     ----------
     rows : sequence of RobustnessRow
-        Rows of :func:`frequency_robustness`.
+        Rows of :func:`lbt_synth.studies.robustness`.
     published : mapping, optional
         For each method, pairs (error [Hz], Strehl ratio [%]) drawn as open markers.
 
@@ -91,8 +91,9 @@ def robustness_figure(
                     markeredgecolor=style["color"],
                     label=f"{label}, paper",
                 )
-        axis.set_xlabel("error of the vibration frequency in the model [Hz]")
-        axis.set_ylabel("Strehl ratio [%]")
+        axis.set(
+            xlabel="error of the vibration frequency in the model [Hz]", ylabel="Strehl ratio [%]"
+        )
         axis.set_ylim(0, 1.06 * axis.get_ylim()[1])
         axis.legend(loc="best")
     return figure

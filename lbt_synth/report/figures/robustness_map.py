@@ -24,13 +24,13 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
 
     Parameters
     ----------
-    maps : mapping of str to StrehlMap
-        Maps of :func:`strehl_map` by the names of their designs.
+    maps : mapping of str to RobustnessMap
+        Maps of :func:`robustness_map` by the names of their designs.
 
     Returns
     -------
     matplotlib.figure.Figure
-        One column of panels a design, one row a delay error, one colour bar for all. Sensor
+        One column of panels per design, one row per delay error, one colour bar for all. Sensor
         gains at which the loop is unstable are hatched.
 
     Raises

@@ -37,7 +37,7 @@ def sigma_figure(
     Returns
     -------
     matplotlib.figure.Figure
-        One panel a transfer function, the vibration frequencies marked. A loop that is
+        One panel per transfer function, the vibration frequencies marked. A loop that is
         unstable at this sensor gain is named and not drawn. With several axes the
         largest singular value is that of the worst one.
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.loop import Simulation
 from lbt_synth.report.figures.style import house_style, new_figure
-from lbt_synth.report.line_styles import line_styles
+from lbt_synth.report.line_styles import COLOURS
 
 
 def simulation_figure(run: Simulation, *, title: str = "") -> Any:
@@ -46,15 +47,9 @@ def simulation_figure(run: Simulation, *, title: str = "") -> Any:
         series, spectrum = figure.subplots(2, 1)
         time = np.arange(frames) / run.frame_rate_hz
         length = min(frames, 2048)
-        for i, style in zip(range(n), line_styles(), strict=False):
-            series.plot(
-                time,
-                run.residual_nm[0, :, i],
-                label=names[i],
-                linewidth=0.6,
-                alpha=0.8,
-                color=style["color"],
-            )
+        for i, colour in zip(range(n), cycle(COLOURS), strict=False):
+            residual = run.residual_nm[0, :, i]
+            series.plot(time, residual, label=names[i], linewidth=0.6, alpha=0.8, color=colour)
             for data, word, line in (
                 (run.total_nm, "open loop", ":"),
                 (run.residual_nm, "residual", "-"),
@@ -65,15 +60,13 @@ def simulation_figure(run: Simulation, *, title: str = "") -> Any:
                     f[1:],
                     mean,
                     linestyle=line,
-                    color=style["color"],
+                    color=colour,
                     label=f"{names[i]}, {word}",
                     linewidth=1.0,
                 )
-        series.set_xlabel("time [s]")
-        series.set_ylabel("residual [nm rms wavefront]")
+        series.set(xlabel="time [s]", ylabel="residual [nm rms wavefront]")
         series.legend(loc="upper right")
-        spectrum.set_xlabel("frequency [Hz]")
-        spectrum.set_ylabel(r"power spectrum [nm$^2$/Hz]")
+        spectrum.set(xlabel="frequency [Hz]", ylabel=r"power spectrum [nm$^2$/Hz]")
         spectrum.legend(loc="best", ncols=2)
         if title:
             figure.suptitle(title, fontsize=10)

@@ -43,8 +43,9 @@ def tracking_figure(
     Returns
     -------
     matplotlib.figure.Figure
-        Above, the frequencies that the filter assumed, those of each window at its middle,
-        and updates at which the filter was kept; below, the residual in parts of ``bin_s``.
+        Above, the frequencies that the filter assumed, those fitted to each window at its
+        middle, and updates that left the filter as it was; below, the residual in parts of
+        ``bin_s``.
 
     Raises
     ------
@@ -74,7 +75,7 @@ def tracking_figure(
         )
     number(start_s, "start_s")
     number(bin_s, "bin_s", above=0)
-    residuals = {name: _in_parts(name, run, bin_s) for name, run in runs.items()}
+    residuals = {name: _rms_in_parts(name, run, bin_s) for name, run in runs.items()}
     last_s = max(len(values) for values in residuals.values()) * bin_s
     with house_style():
         figure = new_figure(6.3, 5.0)
@@ -127,8 +128,8 @@ def _draw_history(
             axis.plot(*zip(*points, strict=True), marker, color=colour, markersize=4, label=name)
 
 
-def _in_parts(name: str, run: Simulation, bin_s: float) -> FloatArray:
-    """Residual of the first case over all modes, in whole parts [nm rms]."""
+def _rms_in_parts(name: str, run: Simulation, bin_s: float) -> FloatArray:
+    """Residual of the first case over all modes, in parts of a length [nm rms]."""
     power = np.sum(run.residual_nm[0] ** 2, axis=1)
     each = max(1, round(bin_s * run.frame_rate_hz))
     parts = len(power) // each

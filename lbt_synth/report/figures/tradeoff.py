@@ -63,7 +63,7 @@ def tradeoff_figure(points: Sequence[TradeoffPoint]) -> Any:
                 gamma, [p.rms for p in own], marker=marker, markersize=4, label=label, **style
             )
             if loops:
-                _interval(axes[1], own, marker, label, style)
+                _draw_stable_gains(axes[1], own, marker, label, style)
         axes[0].set_ylabel(f"estimation error, rms [{unit}]")
         for axis in axes:
             axis.axvspan(
@@ -105,7 +105,7 @@ def tradeoff_figure(points: Sequence[TradeoffPoint]) -> Any:
     return figure
 
 
-def _interval(
+def _draw_stable_gains(
     axis: Any, own: Sequence[TradeoffPoint], marker: str, label: str, style: dict[str, Any]
 ) -> None:
     gamma = [p.gamma for p in own]

@@ -23,7 +23,7 @@ class Paragraph:
 class Notice:
     """A paragraph that must not be overlooked."""
 
-    text: str  # The text
+    text: str
     # "bad" for what is wrong, "note" for what has to be known, "good" for what was proved
     tone: str = "note"
 

@@ -24,7 +24,7 @@ class EmbeddedCharts:
     embedding: dict[str, Any]  # ``documents`` and ``items`` for ``Bokeh.embed.embed_items``
     # For each chart, the identifiers of the elements that its panels are drawn in
     places: dict[str, tuple[str, ...]]
-    # For each chart and each name of its legend, the models that it stands for
+    # For each chart and each name of its legend, the models that it hides or shows
     lines: dict[str, dict[str, tuple[str, ...]]]
 
 
@@ -37,10 +37,7 @@ def bokeh_script() -> str:
 
 
 def embed_charts(charts: Sequence[Chart]) -> EmbeddedCharts:
-    """Make charts into data for BokehJS.
-
-    The same charts give the same data: models are numbered in their order.
-    """
+    """Turn charts into data for BokehJS; the same charts give the same data."""
     from bokeh.document import Document
 
     document = Document()
@@ -59,7 +56,7 @@ def embed_charts(charts: Sequence[Chart]) -> EmbeddedCharts:
             roots[figure.id] = elements[-1]
         places[chart.key] = tuple(elements)
         lines[chart.key] = {name: tuple(ids) for name, ids in named.items()}
-    with document.models.freeze():  # what belongs to it is looked up once
+    with document.models.freeze():  # its models are looked up once
         for figure in figures:
             document.add_root(figure)
     data = document.to_json(deferred=False)
@@ -85,7 +82,7 @@ def embed_charts(charts: Sequence[Chart]) -> EmbeddedCharts:
 
 
 def _renumber(value: Any, numbers: dict[str, str]) -> Any:
-    """Copy of a document with its models numbered from 1 in their order."""
+    """Copy a document with its models numbered from 1 in their order."""
     if isinstance(value, dict):
         out = {}
         for key, inner in value.items():

@@ -1,4 +1,4 @@
-"""What a chart shows, whoever draws it: axes with units, curves, areas, bars and maps.
+"""What a chart shows, independent of who draws it: axes, curves, areas, bars and maps.
 
 A description knows no drawing library. ``matplotlib_charts`` draws it for paper and
 ``bokeh_charts`` for the screen, both from the same numbers and limits.
@@ -27,9 +27,8 @@ class Axis:
     label: str  # What is on it
     unit: str = ""  # Its unit; empty for a name without one, "-" for a pure number
     log: bool = False  # Whether its scale is logarithmic; what is not positive is then not drawn
-    # low, high: Ends of the scale; by default those of what is drawn
-    low: float | None = None
-    high: float | None = None
+    low: float | None = None  # Lower end of the scale; by default that of what is drawn
+    high: float | None = None  # Its upper end
 
     @property
     def text(self) -> str:
@@ -44,7 +43,7 @@ class Curve:
     # What the legend calls it; an empty name is not in the legend. The same name in several panels
     # of a chart is one entry.
     name: str
-    # x, y (n,): the points; nan breaks the line. Empty for a name that is in the legend only.
+    # (n,): the points; nan breaks the line. Empty for a name that is in the legend only.
     x: FloatArray
     y: FloatArray
     look: int | None = 0  # Number of its colour, dashes and marker; None is dark grey
@@ -71,10 +70,9 @@ class Area:
     """The area between two curves: an interval of confidence, a spread of quantiles."""
 
     name: str  # What the legend calls it
-    # x, low, high (n,): where, and between what
-    x: FloatArray
-    low: FloatArray
-    high: FloatArray
+    x: FloatArray  # (n,): where
+    low: FloatArray  # (n,): lower edge
+    high: FloatArray  # (n,): upper edge
     look: int | None = 0  # Number of its colour; None is grey
 
     def __post_init__(self) -> None:
@@ -99,9 +97,8 @@ class Span:
     """A shaded range of an axis, from end to end of the other."""
 
     name: str  # What the legend calls it
-    # low, high: The range
-    low: float
-    high: float
+    low: float  # Where it begins
+    high: float  # Where it ends
     axis: str = "x"  # "x" or "y": the axis that these are values of
     look: int | None = None  # Number of its colour; None is grey
 
@@ -111,13 +108,12 @@ class Span:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bars:
-    """Bars along x, one a category of the panel, from the top; several series stand in groups."""
+    """Bars along x, one per category of the panel, from the top; several series stand in groups."""
 
     name: str  # What the legend calls the series
     values: FloatArray  # (c,): lengths; nan draws none
-    # low, high (c,): ends of an interval around each value
-    low: FloatArray | None = None
-    high: FloatArray | None = None
+    low: FloatArray | None = None  # (c,): lower end of an interval around each value
+    high: FloatArray | None = None  # (c,): its upper end
     look: int | None = 0  # Number of its colour
 
     def __post_init__(self) -> None:
@@ -129,16 +125,13 @@ class Bars:
 class Map:
     """Values over a grid, as colours."""
 
-    # x, y (nx,): increasing centres of the cells
-    x: FloatArray
-    y: FloatArray
+    x: FloatArray  # (nx,): increasing centres of the cells
+    y: FloatArray  # (ny,): the same
     values: FloatArray  # (ny, nx): what is shown; nan is hatched
-    # label, unit: Of the values
-    label: str
-    unit: str = ""
-    # low, high: Ends of the colour scale
-    low: float = 0.0
-    high: float = 1.0
+    label: str  # What the values are
+    unit: str = ""  # Their unit
+    low: float = 0.0  # Lower end of the colour scale
+    high: float = 1.0  # Its upper end
     levels: tuple[float, ...] = ()  # Where lines of equal value are drawn
     blank: str = "no value"  # What a hatched cell means
 
@@ -169,11 +162,10 @@ Mark: TypeAlias = Curve | Area | Rule | Span | Bars | Map
 class Panel:
     """One pair of axes and what is drawn in them, the first things at the bottom."""
 
-    # x, y: The axes
-    x: Axis
-    y: Axis
+    x: Axis  # The axis along the bottom
+    y: Axis  # The axis along the left
     marks: tuple[Mark, ...]  # What is drawn
-    title: str = ""  # What tells this panel from the others of its chart
+    title: str = ""  # What distinguishes this panel from the others of its chart
     categories: tuple[str, ...] = ()  # Names along y, from the top, for bars
     equal: bool = False  # Whether both axes have the same scale
     height_in: float | None = None  # Height of the axes on paper [inch]
@@ -230,7 +222,7 @@ def require_key(key: str) -> str:
 
 
 def legend_entries(panels: Sequence[Panel]) -> dict[str, Mark]:
-    """Return what a legend has to name, each by the first mark of that name."""
+    """Return the entries of a legend, each name with the first mark that has it."""
     found: dict[str, Mark] = {}
     for panel in panels:
         for mark in panel.marks:

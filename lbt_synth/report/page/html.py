@@ -30,7 +30,7 @@ _KINDS = {
     Table: "table",
     Chart: "chart",
 }
-_COLUMNS = 6  # of a table, after the first one, that fit a sheet of paper
+_COLUMNS = 6  # that fit a sheet of paper beside the first one of a table
 
 
 def page_html(page: Page) -> bytes:
@@ -69,7 +69,7 @@ def page_html(page: Page) -> bytes:
 
 
 def _script_json(value: Any) -> str:
-    """JSON that cannot end the script element that it is in."""
+    """Return JSON that cannot close the script element around it."""
     text = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")

@@ -52,7 +52,7 @@ _SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 @contextmanager
 def chart_style() -> Iterator[None]:
-    """Set the house style for the time of a drawing; names are never mathematics in it."""
+    """Set the style of charts for the time of the block; names are never read as mathematics."""
     import matplotlib as mpl
 
     with house_style(), mpl.rc_context(_STYLE), warnings.catch_warnings():
@@ -94,7 +94,7 @@ def chart_svg(chart: Chart) -> str:
     root.attrib |= {"role": "img", "aria-label": chart.alt}
     seen: set[str] = set()
     for element in root.iter():
-        if element.attrib.get("id") in seen:  # the same thing, defined again
+        if element.attrib.get("id") in seen:  # the same path, defined again
             del element.attrib["id"]
         for name, value in element.attrib.items():
             if name == "id":
@@ -248,7 +248,7 @@ def _rule_style(rule: Rule) -> dict[str, Any]:
 
 
 def _draw_panel(axes: Any, panel: Panel, letters: int) -> Any:
-    """Draw a panel, its title of so many letters at most, and return its map if it has one."""
+    """Draw a panel with a title of at most so many letters, and return its map if it has one."""
     image = None
     axes.set_title(shorten(panel.title, letters), loc="left", fontweight="bold")
     for mark in panel.marks:

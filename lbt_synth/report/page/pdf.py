@@ -26,7 +26,7 @@ from lbt_synth.storage.tables import Cell, Table
 WIDTH, HEIGHT = 8.27, 11.69  # A4 [inch]
 _SIDE, _TOP, _BOTTOM = 0.635, 0.6, 0.65
 INSIDE = WIDTH - 2 * _SIDE
-_COLUMNS = 6  # of a table, after the first one
+_COLUMNS = 6  # that fit beside the first one of a table
 _ROOM = HEIGHT - _TOP - _BOTTOM - 0.5  # of a sheet below the heading of a section [inch]
 _TOGETHER = 12  # lines of a paragraph or rows of a table that stay on one sheet
 _PAD = 0.05  # around the text of a cell

@@ -11,7 +11,7 @@ from lbt_synth.report.map_cells import cell_edges
 from lbt_synth.report.page.charts import Area, Axis, Bars, Curve, Map, Panel, Rule
 from lbt_synth.validation import FloatArray
 
-_ROOM = 0.04  # around what is drawn, of its extent
+_ROOM = 0.04  # around what is drawn, as a part of its extent
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -60,7 +60,7 @@ def scale_ends(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def _has_only_lines(panel: Panel) -> bool:
-    """Whether everything is a line, which may reach from end to end."""
+    """Whether all curves are plain lines, which may reach from end to end."""
     return not panel.categories and all(
         mark.line and mark.marker is None for mark in panel.select(Curve)
     )
@@ -72,9 +72,10 @@ def _axis_ends(
     room: float,
     curves: Sequence[tuple[FloatArray, bool]],
 ) -> tuple[float, float]:
-    """Return the ends of a scale: those given, else of the values with room of what is shown.
+    """Return the ends of a scale: those of the axis, else those of the values and some room.
 
-    A given end is moved out where curves, told with whether they have markers, would be cut by it.
+    An end of the axis moves out where it would cut a curve; each curve comes with whether it has
+    markers.
     """
     found = np.concatenate([np.zeros(0), *values])
     found = found[np.isfinite(found) & ((found > 0) | (not axis.log))]
@@ -111,9 +112,9 @@ def _is_cut(values: FloatArray, end: float, *, marked: bool) -> bool:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return ticks of a logarithmic scale: decades, and 2 and 5 between where these are few.
+    """Return ticks of a logarithmic scale: decades, with 2 and 5 between if these are few.
 
-    Within a decade that has fewer than three of them, round values at equal steps.
+    A scale within a decade that would have fewer than three gets round values at equal steps.
     """
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     factors = (1, 2, 5) if math.log10(high / low) < 2.2 else (1,)
@@ -143,7 +144,7 @@ def _power_text(value: float) -> str:
 
 
 def shorten(text: str, most: int) -> str:
-    """Return a text of so many characters at most, its middle left out."""
+    """Return a text of at most so many characters, with its middle left out if need be."""
     if len(text) <= most:
         return text
     kept = most - 1

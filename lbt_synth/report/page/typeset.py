@@ -38,7 +38,7 @@ def text_width(text: str, style: Style) -> float:
 
 
 def _split_words(text: str) -> list[str]:
-    """Words and spaces, so that the widths of words are found again."""
+    """Split a text into words and spaces, whose widths are cached."""
     words = text.split(" ")
     return [part for word in words for part in (word, " ")][:-1]
 
@@ -58,7 +58,7 @@ def _word_width(part: str, weight: str, family: str) -> float:
 
 
 def wrap(text: str, style: Style, width: float) -> list[str]:
-    """Lines of a text that are not wider than a width [inch]; words that are, are broken."""
+    """Break a text into lines of at most a width [inch]; longer words are broken, too."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
         line = ""
@@ -91,7 +91,7 @@ def _count_fitting(word: str, style: Style, width: float) -> int:
 
 
 def mono_lines(text: str, width: float) -> list[str]:
-    """Lines of a listing; those that are too long go on in the next line."""
+    """Break a listing into lines; those that are too long continue on the next line."""
     letters = max(8, int(width / text_width("m", MONO)))
     lines: list[str] = []
     for line in text.expandtabs(4).splitlines():

@@ -1,4 +1,4 @@
-"""Charts of a study's page, from binned data: their size does not grow with the samples."""
+"""Charts of a study, made of binned data, so that their size does not grow with the samples."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lbt_synth.studies.study.summary import varying_parameters
 from lbt_synth.validation import FloatArray
 
 _UNSTABLE_PANELS = 4
-_HIGH = 40.0  # Strehl ratio [%]; an axis of curves that are all above it does not start at 0
+_HIGH = 40.0  # Strehl ratio [%] above which the axis need not start at 0
 
 
 def distribution_chart(found: Sequence[ControllerSamples]) -> Chart | None:
@@ -118,7 +118,7 @@ def parameter_chart(parameters: Mapping[str, FloatArray], names: Mapping[str, st
             places, part = listed
             x, y = np.repeat(places, 3), np.zeros(3 * len(places))
             y[1::3] = 100 * part
-            x[2::3] = np.nan  # stems that are not joined
+            x[2::3] = np.nan  # the stems are not joined
             panels.append(
                 _histogram_panel(
                     names[name],

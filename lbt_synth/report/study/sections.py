@@ -33,8 +33,8 @@ from lbt_synth.studies.study.summary import (
 )
 from lbt_synth.validation import FloatArray
 
-_FAILURES = 10  # that are listed
-_LISTED = 5  # parameters of a worst sample: with the row and the Strehl ratio, a sheet is full
+_MOST_FAILURES = 10  # that are listed
+_PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
 
 
 def summary_section(
@@ -73,15 +73,15 @@ def summary_section(
         blocks.append(
             Notice(text="Every controller is stable in every sample, and none failed.", tone="good")
         )
-    blocks.append(Paragraph(text=_verdict(statistics.controllers)))
+    blocks.append(Paragraph(text=_verdict_text(statistics.controllers)))
     blocks.append(strehl_table(statistics))
     chart = distribution_chart(found)
     blocks += [chart] if chart is not None else []
     return Section(key="summary", title="Summary", blocks=tuple(blocks))
 
 
-def _verdict(controllers: Sequence[ControllerStatistics]) -> str:
-    """Which controller leads by what measure; the reader decides which measure counts."""
+def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
+    """Say which controller leads by each measure; the reader decides which measure counts."""
     with_data = [each for each in controllers if each.samples]
     if not with_data:
         return "No controller was evaluated on any sample."
@@ -138,7 +138,7 @@ def samples_section(
 
 
 def _rounded_texts(values: FloatArray) -> list[str]:
-    """Return numbers with four digits of their range, or of themselves if they are the same."""
+    """Return numbers with four digits of their range, or of their size if all are equal."""
     span = float(np.ptp(values)) or float(np.max(np.abs(values))) or 1.0
     digits = 3 - int(np.floor(np.log10(span)))
     return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
@@ -165,15 +165,15 @@ def controllers_section(info: StudyInfo, statistics: StudyStatistics) -> Section
         )
     ]
     if info.failures:
-        more = len(info.failures) - _FAILURES
+        more = len(info.failures) - _MOST_FAILURES
         blocks.append(
             Table(
                 caption="Evaluations that failed"
-                + (f": the first {_FAILURES}, and {more} more" if more > 0 else ""),
+                + (f": the first {_MOST_FAILURES}, and {more} more" if more > 0 else ""),
                 headings=("row", "controller", "error"),
                 rows=tuple(
                     (str(each.row), each.controller, each.error)
-                    for each in info.failures[:_FAILURES]
+                    for each in info.failures[:_MOST_FAILURES]
                 ),
                 words=(1, 2),
             )
@@ -239,14 +239,14 @@ def worst_section(
         if each.worst:
             ranked = tuple(p.parameter for p in one.ranked)
             others = tuple(name for name in statistics.parameters if name not in ranked)
-            shown = (ranked or others)[:_LISTED]
+            shown = (ranked or others)[:_PARAMETERS]
             most = max(most, len(ranked) - len(shown))
             blocks.append(worst_table(each, shown, names=names))
             commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
     if most:
         text = (
-            f"Unstable loops first, then by the Strehl ratio; of the parameters, the {_LISTED} "
-            "with the greatest indices of the controller."
+            "Unstable loops first, then by the Strehl ratio; of the parameters, the "
+            f"{_PARAMETERS} with the greatest indices of the controller."
         )
         blocks.insert(0, Paragraph(text=text))
     if commands:

@@ -13,7 +13,7 @@ from lbt_synth.report.page.charts import Axis, Chart, Curve, Panel, legend_entri
 from lbt_synth.report.page.matplotlib_charts import chart_height, draw_chart
 
 
-def test_the_data_of_charts_are_those_given(plain):
+def test_the_data_of_charts_are_those_given():
     chart = every_mark()[0]
     drawn = embed_charts([chart])
     numbers = json.dumps(drawn.embedding)

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lbt_synth.report.figures.identification import _apart
+from lbt_synth.report.figures.identification import _spread_labels
 
 
 @given(st.lists(st.floats(0, 1), max_size=40))
 def test_labels_do_not_overlap(wanted):
     wanted = sorted(wanted)
-    places = _apart(wanted)
+    places = _spread_labels(wanted)
     gap = min(0.045, 1 / max(len(wanted), 1))
     assert places.size == len(wanted)
     assert np.all(np.diff(places) > gap - 1e-9)
