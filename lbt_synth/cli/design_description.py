@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.cli.certificate_table import certificate_table, check_records
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Facts, Report, TableText, fact_table
 from lbt_synth.design import (
     Design,
     EstimatorDesign,
@@ -23,7 +23,6 @@ from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.models import LoopHardware
 from lbt_synth.studies.limits import model_limit, shaped_limit
 
-Facts: TypeAlias = list[tuple[str, Any, str]]  # quantity, value, unit
 Data: TypeAlias = dict[str, Any]
 
 _SMALL_MODULUS = 0.3
@@ -53,7 +52,7 @@ def describe_design(design: Design) -> Report:
         more_facts, more_data = _describe_loop(design, design.hardware)
         facts += more_facts
         data |= more_data
-    tables = [TableText(title="Design", headings=("quantity", "value", "unit"), rows=facts)]
+    tables = [fact_table("Design", facts)]
     if isinstance(design, ShapedDesign):
         tables += _shaping_tables(data)
     tables.append(certificate_table(design.certificate))

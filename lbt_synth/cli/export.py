@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 from lbt_synth.cli.frame_cost import cost_facts, cost_record
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Facts, Report, fact_table
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -33,7 +32,7 @@ def run(arguments: Namespace) -> Report:
         written = _export_as(arguments, design, digest)
     cost = frame_cost(design)
     stable_single = math.isfinite(written.error_single)
-    facts: list[tuple[str, Any, str]] = [
+    facts: Facts = [
         ("method", design.method, ""),
         ("states of the controller", design.controller.n_states, ""),
         ("measurements", design.controller.B.shape[1], ""),
@@ -60,7 +59,7 @@ def run(arguments: Namespace) -> Report:
             "stable_single": stable_single,
             "frame_cost": cost_record(cost),
         },
-        tables=[TableText(title="Export", headings=("quantity", "value", "unit"), rows=facts)],
+        tables=[fact_table("Export", facts)],
         notes=[
             *_precision_notes(arguments, written),
             *(f"written: {file}" for file in written.files),

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from lbt_synth.cli.output import Facts
 from lbt_synth.interop import FrameCost
 
 
-def cost_facts(cost: FrameCost) -> list[tuple[str, Any, str]]:
+def cost_facts(cost: FrameCost) -> Facts:
     """Return rows of a table: what a frame costs, and what it would cost with whole matrices."""
     return [
         ("multiplications per frame", cost.multiplications, f"({cost.form})"),

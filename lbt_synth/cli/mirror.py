@@ -6,7 +6,7 @@ from argparse import Namespace
 from dataclasses import asdict
 
 from lbt_synth import studies
-from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
+from lbt_synth.cli.output import Report, fact_table, format_fixed, tabulate
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import load_config
@@ -57,10 +57,9 @@ def run(arguments: Namespace) -> Report:
             "limit_nm": limit_nm,
         },
         tables=[
-            TableText(
-                title="The mirror after a step of its command",
-                headings=("quantity", "value", "unit"),
-                rows=[
+            fact_table(
+                "The mirror after a step of its command",
+                [
                     ("rise, 10 % to 90 %", 1e3 * step.rise_s, "ms"),
                     ("overshoot", 100 * step.overshoot, "%"),
                     (f"settling time, to {100 * step.tolerance:g} %", 1e3 * step.settling_s, "ms"),

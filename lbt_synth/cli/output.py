@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -19,6 +19,8 @@ from rich.text import Text
 _WIDTH = 200  # where the output is no terminal
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
 
+Facts: TypeAlias = list[tuple[str, Any, str]]  # quantity, value, unit
+
 
 @dataclass(kw_only=True)
 class TableText:
@@ -27,6 +29,11 @@ class TableText:
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[Any]]
+
+
+def fact_table(title: str, facts: Facts) -> TableText:
+    """Make a table of facts: a quantity, its value, and its unit."""
+    return TableText(title=title, headings=("quantity", "value", "unit"), rows=facts)
 
 
 def tabulate(

@@ -8,7 +8,7 @@ import numpy as np
 
 from lbt_synth.cli.design_description import describe_design
 from lbt_synth.cli.frame_cost import cost_facts, cost_record
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Report, fact_table
 from lbt_synth.design import Design, FilterDesign, PolytopicDesign
 from lbt_synth.files import load_gain
 from lbt_synth.interop import frame_cost
@@ -21,13 +21,7 @@ def run(arguments: Namespace) -> Report:
     report = describe_design(design)
     cost = frame_cost(design)
     report.data |= {"file": arguments.gain, "frame_cost": cost_record(cost)}
-    report.tables.append(
-        TableText(
-            title="Cost of one frame, as exported to C",
-            headings=("quantity", "value", "unit"),
-            rows=cost_facts(cost),
-        )
-    )
+    report.tables.append(fact_table("Cost of one frame, as exported to C", cost_facts(cost)))
     if arguments.matrices:
         matrices = _matrices(design)
         report.data["matrices"] = matrices

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Report, TableText, fact_table
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.errors import ProblemError
@@ -203,10 +203,9 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
             **asdict(cost),
         },
         tables=[
-            TableText(
-                title=f"Study {loaded.source}",
-                headings=("quantity", "value", "unit"),
-                rows=[
+            fact_table(
+                f"Study {loaded.source}",
+                [
                     ("samples", str(loaded.samples), ""),
                     (
                         "sampling",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Facts, Report, TableText, fact_table
 from lbt_synth.cli.output_files import write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
@@ -74,7 +74,7 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         )
         for name, array, layer in arrays
     ]
-    facts: list[tuple[Any, ...]] = [
+    facts: Facts = [
         (word, getattr(telemetry, name), unit)
         for word, name, unit in _FACTS
         if getattr(telemetry, name) not in (None, "")
@@ -112,7 +112,7 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
                 headings=("array", "shape", "axes", "unit", "rms"),
                 rows=rows,
             ),
-            TableText(title="Loop", headings=("quantity", "value", "unit"), rows=facts),
+            fact_table("Loop", facts),
         ],
     )
 
