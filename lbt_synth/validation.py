@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,13 +20,18 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+Entry = TypeVar("Entry", bound=np.generic)
+
+
+def read_only(array: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
+    """Make an array read-only and return it."""
+    array.setflags(write=False)
+    return array
 
 
 def frozen_copy(array: npt.ArrayLike) -> FloatArray:
     """Return a read-only float64 copy of an array."""
-    out = np.array(array, dtype=np.float64)
-    out.setflags(write=False)
-    return out
+    return read_only(np.array(array, dtype=np.float64))
 
 
 def float_array(value: Any, name: str) -> FloatArray:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.validation import FloatArray
-
-Entry = TypeVar("Entry", bound=np.generic)
+from lbt_synth.validation import Entry, FloatArray
 
 
 def transpose(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:

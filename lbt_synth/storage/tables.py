@@ -52,14 +52,15 @@ class Table:
         """Split into tables of at most so many columns after the first, which each repeats."""
         columns = range(1, len(self.headings))
         for start in range(1, max(len(self.headings), 2), most):
-            kept = [c for c in columns if start <= c < start + most]
+            chosen = [c for c in columns if start <= c < start + most]
             yield Table(
                 caption=self.caption if start == 1 else f"{self.caption} (continued)",
-                headings=(self.headings[0], *(self.headings[c] for c in kept)),
+                headings=(self.headings[0], *(self.headings[c] for c in chosen)),
                 rows=tuple(
-                    row if len(row) == 1 else (row[0], *(row[c] for c in kept)) for row in self.rows
+                    row if len(row) == 1 else (row[0], *(row[c] for c in chosen))
+                    for row in self.rows
                 ),
-                words=tuple(i + 1 for i, c in enumerate(kept) if c in self.words),
+                words=tuple(i + 1 for i, c in enumerate(chosen) if c in self.words),
             )
 
 

@@ -66,7 +66,7 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
         except ValueError as error:  # raised by cvxpy on data that are not finite
             raise _solver_error("its numbers are not finite.") from error
         except BaseException as error:
-            # on numbers out of range the compiled solver raises what is no Exception
+            # on numbers out of range the compiled solver raises something other than an Exception
             if type(error).__name__ != "PanicException":
                 raise
             raise _solver_error("the solver gave up on numbers out of its range.") from error

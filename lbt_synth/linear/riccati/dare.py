@@ -17,6 +17,7 @@ from lbt_synth.validation import (
     IntArray,
     frozen_copy,
     matrix,
+    read_only,
     square,
     symmetric,
 )
@@ -193,18 +194,13 @@ def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     return DareSolution(
         X=frozen_copy((X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
         gain_feedback=frozen_copy((best.gains / column).reshape(*lead, m, n)),
-        poles=_read_only(best.poles.reshape(*lead, n)),
+        poles=read_only(best.poles.reshape(*lead, n)),
         residuals=frozen_copy(best.residuals.reshape(lead)),
         errors=frozen_copy(best.errors.reshape(lead)),
-        negative=_read_only(negative.reshape(lead)),
+        negative=read_only(negative.reshape(lead)),
         iterations=int(np.max(best.steps, initial=0)),
         attempts=tuple(best.attempts),
     )
-
-
-def _read_only(array: Any) -> Any:
-    array.setflags(write=False)
-    return array
 
 
 def _stack_arguments(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations, tuple[int, ...]]:

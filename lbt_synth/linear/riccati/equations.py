@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,9 +40,7 @@ class Equations:
 
     def take(self, which: IntArray) -> Equations:
         """Return some of the equations."""
-        return Equations(
-            A=self.A[which], B=self.B[which], Q=self.Q[which], R=self.R[which], S=self.S[which]
-        )
+        return Equations(**{name: getattr(self, name)[which] for name in "ABQRS"})
 
     def normalising_factors(self) -> FloatArray:
         """Powers of two by which to divide Q, R and S so that the largest is of size one, (N,)."""
@@ -54,18 +52,13 @@ class Equations:
     def divide_weights(self, factors: FloatArray) -> Equations:
         """Divide the weights of each equation by its factor, and with them its X."""
         f = factors[:, None, None]
-        return Equations(A=self.A, B=self.B, Q=self.Q / f, R=self.R / f, S=self.S / f)
+        return replace(self, Q=self.Q / f, R=self.R / f, S=self.S / f)
 
     def change_units(self, units: FloatArray) -> Equations:
         """Change to states ``x_i / units_i``, (N, n); exact for powers of two."""
         column, row = units[:, None, :], units[:, :, None]
-        return Equations(
-            A=self.A * column / row,
-            B=self.B / row,
-            Q=self.Q * column * row,
-            R=self.R,
-            S=self.S * row,
-        )
+        Q = self.Q * column * row
+        return replace(self, A=self.A * column / row, B=self.B / row, Q=Q, S=self.S * row)
 
     def balancing_units(self) -> FloatArray:
         """Powers of two that make rows and columns of A, bordered by B and Q, alike, (N, n)."""

@@ -53,7 +53,7 @@ class Response:
         return np.linalg.eigvals(inverse).astype(np.complex128)
 
     def impulse(self, frames: int) -> FloatArray:
-        """Impulse response over so many frames."""
+        """Impulse response over a number of frames."""
         out, state = np.zeros(frames), self.B
         out[0] = self.D
         for k in range(1, frames):

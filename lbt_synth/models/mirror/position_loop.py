@@ -88,7 +88,7 @@ class PositionLoop:
     delay_samples : int, optional
         Computing delay of the local loop [samples].
     ramp_samples : int, optional
-        The command is reached in so many equal steps, one per sample; 1 for a plain step.
+        Number of equal steps, one per sample, in which the command is reached; 1 for a plain step.
 
     Raises
     ------

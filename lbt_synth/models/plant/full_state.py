@@ -62,7 +62,7 @@ class FullStatePlant(EstimationProblem):
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s)
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from y(k) and the command u(k-1), whoever gave that command.
+        """Estimator of z from y(k) and the command u(k-1), whatever gave that command.
 
         Parameters
         ----------

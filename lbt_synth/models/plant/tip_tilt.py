@@ -41,7 +41,7 @@ class TipTiltPlant(EstimationProblem):
     """Turbulence, vibrations, delay and noise as an estimation problem (reduced form).
 
     Made by :func:`tip_tilt_plant`. The measurement of this problem is
-    ``ybar(k) = y(k) + sensor_matrix N u(k-d)``: the known input is taken out.
+    ``ybar(k) = y(k) + sensor_matrix N u(k-d)``, without the known input.
 
     Parameters
     ----------
@@ -120,9 +120,9 @@ class TipTiltPlant(EstimationProblem):
         return full.controller(self._padded(gain_predictor, full))
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from y(k) and the command u(k-1), whoever gave that command.
+        """Estimator of z from y(k) and the command u(k-1), whatever gave that command.
 
-        The known input is taken out exactly: the estimation error does not depend on it.
+        The known input is removed exactly, so the estimation error does not depend on it.
 
         Parameters
         ----------

@@ -25,7 +25,7 @@ from lbt_synth.models.turbulence.atmosphere import (
 from lbt_synth.validation import FloatArray, IntArray, real_array, require_instance, set_fields
 
 _TERMS = 12  # of the polynomial over an octave of the outer scale
-_FEW_SCALES = 16  # up to so many outer scales have a table each
+_FEW_SCALES = 16  # up to this many outer scales have a table each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,7 +35,7 @@ class FrozenFlows:
     Parameters
     ----------
     atmosphere : Atmosphere
-        The telescope, and the values of what is not given.
+        The telescope, and the default values.
     seeing_arcsec, wind_speed_m_s, outer_scale_m : (p,) array_like, optional
         Seeing [arcsec], wind speed [m/s] and outer scale [m] of each loop, or one number for
         all; those of the atmosphere by default.

@@ -12,7 +12,7 @@ from scipy.special import jv
 
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models.turbulence.atmosphere import Atmosphere, kolmogorov_constant_nm2
-from lbt_synth.validation import FloatArray, IntArray, frozen_copy, integer
+from lbt_synth.validation import FloatArray, IntArray, frozen_copy, integer, read_only
 
 _FURTHEST = 30  # the tail of the integral begins at this multiple of the order plus 2
 
@@ -52,7 +52,7 @@ def noll_orders(modes: int) -> tuple[IntArray, IntArray]:
             twice = 1 if m == 0 else 2
             radial += [n] * twice
             azimuthal += [m] * twice
-    return _read_only(radial[:count]), _read_only(azimuthal[:count])
+    return read_only(np.array(radial[:count])), read_only(np.array(azimuthal[:count]))
 
 
 @lru_cache(maxsize=32)
@@ -88,9 +88,3 @@ def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
         integral += per_x ** (11 / 3) * edges[-1] ** (-14 / 3) * 3 / (14 * np.pi)
         out[n - 1] = 8 * np.pi * (n + 1) / per_x**2 * integral
     return frozen_copy(kolmogorov_constant_nm2(atmosphere) * out)
-
-
-def _read_only(values: list[int]) -> IntArray:
-    out = np.array(values, dtype=np.int64)
-    out.setflags(write=False)
-    return out

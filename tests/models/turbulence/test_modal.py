@@ -9,6 +9,8 @@ import lbt_synth as lbt
 
 SITE = {"seeing_arcsec": 0.8, "wind_speed_m_s": 20, "diameter_m": 8.22}
 
+RATE = 800.0
+
 
 def test_modes_of_a_telescope():
     air = lbt.Atmosphere(outer_scale_m=22, **SITE)
@@ -29,10 +31,6 @@ def test_modes_of_a_telescope():
         lbt.models.modal_turbulence(air, modes=3, frame_rate_hz=-1)
 
 
-RATE = 800.0
-
-
-# ---------------------------------------------------------------- turbulence as arrays
 def test_arrays_are_the_single_models():
     models = [
         lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=3.0, frame_rate_hz=RATE),
