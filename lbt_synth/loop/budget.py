@@ -142,7 +142,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
             lines.append(vibration.amplitude_nm * response @ direction)
     return ResidualBudget(
         turbulence_nm2=frozen_copy(turbulence),
-        noise_nm2=frozen_copy(noise_covariance(loop, truth)),
+        noise_nm2=frozen_copy(_noise_covariance(loop, truth)),
         random_vibration_nm2=frozen_copy(random_vibration),
         line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
     )
@@ -215,7 +215,7 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
     )
 
 
-def noise_covariance(loop: ClosedLoop, truth: Truth) -> FloatArray:
+def _noise_covariance(loop: ClosedLoop, truth: Truth) -> FloatArray:
     """Covariance of the residual that white noise on each measurement leaves."""
     n, s = loop.hardware.modes, loop.system.balanced()
     noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)

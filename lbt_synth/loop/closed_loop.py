@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,42 +137,25 @@ def close_loop(
     >>> lbt.close_loop(path, lazy).is_stable
     True
     """
-    return close_loops(hardware, controller, [sensor_gain])[0]
-
-
-def close_loops(
-    hardware: LoopHardware, controller: Controller, sensor_gains: Sequence[float] | FloatArray
-) -> list[ClosedLoop]:
-    """Return the loops closed at several sensor gains."""
-    gains = [number(gain, "sensor_gain", above=0) for gain in sensor_gains]
-    A0, A1, B, C0, C1, D = _loop_matrices(hardware, controller)
-    systems = (
-        StateSpace(A=A0 + g * A1, B=B, C=C0 + g * C1, D=D, dt_s=hardware.dt_s) for g in gains
-    )
-    return [
-        ClosedLoop(system=system, hardware=hardware, controller=controller, sensor_gain=gain)
-        for system, gain in zip(systems, gains, strict=True)
-    ]
-
-
-def loop_poles(
-    hardware: LoopHardware, controller: Controller, sensor_gains: FloatArray
-) -> ComplexArray:
-    """Poles of the closed loop for many sensor gains at once, (g, states)."""
-    A0, A1, *_ = _loop_matrices(hardware, controller)
-    loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
-    return np.linalg.eigvals(loops).astype(np.complex128)
+    gain = number(sensor_gain, "sensor_gain", above=0)
+    A0, A1, B, C0, C1, D = _checked_loop_matrices(hardware, controller)
+    system = StateSpace(A=A0 + gain * A1, B=B, C=C0 + gain * C1, D=D, dt_s=hardware.dt_s)
+    return ClosedLoop(system=system, hardware=hardware, controller=controller, sensor_gain=gain)
 
 
 def spectral_radii(
     hardware: LoopHardware, controller: Controller, sensor_gains: FloatArray
 ) -> FloatArray:
     """Spectral radius of the closed loop for many sensor gains at once, (g,)."""
-    return np.asarray(np.max(np.abs(loop_poles(hardware, controller, sensor_gains)), axis=1))
+    A0, A1, *_ = _checked_loop_matrices(hardware, controller)
+    loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
+    return np.asarray(np.max(np.abs(np.linalg.eigvals(loops)), axis=1))
 
 
-def _loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:
-    """Matrices of :func:`loop_matrices` for a controller of the loop's sizes."""
+def _checked_loop_matrices(
+    hardware: LoopHardware, controller: Controller
+) -> tuple[FloatArray, ...]:
+    """Matrices of :func:`loop_matrices`, for a controller that matches the loop."""
     require_matching_controller(hardware, controller)
     k = controller.to_statespace()
     return loop_matrices(

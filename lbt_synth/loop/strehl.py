@@ -31,7 +31,7 @@ from lbt_synth.validation import (
 )
 
 _DIRECTIONS = 64
-_FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])  # to be tried
+_FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])  # directions to try
 _STRIPS = np.linspace(0.2, 4, 20)
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before

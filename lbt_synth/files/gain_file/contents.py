@@ -46,7 +46,7 @@ CONVENTION = (
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
-_REQUESTS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
+_FILTER_CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
 _SIZES = ("bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme")
 _PROBLEMS: dict[str, type[EstimationProblem]] = {
     "problem": EstimationProblem,
@@ -91,7 +91,7 @@ def pack_design(design: Design) -> tuple[Arrays, Meta]:
         }
     if isinstance(design, FilterDesign):
         arrays |= {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
-        meta |= {name: getattr(design, name) for name in _REQUESTS}
+        meta |= {name: getattr(design, name) for name in _FILTER_CLAIMS}
         if design.witness is not None:
             arrays["WITNESS_X"] = design.witness.states
             arrays["WITNESS_W"] = design.witness.disturbances

@@ -1,1 +1,1 @@
-"""Telemetry of a loop: a record, its files, and those of the AOT standard."""
+"""Telemetry of a loop: its series and facts, their files, and those of the AOT standard."""

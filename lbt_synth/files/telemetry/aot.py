@@ -27,8 +27,8 @@ from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.fits import has_card
 from lbt_synth.validation import FloatArray
 
-_CARD_OF_OURS = "LBTSYNTH"  # one card with what the standard has no field for, JSON
-_IN_OURS = ("seed", "name", "controller_name", "controller_digest", "metadata")
+_OWN_CARD = "LBTSYNTH"  # one card with what the standard has no field for, JSON
+_OWN_FIELDS = ("seed", "name", "controller_name", "controller_digest", "metadata")
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
 _RAD_PER_MAS = np.pi / 180 / 3600e3
 _FOREIGN = "that of another program: the AOT standard does not say which exposure a row is of"
@@ -177,20 +177,20 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
 
 def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     """Cards of the primary header, for what the tables have no place for."""
-    ours = {name: getattr(seen, name) for name in _IN_OURS} | {"metadata": dict(seen.metadata)}
+    own = {name: getattr(seen, name) for name in _OWN_FIELDS} | {"metadata": dict(seen.metadata)}
     gains = seen.integrator_gains
-    ours["integrator_gains"] = None if gains is None else gains.tolist()
-    ours["psf_pixel_mas"] = seen.psf_pixel_mas if seen.psf is None else None
+    own["integrator_gains"] = None if gains is None else gains.tolist()
+    own["psf_pixel_mas"] = seen.psf_pixel_mas if seen.psf is None else None
     if seen.mirror is not None and seen.mirror_taps is not None:
         # the standard does not say what its TFZ_NUM and TFZ_DEN of a corrector act on, nor with
         # which delay
-        ours["mirror"], ours["mirror_taps"] = asdict(seen.mirror), seen.mirror_taps.tolist()
+        own["mirror"], own["mirror_taps"] = asdict(seen.mirror), seen.mirror_taps.tolist()
     if seen.controller is not None:
-        ours["controller_states"] = seen.controller.n_states
-    text = json.dumps(ours, allow_nan=False)
+        own["controller_states"] = seen.controller.n_states
+    text = json.dumps(own, allow_nan=False)
     for sign in _UNSAFE:  # they stand only in texts, where JSON may write them by their number
         text = text.replace(sign, f"\\u{ord(sign):04x}")
-    cards = [aotpy.Metadatum(_CARD_OF_OURS, text)]
+    cards = [aotpy.Metadatum(_OWN_CARD, text)]
     if (wavelength := _wavelength_m(seen)) is not None:
         # aotpy 3.2.1 writes its strehl_wavelength over the Strehl ratio
         cards.append(aotpy.Metadatum("STREHL-L", wavelength))
@@ -266,12 +266,14 @@ def _system_fields(system: Any) -> dict[str, Any]:
     facts: dict[str, Any] = {"name": system.name or "", "strehl": system.strehl_ratio}
     facts["metadata"] = {"timing": _FOREIGN}
     for datum in system.metadata:
-        if datum.key == _CARD_OF_OURS:
-            ours = json.loads(datum.value)
-            facts |= {name: ours[name] for name in (*_IN_OURS, "integrator_gains", "psf_pixel_mas")}
-            if "mirror" in ours:
-                facts["mirror"] = PositionLoop(**ours["mirror"])
-                facts["mirror_taps"] = ours["mirror_taps"]
+        if datum.key == _OWN_CARD:
+            own = json.loads(datum.value)
+            facts |= {
+                name: own[name] for name in (*_OWN_FIELDS, "integrator_gains", "psf_pixel_mas")
+            }
+            if "mirror" in own:
+                facts["mirror"] = PositionLoop(**own["mirror"])
+                facts["mirror_taps"] = own["mirror_taps"]
     telescope = system.main_telescope
     if telescope is not None:
         facts["diameter_m"] = telescope.enclosing_diameter or telescope.inscribed_diameter

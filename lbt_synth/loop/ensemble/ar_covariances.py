@@ -15,7 +15,7 @@ PROCESSES = (ARModel, ModalTurbulence)
 _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 
 
-def process_covariances(
+def _process_covariances(
     loops: BatchedLoops, process: ARModel | ModalTurbulence, directions: FloatArray
 ) -> FloatArray:
     """Covariance (k, n, n) of the residual that a process, or one per loop, leaves.
@@ -67,4 +67,4 @@ def add_process(
     modes = np.concatenate([modes for modes, _ in reached])
     joined = join_subloops([batch for _, batch in reached])
     at = (rows[:, None, None], *np.ix_(modes, modes))
-    total[at] += process_covariances(joined, process, direction[..., modes])
+    total[at] += _process_covariances(joined, process, direction[..., modes])

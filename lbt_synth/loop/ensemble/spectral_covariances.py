@@ -154,7 +154,8 @@ def spectral_covariances(
 
     ``turbulence`` pairs each spectrum with its modes of the subloop.
     """
-    evaluate = _scalar_covariances if subloop.is_scalar else _matrix_covariances
+    is_scalar = subloop.sensor.shape == subloop.influence.shape == (1, 1)
+    evaluate = _scalar_covariances if is_scalar else _matrix_covariances
     spectra = [spectrum for spectrum, _ in turbulence]
     samples = _sample_responses(subloop, group, poles, spectra, frame_rate_hz)
     densities = [(_weighted_density(spectrum, samples), modes) for spectrum, modes in turbulence]
@@ -222,7 +223,7 @@ def _matrix_covariances(
         controller = samples.controller if subloop.is_shared else samples.controller[k]
         path = subloop.influence @ (mirror[:, None, None] * controller)  # (f, n, q)
         loop = path @ (gain * subloop.sensor) * samples.delay[:, None, None]
-        S = inverses(np.eye(n) + loop)
+        S = _inverses(np.eye(n) + loop)
         N = S @ (path * noise_nm[k])
         noise[k] = _gram(N, white)
         for density, modes in densities:
@@ -237,7 +238,7 @@ def _gram(transfer: ComplexArray, density: FloatArray) -> FloatArray:
     return np.asarray(wide @ wide.T)
 
 
-def inverses(matrices: ComplexArray) -> ComplexArray:
+def _inverses(matrices: ComplexArray) -> ComplexArray:
     """Inverses of many matrices; two by two by their adjugates, several times faster."""
     if matrices.shape[-1] != 2:
         return np.asarray(np.linalg.inv(matrices))

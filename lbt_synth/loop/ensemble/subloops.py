@@ -37,11 +37,6 @@ class Subloop:
         """Whether one controller serves all loops."""
         return len(self.A) == 1
 
-    @property
-    def is_scalar(self) -> bool:
-        """Whether it has one mode, one measurement and one command."""
-        return self.sensor.shape == self.influence.shape == (1, 1)
-
     def controllers(self, rows: IntArray) -> tuple[FloatArray, ...]:
         """Return the controllers ``A, B, C, D`` of some loops, or the one that serves all."""
         matrices = self.A, self.B, self.C, self.D

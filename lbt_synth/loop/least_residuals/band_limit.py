@@ -220,7 +220,7 @@ def _find_saddle(
     if band is None:  # the spectrum vanishes outside the band: the line is known from its past
         x, q = gauss_panels(np.linspace(*ends, _PANELS + 1), _ORDER)
         return _Saddle(lower=0.0, gap=0.0, x=x, weight=q / q.sum())
-    # between the nodes, too
+    # the worst case is sought between the nodes, too
     fine = np.unique(np.concatenate([np.linspace(*ends, 8 * _PANELS + 1), band.x]))
     base = mode.power(fine) + mode.noise_nm2
     shape, fine_shape = np.ones(band.x.size), np.ones(fine.size)
