@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-import lbt_synth
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.design_methods import DesignRequest, design_by_method
 from lbt_synth.config.load import read_mapping, validate_sections
@@ -26,6 +25,9 @@ from lbt_synth.studies.study.schema import ParameterSection, StudySection
 from lbt_synth.studies.study.store import read_design, read_manifest, require_same_study
 from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController
 
+# The oldest version whose results this one repeats to rounding: studies that it began are read
+# and resumed. Raise it with any change that moves a result.
+_SAME_RESULTS_SINCE = "0.1.0"
 _MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
 
 
@@ -152,7 +154,7 @@ def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> st
     for section in study["controllers"].values():
         del section["file"]
     content = {
-        "version": lbt_synth.__version__,
+        "version": _SAME_RESULTS_SINCE,
         "study": study,
         "config": config.settings.model_dump(),
         "gains": gains,
@@ -167,7 +169,7 @@ def _require_file_names(names: list[str], source: Path) -> None:
         other = first.setdefault(name.casefold(), name)
         if other != name:
             raise ConfigError(
-                f"{source}: controllers.{name}: its files could not be told from those of {other}; "
+                f"{source}: controllers.{name}: its files would have the names of {other}'s; "
                 "give a name that differs by more than its case.",
                 path=f"controllers.{name}",
             )
