@@ -252,35 +252,27 @@ def _synthesise(interval: FrequencyInterval, norm: str) -> tuple[Controller, flo
     from lbt_synth.linear.lmi.polytopic import SegmentFilter, segment_filter
 
     plant = interval.plant
-    made: list[SegmentFilter] = []
-    solved: list[tuple[TipTiltPlant, SegmentFilter]] = []
+    filters: list[SegmentFilter] = []
+    distinct: list[tuple[TipTiltPlant, SegmentFilter]] = []
     for axis in _decoupled_axes(plant):
-        known = [filtered for other, filtered in solved if _equal_plants(axis, other)]
-        if not known:
+        same = [known for other, known in distinct if _equal_plants(axis, other)]
+        if not same:
             ends = (axis.A, axis.A)
             if axis.vibrations:
                 own = replace(interval, plant=axis)
                 low, high = own.coefficients
                 ends = (own.state_matrix(low), own.state_matrix(high))
             coordinates, scale = _expected_error(axis, interval.half_width_hz, norm)
-            known = [segment_filter(axis, ends, norm=norm, coordinates=coordinates, scale=scale)]
-            solved.append((axis, known[0]))
-        made.append(known[0])
-    bounds = np.array([part.bound for part in made])
-    C = block_diag(*(part.C for part in made))
-    B = block_diag(*(part.B for part in made))
-    predictor = Controller(
-        A=block_diag(*(part.A for part in made)),
-        B=B,
-        C=C,
-        D=np.zeros((len(C), B.shape[1])),
-        dt_s=plant.dt_s,
-    )
-    inaccurate = [part.status for part in made if part.status != "optimal"]
+            same = [segment_filter(axis, ends, norm=norm, coordinates=coordinates, scale=scale)]
+            distinct.append((axis, same[0]))
+        filters.append(same[0])
+    bounds = np.array([each.bound for each in filters])
+    A, B, C = (block_diag(*(getattr(each, name) for each in filters)) for name in "ABC")
+    predictor = Controller(A=A, B=B, C=C, D=np.zeros((len(C), B.shape[1])), dt_s=plant.dt_s)
     report = SolverReport(
         route="lmi",
-        status=inaccurate[0] if inaccurate else "optimal",
-        iterations=sum(filtered.iterations for _, filtered in solved),
+        status=next((each.status for each in filters if each.status != "optimal"), "optimal"),
+        iterations=sum(each.iterations for _, each in distinct),
     )
     return predictor, float(np.max(bounds) if norm == "hinf" else np.linalg.norm(bounds)), report
 
