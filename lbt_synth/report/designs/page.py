@@ -154,7 +154,7 @@ def _situation_text(report: DesignReport) -> str:
         f"{number_text(hardware.delay_frames)} frames, a mirror "
         f"{'that settles at once' if hardware.mirror is None else 'with dynamics'}. What it "
         f"meets: turbulence ({turbulence}), {listing_text(lines) or 'no vibration'}, {noise} nm of "
-        f"noise a frame and measurement, a real sensor gain of {number_text(report.real_gain)}. "
+        f"noise per frame and measurement, a real sensor gain of {number_text(report.real_gain)}. "
         "Residuals and Strehl ratios are exact, by Lyapunov equations and integrals over transfer "
         "functions, unless they are called simulated."
     )
@@ -190,7 +190,7 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
 def _certificate_blocks(report: DesignReport) -> list[Block]:
     blocks: list[Block] = [
         Paragraph(
-            text="Every check was computed anew from the matrices of the gain file, by other means "
+            text="Every check was recomputed from the matrices of the gain file, by other means "
             "than the solver that made the design. They hold for the loop that the design was made "
             "for, at the sensor gain that it assumes."
         )

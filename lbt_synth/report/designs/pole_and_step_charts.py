@@ -59,7 +59,7 @@ def pole_and_step_charts(report: DesignReport) -> list[Chart]:
                 caption="Poles of the closed loop (crosses) at the real sensor gain and of the "
                 "controller by itself (circles). The loop is stable if all crosses lie inside the "
                 "unit circle; near 1 they are slow, near the circle lightly damped.",
-                alt="One complex plane a design, with the unit circle. Largest modulus of the "
+                alt="One complex plane per design, with the unit circle. Largest modulus of the "
                 f"closed loop's poles: {listing_text(radii)}.",
                 panels=tuple(panels),
                 columns=count_columns(len(panels)),
@@ -93,7 +93,7 @@ def _step_chart(report: DesignReport) -> Chart:
         "and there is no noise. Residual (above) and command (below) in frames of "
         f"{number_text(1e3 / report.config.hardware.frame_rate_hz)} ms. A controller with a model "
         "of a vibration rings at its frequency.",
-        alt="Two panels over time, one curve a design. Largest residual from the sixth frame on: "
+        alt="Two panels over time, one curve per design. Largest residual from the sixth frame on: "
         f"{listing_text(peaks)}.",
         panels=(
             Panel(x=time, y=Axis(label="residual", unit="nm"), marks=tuple(residuals)),

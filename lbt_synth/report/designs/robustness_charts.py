@@ -9,7 +9,7 @@ from lbt_synth.report.designs.design_curves import count_columns, design_curve, 
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.map_cells import STREHL_LEVELS, strehl_scale
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
-from lbt_synth.report.page.charts import Axis, Chart, Curve, Map, Panel, Rule
+from lbt_synth.report.page.charts import Axis, Chart, Map, Mark, Panel, Rule
 
 _ERROR = Axis(label="frequency error, design less truth", unit="Hz")
 _STREHL_LABEL = "Strehl ratio"
@@ -31,46 +31,32 @@ def _strehl_chart(report: DesignReport) -> Chart:
     ]
     worst = 100 * min(float(np.min(one.curve.strehl)) for one in report.stable)
     low = max(0.0, 10 * np.floor((worst - 5) / 10))
+    curves = [
+        design_curve(
+            report, one, one.curve.errors_hz, 100 * one.curve.strehl[0, 0] if one.stable else None
+        )
+        for one in report.assessments
+    ]
+    y = Axis(label=_STREHL_LABEL, unit="%", low=low)
     return Chart(
         key="robustness",
         title="Strehl ratio over the frequency error",
         caption="Exact long-exposure Strehl ratio with every true vibration moved below the "
         "frequency that the design believes by the error, its rms kept, at the real sensor gain of "
         f"{number_text(report.real_gain)}.",
-        alt=f"One curve a design. {listing_text(ends)}.",
-        panels=(
-            Panel(
-                x=_ERROR,
-                y=Axis(label=_STREHL_LABEL, unit="%", low=low),
-                marks=tuple(
-                    design_curve(
-                        report,
-                        one,
-                        one.curve.errors_hz,
-                        100 * one.curve.strehl[0, 0] if one.stable else None,
-                    )
-                    for one in report.assessments
-                ),
-                height_in=2.5,
-            ),
-        ),
+        alt=f"One curve per design. {listing_text(ends)}.",
+        panels=(Panel(x=_ERROR, y=y, marks=tuple(curves), height_in=2.5),),
     )
 
 
 def _residual_chart(report: DesignReport) -> Chart:
     study = report.limits
-    marks: list[Curve | Rule] = []
+    marks: list[Mark] = []
     if study.limit is not None and study.limit.rms_nm > 0:
         marks.append(Rule(name="limit, frequency known", at=study.limit.rms_nm, axis="y", dash=3))
     if study.band is not None:
-        marks.append(
-            Rule(
-                name="limit, frequency anywhere in this range",
-                at=study.band.rms_nm,
-                axis="y",
-                dash=1,
-            )
-        )
+        name = "limit, frequency anywhere in this range"
+        marks.append(Rule(name=name, at=study.band.rms_nm, axis="y", dash=1))
     for one, curve in zip(report.assessments, study.residual_nm, strict=True):
         values = curve[::-1] if one.stable else None
         marks.append(design_curve(report, one, -study.shift_hz[::-1] + 0.0, values))
@@ -78,22 +64,16 @@ def _residual_chart(report: DesignReport) -> Chart:
         f"{rule.name} {fixed_text(rule.at, 1)} nm" for rule in marks if isinstance(rule, Rule)
     ]
     worst = [f"{row.design} {fixed_text(row.worst_nm, 1)} nm" for row in study.rows if row.stable]
+    y = Axis(label="residual", unit="nm rms", log=True)
     return Chart(
         key="limits",
         title="Residual over the frequency error, beside the limits",
         caption="Exact residual. The lines are what no linear controller goes below: one that is "
-        "told the frequency, and one that has to serve the whole range. Where a limit cannot be "
+        "given the frequency, and one that has to serve the whole range. Where a limit cannot be "
         "computed it is not drawn.",
-        alt=f"One curve a design. Worst residuals: {listing_text(worst)}."
+        alt=f"One curve per design. Worst residuals: {listing_text(worst)}."
         + (f" Limits: {listing_text(limits)}." if limits else ""),
-        panels=(
-            Panel(
-                x=_ERROR,
-                y=Axis(label="residual", unit="nm rms", log=True),
-                marks=tuple(marks),
-                height_in=2.5,
-            ),
-        ),
+        panels=(Panel(x=_ERROR, y=y, marks=tuple(marks), height_in=2.5),),
     )
 
 
@@ -132,7 +112,7 @@ def _map_charts(report: DesignReport) -> list[Chart]:
                 caption="One scale of colours for all designs; lines at round values. Sensor gains "
                 "are relative to the sensor matrix of the configuration. Hatched: the loop is "
                 "unstable there.",
-                alt=f"One map a design. {' '.join(words)}",
+                alt=f"One map per design. {' '.join(words)}",
                 panels=tuple(panels),
                 columns=count_columns(len(panels)),
             )
@@ -154,22 +134,20 @@ def _map_text(one: DesignAssessment) -> str:
 def _sensor_gain_chart(report: DesignReport) -> Chart:
     """Strehl ratio over the sensor gain, drawn for a truth without vibrations."""
     words = [_map_text(one) for one in report.assessments]
-    curves = [
-        design_curve(report, one, one.map.sensor_gains, 100 * one.map.strehl[0, :, 0])
-        for one in report.assessments
+    marks: list[Mark] = [
+        Rule(name="real sensor gain", at=report.real_gain, dash=3),
+        *(
+            design_curve(report, one, one.map.sensor_gains, 100 * one.map.strehl[0, :, 0])
+            for one in report.assessments
+        ),
     ]
+    x = Axis(label="sensor gain", unit="-")
+    y = Axis(label=_STREHL_LABEL, unit="%", low=0.0)
     return Chart(
         key="sensor-gain",
         title="Strehl ratio over the sensor gain",
         caption="Exact long-exposure Strehl ratio. Sensor gains are relative to the sensor matrix "
         "of the configuration. Curves end where the loop becomes unstable.",
-        alt=f"One curve a design. {' '.join(words)}",
-        panels=(
-            Panel(
-                x=Axis(label="sensor gain", unit="-"),
-                y=Axis(label=_STREHL_LABEL, unit="%", low=0.0),
-                marks=(Rule(name="real sensor gain", at=report.real_gain, dash=3), *curves),
-                height_in=2.5,
-            ),
-        ),
+        alt=f"One curve per design. {' '.join(words)}",
+        panels=(Panel(x=x, y=y, marks=tuple(marks), height_in=2.5),),
     )

@@ -28,7 +28,7 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
         title="Simulated residual",
         caption=f"First {duration} s of the first run, first axis; the same turbulence, vibrations "
         "and noise for all designs.",
-        alt="One panel a design, all of the same scale, over time. Residuals over all runs: "
+        alt="One panel per design, all of the same scale, over time. Residuals over all runs: "
         + listing_text([f"{one.name} {fixed_text(run.residual_nm, 1)} nm rms" for one, run in rows])
         + ".",
         panels=tuple(
@@ -57,7 +57,7 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
         title="Spectra, simulated and exact",
         caption="Welch's method over all runs, with a Hann window; sums over the axes. The exact "
         "spectrum is that of the transfer functions, a sinusoid as the same window shows it.",
-        alt="One panel a design: the spectrum before the correction, and that of the residual "
+        alt="One panel per design: the spectrum before the correction, and that of the residual "
         "twice, simulated and exact, which lie on each other.",
         panels=panels,
         columns=count_columns(len(panels)),

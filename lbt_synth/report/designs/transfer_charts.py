@@ -7,7 +7,7 @@ import numpy as np
 from lbt_synth.report.designs.design_curves import FREQUENCY, design_curve
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.number_text import listing_text, number_text
-from lbt_synth.report.page.charts import Axis, Chart, Panel, Rule
+from lbt_synth.report.page.charts import Axis, Chart, Mark, Panel, Rule
 
 
 def transfer_charts(report: DesignReport) -> list[Chart]:
@@ -16,6 +16,15 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
     charts = []
     if norms:
         peaks = [f"{name} {number_text(float(np.max(n)), 3)} nm" for name, n in norms.items()]
+        marks: list[Mark] = [
+            *_vibration_rules(report),
+            *(
+                design_curve(report, one, report.frequency_hz, norms[one.name])
+                for one in report.assessments
+                if one.name in norms
+            ),
+        ]
+        y = Axis(label="largest singular value", unit="nm", log=True)
         charts.append(
             Chart(
                 key="sigma",
@@ -24,22 +33,9 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
                 "(of unit size) to the error of its estimate; of an LQG, to its residual. The "
                 "peak is the H-infinity norm, the area under the square the variance. Designs "
                 "that estimate nothing, such as integrators and shaped controllers, have none.",
-                alt="Curves over frequency, one a design that estimates. Peaks on this grid: "
+                alt="Curves over frequency, one per design that estimates. Peaks on this grid: "
                 f"{listing_text(peaks)}.",
-                panels=(
-                    Panel(
-                        x=FREQUENCY,
-                        y=Axis(label="largest singular value", unit="nm", log=True),
-                        marks=(
-                            *_vibration_rules(report),
-                            *(
-                                design_curve(report, one, report.frequency_hz, norms[one.name])
-                                for one in report.assessments
-                                if one.name in norms
-                            ),
-                        ),
-                    ),
-                ),
+                panels=(Panel(x=FREQUENCY, y=y, marks=tuple(marks)),),
             )
         )
     if report.stable:
@@ -63,7 +59,7 @@ def _loop_chart(report: DesignReport) -> Chart:
         f"{number_text(report.real_gain)}: from the phase to "
         "the residual (above; below 1 a disturbance is reduced) and from the measurement noise "
         "to the residual (below). With several axes it is that of the worst one.",
-        alt="Two panels over frequency, one curve a design. "
+        alt="Two panels over frequency, one curve per design. "
         + _largest_text(report, "rejection", "Largest rejection")
         + " "
         + _largest_text(report, "noise_transfer", "Largest noise transfer"),

@@ -131,5 +131,5 @@ def _certificate_sentence(report: DesignReport) -> str:
         # a proof about another loop must not be taken for one about this loop
         about = "; they are about the loops that the designs were made for, not about this one"
         about = "" if len(report.stable) == len(report.assessments) else about
-        return f"All {checks} checks of the certificates were computed anew and passed{about}."
+        return f"All {checks} checks of the certificates were recomputed and passed{about}."
     return f"The certificate of {listing_text(failed)} does NOT hold."

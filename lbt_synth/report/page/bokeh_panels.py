@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.report.line_styles import GREY, colour, dashes, marker_name
-from lbt_synth.report.page.bokeh_cells import FONT, draw_bars, draw_map
+from lbt_synth.report.page.bokeh_bars_and_maps import FONT, draw_bars, draw_map
 from lbt_synth.report.page.bokeh_hover import hover_curves
 from lbt_synth.report.page.charts import Area, Axis, Bars, Curve, Map, Mark, Panel, Rule, Span
 from lbt_synth.report.page.scales import log_tick_texts, log_ticks, scale_ends, shorten

@@ -29,7 +29,7 @@ from lbt_synth.report.page.charts import (
     Span,
     legend_entries,
 )
-from lbt_synth.report.page.scales import log_tick_texts, log_ticks, scale_ends, shorten
+from lbt_synth.report.page.scales import bar_places, log_tick_texts, log_ticks, scale_ends, shorten
 
 WIDTH_IN = 7.0
 _PANEL_IN, _BAR_IN = 2.1, 0.24  # height of a panel, and of one bar
@@ -302,12 +302,6 @@ def _draw_bars(axes: Any, panel: Panel) -> None:
         axes.barh(places[drawn], bars.values[drawn], height=height, color=colour(bars.look))
         if bars.low is not None and bars.high is not None:
             axes.hlines(places, bars.low, bars.high, color="black", linewidth=1.0)
-
-
-def bar_places(count: int) -> list[tuple[float, float]]:
-    """Offset of each series of bars from its category, and the height of its bars."""
-    height = 0.8 / max(count, 1)
-    return [((i - (count - 1) / 2) * height, 0.9 * height) for i in range(count)]
 
 
 def _draw_map(axes: Any, found: Map) -> Any:

@@ -10,8 +10,7 @@ from typing import Any
 
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.charts import Chart, Panel
-from lbt_synth.report.page.matplotlib_charts import chart_height, chart_style, draw_chart
-from lbt_synth.report.page.typeset import (
+from lbt_synth.report.page.line_breaking import (
     BODY,
     BOLD,
     LINE,
@@ -21,6 +20,7 @@ from lbt_synth.report.page.typeset import (
     text_width,
     wrap,
 )
+from lbt_synth.report.page.matplotlib_charts import chart_height, chart_style, draw_chart
 from lbt_synth.storage.tables import Cell, Table
 
 WIDTH, HEIGHT = 8.27, 11.69  # A4 [inch]

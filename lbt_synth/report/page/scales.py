@@ -149,3 +149,9 @@ def shorten(text: str, most: int) -> str:
         return text
     kept = most - 1
     return text[: (kept + 1) // 2] + "…" + text[len(text) - kept // 2 :]
+
+
+def bar_places(count: int) -> list[tuple[float, float]]:
+    """Offset of each series of bars from its category, and the height of its bars."""
+    height = 0.8 / max(count, 1)
+    return [((i - (count - 1) / 2) * height, 0.9 * height) for i in range(count)]

@@ -88,6 +88,8 @@ def loss_chart(found: Sequence[ControllerSamples]) -> Chart | None:
         curves.append(
             Curve(name=each.controller, x=100 * x, y=100 * y, look=look, step=True, width=1.8)
         )
+    x_axis = Axis(label="loss of Strehl ratio", unit="points", low=0)
+    y_axis = Axis(label="samples that lose more", unit="%", low=0, high=100)
     return Chart(
         key="loss",
         title="Loss against the best controller of each sample",
@@ -97,13 +99,7 @@ def loss_chart(found: Sequence[ControllerSamples]) -> Chart | None:
             "better. What a controller would gain if it could be changed with the conditions."
         ),
         alt="For each controller, the part of the samples over the loss of Strehl ratio.",
-        panels=(
-            Panel(
-                x=Axis(label="loss of Strehl ratio", unit="points", low=0),
-                y=Axis(label="samples that lose more", unit="%", low=0, high=100),
-                marks=tuple(curves),
-            ),
-        ),
+        panels=(Panel(x=x_axis, y=y_axis, marks=tuple(curves)),),
     )
 
 
@@ -289,6 +285,16 @@ def map_charts(
         kept = each.evaluated
         binned = binned_map(parameters[first][kept], parameters[second][kept], each.strehl[kept])
         low, high = (100 * float(end(binned.mean)) for end in (np.nanmin, np.nanmax))
+        mark = Map(
+            x=binned.x,
+            y=binned.y,
+            values=100 * binned.mean,
+            label="mean Strehl ratio",
+            unit="%",
+            low=5 * np.floor(low / 5),
+            high=5 * np.floor(high / 5) + 5,
+            blank="no sample",
+        )
         charts.append(
             Chart(
                 key=f"map-{place + 1}",
@@ -304,22 +310,7 @@ def map_charts(
                     f"from {low:.1f} to {high:.1f} %."
                 ),
                 panels=(
-                    Panel(
-                        x=Axis(label=names[first]),
-                        y=Axis(label=names[second]),
-                        marks=(
-                            Map(
-                                x=binned.x,
-                                y=binned.y,
-                                values=100 * binned.mean,
-                                label="mean Strehl ratio",
-                                unit="%",
-                                low=5 * np.floor(low / 5),
-                                high=5 * np.floor(high / 5) + 5,
-                                blank="no sample",
-                            ),
-                        ),
-                    ),
+                    Panel(x=Axis(label=names[first]), y=Axis(label=names[second]), marks=(mark,)),
                 ),
             )
         )

@@ -16,7 +16,6 @@ from lbt_synth.report.number_text import NO_BREAK
 from lbt_synth.report.page.blocks import Block, Page
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import creator_name, time_text
-from lbt_synth.report.study.info import StudyInfo, study_info
 from lbt_synth.report.study.sections import (
     comparison_section,
     controllers_section,
@@ -27,6 +26,7 @@ from lbt_synth.report.study.sections import (
     summary_section,
     worst_section,
 )
+from lbt_synth.report.study.study_info import StudyInfo, study_info
 from lbt_synth.storage.tables import Table
 from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
 from lbt_synth.studies.study.controller_samples import read_column, read_controller_samples

@@ -17,7 +17,7 @@ from lbt_synth.report.study.charts import (
     sensitivity_chart,
     unstable_chart,
 )
-from lbt_synth.report.study.info import StudyInfo
+from lbt_synth.report.study.study_info import StudyInfo
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies import ControllerStatistics, StudyStatistics
 from lbt_synth.studies.study.controller_samples import ControllerSamples

@@ -28,7 +28,7 @@ def test_an_unstable_loop_is_told_loudly(report, text):
     # an integrator of 1.5 in two frames is stable below 1 / 1.5
     (ends,) = wild.sensor_gains
     assert ends == pytest.approx((0.0, 2 / 3), abs=1e-6)
-    assert not wild.certified  # its loop at the assumed gain, computed anew
+    assert not wild.certified  # its loop at the assumed gain, recomputed
     reader = Reader(text)
     notices = [a for a in reader.named("p") if "bad" in (a.get("class") or "")]
     assert len(notices) == 2
@@ -66,7 +66,7 @@ def test_the_page_has_all_that_it_should(text, report, config):
         "modulus margin",
         "states of the controller",
         "stable real sensor gains",
-        "certificate, computed anew",
+        "certificate, recomputed",
     ):
         assert heading in reader.texts["th"]
     kalman = report.assessments[0]

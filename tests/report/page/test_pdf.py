@@ -10,8 +10,8 @@ from support.pages import HOSTILE, many_panels, whole_page
 
 from lbt_synth.report.page.blocks import Listing, Page, Paragraph, Section
 from lbt_synth.report.page.charts import Axis, Bars, Chart, Panel
+from lbt_synth.report.page.line_breaking import MONO
 from lbt_synth.report.page.pdf import HEIGHT, block_height, page_pdf, split_by_sheets
-from lbt_synth.report.page.typeset import MONO
 from lbt_synth.storage.tables import Table
 
 

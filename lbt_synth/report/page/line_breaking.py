@@ -1,4 +1,4 @@
-"""Lines of text that fit a width, measured in the font that they are set in."""
+"""Lines of text broken to a width, measured in the font that they are set in."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from lbt_synth.report.line_styles import GREY, PALE, colour
 from lbt_synth.report.map_cells import blank_cells, cell_edges, level_colour, levels_within
 from lbt_synth.report.page.bokeh_hover import add_hover, value_format
 from lbt_synth.report.page.charts import Bars, Map, Panel
-from lbt_synth.report.page.matplotlib_charts import bar_places
+from lbt_synth.report.page.scales import bar_places
 
 FONT = "system-ui, sans-serif"
 
@@ -37,17 +37,9 @@ def draw_bars(figure: Any, panel: Panel, named: dict[str, list[str]]) -> None:
             (bars.name or panel.x.label, value_format("right", panel.x.unit)),
         ]
         if "low" in source:
-            models.append(
-                figure.segment(
-                    x0="low",
-                    x1="high",
-                    y0="y",
-                    y1="y",
-                    source=box.data_source,
-                    line_color="black",
-                    line_width=1.5,
-                )
-            )
+            ends = {"x0": "low", "x1": "high", "y0": "y", "y1": "y"}
+            line = {"line_color": "black", "line_width": 1.5}
+            models.append(figure.segment(**ends, source=box.data_source, **line))
             tips.append(("interval", f"@low{{%.4g}} to {value_format('high', panel.x.unit)}"))
         add_hover(figure, box, tips, ("right", "low", "high"))
         if bars.name:

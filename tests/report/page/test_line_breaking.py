@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lbt_synth.report.page.typeset import BODY, MONO, mono_lines, text_width, wrap
+from lbt_synth.report.page.line_breaking import BODY, MONO, mono_lines, text_width, wrap
 
 
 def test_lines_fit_their_width():
