@@ -1,8 +1,8 @@
-"""Studies: what a design is worth when the world is not its model.
+"""Studies of designs on loops that differ from their model.
 
-Each study answers one question over many loops: frequency errors, sensor gains, limits, trade-offs.
-A Monte Carlo study draws its samples from a configuration and resumes after an interrupt.
-The tables of Agapito et al. (2008) are computed beside the published ones.
+Each study answers one question: frequency errors, sensor gains, limits, trade-offs, mirrors.
+A Monte Carlo study draws its samples from a configuration, and resumes after an interrupt.
+The tables of Agapito et al. (2008) are compared with the published ones.
 """
 
 import lazy_loader

@@ -1,1 +1,1 @@
-"""The tables of Agapito et al. (2008), computed beside the published ones."""
+"""The tables of Agapito et al. (2008), compared with the published ones."""

@@ -1,1 +1,1 @@
-"""The command study: samples of a configuration on many processes, and their statistics."""
+"""Monte Carlo studies: samples of a configuration, run in parallel, and their statistics."""

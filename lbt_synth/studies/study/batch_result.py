@@ -40,7 +40,7 @@ class BatchResult:
     start : int
         Row of the first sample.
     columns : mapping of str to (b,) ndarray
-        Results by the names of their columns, ``Study.result_columns``; nan where there is none.
+        Results by column, one of ``Study.result_columns``; nan without a result.
     failures : tuple of Failure
         In the order of their rows.
     """

@@ -13,7 +13,7 @@ from concurrent.futures import (
     Future,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,12 +55,12 @@ class _InlineExecutor(Executor):
 
 
 class _Workers:
-    """An executor, and how to replace it when it breaks."""
+    """An executor: that of the caller, one in this process, or a pool that can be renewed."""
 
-    def __init__(self, executor: Executor, pool: WorkerPool | None, jobs: int) -> None:
-        self.executor = executor
-        self._pool = pool
+    def __init__(self, jobs: int, executor: Executor | None) -> None:
         self._jobs = jobs
+        self._pool = WorkerPool(jobs) if executor is None and jobs > 1 else None
+        self.executor = self._pool.executor if self._pool else executor or _InlineExecutor()
 
     def renew(self, error: BaseException) -> None:
         """Start new processes after some died."""
@@ -83,12 +83,9 @@ class _Workers:
 
 @contextmanager
 def _open_workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
-    if executor is not None or jobs == 1:
-        yield _Workers(executor or _InlineExecutor(), None, jobs)
-        return
-    with limit_threads():
-        pool = WorkerPool(jobs)
-        workers = _Workers(pool.executor, pool, jobs)
+    own = executor is None and jobs > 1
+    with limit_threads() if own else nullcontext():
+        workers = _Workers(jobs, executor)
         try:
             yield workers
         except BaseException:

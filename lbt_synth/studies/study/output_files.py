@@ -55,10 +55,7 @@ def _table_blocks(study: Study, parts: Sequence[Part]) -> Iterator[tuple[int, Fl
 
 def write_failures(folder: Path, failures: Sequence[Failure]) -> Path:
     """Write the table of failures, in the order of the rows."""
-    rows = [
-        (failure.row, failure.controller, failure.error)
-        for failure in sorted(failures, key=lambda failure: failure.row)
-    ]
+    rows = [(f.row, f.controller, f.error) for f in sorted(failures, key=lambda f: f.row)]
     return write_atomically(folder / FAILED, csv_bytes(("row", "controller", "error"), rows))
 
 
