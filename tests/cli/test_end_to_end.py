@@ -1,4 +1,4 @@
-"""The commands e2e and e2e-table."""
+"""The commands end-to-end and end-to-end-table."""
 
 from __future__ import annotations
 
