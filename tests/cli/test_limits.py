@@ -83,7 +83,7 @@ def test_limits_command_refuses(tmp_path, monkeypatch, capsys, arguments, text):
     assert error.count("\n") == 1
 
 
-def test_show_and_simulate_tell_the_distance(tmp_path, capsys, config):
+def test_show_and_simulate_print_the_limit(tmp_path, capsys, config):
     gain = lbt.save_gain(tmp_path / "k.fits", lbt.kalman(config.plant))
     data = json.loads(run(capsys, "show", gain, "--json")[1])
     assert data["limit_nm"] == pytest.approx(192.619, abs=1e-3)

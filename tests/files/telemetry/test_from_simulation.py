@@ -26,7 +26,7 @@ def test_the_camera_gives_telescope_and_strehl_ratio():
     assert lbt.files.telemetry_from_simulation(wide, three, imaging=camera).strehl is None
 
 
-def test_telemetry_of_refuses(axis_plant):
+def test_what_is_no_simulation_is_refused(axis_plant):
     path = axis_plant.hardware
     design = lbt.kalman(axis_plant)
     run = lbt.simulate(design.controller, lbt.Truth(turbulence=None), hardware=path, frames=5)

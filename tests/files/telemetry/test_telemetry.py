@@ -48,7 +48,7 @@ def test_hardware_of_slopes_is_seen_through_the_reconstructor():
         ),
     ],
 )
-def test_hardware_that_is_not_told(changes, text):
+def test_hardware_that_is_not_known(changes, text):
     with pytest.raises(lbt.errors.ProblemError, match=text):
         _ = full(**changes).hardware
 

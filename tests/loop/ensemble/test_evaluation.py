@@ -120,7 +120,7 @@ def test_each_loop_on_its_own_under_processes(which, request):
         agree(found, design, w, single)
 
 
-def test_unstable_loops_are_told(kalman):
+def test_unstable_loops_have_no_residual(kalman):
     w = weather(20, seed=3)
     w["gains"] = np.linspace(0.2, 4, 20)
     found = lbt.loop.ensemble_residuals(

@@ -8,19 +8,19 @@ import lbt_synth as lbt
 from lbt_synth.loop.ensemble.subloops import split_into_subloops
 
 
-def test_pieces_of_a_loop(kalman, coupled):
-    def pieces(design):
+def test_a_loop_is_split_into_subloops(kalman, coupled):
+    def split(design):
         system = design.controller.to_statespace()
         matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
         return split_into_subloops(matrices, design.hardware)
 
-    parts, rest = pieces(kalman)
+    parts, rest = split(kalman)
     assert [part.modes.tolist() for part in parts] == [[0], [1]]
     assert parts[0].equals(parts[1])
     assert rest == []
-    assert [part.modes.tolist() for part in pieces(coupled)[0]] == [[0, 1]]
-    # an axis without a vibration is another piece than one with
-    parts, _ = pieces(lbt.kalman(plant(vibrations=[LINE])))
+    assert [part.modes.tolist() for part in split(coupled)[0]] == [[0, 1]]
+    # an axis without a vibration is another subloop than one with
+    parts, _ = split(lbt.kalman(plant(vibrations=[LINE])))
     assert not parts[0].equals(parts[1])
 
 
