@@ -97,7 +97,7 @@ class Design:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EstimatorDesign(Design, ABC):
-    """A controller made of an estimator of z.
+    """A controller that applies an estimator of z.
 
     Attributes
     ----------

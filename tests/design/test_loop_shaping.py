@@ -132,7 +132,7 @@ def test_too_few_states_for_the_loss_are_refused():
         terms=(BASIC, lbt.design.shaping.VibrationBand(low_hz=15, high_hz=25, rms_nm=500))
     )
     with pytest.raises(
-        lbt.errors.InfeasibleError, match="no controller of 5 states a mode came within 1 %"
+        lbt.errors.InfeasibleError, match="no controller of 5 states per mode came within 1 %"
     ):
         lbt.design.shape(ONE, spec(objective=objective), functions=30, states=5, loss=0.01)
 

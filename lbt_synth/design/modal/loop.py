@@ -145,7 +145,7 @@ class ModalLoop:
             If sizes clash, a value is out of its range, or the models are sampled at another
             frame rate than the loop's.
         NumericalError
-            If rounding leaves too few digits: a process that is all but a random walk.
+            If rounding leaves too few digits: a process that is nearly a random walk.
         """
         self.require_stable()
         air = as_modal_turbulence(turbulence, self.n_modes)
@@ -190,7 +190,7 @@ class ModalLoop:
         settle_frames : int, optional
             Frames at the beginning that are run and dropped.
         all_series : bool, optional
-            Whether commands and measurements are wanted, too.
+            Whether to return commands and measurements, too.
 
         Returns
         -------

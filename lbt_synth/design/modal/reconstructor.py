@@ -53,7 +53,7 @@ class Reconstructor:
 
     @property
     def condition_number_full(self) -> float:
-        """Largest over smallest of all singular values; inf where modes cannot be told apart."""
+        """Largest over smallest of all singular values; inf where modes are not distinct."""
         if self.n_modes > self.n_slopes or self.singular_values[-1] == 0:
             return float("inf")
         return float(self.singular_values[0] / self.singular_values[-1])
@@ -93,7 +93,7 @@ def reconstructor(
         If there are more modes than slopes and no truncation.
     ProblemError
         If an entry is not finite, a mode gives no slopes at all, both truncations are given or
-        one is out of its range, or the modes cannot be told apart and nothing is left out.
+        one is out of its range, or the modes are not distinct and nothing is left out.
 
     Examples
     --------
@@ -167,7 +167,7 @@ def project_out(
         Phase of each mode over the points of the pupil; or, with ``influence_matrix``, the
         commands of each mode, (actuators, n).
     removed : sequence of int, optional
-        Columns of the modes that are taken out of the others; they stay as they are.
+        Columns of the modes that are taken out of the others; they do not change.
     weights : (points,) array_like, optional
         Weight of each point of the pupil, at least 0; all the same by default.
     influence_matrix : (points, actuators) array_like, optional

@@ -30,7 +30,7 @@ def filter_phase(
     *,
     with_commands: bool,
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the residuals of all modes, and the commands if they are wanted.
+    """Return the residuals of all modes, and the commands on request.
 
     Shapes: total, scaled (noise over sensor gain), residuals, commands (n, frames).
     """

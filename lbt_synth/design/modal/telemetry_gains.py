@@ -53,7 +53,7 @@ def modal_gains_from_telemetry(
     noise_nm : float or (n,) array_like, optional
         Measurement noise per frame [nm]; by default the mean of the periodogram's upper
         fifth, where there should be nothing but noise: turbulence that reaches up there makes
-        the noise too large and the residuals too small, and leaves the gains as they are.
+        the noise too large and the residuals too small, and does not change the gains.
     delay_frames : float, optional
         Total delay of the loop [frames], at least 1, fractions allowed.
     sensor_gain : float or (n,) array_like, optional

@@ -65,14 +65,14 @@ def starting_poles(
         0.62 * np.exp(0.5j),
         0.8 * np.exp(1.0j),
     ]
-    wanted = count // 2
-    each = max((wanted - 3) // max(len(bands), 1), 1)
+    number = count // 2
+    each = max((number - 3) // max(len(bands), 1), 1)
     for low, high in bands:
         width = (high - low) / (2 * each)
         centres = low + width * (2 * np.arange(each) + 1)
         pairs = [*pairs[:1], *((1 - 0.8 * width) * np.exp(1j * centres)), *pairs[1:]]
-    spare = 0.5 * np.exp(1j * np.linspace(1.5, 3.0, max(wanted - len(pairs), 0)))
-    pairs = [*pairs, *spare][:wanted]
+    spare = 0.5 * np.exp(1j * np.linspace(1.5, 3.0, max(number - len(pairs), 0)))
+    pairs = [*pairs, *spare][:number]
     upper = np.array(pairs, dtype=np.complex128)
     single = np.full(count - 2 * upper.size, 0.3, dtype=np.complex128)
     return np.concatenate([upper, upper.conj(), single])

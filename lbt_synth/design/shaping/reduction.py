@@ -98,9 +98,10 @@ def reduce_poles(
     if accepted is None or loss > tolerance:
         best = f"the best lost {100 * loss:.3g} %" if np.isfinite(loss) else "none was feasible"
         raise InfeasibleError(
-            f"no controller of {order + hardware.mirror_system.whole.n_states} states a mode came "
-            f"within {100 * tolerance:.3g} % of the long parameter's {long.objective_nm:.4g} nm "
-            f"(root of the whole objective): {best}. Allow more states or a larger loss."
+            f"no controller of {order + hardware.mirror_system.whole.n_states} states per mode "
+            f"came within {100 * tolerance:.3g} % of the long parameter's "
+            f"{long.objective_nm:.4g} nm (root of the whole objective): {best}. "
+            "Allow more states or a larger loss."
         )
     kept, failed = 0, len(candidates)
     while failed - kept > 1:  # fewer poles lose more: bisection
