@@ -5,7 +5,7 @@ from __future__ import annotations
 from lbt_synth.report.line_styles import colour, dashes, marker_name
 
 
-def test_unequal_looks_are_told_apart():
+def test_different_looks_differ():
     looks = [(colour(i), dashes(i)) for i in range(36)]
     assert len(set(looks)) == 36
     marks = {(colour(i), marker_name("own", i)) for i in range(36)}

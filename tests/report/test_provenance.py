@@ -10,7 +10,7 @@ import lbt_synth as lbt
 from lbt_synth.report.provenance import creation_time
 
 
-def test_the_time_of_making(monkeypatch):
+def test_the_creation_time(monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     assert creation_time() == datetime(1970, 1, 2, tzinfo=UTC)
     for wrong in ("tomorrow", "1e400", str(10**30)):

@@ -114,14 +114,12 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
     blocks: list[Block] = []
     for one in report.assessments:
         if not one.stable:
-            blocks.append(
-                Notice(
-                    text=f"{one.name} is UNSTABLE in the loop of this configuration: its largest "
-                    f"pole has a modulus of {number_text(one.spectral_radius, 6)} at a sensor gain "
-                    f"of {number_text(report.real_gain)}. It must not be used here.",
-                    tone="bad",
-                )
+            text = (
+                f"{one.name} is UNSTABLE in the loop of this configuration: its largest pole has a "
+                f"modulus of {number_text(one.spectral_radius, 6)} at a sensor gain of "
+                f"{number_text(report.real_gain)}. It must not be used here."
             )
+            blocks.append(Notice(text=text, tone="bad"))
         if not one.certified:
             why = one.certificate_error or "; ".join(
                 f"{check.name} {number_text(check.value, 6)}, limit {number_text(check.limit, 6)}"
@@ -129,13 +127,17 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
                 if not check.passed
             )
             blocks.append(Notice(text=f"The certificate of {one.name} fails: {why}", tone="bad"))
-    blocks.append(Paragraph(text=verdict(report)))
-    blocks.append(summary_table(report))
-    blocks.append(Paragraph(text=_situation_text(report)))
-    blocks += [
-        Notice(text=f"{one.name} was {note}") for one in report.assessments for note in one.notes
+    return [
+        *blocks,
+        Paragraph(text=verdict(report)),
+        summary_table(report),
+        Paragraph(text=_situation_text(report)),
+        *(
+            Notice(text=f"{one.name} was {note}")
+            for one in report.assessments
+            for note in one.notes
+        ),
     ]
-    return blocks
 
 
 def _situation_text(report: DesignReport) -> str:
@@ -196,10 +198,8 @@ def _certificate_blocks(report: DesignReport) -> list[Block]:
         )
     ]
     for one in report.assessments:
-        if one.certificate_error:
-            blocks.append(
-                Notice(text=f"{one.name}: not computed: {one.certificate_error}", tone="bad")
-            )
-        else:
-            blocks.append(certificate_table(one))
+        missing = f"{one.name}: not computed: {one.certificate_error}"
+        blocks.append(
+            Notice(text=missing, tone="bad") if one.certificate_error else certificate_table(one)
+        )
     return blocks

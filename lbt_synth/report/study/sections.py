@@ -41,40 +41,29 @@ def summary_section(
     info: StudyInfo, statistics: StudyStatistics, found: Sequence[ControllerSamples]
 ) -> Section:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    blocks: list[Block] = []
-    if statistics.samples < info.samples:
-        blocks.append(
-            Notice(
-                text=(
-                    f"The study is not complete: {statistics.samples} of {info.samples} samples "
-                    "have results. What follows is of these alone."
-                ),
-                tone="bad",
-            )
-        )
     unstable = [each for each in statistics.controllers if each.unstable.count]
+    failed = [each for each in statistics.controllers if each.failed]
+    warnings = []
+    if statistics.samples < info.samples:
+        warnings.append(
+            f"The study is not complete: {statistics.samples} of {info.samples} samples have "
+            "results. What follows is of these alone."
+        )
     if unstable:
         parts = ", ".join(
             f"{each.controller} in {each.unstable.count} of {each.samples} "
             f"({percent(each.unstable.value, 2)} %)"
             for each in unstable
         )
-        blocks.append(Notice(text=f"Unstable loops: {parts}.", tone="bad"))
-    failed = [each for each in statistics.controllers if each.failed]
+        warnings.append(f"Unstable loops: {parts}.")
     if failed:
         parts = ", ".join(f"{each.controller} {each.failed}" for each in failed)
-        blocks.append(
-            Notice(
-                text=f"Evaluations that failed, and are in none of the figures: {parts}.",
-                tone="bad",
-            )
-        )
+        warnings.append(f"Evaluations that failed, and are in none of the figures: {parts}.")
+    blocks: list[Block] = [Notice(text=text, tone="bad") for text in warnings]
     if not unstable and not failed and statistics.samples:
-        blocks.append(
-            Notice(text="Every controller is stable in every sample, and none failed.", tone="good")
-        )
-    blocks.append(Paragraph(text=_verdict_text(statistics.controllers)))
-    blocks.append(strehl_table(statistics))
+        text = "Every controller is stable in every sample, and none failed."
+        blocks.append(Notice(text=text, tone="good"))
+    blocks += [Paragraph(text=_verdict_text(statistics.controllers)), strehl_table(statistics)]
     chart = distribution_chart(found)
     blocks += [chart] if chart is not None else []
     return Section(key="summary", title="Summary", blocks=tuple(blocks))

@@ -18,7 +18,7 @@ from lbt_synth.report.number_text import fixed_text
 from lbt_synth.storage.tables import Table
 
 
-def test_an_unstable_loop_is_told_loudly(report, text):
+def test_an_unstable_loop_is_named_loudly(report, text):
     wild = report.assessments[2]
     assert not wild.stable
     assert wild.spectral_radius > 1
@@ -47,7 +47,7 @@ def test_a_limit_of_nothing_is_no_limit(config, designs):
     assert "passed, 1 check " in words_of(report) + " "
 
 
-def test_the_page_has_all_that_it_should(text, report, config):
+def test_the_page_is_complete(text, report, config):
     reader = Reader(text)
     titles = " ".join(reader.texts["h2"] + reader.texts["h3"])
     for word in (

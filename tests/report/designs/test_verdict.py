@@ -27,7 +27,7 @@ def test_the_verdict_is_made_of_the_numbers(report):
     assert "The certificate of wild does NOT hold." in words
 
 
-def test_equals_are_told_as_equals(config, designs):
+def test_equal_designs_share_the_lead(config, designs):
     kalman = designs["kalman"]
     pair = {"one": kalman, "two": kalman}
     words = verdict(lbt.report.design_report(config, pair)).replace("\u00a0", " ")

@@ -21,7 +21,7 @@ def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
     assert curve.max() == pytest.approx(designs["Kalman"].gamma, rel=1e-3)
 
 
-def test_curves_are_told_apart_in_grey(designs):
+def test_curves_differ_in_grey(designs):
     lines = lbt.report.figures.sigma_figure(designs).axes[1].get_lines()[:3]
     assert len({str(line.get_linestyle()) for line in lines}) == 3
     assert len({line.get_color() for line in lines}) == 3

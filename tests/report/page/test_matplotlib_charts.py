@@ -34,7 +34,7 @@ def test_titles_of_panels_stay_in_their_drawing():
             draw_chart(figure, many_panels(columns, title, columns), left=0, top=12)
             figure.canvas.draw()
             for axes in figure.axes:
-                told = axes.get_title(loc="left")
-                assert "…" in told
+                shown = axes.get_title(loc="left")
+                assert "…" in shown
                 ends = axes._left_title.get_window_extent()
                 assert ends.x1 <= axes.get_window_extent().x1 + 1

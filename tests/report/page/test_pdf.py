@@ -36,7 +36,7 @@ def test_a_pdf_has_its_pages_and_no_date(sheets):
 
 
 @pytest.mark.parametrize("count", [1, 6, 7, 40])
-def test_charts_that_are_too_high_go_on_on_the_next_sheet(count):
+def test_high_charts_continue_on_the_next_sheet(count):
     chart = many_panels(count)
     parts = list(split_by_sheets(chart))
     assert sum(len(part.panels) for part in parts) == count
@@ -62,7 +62,7 @@ def test_bars_fit_a_sheet():
     assert block_height(chart) <= HEIGHT - 1.25 - 0.5
 
 
-def test_long_listings_and_tables_go_on_on_the_next_sheet():
+def test_long_listings_and_tables_continue_on_the_next_sheet():
     def count(block):
         section = Section(key="a", title="A", blocks=(block,))
         page = Page(title="t", subtitle="s", creator="c", sections=(section,))
