@@ -87,7 +87,7 @@ def mixed() -> None:
     """Least variance at 1.05 times the least gamma: central, best own gain, mixed."""
     plant = lbt_axis_plant()
     bound = 1.05 * lbt.hinf(plant, route="riccati").gamma_least
-    central = lbt.design.central(plant, gamma=bound)
+    central = lbt.design.central_filter(plant, gamma=bound)
     gain = central.gain_predictor
     unit = np.abs(gain.ravel())
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.design.worst_case import error_size, worst_found, worst_guaranteed
+from lbt_synth.design.worst_case import error_size, search_worst_error, bound_worst_error
 from lbt_synth.models.plant.frequency_interval import FrequencyInterval
 
 SLOW = lbt.models.ARModel(
@@ -40,7 +40,7 @@ def mixture(interval: FrequencyInterval, lines: int, *, covering: bool) -> lbt.m
     worst = (2 * drive**2 / 800) / (
         (across - np.clip(across, low, high)) ** 2 + ((1 - kept) * np.sin(angle)) ** 2
     )
-    moved = [LINE.moved(float(f)) for f in np.linspace(interval.low_hz, interval.high_hz, lines)]
+    moved = [LINE.at_frequency(float(f)) for f in np.linspace(interval.low_hz, interval.high_hz, lines)]
     total = sum(line.ar_model(800).psd(angle * 800 / (2 * np.pi)) for line in moved)
     size = float(np.sqrt(np.max(worst / total) if covering else np.min(worst / total)))
     return lbt.tip_tilt_plant(
@@ -70,9 +70,9 @@ def main() -> None:
         designs |= {f"polytopic {norm}": design.predictor for norm, design in made.items()}
         print(f"20 Hz +- {half:g} Hz: worst norm (guaranteed) and worst rms [nm], mean rms, states")
         for name, filtered in designs.items():
-            norm, _ = worst_found(interval, filtered, "hinf")
-            rms, _ = worst_found(interval, filtered, "h2")
-            sure = worst_guaranteed(interval, filtered, "hinf")
+            norm, _ = search_worst_error(interval, filtered, "hinf")
+            rms, _ = search_worst_error(interval, filtered, "h2")
+            sure = bound_worst_error(interval, filtered, "hinf")
             variances = []
             for f in np.linspace(interval.low_hz, interval.high_hz, 41):
                 error = interval.error_system(interval.coefficient(float(f)), filtered)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.identification.records.clock import clock_of
+from lbt_synth.identification.records.clock import build_clock
 
 RATE = 1000.0
 
@@ -65,7 +65,7 @@ def rounded_times() -> None:
         times = 1e-3 * (np.round(ms) if rng.choice([0, 1]) else np.floor(ms))
         times = times + rng.choice([0, 1.7e9])
         try:
-            frame = clock_of(len(kept), frame_rate_hz=rate, times_s=times).frame_of_row
+            frame = build_clock(len(kept), frame_rate_hz=rate, times_s=times).frame_of_row
             word = "right" if np.array_equal(frame, kept) else "wrong"
         except lbt.errors.ProblemError:
             word = "refused"
@@ -92,7 +92,7 @@ def missed() -> None:
 
 def pseudo_open_loop() -> None:
     """Error of the pseudo-open loop of a simulated loop without noise."""
-    shell = lbt.models.PositionLoop.of_bandwidth(
+    shell = lbt.models.PositionLoop.from_bandwidth(
         natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
     )
     air = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80.0, frame_rate_hz=RATE)
@@ -102,7 +102,7 @@ def pseudo_open_loop() -> None:
             truth = lbt.Truth(turbulence=air, sensor_gain=0.4)
             controller = lbt.integrator(path, gain=0.2).controller
             run = lbt.simulate(controller, truth, hardware=path, frames=30_000)
-            seen = lbt.identification.record_of(lbt.files.telemetry_of(run, path))
+            seen = lbt.identification.record_from_telemetry(lbt.files.telemetry_from_simulation(run, path))
             good = np.flatnonzero(seen.usable)
             error = seen.pseudo_open_loop(0.4)[good] - run.total_nm[0, good - 1]
             print(

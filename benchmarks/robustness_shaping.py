@@ -1,4 +1,4 @@
-"""Figures on shaping that docs/decisions.md cites.
+"""Figures on shaping that docs/decisions/design.md cites.
 
 Run with ``python benchmarks/robustness_shaping.py`` from the repository (a minute or two).
 """

@@ -77,7 +77,7 @@ def main() -> None:
             run = lbt.simulate(
                 design.controller, config.truth, hardware=config.hardware, frames=8000
             )
-            seen = lbt.files.telemetry_of(
+            seen = lbt.files.telemetry_from_simulation(
                 run, config.hardware, sensor_gain=config.truth.sensor_gain, design=design
             )
             if method == "integrator":

@@ -57,7 +57,7 @@ class Case:
     def design(self, frequency_hz: float) -> lbt.design.FilterDesign:
         """Return the filter for a frequency."""
         (line,) = self.plant.vibrations
-        return lbt.kalman(with_vibrations(self.plant, [line.moved(frequency_hz)]))
+        return lbt.kalman(with_vibrations(self.plant, [line.at_frequency(frequency_hz)]))
 
 
 def axis(

@@ -1,4 +1,4 @@
-"""Lines next to each other: run with ``python benchmarks/tracking_neighbours.py`` from the repository."""
+"""Lines next to each other: ``python benchmarks/tracking_neighbours.py``."""
 
 import time
 from dataclasses import replace
