@@ -1,0 +1,73 @@
+"""Pages cite files that are there, and the parts made from the code fail where the code says nothing."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+
+import pytest
+from support.plants import ROOT
+
+PAGES = sorted(
+    path
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
+    if "generated" not in path.parts and "_build" not in path.parts
+)
+
+
+@pytest.fixture(scope="module")
+def house():
+    spec = importlib.util.spec_from_file_location("house", ROOT / "docs" / "house.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_that_a_page_cites_are_there(page):
+    cited = re.findall(
+        r"\b(?:tests|benchmarks|docs|examples|lbt_synth)/[\w/]+\.(?:py|md|yaml|png)\b",
+        page.read_text(encoding="utf-8"),
+    )
+    assert [path for path in cited if not (ROOT / path).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_tests_that_a_page_cites_are_there(page):
+    everything = "".join(path.read_text() for path in ROOT.glob("tests/**/test_*.py"))
+    cited = re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))
+    assert [name for name in cited if f"def {name}(" not in everything] == []
+
+
+def test_every_module_has_a_sentence_and_every_room_a_table(house):
+    text = house.architecture()
+    modules = [path for path in (ROOT / "lbt_synth").rglob("*.py") if path.name != "__init__.py"]
+    rows = re.findall(r"^\| `([\w.]+)` \| .+\. \|$", text, re.MULTILINE)
+    for path in modules:
+        name = ".".join(path.relative_to(ROOT / "lbt_synth").with_suffix("").parts)
+        assert name in rows or f"### {name}" in text
+    assert re.findall(r"^### (\w+)$", text, re.MULTILINE) == house.rooms()
+
+
+@pytest.mark.parametrize("text", ["", '"""TODO"""\n', '"""No full stop"""\n', "import os\n"])
+def test_a_module_without_a_sentence_fails_the_build(house, tmp_path, text):
+    (tmp_path / "lbt_synth").mkdir()
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for room in house.rooms():
+        (tmp_path / "lbt_synth" / room).mkdir()
+        (tmp_path / "lbt_synth" / room / "__init__.py").write_text('"""A room for a test."""\n')
+    assert "### linear" in house.architecture(tmp_path)
+    (tmp_path / "lbt_synth" / "linear" / "new.py").write_text(text)
+    with pytest.raises(ValueError, match=r"new\.py: the docstring must begin with a sentence"):
+        house.architecture(tmp_path)
+
+
+def test_the_reference_has_the_names_of_the_stubs(house):
+    pages = house.reference()
+    index = (ROOT / "docs" / "api" / "index.md").read_text()
+    assert {f"rooms/{room.replace('.', '_')}" for room in pages} == set(
+        re.findall(r"^rooms/\w+$", index, re.MULTILINE)
+    )
+    assert "\n   solve_dare\n" in pages["linear"]
+    assert "\n   InfeasibleError\n" in pages["errors"]
