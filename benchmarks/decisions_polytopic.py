@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.design.worst_case import error_size, search_worst_error, bound_worst_error
+from lbt_synth.design.worst_case import bound_worst_error, error_size, search_worst_error
 from lbt_synth.models.plant.frequency_interval import FrequencyInterval
 
 SLOW = lbt.models.ARModel(
