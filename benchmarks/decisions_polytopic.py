@@ -40,7 +40,8 @@ def mixture(interval: FrequencyInterval, lines: int, *, covering: bool) -> lbt.m
     worst = (2 * drive**2 / 800) / (
         (across - np.clip(across, low, high)) ** 2 + ((1 - kept) * np.sin(angle)) ** 2
     )
-    moved = [LINE.at_frequency(float(f)) for f in np.linspace(interval.low_hz, interval.high_hz, lines)]
+    frequencies = np.linspace(interval.low_hz, interval.high_hz, lines)
+    moved = [LINE.at_frequency(float(f)) for f in frequencies]
     total = sum(line.ar_model(800).psd(angle * 800 / (2 * np.pi)) for line in moved)
     size = float(np.sqrt(np.max(worst / total) if covering else np.min(worst / total)))
     return lbt.tip_tilt_plant(

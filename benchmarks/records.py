@@ -102,7 +102,8 @@ def pseudo_open_loop() -> None:
             truth = lbt.Truth(turbulence=air, sensor_gain=0.4)
             controller = lbt.integrator(path, gain=0.2).controller
             run = lbt.simulate(controller, truth, hardware=path, frames=30_000)
-            seen = lbt.identification.record_from_telemetry(lbt.files.telemetry_from_simulation(run, path))
+            night = lbt.files.telemetry_from_simulation(run, path)
+            seen = lbt.identification.record_from_telemetry(night)
             good = np.flatnonzero(seen.usable)
             error = seen.pseudo_open_loop(0.4)[good] - run.total_nm[0, good - 1]
             print(

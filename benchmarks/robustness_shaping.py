@@ -41,7 +41,9 @@ def specification(gains: tuple[float, ...]) -> lbt.design.shaping.Specification:
     )
 
 
-def timed(spec: lbt.design.shaping.Specification, size: int, pole: float) -> tuple[ModeSolution, float]:
+def timed(
+    spec: lbt.design.shaping.Specification, size: int, pole: float
+) -> tuple[ModeSolution, float]:
     """Solve with Laguerre functions, and take the time."""
     basis = laguerre_basis(size, pole, dt_s=PATH.dt_s)
     start = time.perf_counter()
