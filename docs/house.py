@@ -94,7 +94,7 @@ def reference(root: Path = ROOT) -> dict[str, str]:
     return {
         room: "\n".join(
             [
-                f"# lbt.{room}",
+                f"# lbt_synth.{room}",
                 "",
                 "```{eval-rst}",
                 f".. automodule:: lbt_synth.{room}",

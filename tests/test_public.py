@@ -71,6 +71,21 @@ def test_the_face_has_at_most_forty_names():
             assert any(thing is public(other) for other in NAMES), name
 
 
+@pytest.mark.parametrize(
+    "name",
+    [name for name in NAMES if name.count(".") and name.rpartition(".")[2] not in lbt.__all__],
+)
+def test_a_name_that_is_in_a_room_is_pointed_to(name):
+    with pytest.raises(AttributeError, match=rf"try lbt_synth\.{re.escape(name)}\."):
+        getattr(lbt, name.rpartition(".")[2])
+
+
+def test_a_name_that_is_nowhere_is_refused():
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = lbt.no_such_name
+    assert not hasattr(lbt, "__wrapped__")
+
+
 @pytest.mark.parametrize("path", [path for path in ROOMS if path != "errors"])
 def test_the_stub_of_a_room_lists_what_is_there(path):
     shown = room(path)

@@ -71,14 +71,12 @@ def run_cases(
     Examples
     --------
     >>> import tempfile
-    >>> import lbt_synth as lbt
+    >>> from lbt_synth.storage import run_cases
     >>> def double(case):
     ...     return {"twice": 2 * case["x"]}
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     first = lbt.storage.run_cases(double, {"a": {"x": 1}}, folder)
-    ...     both = lbt.storage.run_cases(
-    ...         double, {"a": {"x": 1}, "b": {"x": 2}}, folder
-    ...     )  # only b is run
+    ...     first = run_cases(double, {"a": {"x": 1}}, folder)
+    ...     both = run_cases(double, {"a": {"x": 1}, "b": {"x": 2}}, folder)  # only b is run
     >>> both
     {'a': {'twice': 2}, 'b': {'twice': 4}}
     """
