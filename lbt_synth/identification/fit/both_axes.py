@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from lbt_synth.identification.fit.jumps import (
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
-from lbt_synth.validation import require_instance
+from lbt_synth.validation import FloatArray, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
@@ -114,17 +114,108 @@ def identify(
     """
     for line in announced:
         require_instance(line, LinePrior)
-    known = [(line.frequency_hz, line.frequency_error_hz) for line in announced]
     if start is not None:
         require_instance(start, IdentifiedModel)
     options: dict[str, Any] = {
-        "announced": known,
+        "announced": [(line.frequency_hz, line.frequency_error_hz) for line in announced],
         "lowest_line_hz": lowest_line_hz,
         "most_lines": most_lines,
     }
     if isinstance(record, SpectrumRecord):
         return _identify_spectra(record, frame_rate_hz, delay_frames, options)
     require_instance(record, LoopRecord)
+    _require_agreement(record, frame_rate_hz, delay_frames, start)
+    count = record.axes
+    gains = _gain_per_axis(sensor_gain, count)
+    fitter = _AxisFitter(
+        record=record,
+        corrections=_known_corrections(record),
+        pieces=list(
+            record.stretches() if stretches is None else _check_stretches(stretches, record)
+        ),
+        options={**options, "assumed_gain": assumed_gain},
+        progress=progress,
+    )
+    _require_signal(record)
+    notes: list[str] = []
+    if fitter.corrections is not None:
+        early = find_correction_jumps(fitter.corrections, fitter.pieces)
+        if early:
+            notes.append(describe_jumps(early, "commands"))
+            fitter.pieces = cut_at_jumps(fitter.pieces, early)
+    axes = [fitter.fit(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
+    series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
+    late = find_jumps(series, axes, fitter.pieces)
+    if late:
+        notes.append(describe_jumps(late, "pseudo-open loop"))
+        if len(late) <= MOST_JUMPS:
+            fitter.pieces = cut_at_jumps(fitter.pieces, late)
+            axes = [fitter.fit(i, gains[i], axes[i]) for i in range(count)]
+    found_gain = [i for i in range(count) if axes[i].sensor_gain_error is not None]
+    if count > 1 and found_gain and all(gain is None for gain in gains):
+        axes, note = _pool_gains(axes, found_gain, fitter)
+        notes.append(note)
+    notes += _find_doubts(record, axes, found_gain, fitter.pieces)
+    notes += [
+        f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and the "
+        "rest of the model suffers"
+        for i, axis in enumerate(axes)
+        if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0
+    ]
+    if progress is not None and fitter.done < fitter.total:
+        progress(fitter.total, fitter.total)
+    return IdentifiedModel(
+        axes=tuple(axes),
+        frame_rate_hz=record.frame_rate_hz,
+        delay_frames=next(d for d in (record.delay_frames, delay_frames, _DELAY) if d is not None),
+        mirror=record.mirror,
+        notes=tuple(notes),
+    )
+
+
+@dataclass(slots=True, kw_only=True)
+class _AxisFitter:
+    """Fits single axes of a record, and counts the fits."""
+
+    record: LoopRecord
+    corrections: FloatArray | None
+    pieces: list[tuple[int, int]]
+    options: dict[str, Any]  # of identify_axis
+    progress: Callable[[int, int], None] | None
+    done: int = 0
+
+    @property
+    def total(self) -> int:
+        """Most fits that a record takes."""
+        return 2 * self.record.axes
+
+    def fit(
+        self, i: int, gain: float | None, start: IdentifiedAxis | None, error: float = 0.0
+    ) -> IdentifiedAxis:
+        """Identify axis i, at a known gain with its standard error or with a free one."""
+        found = identify_axis(
+            self.record.measurements[:, i],
+            None if self.corrections is None else self.corrections[:, i],
+            frame_rate_hz=self.record.frame_rate_hz,
+            stretches=self.pieces,
+            sensor_gain=gain,
+            sensor_gain_error=error,
+            start=start,
+            **self.options,
+        )
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, self.total)
+        return found
+
+
+def _require_agreement(
+    record: LoopRecord,
+    frame_rate_hz: float | None,
+    delay_frames: float | None,
+    start: IdentifiedModel | None,
+) -> None:
+    """Refuse a frame rate, a delay or a start that contradicts the record."""
     if frame_rate_hz is not None and frame_rate_hz != record.frame_rate_hz:
         raise ProblemError(
             f"the record has {record.frame_rate_hz:.9g} frames a second; got frame_rate_hz="
@@ -136,81 +227,31 @@ def identify(
             f"the record has a delay of {delay:g} frames; got {delay_frames!r}. Try "
             "record.with_delay(...)."
         )
-    count = record.axes
-    if start is not None and len(start.axes) != count:
-        raise ProblemError(f"start must have {count} axes; got {len(start.axes)}.")
-    gains = _gain_per_axis(sensor_gain, count)
-    corrections = None
-    if record.commands is not None:
-        if delay is None:
-            raise ProblemError(
-                "the delay of a closed loop is needed to know what the mirror did; got a record "
-                "without one. Try record.with_delay(...)."
-            )
-        corrections = record.corrections()
-    pieces = list(record.stretches() if stretches is None else _check_stretches(stretches, record))
-    dead = [i for i in range(count) if np.ptp(record.measurements[record.usable, i]) == 0]
-    if dead and record.usable.any():
+    if start is not None and len(start.axes) != record.axes:
+        raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
+
+
+def _known_corrections(record: LoopRecord) -> FloatArray | None:
+    """Return what the mirror did, None in open loop."""
+    if record.commands is None:
+        return None
+    if record.delay_frames is None:
         raise ProblemError(
-            f"axis {dead[0]} of the record is constant: there is nothing to identify. Choose the "
-            "other axis."
+            "the delay of a closed loop is needed to know what the mirror did; got a record "
+            "without one. Try record.with_delay(...)."
         )
-    total, done = 2 * count, 0
+    return record.corrections()
 
-    def fit(
-        i: int, gain: float | None, begin: IdentifiedAxis | None, error: float = 0.0
-    ) -> IdentifiedAxis:
-        nonlocal done
-        found = identify_axis(
-            record.measurements[:, i],
-            None if corrections is None else corrections[:, i],
-            frame_rate_hz=record.frame_rate_hz,
-            stretches=pieces,
-            sensor_gain=gain,
-            sensor_gain_error=error,
-            assumed_gain=assumed_gain,
-            start=begin,
-            **options,
-        )
-        done += 1
-        if progress is not None:
-            progress(done, total)
-        return found
 
-    notes: list[str] = []
-    if corrections is not None:
-        early = find_correction_jumps(corrections, pieces)
-        if early:
-            notes.append(describe_jumps(early, "commands"))
-            pieces = cut_at_jumps(pieces, early)
-    axes = [fit(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
-    series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
-    late = find_jumps(series, axes, pieces)
-    if late:
-        notes.append(describe_jumps(late, "pseudo-open loop"))
-        if len(late) <= MOST_JUMPS:
-            pieces = cut_at_jumps(pieces, late)
-            axes = [fit(i, gains[i], axes[i]) for i in range(count)]
-    found_gain = [i for i in range(count) if axes[i].sensor_gain_error is not None]
-    if count > 1 and found_gain and all(gain is None for gain in gains):
-        axes, note = _pool_gains(axes, found_gain, fit)
-        notes.append(note)
-    notes += _find_doubts(record, axes, found_gain, pieces)
-    notes += [
-        f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and the "
-        "rest of the model suffers"
-        for i, axis in enumerate(axes)
-        if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0
-    ]
-    if progress is not None and done < total:
-        progress(total, total)
-    return IdentifiedModel(
-        axes=tuple(axes),
-        frame_rate_hz=record.frame_rate_hz,
-        delay_frames=next(d for d in (delay, delay_frames, _DELAY) if d is not None),
-        mirror=record.mirror,
-        notes=tuple(notes),
-    )
+def _require_signal(record: LoopRecord) -> None:
+    """Refuse a record with an axis that is constant."""
+    usable = record.measurements[record.usable]
+    for i in range(record.axes):
+        if len(usable) and np.ptp(usable[:, i]) == 0:
+            raise ProblemError(
+                f"axis {i} of the record is constant: there is nothing to identify. Choose the "
+                "other axis."
+            )
 
 
 def _identify_spectra(
@@ -311,7 +352,7 @@ def _gain_per_axis(given: Any, count: int) -> list[float | None]:
 def _pool_gains(
     axes: list[IdentifiedAxis],
     found_gain: list[int],
-    fit: Callable[[int, float | None, IdentifiedAxis | None, float], IdentifiedAxis],
+    fitter: _AxisFitter,
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of the gains that were found, if they agree."""
     log = np.array([np.log(axes[i].sensor_gain) for i in found_gain])
@@ -330,5 +371,5 @@ def _pool_gains(
         note = "found in the closed loop's data" if i in found_gain else "that of the other axis"
         if len(found_gain) == len(axes):
             note = "mean of the axes"
-        out.append(replace(fit(i, gain, axis, spread), sensor_gain_note=note))
+        out.append(replace(fitter.fit(i, gain, axis, spread), sensor_gain_note=note))
     return out, "one sensor gain for all axes"
