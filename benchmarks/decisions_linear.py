@@ -15,10 +15,17 @@ import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance
 
 sys.path.insert(0, "tests")
-from support.darex import EXAMPLES, example_2_1, example_2_4
+from support.darex import (
+    EXAMPLES,
+    error_in_digits,
+    exact_solution,
+    example_2_1,
+    example_2_4,
+    peers,
+    relative,
+)
 from support.plants import lbt_axis_plant
-from test_darex import error_in_digits, exact_solution, peers, relative
-from test_norms import random_system
+from support.systems import random_system
 
 
 def darex() -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import importlib.util
+import inspect
 import re
 import shutil
 
 import pytest
 from support.plants import ROOT
+
+import lbt_synth as lbt
 
 PAGES = sorted(
     path
@@ -71,3 +76,31 @@ def test_the_reference_has_the_names_of_the_stubs(house):
     )
     assert "\n   solve_dare\n" in pages["linear"]
     assert "\n   InfeasibleError\n" in pages["errors"]
+
+
+SCRIPTS = sorted([*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/*.py")])
+
+
+def module_path(node):
+    """``lbt.models.ARModel`` as ["models", "ARModel"]; None if it does not begin with lbt."""
+    names = []
+    while isinstance(node, ast.Attribute):
+        names.append(node.attr)
+        node = node.value
+    return names[::-1] if isinstance(node, ast.Name) and node.id == "lbt" else None
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_names_that_a_script_uses_are_there(script):
+    for node in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lbt_synth"):
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    importlib.import_module(f"{node.module}.{alias.name}")
+        elif path := module_path(node):
+            thing = lbt
+            for name in path:
+                thing = getattr(thing, name)
+                if not inspect.ismodule(thing):
+                    break

@@ -6,16 +6,10 @@ import pytest
 import slycot
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.systems import random_system
 
 import lbt_synth as lbt
 from lbt_synth.linear.norms import band_norm, largest_real_part
-
-
-def random_system(seed, n, m, p, radius):
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((n, n))
-    A *= radius / max(abs(np.linalg.eigvals(A)))
-    return A, rng.standard_normal((n, m)), rng.standard_normal((p, n)), rng.standard_normal((p, m))
 
 
 @given(

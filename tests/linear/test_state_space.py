@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.systems import random_system
 
 import lbt_synth as lbt
-
-
-def random_system(seed, n, m, p, radius):
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((n, n))
-    A *= radius / max(abs(np.linalg.eigvals(A)))
-    return A, rng.standard_normal((n, m)), rng.standard_normal((p, n)), rng.standard_normal((p, m))
 
 
 def test_round_trip_through_python_control():

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import mpmath
 import numpy as np
+import scipy.linalg
+import slycot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,3 +111,41 @@ EXAMPLES = (
         np.diag(np.arange(1.0, 101)),
     ),
 )
+
+
+def relative(X, exact):
+    return np.linalg.norm(X - exact) / np.linalg.norm(exact)
+
+
+def peers(e):
+    """Answers of scipy and SLICOT, those that they give."""
+    answers = {}
+    for name, call in (
+        ("scipy", lambda: scipy.linalg.solve_discrete_are(e.A, e.B, e.Q, e.R)),
+        ("slycot", lambda: slycot.sb02od(len(e.A), e.B.shape[1], e.A, e.B, e.Q, e.R, "D")[0]),
+    ):
+        try:
+            with np.errstate(all="ignore"):
+                answers[name] = call()
+        except (np.linalg.LinAlgError, ValueError, ArithmeticError):
+            continue
+    return answers
+
+
+def exact_solution(e):
+    """Newton's method with 40 digits on the data as they are in double precision."""
+    with mpmath.workdps(40):
+        A, B, Q, R, X = (mpmath.matrix(M.tolist()) for M in (e.A, e.B, e.Q, e.R, e.X))
+        for _ in range(6):
+            gain = mpmath.inverse(R + B.T * X * B) * (B.T * X * A)
+            power = A - B * gain
+            X = Q + gain.T * R * gain
+            for _ in range(60):
+                X, power = X + power.T * X * power, power * power
+        return X
+
+
+def error_in_digits(X, exact):
+    with mpmath.workdps(40):
+        difference = mpmath.matrix(X.tolist()) - exact
+        return float(mpmath.sqrt(sum(x * x for x in difference) / sum(x * x for x in exact)))
