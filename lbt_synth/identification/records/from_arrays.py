@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError
-from lbt_synth.identification.records.clock import build_clock, first_per_frame
+from lbt_synth.identification.records.clock import Clock, build_clock, first_per_frame
 from lbt_synth.identification.records.faults import (
     equal_runs,
     fill,
@@ -18,7 +18,7 @@ from lbt_synth.identification.records.faults import (
     runs,
 )
 from lbt_synth.identification.records.health import Finding, RecordHealth, finding_in, merge_notes
-from lbt_synth.identification.records.record import LoopRecord, known_frames
+from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.units import nm_per
 from lbt_synth.models import PositionLoop
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
@@ -123,29 +123,11 @@ def loop_record(
     clock = build_clock(
         len(y), frame_rate_hz=frame_rate_hz, times_s=times_s, frame_numbers=frame_numbers
     )
-
-    def same(rows: IntArray) -> bool:
-        each = [y[rows]] if u is None else [y[rows], u[rows]]
-        return all(np.array_equal(a, np.broadcast_to(a[0], a.shape), equal_nan=True) for a in each)
-
-    keep, torn, again = first_per_frame(clock, same)
-    at = clock.frame_of_row[keep]
-    frames, findings, said = clock.frames, list[Finding](), list(clock.notes)
-    there = np.zeros(frames, dtype=np.bool_)
-    there[at] = True
-    there[torn] = False
-    missing = np.ones(frames, dtype=np.bool_)
-    missing[at] = False
-    _report(findings, "missing", "frames", None, missing)
-    if again:
-        said.append(f"{again} rows of a time that had been recorded already were left out")
-        if torn.size:
-            contradicted = np.zeros(frames, dtype=np.bool_)
-            contradicted[torn] = True
-            _report(findings, "repeated", "frames", None, contradicted)
-    y = _lay_on_grid(y[keep], at, frames)
+    findings, said = list[Finding](), list(clock.notes)
+    keep, there = _choose_rows(clock, y if u is None else np.hstack([y, u]), findings, said)
+    at, frames = clock.frame_of_row[keep], clock.frames
     y, measured = _judge_series(
-        y,
+        _lay_on_grid(y[keep], at, frames),
         there,
         "measurements",
         findings,
@@ -159,29 +141,16 @@ def loop_record(
         )
         _report_held(u, commanded, findings)
     said += _note_trends(y, measured)
-    usable = measured
-    if u is not None and delay_frames is not None:
-        path = LoopRecord(  # checks delay and mirror
-            frame_rate_hz=clock.frame_rate_hz,
-            measurements=y,
-            commands=u,
-            delay_frames=delay_frames,
-            mirror=mirror,
-            usable=measured,
-            health=RecordHealth(frames=frames, usable=0),
-        )
-        usable, unknown = known_frames(path.mirror_taps, measured, commanded)
-        findings.append(unknown)
-    return LoopRecord(
+    record = LoopRecord(
         frame_rate_hz=clock.frame_rate_hz,
         measurements=y,
         commands=u,
         delay_frames=delay_frames,
         mirror=mirror,
-        usable=usable,
+        usable=measured,
         health=RecordHealth(
             frames=frames,
-            usable=int(np.sum(usable)),
+            usable=int(np.sum(measured)),
             findings=tuple(findings),
             notes=merge_notes(notes, said),
         ),
@@ -191,6 +160,7 @@ def loop_record(
         measured=measured,
         commanded=commanded,
     )
+    return record if record.delay_frames is None else record.with_delay(record.delay_frames)
 
 
 def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
@@ -208,6 +178,32 @@ def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = scale * out
         return np.where(np.abs(scaled) < _LARGEST_NM, scaled, np.nan)
+
+
+def _choose_rows(
+    clock: Clock, series: FloatArray, findings: list[Finding], said: list[str]
+) -> tuple[IntArray, BoolArray]:
+    """Return the first row of each frame, and the frames with rows that agree."""
+
+    def same(rows: IntArray) -> bool:
+        first = series[rows[:1]]
+        return np.array_equal(series[rows], np.repeat(first, rows.size, axis=0), equal_nan=True)
+
+    keep, torn, again = first_per_frame(clock, same)
+    there = _mark(clock.frame_of_row[keep], clock.frames)
+    _report(findings, "missing", "frames", None, ~there)
+    if again:
+        said.append(f"{again} rows of a time that had been recorded already were left out")
+    contradicted = _mark(torn, clock.frames)
+    _report(findings, "repeated", "frames", None, contradicted)
+    return keep, there & ~contradicted
+
+
+def _mark(frames: IntArray, count: int) -> BoolArray:
+    """Return which of ``count`` frames are among those given."""
+    marks = np.zeros(count, dtype=np.bool_)
+    marks[frames] = True
+    return marks
 
 
 def _lay_on_grid(rows: FloatArray, at: IntArray, frames: int) -> FloatArray:
