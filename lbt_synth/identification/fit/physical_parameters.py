@@ -88,49 +88,17 @@ def describe_axis(
     """
     theta, rate = model.theta, data.frame_rate_hz
     covariance = parameter_covariance(model, known)
-    error = np.sqrt(np.maximum(np.diag(covariance), 0))
     gain = float(np.exp(theta[GAIN]))
-    to_hz = rate / (2 * np.pi)
     density, _, _ = Likelihood(data).parts(theta)
     fitted = density.sum(axis=0)
-    lines: list[IdentifiedLine] = []
+    lines = [
+        _describe_line(data, rules, model, i, covariance, density)
+        for i in range(1, len(model.parts))
+    ]
     background = fitted.copy()
-    for i, part in enumerate(model.parts[1:], start=1):
-        log_frequency, odds, log_variance = component(theta, i)
-        log_error = component(error, i)
-        frequency = float(np.exp(log_frequency)) * to_hz
-        damping = damping_ratio(odds, first=False)
-        damping_error = damping * damping_slope(damping, first=False) * float(log_error[DAMPING])
-        finest = 0.0 if data.duration_s is None else UNRESOLVED / data.duration_s / frequency
-        resolved = damping >= finest
-        if not resolved:
-            damping = damping_error = finest
-        rms = float(np.exp(log_variance / 2 - theta[GAIN]))
-        along = np.zeros(theta.size)
-        component(along, i)[VARIANCE], along[GAIN] = 0.5, -1.0
-        own = float(np.interp(frequency, data.frequency_hz, density[1 + i]))
-        rest = float(np.interp(frequency, data.frequency_hz, fitted)) - own
-        narrow = damping < WIDE_DAMPING and own > rest
-        kind: Kind = "line" if narrow else "broad"
-        if frequency < rules.lowest_line_hz:
-            kind = "turbulence"
-        if kind == "line":
-            background -= density[1 + i]
-        lines.append(
-            IdentifiedLine(
-                kind=kind,
-                frequency_hz=frequency,
-                frequency_error_hz=frequency * float(log_error[FREQUENCY]),
-                damping=damping,
-                damping_error=damping_error,
-                resolved=resolved,
-                rms_nm=rms,
-                rms_error_nm=rms * float(np.sqrt(along @ covariance @ along)),
-                prominence=own / rest if rest > 0 else float("inf"),
-                evidence=model.evidence[i],
-                announced=part.frequency is not None,
-            )
-        )
+    for line, own in zip(lines, density[2:], strict=True):
+        if line.kind == "line":
+            background -= own
     innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
     noise = max(float(np.exp(theta[NOISE] / 2)), _LEAST_NOISE * innovation)
     return IdentifiedAxis(
@@ -138,7 +106,7 @@ def describe_axis(
         turbulence_fit=_turbulence_fit(theta, covariance, rate),
         parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
         noise_nm=noise,
-        noise_error_nm=min(noise * float(error[NOISE]) / 2, innovation),
+        noise_error_nm=min(noise * float(_standard_errors(covariance)[NOISE]) / 2, innovation),
         sensor_gain=gain,
         sensor_gain_error=None if gain_error is None else gain * gain_error,
         sensor_gain_note=note,
@@ -154,9 +122,56 @@ def describe_axis(
     )
 
 
+def _describe_line(
+    data: LoopPeriodogram,
+    rules: Rules,
+    model: FittedModel,
+    i: int,
+    covariance: FloatArray,
+    density: FloatArray,
+) -> IdentifiedLine:
+    """Return the resonance of component i, given the ``density`` (1 + parts, f) of each part."""
+    theta = model.theta
+    log_frequency, odds, log_variance = component(theta, i)
+    log_error = component(_standard_errors(covariance), i)
+    frequency = float(np.exp(log_frequency)) * (data.frame_rate_hz / (2 * np.pi))
+    damping = damping_ratio(odds, first=False)
+    damping_error = damping * damping_slope(damping, first=False) * float(log_error[DAMPING])
+    finest = 0.0 if data.duration_s is None else UNRESOLVED / data.duration_s / frequency
+    resolved = damping >= finest
+    if not resolved:
+        damping = damping_error = finest
+    rms = float(np.exp(log_variance / 2 - theta[GAIN]))
+    along = np.zeros(theta.size)
+    component(along, i)[VARIANCE], along[GAIN] = 0.5, -1.0
+    own = float(np.interp(frequency, data.frequency_hz, density[1 + i]))
+    rest = float(np.interp(frequency, data.frequency_hz, density.sum(axis=0))) - own
+    narrow = damping < WIDE_DAMPING and own > rest
+    kind: Kind = "line" if narrow else "broad"
+    if frequency < rules.lowest_line_hz:
+        kind = "turbulence"
+    return IdentifiedLine(
+        kind=kind,
+        frequency_hz=frequency,
+        frequency_error_hz=frequency * float(log_error[FREQUENCY]),
+        damping=damping,
+        damping_error=damping_error,
+        resolved=resolved,
+        rms_nm=rms,
+        rms_error_nm=rms * float(np.sqrt(along @ covariance @ along)),
+        prominence=own / rest if rest > 0 else float("inf"),
+        evidence=model.evidence[i],
+        announced=model.parts[i].frequency is not None,
+    )
+
+
+def _standard_errors(covariance: FloatArray) -> FloatArray:
+    return np.sqrt(np.maximum(np.diag(covariance), 0))
+
+
 def _turbulence_fit(theta: FloatArray, covariance: FloatArray, rate: float) -> IdentifiedTurbulence:
     """Return the parameters of the turbulence; the error of its rms is by differences."""
-    error = np.sqrt(np.maximum(np.diag(covariance), 0))
+    error = _standard_errors(covariance)
     slope = np.zeros(theta.size)
     for i in (GAIN, CORNER, *range(theta.size)[component_slice(0)]):
         step = np.zeros(theta.size)
