@@ -11,9 +11,10 @@ from __future__ import annotations
 import io
 import json
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,8 @@ from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.fits import has_card
 from lbt_synth.validation import FloatArray
+
+_MakeImage: TypeAlias = Callable[..., Any]  # from a name and an array
 
 _OWN_CARD = "LBTSYNTH"  # one card with what the standard has no field for, JSON
 _OWN_FIELDS = ("seed", "name", "controller_name", "controller_digest", "metadata")
@@ -97,68 +100,21 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         stored = data.astype(np.float32 if timed and precision == "float32" else np.float64)
         return aotpy.Image(name, stored, unit=unit or None, time=clock if timed else None)
 
-    axes, subapertures = seen.subaperture_axes, seen.sensed.shape[1] // seen.subaperture_axes
-    slopes = seen.slopes is not None
-    sensed_unit = seen.slope_unit if slopes else seen.measurement_unit
-    measured = seen.sensed.reshape(seen.frames, axes, subapertures)
-    gain = None if seen.sensor_gain is None else np.array([seen.sensor_gain])
-    sensor = aotpy.Pyramid(
-        "Pyramid",
-        source=star,
-        dimensions=axes,
-        n_valid_subapertures=subapertures,
-        n_sides=4,
-        measurements=image("MEASUREMENTS", measured, sensed_unit, timed=True),
-        optical_gain=image("OPTICAL GAIN", gain),
-    )
+    sensor = _sensor(aotpy, seen, image, star)
     m = seen.commands.shape[1]
     if m == 2:
         mirror = aotpy.TipTiltMirror("Mirror", telescope=telescope)
     else:
         mirror = aotpy.DeformableMirror("Mirror", telescope=telescope, n_valid_actuators=m)
-    metres, command_unit = (1e-9, "m") if seen.command_unit == "nm" else (1.0, seen.command_unit)
-    filters = _filters(seen)
-    matrix = None if filters is None else filters.matrix
-    if matrix is not None and slopes:
-        matrix = None if seen.reconstructor is None else matrix @ seen.reconstructor
-    response = seen.interaction_matrix
-    if response is not None:  # (s, n) to (s_v, d, n)
-        response = response.reshape(axes, subapertures, -1).transpose(1, 0, 2)
-    modal = seen.measurements if slopes else None
-    numerators, denominators, residual = None, None, None
-    if filters is not None:
-        numerators, denominators = filters.numerators, filters.denominators
-        residual = metres * seen.measurements @ filters.matrix.T
-    back = _split_by_subaperture(seen.reconstructor, axes)
     loop = aotpy.ControlLoop(
         "Control loop",
         input_sensor=sensor,
         commanded_corrector=mirror,
         time=clock,
-        commands=image("COMMANDS", metres * seen.commands, command_unit, timed=True),
         framerate=seen.frame_rate_hz,
         delay=seen.delay_frames,
-        time_filter_num=image("TIME FILTER NUM", numerators),
-        time_filter_den=image("TIME FILTER DEN", denominators),
-        modes=image("MODES", seen.mode_maps),
-        modal_coefficients=image("MODAL COEFFICIENTS", modal, seen.measurement_unit, timed=True),
-        control_matrix=image("CONTROL MATRIX", _split_by_subaperture(matrix, axes)),
-        residual_commands=image("RESIDUAL COMMANDS", residual, command_unit, timed=True),
-        measurements_to_modes=image("MEASUREMENTS TO MODES", back),
-        modes_to_measurements=image("MODES TO MEASUREMENTS", response),
-        commands_to_modes=image("COMMANDS TO MODES", seen.influence_matrix),
+        **_loop_images(seen, image),
     )
-    cameras = []
-    if seen.psf is not None:
-        pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
-        detector = aotpy.Detector(
-            "Camera detector",
-            pixel_intensities=image("PSF", seen.psf[None]),
-            pixel_scale=pixel,
-        )
-        cameras.append(
-            aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))
-        )
     return aotpy.AOSystem(
         ao_mode="SCAO",
         name=_to_ascii(seen.name) or None,
@@ -167,12 +123,69 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         + " Time filters: sum b_i z^i / sum a_i z^i, after the control matrix.",
         main_telescope=telescope,
         sources=[star],
-        scoring_cameras=cameras,
+        scoring_cameras=_cameras(aotpy, seen, image),
         wavefront_sensors=[sensor],
         wavefront_correctors=[mirror],
         loops=[loop],
         metadata=_header_cards(aotpy, seen),
     )
+
+
+def _sensor(aotpy: Any, seen: Telemetry, image: _MakeImage, star: Any) -> Any:
+    axes, subapertures = seen.subaperture_axes, seen.sensed.shape[1] // seen.subaperture_axes
+    unit = seen.measurement_unit if seen.slopes is None else seen.slope_unit
+    measured = seen.sensed.reshape(seen.frames, axes, subapertures)
+    gain = None if seen.sensor_gain is None else np.array([seen.sensor_gain])
+    return aotpy.Pyramid(
+        "Pyramid",
+        source=star,
+        dimensions=axes,
+        n_valid_subapertures=subapertures,
+        n_sides=4,
+        measurements=image("MEASUREMENTS", measured, unit, timed=True),
+        optical_gain=image("OPTICAL GAIN", gain),
+    )
+
+
+def _loop_images(seen: Telemetry, image: _MakeImage) -> dict[str, Any]:
+    """Series, matrices and time filters of a control loop, by aotpy's names."""
+    metres, unit = (1e-9, "m") if seen.command_unit == "nm" else (1.0, seen.command_unit)
+    axes, modal, matrix = seen.subaperture_axes, None, None
+    numerators, denominators, residual = None, None, None
+    if (filters := _filters(seen)) is not None:
+        matrix, numerators, denominators = filters.matrix, filters.numerators, filters.denominators
+        residual = metres * seen.measurements @ matrix.T
+    if seen.slopes is not None:
+        modal = seen.measurements
+        if matrix is not None:
+            matrix = None if seen.reconstructor is None else matrix @ seen.reconstructor
+    response = seen.interaction_matrix
+    if response is not None:  # (s, n) to (s_v, d, n)
+        response = response.reshape(axes, -1, response.shape[1]).transpose(1, 0, 2)
+    back = _split_by_subaperture(seen.reconstructor, axes)
+    return {
+        "commands": image("COMMANDS", metres * seen.commands, unit, timed=True),
+        "time_filter_num": image("TIME FILTER NUM", numerators),
+        "time_filter_den": image("TIME FILTER DEN", denominators),
+        "modes": image("MODES", seen.mode_maps),
+        "modal_coefficients": image("MODAL COEFFICIENTS", modal, seen.measurement_unit, timed=True),
+        "control_matrix": image("CONTROL MATRIX", _split_by_subaperture(matrix, axes)),
+        "residual_commands": image("RESIDUAL COMMANDS", residual, unit, timed=True),
+        "measurements_to_modes": image("MEASUREMENTS TO MODES", back),
+        "modes_to_measurements": image("MODES TO MEASUREMENTS", response),
+        "commands_to_modes": image("COMMANDS TO MODES", seen.influence_matrix),
+    }
+
+
+def _cameras(aotpy: Any, seen: Telemetry, image: _MakeImage) -> list[Any]:
+    """Return the camera that took the image, if there is one."""
+    if seen.psf is None:
+        return []
+    pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
+    detector = aotpy.Detector(
+        "Camera detector", pixel_intensities=image("PSF", seen.psf[None]), pixel_scale=pixel
+    )
+    return [aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))]
 
 
 def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
