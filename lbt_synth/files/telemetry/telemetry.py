@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -22,6 +22,7 @@ from lbt_synth.validation import (
     number,
     real_array,
     require_instance,
+    set_fields,
 )
 
 Scalar: TypeAlias = str | float | int | bool
@@ -176,12 +177,11 @@ class Telemetry:
     metadata: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._set("frame_rate_hz", number(self.frame_rate_hz, "frame_rate_hz", above=0))
-        for name, bounds in _BOUNDED.items():
-            if (value := getattr(self, name)) is not None:
-                self._set(name, number(value, name, **bounds))
+        set_fields(self, frame_rate_hz=number(self.frame_rate_hz, "frame_rate_hz", above=0))
+        for name, value in self._given(_BOUNDED).items():
+            set_fields(self, **{name: number(value, name, **_BOUNDED[name])})
         if self.seed is not None:
-            self._set("seed", integer(self.seed, "seed", at_least=0))
+            set_fields(self, seed=integer(self.seed, "seed", at_least=0))
         if self.mirror is not None:
             require_instance(self.mirror, PositionLoop)
             if self.delay_frames is None:
@@ -192,8 +192,9 @@ class Telemetry:
         self._check_words()
         self._check_controller()
 
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
+    def _given(self, names: Iterable[str]) -> dict[str, Any]:
+        """Return those of some fields that are set."""
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def _check_series(self) -> None:
         commands = matrix(self.commands, "commands")
@@ -201,16 +202,14 @@ class Telemetry:
             raise DimensionError(
                 f"commands must have a frame and a command at least; got {commands.shape}."
             )
-        self._set("commands", commands)
+        set_fields(self, commands=commands)
         rows = (len(commands), f"to match commands {commands.shape}")
-        for name in ("measurements", "residual_nm", "total_nm", "slopes"):
-            value = getattr(self, name)
-            if value is None and name != "measurements":
-                continue
+        others = self._given(("residual_nm", "total_nm", "slopes"))
+        for name, value in {"measurements": self.measurements, **others}.items():
             series = matrix(value, name, rows=rows)
             if series.shape[1] == 0:
                 raise DimensionError(f"{name} must have a column at least; got {series.shape}.")
-            self._set(name, series)
+            set_fields(self, **{name: series})
         if self.times_s is not None:
             times = real_array(self.times_s, "times_s")
             if times.shape != (self.frames,):
@@ -220,34 +219,34 @@ class Telemetry:
                 )
             if np.any(np.diff(times) <= 0):
                 raise ProblemError("times_s must rise from frame to frame.")
-            self._set("times_s", times)
+            set_fields(self, times_s=times)
         axes = integer(self.subaperture_axes, "subaperture_axes", at_least=1)
         if self.sensed.shape[1] % axes:
             raise DimensionError(
                 f"subaperture_axes must divide the {self.sensed.shape[1]} values that the sensor "
                 f"gives; got {axes}."
             )
-        self._set("subaperture_axes", axes)
+        set_fields(self, subaperture_axes=axes)
 
     def _check_matrices(self) -> None:
         s, m = self.sensed.shape[1], self.commands.shape[1]
         sensed = (s, "to match what the sensor gives")
         commanded = (m, f"to match commands {self.commands.shape}")
-        for name, rows, cols in (
-            ("interaction_matrix", sensed, None),
-            ("reconstructor", None, sensed),
-            ("influence_matrix", None, commanded),
-        ):
-            if (value := getattr(self, name)) is not None:
-                self._set(name, matrix(value, name, rows=rows, cols=cols))
-        for name, ndim in (("mode_maps", 3), ("psf", 2)):
-            if (value := getattr(self, name)) is not None:
-                image = real_array(value, name)
-                if image.ndim != ndim or image.size == 0:
-                    raise DimensionError(
-                        f"{name} must be {ndim}-D and not empty; got shape {image.shape}."
-                    )
-                self._set(name, image)
+        sizes: dict[str, dict[str, Any]] = {
+            "interaction_matrix": {"rows": sensed},
+            "reconstructor": {"cols": sensed},
+            "influence_matrix": {"cols": commanded},
+        }
+        for name, value in self._given(sizes).items():
+            set_fields(self, **{name: matrix(value, name, **sizes[name])})
+        dimensions = {"mode_maps": 3, "psf": 2}
+        for name, value in self._given(dimensions).items():
+            image = real_array(value, name)
+            if image.ndim != dimensions[name] or image.size == 0:
+                raise DimensionError(
+                    f"{name} must be {dimensions[name]}-D and not empty; got shape {image.shape}."
+                )
+            set_fields(self, **{name: image})
         counts = self._mode_counts()
         if len(set(counts.values())) > 1:
             found = ", ".join(f"{count} in {name}" for name, count in counts.items())
@@ -257,11 +256,9 @@ class Telemetry:
 
     def _mode_counts(self) -> dict[str, int]:
         """Return the number of modes according to each field that has it."""
-        arrays = {name: getattr(self, name) for name in _MODE_AXES}
         counts = {
             name: int(array.shape[_MODE_AXES[name]])
-            for name, array in arrays.items()
-            if array is not None
+            for name, array in self._given(_MODE_AXES).items()
         }
         if self.slopes is not None:
             counts["measurements, of which there are slopes"] = int(self.measurements.shape[1])
@@ -293,7 +290,7 @@ class Telemetry:
         checked = {
             _check_key(key): _check_scalar(value, key) for key, value in self.metadata.items()
         }
-        self._set("metadata", MappingProxyType(checked))
+        set_fields(self, metadata=MappingProxyType(checked))
 
     def _check_controller(self) -> None:
         m, q = self.commands.shape[1], self.measurements.shape[1]
@@ -303,7 +300,7 @@ class Telemetry:
                 raise DimensionError(
                     f"integrator_gains must have shape ({m},), one per command; got {gains.shape}."
                 )
-            self._set("integrator_gains", gains)
+            set_fields(self, integrator_gains=gains)
         k = self.controller
         if k is None:
             return
