@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import asdict
 
 from lbt_synth import studies
-from lbt_synth.cli.output import Report, fact_table, format_fixed, tabulate
+from lbt_synth.cli.output import Report, TableText, fact_table, format_fixed, tabulate
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.config import load_config
+from lbt_synth.config import Config, load_config
 from lbt_synth.errors import ConfigError
 from lbt_synth.loop import least_residual
+from lbt_synth.models import PositionLoop
 from lbt_synth.report.figures import mirror_figure
+from lbt_synth.studies import MirrorRow
 from lbt_synth.studies.limits import limit_or_nan
 
 _SHOWN_TAPS = 8
@@ -22,14 +25,7 @@ def run(arguments: Namespace) -> Report:
     """Show how the mirror of a configuration settles, and compare designs on it."""
     require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
-    hardware, shell = config.hardware, config.hardware.mirror
-    if shell is None:
-        key = "mirror.local_loop"
-        raise ConfigError(
-            f"{config.source}: the key {key} is missing: without it the mirror settles at once. "
-            "Try examples/lbt_slow_mirror.yaml.",
-            path=key,
-        )
+    hardware, shell = config.hardware, _require_local_loop(config)
     step = shell.step_response(arguments.tolerance)
     with show_spinner("designing", quiet=arguments.json):
         rows = studies.mirror(
@@ -68,20 +64,7 @@ def run(arguments: Namespace) -> Report:
                     ("one frame", 1e3 * hardware.dt_s, "ms"),
                 ],
             ),
-            tabulate(
-                "Designs on this mirror",
-                rows,
-                ("design", lambda row: row.design),
-                (
-                    "residual [nm]",
-                    lambda row: format_fixed(row.residual_nm, 2) if row.stable else "unstable",
-                ),
-                ("Strehl [%]", lambda row: format_fixed(100 * row.strehl, 2)),
-                (
-                    "settled less real position [nm]",
-                    lambda row: format_fixed(row.unsettled_nm, 2),
-                ),
-            ),
+            _design_table(rows),
         ],
         notes=[
             f"weights of u(k), u(k-1), ... in exposure k: {shown}",
@@ -95,3 +78,28 @@ def run(arguments: Namespace) -> Report:
         figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
     )
     return report
+
+
+def _require_local_loop(config: Config) -> PositionLoop:
+    key, shell = "mirror.local_loop", config.hardware.mirror
+    if shell is None:
+        raise ConfigError(
+            f"{config.source}: the key {key} is missing: without it the mirror settles at once. "
+            "Try examples/lbt_slow_mirror.yaml.",
+            path=key,
+        )
+    return shell
+
+
+def _design_table(rows: Sequence[MirrorRow]) -> TableText:
+    return tabulate(
+        "Designs on this mirror",
+        rows,
+        ("design", lambda row: row.design),
+        (
+            "residual [nm]",
+            lambda row: format_fixed(row.residual_nm, 2) if row.stable else "unstable",
+        ),
+        ("Strehl [%]", lambda row: format_fixed(100 * row.strehl, 2)),
+        ("settled less real position [nm]", lambda row: format_fixed(row.unsettled_nm, 2)),
+    )

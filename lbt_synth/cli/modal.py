@@ -14,7 +14,13 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
 from lbt_synth.errors import ConfigError, ProblemError
-from lbt_synth.models import Vibration, modal_turbulence, noll_orders, pyramid_modal_noise_nm
+from lbt_synth.models import (
+    ModalTurbulence,
+    Vibration,
+    modal_turbulence,
+    noll_orders,
+    pyramid_modal_noise_nm,
+)
 from lbt_synth.report.figures import modal_figure
 from lbt_synth.validation import FloatArray, integer
 
@@ -32,47 +38,26 @@ def run(arguments: Namespace) -> Report:
     noise, assumed = _noise_nm(config, count)
     with show_spinner("designing", quiet=arguments.json):
         air = modal_turbulence(atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz)
-        lines = _axis_vibrations(config, count)
-        path: dict[str, Any] = {
-            "delay_frames": config.hardware.delay_frames,
-            "sensor_gain": config.sensor_gain,
-            "mirror": config.hardware.mirror,
-        }
-        known: dict[str, Any] = {"noise_nm": noise, "vibrations": lines, **path}
-        gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **known)
-        filters = modal_filters(air, **known)
-
-        def integrator_rms(gain: float) -> FloatArray:
-            control = MixedController.integrators(np.full(count, gain))
-            loop = modal_loop(control, frame_rate_hz=air.frame_rate_hz, **path)
-            return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
-
-        best = minimize_scalar(
-            lambda gain: _total_rms(integrator_rms(gain)),
-            bounds=(1e-3 * gains.limit.min(), gains.limit.min()),
-            method="bounded",
-        )
-    residuals = {
-        f"integrators, gain {best.x:.2f}": integrator_rms(float(best.x)),
-        "integrators, optimised gains": gains.rms_nm,
-        "Kalman filters": filters.rms_nm,
-    }
-    records = _order_records(count, air.rms_nm, noise, gains.gains, list(residuals.values()))
+        uniform, gains, residuals = _design_controllers(config, air, noise)
+    records = _order_records(count, air.rms_nm, noise, gains, list(residuals.values()))
     whole = {name: _total_rms(rms) for name, rms in residuals.items()}
+    alone = _total_rms(air.rms_nm)
     report = Report(
         data={
             "modes": count,
-            "uniform_gain": float(best.x),
+            "uniform_gain": uniform,
             "rows": records,
             "residual_nm": whole,
-            "turbulence_nm": _total_rms(air.rms_nm),
+            "turbulence_nm": alone,
         },
         tables=[
-            tabulate(
-                "All modes",
-                [("none, turbulence alone", _total_rms(air.rms_nm)), *whole.items()],
-                ("controller", lambda total: total[0]),
-                ("residual [nm]", lambda total: format_fixed(total[1], 1)),
+            TableText(
+                title="All modes",
+                headings=("controller", "residual [nm]"),
+                rows=[
+                    (name, format_fixed(rms, 1))
+                    for name, rms in {"none, turbulence alone": alone, **whole}.items()
+                ],
             ),
             _order_table(records),
         ],
@@ -88,9 +73,43 @@ def run(arguments: Namespace) -> Report:
         report,
         arguments.output,
         records=records,
-        figure=lambda: modal_figure(residuals, gains=gains.gains, turbulence_nm=air.rms_nm),
+        figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
     )
     return report
+
+
+def _design_controllers(
+    config: Config, air: ModalTurbulence, noise: FloatArray
+) -> tuple[float, FloatArray, dict[str, FloatArray]]:
+    """Return the best single gain, the best of each mode, and the residuals by controller [nm]."""
+    path: dict[str, Any] = {
+        "delay_frames": config.hardware.delay_frames,
+        "sensor_gain": config.sensor_gain,
+        "mirror": config.hardware.mirror,
+    }
+    seen: dict[str, Any] = {
+        "noise_nm": noise,
+        "vibrations": _axis_vibrations(config, noise.size),
+    }
+    gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **path, **seen)
+
+    def integrator_rms(gain: float) -> FloatArray:
+        control = MixedController.integrators(np.full(noise.size, gain))
+        loop = modal_loop(control, frame_rate_hz=air.frame_rate_hz, **path)
+        return loop.residual_rms_nm(air, **seen)
+
+    best = minimize_scalar(
+        lambda gain: _total_rms(integrator_rms(gain)),
+        bounds=(1e-3 * gains.limit.min(), gains.limit.min()),
+        method="bounded",
+    )
+    uniform = float(best.x)
+    residuals = {
+        f"integrators, gain {uniform:.2f}": integrator_rms(uniform),
+        "integrators, optimised gains": gains.rms_nm,
+        "Kalman filters": modal_filters(air, **path, **seen).rms_nm,
+    }
+    return uniform, gains.gains, residuals
 
 
 def _mode_count(given: int | None, config: Config) -> int:

@@ -35,6 +35,7 @@ from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.studies.limits import above_percent, limit_or_nan
+from lbt_synth.validation import FloatArray
 
 
 def run(arguments: Namespace) -> Report:
@@ -48,63 +49,40 @@ def run(arguments: Namespace) -> Report:
     config = load_config(arguments.config)
     design = load_gain(arguments.gain)
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
-    settings = config.settings.simulation
-    frames, cases, seed = (
-        getattr(settings, name) if getattr(arguments, name) is None else getattr(arguments, name)
-        for name in ("frames", "cases", "seed")
-    )
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
     _require_stable(loop, design, config.sensor_gain)
     # the same settling for all controllers, so that one seed is one weather
-    settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
+    settle = max(config.settings.simulation.settle_frames, settling_frames(loop.spectral_radius))
     with show_spinner("closing the loop", quiet=arguments.json):
         simulation = simulate(
             design.controller,
             truth,
             hardware=config.hardware,
-            frames=frames,
-            cases=cases,
-            seed=seed,
+            **_run_size(arguments, config),
             settle_frames=settle,
         )
         strehls = simulation.strehl(config.imaging)
-    command_rms = np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1))))
+    command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
     scatter = float(np.std(strehls, ddof=1)) if len(strehls) > 1 else float("nan")
     exact = _exact_values(loop, config, truth)
-    strehl_exact = exact["strehl_exact"]
-    residual = float(np.sqrt(np.mean(simulation.rms_nm**2)))
-    rows = [
-        (
-            "Strehl ratio",
-            100 * float(np.mean(strehls)),
-            None if strehl_exact is None else 100 * strehl_exact,
-            "%",
-        ),
-        ("residual", residual, exact["residual_exact_nm"], "nm rms"),
-        ("  turbulence", None, exact["turbulence_nm"], "nm rms"),
-        ("  vibration", None, exact["vibration_nm"], "nm rms"),
-        ("  noise", None, exact["noise_nm"], "nm rms"),
-        ("commands", float(command_rms), None, "nm rms"),
-        ("least residual of any linear controller", None, exact["limit_nm"], "nm rms"),
-        ("  residual above it", None, exact["above_limit_percent"], "%"),
-    ]
+    frames = simulation.residual_nm.shape[1]
+    plural = "s" if len(strehls) > 1 else ""
     report = Report(
         data={
             "strehl": strehls,
             "residual_nm": simulation.rms_nm,
             **exact,
             "command_rms": command_rms,
-            "frames": simulation.residual_nm.shape[1],
+            "frames": frames,
             "cases": len(strehls),
             "seed": simulation.seed,
             "sensor_gain": config.sensor_gain * truth.sensor_gain,
         },
         tables=[
             TableText(
-                title=f"{design.method} in the loop: {len(strehls)} "
-                f"run{'s' if len(strehls) > 1 else ''} of {simulation.residual_nm.shape[1]} frames",
+                title=f"{design.method} in the loop: {len(strehls)} run{plural} of {frames} frames",
                 headings=("quantity", "simulated", "exact", "unit"),
-                rows=[row for row in rows if row[1:3] != (None, None)],
+                rows=_quantities(simulation, strehls, command_rms, exact),
             )
         ],
         notes=_simulation_notes(config, design, scatter, settle, drifts=truth.drifts),
@@ -119,6 +97,40 @@ def run(arguments: Namespace) -> Report:
             report, arguments.telemetry, recorded, key="telemetry", what="telemetry of case 0"
         )
     return report
+
+
+def _run_size(arguments: Namespace, config: Config) -> dict[str, Any]:
+    """Return frames, cases and seed: those given, or those of the configuration."""
+    given = {name: getattr(arguments, name) for name in ("frames", "cases", "seed")}
+    settings = config.settings.simulation
+    return {n: getattr(settings, n) if value is None else value for n, value in given.items()}
+
+
+def _quantities(
+    simulation: Simulation,
+    strehls: FloatArray,
+    command_rms: float,
+    exact: dict[str, float | None],
+) -> list[tuple[str, float | None, float | None, str]]:
+    """Return each quantity simulated and exact, with its unit, unless neither is known."""
+    strehl_exact = exact["strehl_exact"]
+    residual = float(np.sqrt(np.mean(simulation.rms_nm**2)))
+    rows = [
+        (
+            "Strehl ratio",
+            100 * float(np.mean(strehls)),
+            None if strehl_exact is None else 100 * strehl_exact,
+            "%",
+        ),
+        ("residual", residual, exact["residual_exact_nm"], "nm rms"),
+        ("  turbulence", None, exact["turbulence_nm"], "nm rms"),
+        ("  vibration", None, exact["vibration_nm"], "nm rms"),
+        ("  noise", None, exact["noise_nm"], "nm rms"),
+        ("commands", command_rms, None, "nm rms"),
+        ("least residual of any linear controller", None, exact["limit_nm"], "nm rms"),
+        ("  residual above it", None, exact["above_limit_percent"], "%"),
+    ]
+    return [row for row in rows if row[1:3] != (None, None)]
 
 
 def _exact_values(loop: ClosedLoop, config: Config, truth: Truth) -> dict[str, float | None]:
