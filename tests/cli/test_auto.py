@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.night import GAIN, NOISE
+from support.recorded_loops import spliced_record
 
 import lbt_synth as lbt
 
@@ -118,3 +119,25 @@ def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
         assert status == 2
         assert words in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
+    record = spliced_record(frames=6000)
+    file = tmp_path / "a\x01.npz"
+    np.savez(file, measurements=record.measurements, commands=record.commands)
+    status, _, error = run(
+        capsys,
+        "auto",
+        file,
+        "-o",
+        tmp_path / "q.fits",
+        "--frame-rate-hz",
+        1000,
+        "--delay-frames",
+        2,
+        "--unit",
+        "nm",
+        "--no-figure",
+    )
+    assert (status, error) == (0, "")
+    assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()

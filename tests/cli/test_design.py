@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
+import numpy as np
 import pytest
 from support.commands import run
-from support.plants import LBT_YAML
+from support.plants import LBT_YAML, ROOT, lbt_axis_plant
+from support.robust_config import SMALL, robust_writer
+from support.vibration_config import write_vibration
 
 import lbt_synth as lbt
+from lbt_synth.cli.main import main
 
 CONFIG = str(LBT_YAML)
 
@@ -46,3 +51,178 @@ def test_default_ratio_comes_from_the_configuration(tmp_path, capsys):
 def test_a_small_margin_gets_a_note(tmp_path, capsys):
     _, out, _ = run(capsys, "design", CONFIG, "--method", "integrator", "-o", tmp_path / "i.fits")
     assert "note: the modulus margin 0.0751 is small" in out
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return lbt_axis_plant()
+
+
+@pytest.fixture(scope="module")
+def ends(plant):
+    return lbt.hinf(plant, route="riccati"), lbt.kalman(plant)
+
+
+def test_bounds_without_a_limit(plant, ends, tmp_path, capsys):
+    assert lbt.mixed(plant, gamma_ratio=1e300 / ends[0].gamma_least).rms == ends[1].rms
+    assert lbt.mixed(plant, rms=1e200).gamma == ends[0].gamma
+    target = str(tmp_path / "m.npz")
+    for size in ("1e30", "1e200"):
+        assert (
+            main(["design", str(LBT_YAML), "--method", "mixed", "--rms", size, "-o", target]) == 0
+        )
+    capsys.readouterr()
+
+
+@pytest.fixture
+def small(tmp_path):
+    return robust_writer(tmp_path)
+
+
+def test_design_show_verify_sigma_and_simulate_take_a_robust_design(small, tmp_path, capsys):
+    gain, picture = str(tmp_path / "robust.fits"), str(tmp_path / "sigma.png")
+    config = small()
+    assert main(["design", config, "--method", "robust", "-o", gain]) == 0
+    assert "modulus margin" in capsys.readouterr().out
+    assert main(["show", gain, "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["method"] == "robust"
+    assert shown["above_limit_percent"] > 0
+    assert shown["limit_nm"] < shown["objective_nm"][0] * np.sqrt(2)
+    assert len(shown["terms"]) == 4
+    assert main(["verify", gain]) == 0
+    assert main(["sigma", gain, "-o", picture]) == 0
+    assert Path(picture).stat().st_size > 10_000
+    assert main(["simulate", config, gain, "--frames", "500", "--cases", "1"]) == 0
+    assert "Strehl ratio" in capsys.readouterr().out
+
+
+def test_an_infeasible_file_names_what_clashes(small, tmp_path, capsys):
+    section = (
+        SMALL
+        + """    modulus_margin: 0.8
+    attenuation:
+      - {low_hz: 0.0, high_hz: 60.0, at_most: 0.2}
+"""
+    )
+    gain = tmp_path / "none.fits"
+    assert main(["design", small(section), "--method", "robust", "-o", str(gain)]) == 1
+    error = capsys.readouterr().err
+    assert "these demands cannot hold" in error
+    assert "attenuation to 0.2 in 0-60 Hz" in error
+    assert not gain.exists()
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("\n  gamma_ratio: 1.2\n", "the key design.robust is missing"),
+        (
+            SMALL.replace("high_hz: 21.0", "high_hz: 18.0"),
+            "design.robust.bands[0]: high_hz must be above 19",
+        ),
+        (SMALL.replace("high_hz: 21.0", "high_hz: 500.0"), "below the Nyquist frequency 400 Hz"),
+        (SMALL.replace("rms_mas: 10.0", "rms_mas: -1.0"), "design.robust.bands[0].rms_mas"),
+        (
+            SMALL + "    attenuation:\n      - {low_hz: 3.0, high_hz: 2.0, at_most: 0.5}\n",
+            "small.yaml: design.robust.attenuation[0]: high_hz must be above 3",
+        ),
+        (
+            SMALL
+            + "    mirror_uncertainty:\n      - {low_hz: 3.0, high_hz: 600.0, relative: 0.5}\n",
+            "design.robust.mirror_uncertainty[0]: must lie below the Nyquist",
+        ),
+        (SMALL.replace("rms_mas: 10.0", "rms: 10.0"), "unknown key design.robust.bands[0].rms"),
+        (
+            SMALL + "    sensor_gain: [1.1, 1.3]\n",
+            "design.robust.sensor_gain: must hold model.sensor_gain, 1; got 1.1 to 1.3",
+        ),
+        (SMALL + "    modulus_margin: 1.5\n", "design.robust.modulus_margin"),
+        (SMALL.replace("functions: 16", "functions: 1000"), "functions must be at most 400"),
+    ],
+)
+def test_a_bad_section_is_refused_with_its_key(small, tmp_path, capsys, section, message):
+    gain = tmp_path / "none.fits"
+    assert main(["design", small(section), "--method", "robust", "-o", str(gain)]) == 2
+    assert message in capsys.readouterr().err
+    assert not gain.exists()
+
+
+@pytest.mark.parametrize(
+    "option", [["--gamma", "3"], ["--horizon", "2"], ["--taps", "4"], ["--route", "lmi"]]
+)
+def test_options_of_other_methods_are_refused(small, tmp_path, capsys, option):
+    argv = ["design", small(), "--method", "robust", *option, "-o", str(tmp_path / "x.fits")]
+    assert main(argv) == 2
+    assert option[0] in capsys.readouterr().err
+
+
+SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
+
+
+def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
+    gain = str(tmp_path / "kalman.npz")
+    assert main(["design", str(SLOW_YAML), "--method", "kalman", "-o", gain]) == 0
+    assert "as if the mirror settled at once" in capsys.readouterr().out
+
+
+def test_the_command_line(tmp_path, capsys):
+    config, target = str(LBT_YAML), str(tmp_path / "p.fits")
+    design = ["design", config, "--method", "polytopic", "-o", target]
+    assert main([*design, "--half-width-hz", "0.5", "--norm", "h2"]) == 0
+    assert main([*design, "--half-width-hz", "0.5"]) == 0
+    capsys.readouterr()
+    assert main(["show", target, "--matrices"]) == 0
+    out = capsys.readouterr().out
+    for text in (
+        "norm on the interval, guaranteed",
+        "norm on the interval, worst found",
+        "guaranteed over found",
+        "1.000000",
+        "predictor_A",
+    ):
+        assert text in out
+    assert main(["show", target, "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["guaranteed_over_found"] == pytest.approx(1.0, abs=1e-6)
+    assert shown["method"] == "polytopic-hinf"
+    assert main(["verify", target]) == 0
+    assert main(["sigma", target, "-o", str(tmp_path / "s.png")]) == 0
+    assert main(["simulate", config, target, "--frames", "400", "--cases", "1"]) == 0
+    capsys.readouterr()
+    for wrong, text in (
+        (design, "needs the half width of the interval of frequencies; try --half-width-hz 1"),
+        (
+            [*design, "--half-width-hz", "1", "--gamma", "200"],
+            "--gamma goes with --method hinf or mixed; got --method polytopic",
+        ),
+        ([*design, "--half-width-hz", "1", "--taps", "3"], "--taps goes with --method mixed"),
+        (
+            [*design, "--half-width-hz", "1", "--route", "lmi"],
+            "--method polytopic takes no --route",
+        ),
+        ([*design, "--half-width-hz", "25"], "must have a frequency above that"),
+        (
+            ["design", config, "--method", "kalman", "--norm", "h2", "-o", target],
+            "--norm goes with --method polytopic; got --method kalman",
+        ),
+        (
+            ["design", config, "--method", "hinf", "--half-width-hz", "1", "-o", target],
+            "--half-width-hz goes with --method polytopic",
+        ),
+        (
+            [
+                "design",
+                str(write_vibration(tmp_path, spread_hz=1.0)),
+                "--method",
+                "polytopic",
+                "--half-width-hz",
+                "1",
+                "-o",
+                target,
+            ],
+            "one uncertain frequency at a time",
+        ),
+    ):
+        assert main(wrong) == 2
+        assert text in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -185,3 +186,26 @@ def test_a_short_record_is_refused_with_the_length_it_needs(tmp_path, capsys):
         )
         assert status == 2
         assert "needs 4096 usable frames" in error
+
+
+def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys) -> None:
+    series = 100 * np.sin(2 * np.pi * 0.05 * np.arange(8192))
+    np.save(tmp_path / "s.npy", series)
+    begin = time.process_time()
+    status, _, error = run(
+        capsys,
+        "identify",
+        tmp_path / "s.npy",
+        "--kind",
+        "open-loop",
+        "--unit",
+        "nm",
+        "--frame-rate-hz",
+        1000,
+        "-o",
+        tmp_path / "s.yaml",
+        "--no-figure",
+    )
+    assert status in (0, 2)
+    assert "Traceback" not in error
+    assert time.process_time() - begin < 60

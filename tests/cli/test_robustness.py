@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.plants import LBT_YAML
+from support.robust_config import robust_writer
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
+from lbt_synth.cli.main import main
 
 CONFIG = str(LBT_YAML)
 
@@ -221,3 +223,16 @@ def test_bad_commands_have_status_2(tmp_path, capsys, monkeypatch, odd, argument
     assert out == ""
     assert text in error
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def small(tmp_path):
+    return robust_writer(tmp_path)
+
+
+def test_one_file_under_two_spellings_is_refused(small, tmp_path, capsys, monkeypatch):
+    config = small()
+    monkeypatch.chdir(tmp_path)
+    assert main(["design", config, "--method", "robust", "-o", "one.fits"]) == 0
+    assert main(["robustness", config, "one.fits", "./one.fits", "-o", "map.png"]) == 2
+    assert "must be given once" in capsys.readouterr().err

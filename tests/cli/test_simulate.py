@@ -6,7 +6,10 @@ import json
 
 import pytest
 from support.commands import run
+from support.drifting import drift_file
 from support.plants import LBT_YAML
+
+from lbt_synth.cli.main import main
 
 CONFIG = str(LBT_YAML)
 
@@ -47,3 +50,24 @@ def test_a_controller_for_another_loop_gets_a_note(tmp_path, capsys, gains):
     assert "note: designed for a delay of 2 frames, run with 2.4." in out
     assert "scatter" not in out  # one run has none
     assert "1 run of 500 frames" in out
+
+
+def test_the_commands_simulate_it_or_refuse(tmp_path, capsys):
+    config, gain = str(drift_file(tmp_path)), str(tmp_path / "kalman.fits")
+    assert main(["design", config, "--method", "kalman", "-o", gain]) == 0
+    capsys.readouterr()
+    assert main(["simulate", config, gain]) == 0
+    out = capsys.readouterr().out
+    assert "a vibration drifts" in out
+    assert "least residual" not in out
+    assert main(["simulate", config, gain, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["strehl_exact"] is None
+    assert 0 < report["strehl"][0] < 1
+    for refused in (
+        ["limits", config, gain],
+        ["robustness", config, "-o", str(tmp_path / "r.csv")],
+        ["design", config, "--method", "integrator", "-o", str(tmp_path / "i.fits")],
+    ):
+        assert main(refused) == 2
+        assert "drifts from 17 to 23 Hz" in " ".join(capsys.readouterr().err.split())

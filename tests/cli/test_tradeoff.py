@@ -1,26 +1,14 @@
-"""Mixed filters on the command line."""
+"""The command tradeoff."""
 
 from __future__ import annotations
 
-import pytest
-from support.plants import LBT_YAML, lbt_axis_plant
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-
-
-@pytest.fixture(scope="module")
-def plant():
-    return lbt_axis_plant()
-
-
-@pytest.fixture(scope="module")
-def ends(plant):
-    return lbt.hinf(plant, route="riccati"), lbt.kalman(plant)
+from lbt_synth.cli.main import main
 
 
 def test_two_axes_on_the_command_line(tmp_path, capsys):
-    from lbt_synth.cli.main import main
-
     assert (
         main(
             [
@@ -98,22 +86,7 @@ def test_two_axes_on_the_command_line(tmp_path, capsys):
     assert lbt.load_gain(target).hardware.delay_frames == 3
 
 
-def test_bounds_without_a_limit(plant, ends, tmp_path, capsys):
-    from lbt_synth.cli.main import main
-
-    assert lbt.mixed(plant, gamma_ratio=1e300 / ends[0].gamma_least).rms == ends[1].rms
-    assert lbt.mixed(plant, rms=1e200).gamma == ends[0].gamma
-    target = str(tmp_path / "m.npz")
-    for size in ("1e30", "1e200"):
-        assert (
-            main(["design", str(LBT_YAML), "--method", "mixed", "--rms", size, "-o", target]) == 0
-        )
-    capsys.readouterr()
-
-
 def test_what_the_command_line_says_of_mixed_filters(tmp_path, capsys, monkeypatch):
-    from lbt_synth.cli.main import main
-
     target = str(tmp_path / "m.fits")
     config = str(LBT_YAML)
     assert main(["design", config, "--method", "mixed", "--gamma", "1e6", "-o", target]) == 0

@@ -1,18 +1,18 @@
-"""Commands for a mirror with dynamics."""
+"""The command mirror."""
 
 from __future__ import annotations
 
+import json
+
 import pytest
 from support.plants import ROOT
+
+from lbt_synth.cli.main import main
 
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
 
 
 def run(capsys, *arguments):
-    import json
-
-    from lbt_synth.cli.main import main
-
     status = main([*map(str, arguments), "--json"])
     captured = capsys.readouterr()
     return status, json.loads(captured.out), captured.err
@@ -36,14 +36,6 @@ def test_commands(tmp_path, capsys):
     status, data, _ = run(capsys, "simulate", SLOW_YAML, gain, "--frames", 500, "--cases", 1)
     assert status == 0
     assert run(capsys, "sigma", gain, "-o", tmp_path / "s.png")[0] == 0
-
-
-def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
-    from lbt_synth.cli.main import main
-
-    gain = str(tmp_path / "kalman.npz")
-    assert main(["design", str(SLOW_YAML), "--method", "kalman", "-o", gain]) == 0
-    assert "as if the mirror settled at once" in capsys.readouterr().out
 
 
 def test_wrong_commands(tmp_path, capsys):
