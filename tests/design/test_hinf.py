@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.plants import lbt_axis_plant, random_problem
+from support.plants import lbt_axis_plant, random_problem, with_own_noise
+from support.random_plants import random_plant
 
 import lbt_synth as lbt
 
@@ -209,3 +211,76 @@ def test_many_states_take_the_equation_by_default():
     small, large = sorted(routes)
     assert small <= 20 < large
     assert (routes[small], routes[large]) == ("lmi", "riccati")
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 3))
+def test_more_measurements_lower_the_least_gamma(seed, n):
+    p = with_own_noise(random_problem(np.random.default_rng(seed), n))
+    least = [lbt.hinf(p, horizon=h, route="riccati").gamma_least for h in (-1, 0, 1, 2)]
+    for earlier, later in itertools.pairwise(least):
+        assert earlier <= later * (1 + 1e-9)
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 3))
+def test_hinf_filter_form_against_its_own_riccati_condition(seed, n):
+    """Hassibi, Sayed, Kailath: the filter of a level exists iff P^-1 + C'R^-1 C - L'L / g^2 > 0."""
+    p = with_own_noise(random_problem(np.random.default_rng(seed), n))
+    least = lbt.hinf(p, horizon=0, route="riccati").gamma_least
+
+    def exists(gamma):
+        outputs = np.vstack([p.C, p.L])
+        weight = np.diag(np.r_[np.diag(p.R), -(gamma**2) * np.ones(len(p.L))])
+        try:
+            P = lbt.solve_dare(p.A.T, outputs.T, p.Q, weight).X
+        except (lbt.errors.SynthesisError, lbt.errors.DetectabilityError):
+            return False
+        P = P + 1e-12 * np.trace(P) * np.eye(n)
+        information = np.linalg.inv(P) + p.C.T @ np.linalg.solve(p.R, p.C) - p.L.T @ p.L / gamma**2
+        return bool(np.linalg.eigvalsh((information + information.T) / 2)[0] > 0)
+
+    assert exists(1.01 * least)
+    assert not exists(0.99 * least)
+
+
+@pytest.mark.parametrize("method", ["kalman", "hinf"])
+def test_a_horizon_is_a_delay_of_the_loop(method):
+    """Plant with delay 2, filter or two-step prediction: the loops of delay 1 and 3."""
+    make = {
+        "kalman": lbt.kalman,
+        "hinf": lambda p, **k: lbt.hinf(p, gamma_ratio=1.2, route="riccati", **k),
+    }[method]
+    for horizon, delay in ((0, 1), (2, 3), (3, 4)):
+        shifted = make(lbt_axis_plant(), horizon=horizon)
+        direct = make(lbt_axis_plant(delay_frames=delay))
+        assert shifted.hardware.delay_frames == delay
+        assert shifted.rms == pytest.approx(direct.rms, rel=1e-10)
+        assert shifted.gamma == pytest.approx(direct.gamma, rel=1e-9)
+        # and of the general construction, which knows nothing of telescopes
+        p = lbt_axis_plant()
+        bare = lbt.EstimationProblem(A=p.A, B=p.B, C=p.C, D=p.D, L=p.L, dt_s=p.dt_s)
+        assert make(bare, horizon=horizon).rms == pytest.approx(direct.rms, rel=1e-9)
+    with pytest.raises(lbt.errors.ProblemError, match="delay of 1 to 100 frames; got -1"):
+        make(lbt_axis_plant(), horizon=-1)
+    with pytest.raises(lbt.errors.ProblemError, match="horizon of 1; got 2"):
+        make(lbt_axis_plant().full(), horizon=2)
+
+
+@pytest.mark.study
+def test_designs_of_random_plants(capsys):
+    """Kalman and H-infinity designs of 1,000 plants, certified, the least gamma bracketed."""
+    rng = np.random.default_rng(0)
+    gaps = []
+    for _ in range(1000):
+        plant = random_plant(rng)
+        assert lbt.kalman(plant).certificate.passed
+        design = lbt.hinf(plant, gamma_ratio=1.2, route="riccati")
+        assert design.certificate.passed
+        gaps.append(design.gamma_least / design.gamma_infeasible - 1)
+    with capsys.disabled():
+        print(
+            f"\n1000 plants: gap of the least gamma, median {np.median(gaps):.2g}, 99th percentile "
+            f"{np.percentile(gaps, 99):.2g}, largest {max(gaps):.2g}"
+        )
+    assert max(gaps) < 1e-5

@@ -45,3 +45,16 @@ def random_problem(rng: np.random.Generator, n: int, q: int = 1, p: int | None =
         D=D,
         L=rng.standard_normal((l, n)),
     )
+
+
+def with_own_noise(problem):
+    """The same problem with its measurement noise on columns of its own."""
+    n, p = problem.B.shape
+    q = problem.C.shape[0]
+    return lbt.EstimationProblem(
+        A=problem.A,
+        B=np.hstack([problem.B, np.zeros((n, q))]),
+        C=problem.C,
+        D=np.hstack([np.zeros((q, p)), problem.D[:, :q] + 2 * np.eye(q)]),
+        L=problem.L,
+    )
