@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.configs import AR, OTHER, SMALL, change_key, minimal_config, write_config
-from support.plants import LBT_YAML
+from support.drifting import drift_file
+from support.plants import LBT_YAML, ROOT
+from support.vibration_config import write_vibration
 
 import lbt_synth as lbt
 
@@ -100,3 +102,103 @@ def test_one_axis(tmp_path, direction):
     )
     limit = lbt.loop.least_residual(both.hardware, truth)
     assert lbt.kalman(config.plant).rms ** 2 == pytest.approx(limit.variance_nm2[0], rel=1e-6)
+
+
+def test_a_configuration_may_have_one(tmp_path):
+    (found,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
+    expected = lbt.models.DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    assert found == expected
+    damped = "kind: drift\n      end_hz: 16\n      duration_s: 9\n      damping: 0.01"
+    (found,) = lbt.load_config(drift_file(tmp_path, damped)).truth.vibrations
+    assert (found.damping, found.end_hz, found.duration_s) == (0.01, 16, 9)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ("kind: drift", "end_hz and duration_s go with kind: drift"),
+        ("kind: drift\n      end_hz: 23", "end_hz and duration_s go with kind: drift"),
+        ("kind: sinusoid\n      end_hz: 23", "end_hz and duration_s go with kind: drift"),
+        ("kind: sinusoid\n      damping: 0.1", "damping goes with kind: resonance"),
+        ("kind: drift\n      end_hz: 500\n      duration_s: 60", r"\[0\].end_hz: must lie below"),
+        ("kind: drift\n      end_hz: -3\n      duration_s: 60", "greater than 0"),
+        (
+            "kind: drift\n      end_hz: 2\n      duration_s: 60\n      damping: 0.5",
+            r"truth.vibrations\[0\]: .* frequency above that",
+        ),
+    ],
+)
+def test_wrong_keys_are_refused(tmp_path, keys, words):
+    with pytest.raises(lbt.errors.ConfigError, match=words):
+        lbt.load_config(drift_file(tmp_path, keys))
+
+
+def test_priors_of_a_configuration(tmp_path):
+    plain = lbt.load_config(LBT_YAML).plant
+    for keys, lines in (({"spread_hz": 1.0}, 5), ({"spread_hz": 0.5, "lines": 2}, 2)):
+        plant = lbt.load_config(write_vibration(tmp_path, **keys)).plant
+        expected = lbt.models.spread_plant(plain, half_width_hz=keys["spread_hz"], lines=lines)
+        assert len(plant.vibrations) == 2 * lines
+        np.testing.assert_allclose(plant.A, expected.A, rtol=1e-13)
+        np.testing.assert_allclose(plant.B, expected.B, rtol=1e-11)
+    for keys, text in (
+        ({"lines": 3}, r"vibrations\[0\]: lines goes with spread_hz, and only with it"),
+        ({"spread_hz": 20.0}, r"model.vibrations\[0\].spread_hz: the half width must be below 20"),
+        ({"spread_hz": -1.0}, "greater than 0"),
+        ({"spread_hz": 1.0, "lines": 65}, "less than or equal to 64"),
+        ({"frequency_hz": 399.0, "spread_hz": 9.0}, r"vibrations\[0\].spread_hz: .*Nyquist"),
+    ):
+        with pytest.raises(lbt.errors.ConfigError, match=text):
+            lbt.load_config(write_vibration(tmp_path, **keys))
+
+
+SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
+
+
+# Configuration and command line
+def test_the_example_has_a_mirror_for_design_and_loop():
+    config = lbt.load_config(SLOW_YAML)
+    assert config.hardware.mirror is config.plant.hardware.mirror
+    step = config.hardware.mirror.step_response()
+    assert 3e-3 < step.settling_s < 6e-3
+    rows = lbt.studies.mirror(config.plant, config.truth, config.imaging)
+    by_name = {row.design: row for row in rows}
+    assert not by_name["kalman, settled mirror"].stable
+    assert by_name["lqg"].strehl > 0.8
+    assert by_name["lqg"].residual_nm < 0.3 * by_name["kalman, real positions"].residual_nm
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("bandwidth_hz: 100.0", "bandwith_hz: 100.0", "did you mean bandwidth_hz"),
+        ("bandwidth_hz: 100.0", "proportional_per_s2: 4.0e5", "expected either bandwidth_hz"),
+        (
+            "    bandwidth_hz: 100.0",
+            "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0",
+            "bandwidth_damping goes with bandwidth_hz",
+        ),
+        ("bandwidth_hz: 100.0", "bandwidth_hz: 10.0", "mirror.local_loop: bandwidth_hz must be"),
+        ("frame_rate_hz: 800.0", "frame_rate_hz: 990.0", "986.30137 and 1000 Hz"),
+        ("delay_samples: 1", "delay_samples: 1.5", "mirror.local_loop.delay_samples"),
+    ],
+)
+def test_wrong_sections_are_refused(tmp_path, old, new, message):
+    text = SLOW_YAML.read_text()
+    assert old in text
+    path = tmp_path / "a.yaml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(lbt.errors.ConfigError, match=message):
+        lbt.load_config(path)
+
+
+def test_gains_of_a_configuration(tmp_path):
+    text = SLOW_YAML.read_text()
+    start = text.index("    bandwidth_hz: 100.0")
+    end = text.index("    sampling_hz")
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        text[:start] + "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0\n" + text[end:]
+    )
+    mirror = lbt.load_config(path).hardware.mirror
+    assert (mirror.proportional_per_s2, mirror.derivative_per_s) == (4.0e5, 800.0)

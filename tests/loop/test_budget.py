@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import predictions
 from support.plants import lbt_axis_plant
 from support.uneven_axes import LINES, LOOPS, QUICK, RATE, SLOW, TABLE, one_axis
 
@@ -200,3 +201,58 @@ def test_coupled_axes_against_the_frequency_response():
     budget = lbt.residual_budget(loop, truth)
     np.testing.assert_allclose(budget.turbulence_nm2, want, rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(budget.noise_nm2, noise, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), predictions.CASES)
+def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor):
+    plant = predictions.a_plant(delay=delay, gain=gain, mirror=mirror, sensor=sensor)
+    controller = lbt.integrator(plant.hardware, gain=0.2).controller
+    loop = lbt.close_loop(plant.hardware, controller)
+    own, other = (
+        lbt.loop.model_budget(loop, plant),
+        lbt.residual_budget(loop, predictions.a_truth()),
+    )
+    for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "total_nm2"):
+        np.testing.assert_allclose(getattr(own, name), getattr(other, name), rtol=1e-9, atol=1e-9)
+    bare = predictions.a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
+    again = lbt.loop.model_budget(lbt.close_loop(bare, controller, sensor_gain=gain), plant)
+    np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
+
+
+def test_noise_that_is_correlated_between_axes():
+    noise = np.array([[200.0, 60.0], [60.0, 100.0]])
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=predictions.RATE, turbulence=predictions.SLOW, noise_nm=noise
+    )
+    design = lbt.kalman(plant)
+    budget = lbt.loop.model_budget(lbt.close_loop(plant.hardware, design.controller), plant)
+    assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
+
+
+def test_a_budget_of_another_loop_is_refused():
+    plant = predictions.a_plant()
+    for other in (
+        predictions.a_plant(delay=3.0),
+        predictions.a_plant(gain=0.5),
+        predictions.a_plant(mirror=predictions.SHELL),
+    ):
+        loop = lbt.close_loop(other.hardware, lbt.integrator(other.hardware, gain=0.1).controller)
+        with pytest.raises(
+            lbt.errors.ProblemError, match="plant's sensor, mirror and delay; got another"
+        ):
+            lbt.loop.model_budget(loop, plant)
+    unstable = lbt.close_loop(
+        plant.hardware, lbt.integrator(plant.hardware, gain=0.9).controller, sensor_gain=1.0
+    )
+    wild = lbt.Controller(
+        A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / predictions.RATE
+    )
+    assert unstable.is_stable
+    with pytest.raises(lbt.errors.UnstableLoopError):
+        lbt.loop.model_budget(lbt.close_loop(plant.hardware, wild), plant)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.loop.model_budget(unstable, predictions.a_truth())
+    with pytest.raises(lbt.errors.ProblemError, match="expected a ClosedLoop"):
+        lbt.loop.model_budget(unstable.system, plant)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        lbt.design.model_integrator(predictions.a_truth())

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from support.plants import lbt_axis_plant
+from support.lqg import shell
+from support.plants import ROOT, lbt_axis_plant
 
 import lbt_synth as lbt
 
@@ -39,3 +42,14 @@ def test_integrator_loop_is_its_textbook_transfer_function(gain, delay):
     z = np.exp(2j * np.pi * np.array([1.0, 40, 200]) / 500)
     open_loop = g * z**-delay / (1 - 1 / z)
     assert np.allclose(loop.sensitivity([1.0, 40, 200])[:, 0, 0], 1 / (1 + open_loop), rtol=1e-9)
+
+
+def test_the_page_says_where_the_settled_design_becomes_unstable(config):
+    """Stable at the figure of docs/mirror.md, unstable a tenth of a hertz below."""
+    text = (ROOT / "docs" / "mirror.md").read_text(encoding="utf-8")
+    edge = float(re.search(r"stable down to ([\d.]+) Hz", text)[1])
+    settled = lbt.kalman(config.plant)
+    for bandwidth, stable in ((edge, True), (edge - 0.1, False)):
+        mirror = shell(natural_frequency_hz=20, damping=0.5, bandwidth_hz=bandwidth)
+        path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, mirror=mirror)
+        assert lbt.close_loop(path, settled.controller).is_stable is stable

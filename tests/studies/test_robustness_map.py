@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import uneven_axes
 from support.plants import LBT_YAML
 from support.robustness_maps import evaluate_point
 
@@ -234,3 +235,28 @@ def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
     three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
     with pytest.raises(lbt.errors.DimensionError, match="got a loop of 3 modes"):
         lbt.studies.robustness_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
+
+
+def test_the_map_is_the_budget_at_each_point():
+    both, _ = uneven_axes.LOOPS
+    truth = lbt.Truth(
+        turbulence=[uneven_axes.SLOW, uneven_axes.TABLE],
+        noise_nm=[15.5, 6.0],
+        vibrations=uneven_axes.LINES,
+    )
+    design = lbt.integrator(both, gain=0.4)
+    camera = lbt.Imaging(diameter_m=8.22)
+    found = lbt.studies.robustness_map(
+        design, truth, camera, errors_hz=[0], sensor_gains=[0.6, 1.0]
+    )
+    for i, gain in enumerate([0.6, 1.0]):
+        loop = lbt.close_loop(both, design.controller, sensor_gain=gain)
+        real = lbt.Truth(
+            turbulence=truth.turbulence,
+            noise_nm=truth.noise_nm,
+            vibrations=uneven_axes.LINES,
+            sensor_gain=gain,
+        )
+        budget = lbt.residual_budget(loop, real)
+        assert found.residual_nm[0, i, 0] == pytest.approx(budget.rms_nm, rel=1e-8)
+        assert found.strehl[0, i, 0] == pytest.approx(lbt.strehl(budget, camera), rel=1e-8)

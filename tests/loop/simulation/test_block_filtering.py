@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.block_filtering import BatchedSystems
+from lbt_synth.loop.simulation.block_filtering import BatchedSystems, last_state
 
 
 @given(
@@ -68,3 +68,15 @@ def test_filter_series_against_python_control(axis_plant):
     u = np.random.default_rng(0).standard_normal((3000, 2))
     _, expected = control.forced_response(loop.system.to_control(), U=u.T)
     assert np.allclose(lbt.loop.filter_series(loop.system, u), expected.T, atol=1e-9)
+
+
+@given(seed=st.integers(0, 100), n=st.integers(1, 5), frames=st.integers(0, 70))
+def test_the_last_state_is_that_of_the_recursion(seed, n, frames):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    A *= 0.99 / max(abs(np.linalg.eigvals(A)))
+    drive = rng.standard_normal((frames, n))
+    x = np.zeros(n)
+    for d in drive:
+        x = A @ x + d
+    assert np.allclose(last_state(A, drive), x, rtol=1e-10, atol=1e-10 * (1 + np.abs(x).max()))

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import hilbert
+from support.drifting import drifting
+from support.lqg import shell
 from support.plants import lbt_axis_plant
 from support.uneven_axes import LINES, LOOPS, SLOW, TABLE
 
@@ -150,3 +153,30 @@ def test_a_simulation_agrees_with_the_exact_answer():
     exact = lbt.residual_budget(lbt.close_loop(both, design.controller), truth)
     power = np.mean(run.residual_nm**2, axis=(0, 1))
     np.testing.assert_allclose(power, np.diag(exact.total_nm2), rtol=0.05)
+
+
+def test_time_0_is_the_first_kept_frame():
+    plant = lbt_axis_plant()
+    truth = lbt.Truth(turbulence=None, vibrations=(drifting(),), noise_nm=1)
+    gentle = lbt.integrator(plant.hardware, gain=0.3).controller
+    series = {
+        settle: lbt.simulate(
+            gentle, truth, hardware=plant.hardware, frames=4000, settle_frames=settle
+        ).total_nm[0, :, 0]
+        for settle in (0, 1000)
+    }
+    # the same phase at random but for the settling: the same frequencies in the same frames
+    phases = [np.unwrap(np.angle(hilbert(s))) for s in series.values()]
+    apart = np.diff(phases, axis=0)[0][300:-300]
+    assert np.ptp(apart) < 0.05
+
+
+def test_simulation_by_taps_is_that_of_the_states():
+    plant = lbt_axis_plant(modes=1)
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell(70, delay_samples=2))
+    slow = lbt.integrator(path, gain=0.1)
+    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
+    same = {"hardware": path, "frames": 400, "seed": 3, "settle_frames": 100}
+    by_states = lbt.simulate(slow.controller, truth, **same)
+    by_taps = lbt.simulate(slow.controller.start(), truth, **same)
+    np.testing.assert_allclose(by_states.residual_nm, by_taps.residual_nm, atol=1e-9)
