@@ -1,4 +1,4 @@
-"""SPECULA's filters, driven as its simulation drives them; run by ``test_specula_filters.py``.
+"""SPECULA's filters, driven as its simulation drives them; run by the tests of ``interop.iir.export``.
 
 The precision of SPECULA is one for a process and is chosen before its classes are imported,
 so each precision is a process of its own::
