@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 import pytest
+from support.eris import ERIS_FILE, eris_example, eris_model, eris_record
 from support.recorded_loops import LINE, integrator_loop, spliced_record
 
 import lbt_synth as lbt
@@ -152,3 +155,89 @@ def test_a_dead_axis_is_named() -> None:
     )
     with pytest.raises(ProblemError, match="axis 1 of the record is constant"):
         lbt.identify(record)
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    return eris_example()
+
+
+@pytest.fixture(scope="module")
+def seen() -> lbt.identification.SpectrumRecord:
+    return eris_record()
+
+
+@pytest.fixture(scope="module")
+def model() -> lbt.identification.IdentifiedModel:
+    return eris_model()
+
+
+def test_spectrum_without_scatter_is_taken_for_one_periodogram(example):
+    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    found = lbt.identify(plain, frame_rate_hz=1000)
+    assert len(found.notes) == 2
+    assert all("does not scatter" in note for note in found.notes)
+    for column, axis in zip(plain.density_nm2_hz.T, found.axes, strict=True):
+        assert axis.data.count[0] == 1
+        assert len(axis.lines) >= 8
+        peaks = np.array(example.peaks(plain.frequency_hz, column))[:, 0]
+        assert all(np.min(np.abs(peaks - line.frequency_hz)) < 0.06 for line in axis.lines)
+        assert all(line.rms_nm < 30 for line in axis.lines)  # 332 where it counts as a million
+
+
+def test_known_lines_are_found(model):
+    for axis, known in zip(
+        model.axes,
+        ([10, 16, 25.8, 45.5, 48.3, 96.7], [10, 16, 45.5, 48.3, 72.5, 96.7]),
+        strict=True,
+    ):
+        places = np.array([line.frequency_hz for line in axis.lines])
+        for frequency in known:
+            assert np.min(np.abs(places - frequency)) < 0.06
+    assert not model.notes
+
+
+def test_identified_rms_are_those_of_the_bins(model, seen, example):
+    strong = 0
+    for i, axis in enumerate(model.axes):
+        peaks = np.array(example.peaks(seen.frequency_hz, seen.density_nm2_hz[:, i]))
+        for line in axis.lines:
+            near = peaks[np.abs(peaks[:, 0] - line.frequency_hz) < 0.08]
+            size = np.sqrt(np.sum(near[:, 1] ** 2))
+            assert size > 0  # none is where the file has nothing
+            assert 0.4 * size < line.rms_nm < 1.4 * size
+            assert 0 < line.rms_error_nm < line.rms_nm
+            strong += abs(line.rms_nm - size) < 2 * line.rms_error_nm
+    assert strong >= 17  # of 22
+
+
+def test_kalman_removes_what_the_integrator_leaves_of_the_lines(model, seen, example):
+    met, plant = example.disturbance(seen), example.composed(model)
+    lines = {}
+    for name, design in {
+        "integrator": lbt.design.model_integrator(plant),
+        "Kalman": lbt.kalman(plant),
+    }.items():
+        assert design.certificate.passed
+        loop = lbt.close_loop(plant.hardware, design.controller)
+        parts = example.residual(loop, met)
+        lines[name] = example.rms(parts["lines"])
+        # bin by bin, without quadrature
+        f, step = seen.frequency_hz, np.median(np.diff(seen.frequency_hz))
+        excess = np.array([part.psd(f) for part in met.lines]).T
+        power = np.einsum("fij,fj->", np.abs(loop.sensitivity(f)) ** 2, excess) * step
+        assert lines[name] == pytest.approx(np.sqrt(power), rel=0.15)
+        assert example.rms(parts["total"]) ** 2 == pytest.approx(
+            sum(example.rms(parts[key]) ** 2 for key in parts if key != "total")
+        )
+        limit = lbt.loop.least_residual(plant.hardware, met.whole)
+        assert limit.rms_nm < example.rms(parts["total"])
+    assert lines["Kalman"] < 0.3 * lines["integrator"]
+
+
+def test_turbulence_of_the_plant_is_the_atmospheres(model, example):
+    plant = example.composed(model)
+    air = lbt.models.ar2_turbulence(example.AIR, frame_rate_hz=1000, noise_nm=example.NOISE_NM)
+    made = plant.vibrations[0].ar_model(1000)
+    assert made.coefficients == pytest.approx(air.coefficients, rel=1e-9)
+    assert made.rms_nm == pytest.approx(air.rms_nm, rel=1e-9)

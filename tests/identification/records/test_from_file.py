@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+from types import ModuleType
+
 import numpy as np
 import pytest
 from astropy.io import fits
+from support.eris import ERIS_FILE, eris_example, eris_record
 from support.record_files import csv, hdus, image, write_csv
 
 import lbt_synth as lbt
@@ -373,3 +377,42 @@ def test_times_that_are_no_seconds(tmp_path, series, step):
         lbt.errors.ProblemError, match="Hz with time in seconds, and their unit is not gi"
     ):
         lbt.load_record(path)
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    return eris_example()
+
+
+@pytest.fixture(scope="module")
+def seen() -> lbt.identification.SpectrumRecord:
+    return eris_record()
+
+
+def test_data_come_unchanged_with_their_licence():
+    readme = (ERIS_FILE.parent / "README.md").read_text("utf-8")
+    assert hashlib.sha256(ERIS_FILE.read_bytes()).hexdigest() in readme
+    licence = (ERIS_FILE.parent / "LICENSE.astro-tiptop").read_text("utf-8")
+    assert "Copyright (c) 2021 FabioRossiArcetri" in licence
+    assert "The above copyright notice and this permission notice shall be included" in licence
+
+
+def test_file_without_names_is_read_as_a_spectrum():
+    found = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    assert (found.axes, found.frequency_hz.size, found.averages) == (2, 3393, None)
+    assert found.rms_nm == pytest.approx([94.6, 101.5], abs=0.05)
+    by_number = lbt.load_record(
+        ERIS_FILE, unit="nm^2/Hz", columns={"frequency": 0, "density": (1, 2)}
+    )
+    assert np.array_equal(by_number.density_nm2_hz, found.density_nm2_hz)
+    with pytest.raises(lbt.errors.ProblemError, match=r"unit of the density; give unit \(nm\^2/Hz"):
+        lbt.load_record(ERIS_FILE, kind="spectrum")
+    with pytest.raises(lbt.errors.ProblemError, match="say what kind"):
+        lbt.load_record(ERIS_FILE)
+
+
+def test_background_of_the_file_is_a_formula(seen, example):
+    formula = example.BACKGROUND_NM2_HZ / seen.frequency_hz**2
+    same = np.abs(seen.density_nm2_hz / formula[:, None] - 1) < 1e-6
+    assert np.all(same.mean(axis=0) > 0.97)
+    assert same.all(axis=1).mean() == pytest.approx(0.963, abs=0.001)

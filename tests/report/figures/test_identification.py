@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.eris import eris_model
 
+import lbt_synth as lbt
 from lbt_synth.report.figures.identification import _spread_labels
 
 
@@ -20,3 +22,30 @@ def test_labels_do_not_overlap(wanted):
     assert np.all((places > 0) & (places < 1))
     if wanted and np.all(np.diff([-0.03, *wanted, 1.03]) > 0.06):
         assert places == pytest.approx(wanted)
+
+
+@pytest.fixture(scope="module")
+def model() -> lbt.identification.IdentifiedModel:
+    return eris_model()
+
+
+def test_figure_of_a_short_spectrum(model):
+    figure = lbt.report.figures.identification_figure(model)
+    figure.canvas.draw()
+    labels = [text.get_text() for text in figure.axes[4].get_xticklabels() if text.get_text()]
+    assert {"10", "20", "50"} <= set(labels)
+    for plot, axis in zip(figure.axes[:2], model.axes, strict=True):
+        assert len(plot.texts) == len(axis.lines)
+        edges = plot.get_window_extent()
+        blended = plot.get_xaxis_transform()
+        places = [blended.transform(text.get_position())[0] for text in plot.texts]
+        # 6.5 points of type, and a little more
+        assert np.all(np.diff(places) > 1.1 * 6.5 / 72 * figure.dpi)
+        highest = np.max(
+            np.interp([x.frequency_hz for x in axis.lines], axis.frequency_hz, axis.fitted_nm2_hz)
+        )
+        top = plot.transData.transform((10, highest))[1]
+        for text in plot.texts:
+            x, y = blended.transform(text.get_position())
+            assert edges.x0 < x < edges.x1
+            assert y > top

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from support.figures import legend
+from support.intervals import interval_designs
 
 import lbt_synth as lbt
 
@@ -35,3 +36,23 @@ def test_an_unstable_loop_is_named_and_not_drawn(designs):
         curves = {line.get_label(): len(line.get_xdata()) for line in axis.get_lines()}
         assert curves["H-infinity: unstable"] == 0
         assert curves["Kalman"] > 100
+
+
+def test_empty_figures_are_refused():
+    for empty in (
+        lambda: lbt.report.figures.sigma_figure({}),
+        lambda: lbt.report.figures.loop_figure({}),
+        lambda: lbt.report.figures.robustness_figure([]),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match="at least one"):
+            empty()
+
+
+@pytest.fixture(scope="module")
+def made():
+    return interval_designs()
+
+
+def test_the_sigma_figure_draws_its_error(made):
+    figure = lbt.report.figures.sigma_figure({"interval": made["hinf", 1.0]}, unit_weights=True)
+    assert len(figure.axes) == 3

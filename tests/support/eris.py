@@ -1,0 +1,35 @@
+"""The example on the vibration spectrum of VLT/ERIS: its module, its record, and the model of it."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import sys
+from types import ModuleType
+
+from support.plants import ROOT
+
+import lbt_synth as lbt
+
+ERIS_FILE = ROOT / "examples" / "data" / "eris_vibrations_psd.fits"
+
+
+@functools.cache
+def eris_example() -> ModuleType:
+    spec = importlib.util.spec_from_file_location(
+        "eris_vibrations", ROOT / "examples" / "eris_vibrations.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["eris_vibrations"] = module  # its dataclass looks there
+    spec.loader.exec_module(module)
+    return module
+
+
+@functools.cache
+def eris_record() -> lbt.identification.SpectrumRecord:
+    return eris_example().record()
+
+
+@functools.cache
+def eris_model() -> lbt.identification.IdentifiedModel:
+    return lbt.identify(eris_record(), frame_rate_hz=1000, delay_frames=2)
