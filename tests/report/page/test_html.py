@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from support.browser import DESK, PHONE, chain, opened
 from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 from lbt_synth.report.page.blocks import Page, Paragraph, Section
@@ -137,3 +139,167 @@ def test_contrast_of_texts(plain):
         ("bad", "paper"),
     ):
         assert contrast(named[ink], named[paper]) >= 4.5, (ink, paper)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", ["report", "study", "marks", "hostile"])
+def test_it_opens_offline_without_a_word(browser, pages, name):
+    opened(browser, pages[name])
+    said = [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"]
+    assert said == []
+    asked = [
+        found
+        for entry in browser.get_log("performance")
+        if '"Network.requestWillBeSent"' in entry["message"]
+        for found in re.findall(r'"url":"([^"]*)"', entry["message"])
+    ]
+    outside = {url for url in asked if not url.startswith(("data:", "blob:"))}
+    assert {url.split("#")[0] for url in outside} <= {pages[name]}
+    assert (
+        browser.execute_script("return window.hacked === undefined && Bokeh.documents.length") == 1
+    )
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", ["report", "study", "marks", "hostile"])
+def test_it_fits_a_phone(browser, pages, name):
+    opened(browser, pages[name], PHONE)
+    widths = browser.execute_script(
+        "return [document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]"
+    )
+    assert max(widths) <= 360
+    out = browser.execute_script(
+        """
+        const out = [];
+        for (const node of document.body.querySelectorAll("*")) {
+          if (node.closest(".scroll, pre, .skip, .static")) continue;
+          const box = node.getBoundingClientRect();
+          if (box.width && (box.right > innerWidth + 1 || box.left < -1))
+            out.push([node.tagName, node.className, box.left, box.right]);
+        }
+        return out;
+        """
+    )
+    assert out == []
+    small = browser.execute_script(
+        """
+        return [...document.querySelectorAll("p, td, th, a, figcaption, button, pre")]
+          .filter(e => e.offsetHeight && parseFloat(getComputedStyle(e).fontSize) < 12).length
+        """
+    )
+    assert small == 0
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", ["report", "study", "marks", "hostile"])
+def test_it_fits_a_sheet_of_paper(browser, pages, name):
+    opened(browser, pages[name])
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    inside = {**DESK, "width": 688, "height": 1009}  # A4 less the margins, at 96 pixels an inch
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", inside)
+    out = browser.execute_script(
+        """
+        const out = [];
+        for (const node of document.body.querySelectorAll("*")) {
+          if (node.closest(".skip, defs")) continue;
+          const box = node.getBoundingClientRect();
+          if (box.width && box.right > innerWidth + 1) out.push([node.tagName, box.right]);
+        }
+        return [out, [...document.querySelectorAll(".static svg")].map(e => e.clientHeight),
+                [...document.querySelectorAll(".plot")].every(e => e.offsetHeight === 0),
+                document.documentElement.scrollWidth];
+        """
+    )
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    assert out[0] == []
+    assert 200 < min(out[1]) <= max(out[1]) < 1009
+    assert out[2]
+    assert out[3] <= 688
+    options = {"preferCSSPageSize": True, "printBackground": True}
+    pdf = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", options)["data"])
+    sheets = len(re.findall(rb"/Type\s*/Page\b", pdf))
+    assert (7 if name == "report" else 3) <= sheets <= 15
+    boxes = {tuple(map(float, box.split())) for box in re.findall(rb"/MediaBox\s*\[(.*?)\]", pdf)}
+    assert all(box[2:] == pytest.approx((595, 842), abs=1) for box in boxes)
+
+
+@pytest.mark.browser
+def test_without_javascript_the_drawings_show(browser, pages):
+    opened(browser, pages["report"], script=False)
+    browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+    sizes = browser.execute_script(
+        """return [...document.querySelectorAll(".static svg")].map(e => {
+             const box = e.getBoundingClientRect(); return [box.width, box.height]; })"""
+    )
+    shown = "return [...document.querySelectorAll('.interactive')].some(e => e.offsetHeight)"
+    assert not browser.execute_script(shown)
+    assert len(sizes) >= 8
+    assert all(width > 500 and height > 100 for width, height in sizes)
+
+
+@pytest.mark.browser
+def test_the_keyboard_reaches_the_content(browser, pages):
+    opened(browser, pages["report"])
+    keys = chain(browser)
+    keys.send_keys("\ue004").perform()  # tabulator
+    active = "return document.activeElement"
+    assert browser.execute_script(f"{active}.className") == "skip"
+    assert browser.execute_script(f"return {active[7:]}.getBoundingClientRect().left") >= 0
+    chain(browser).send_keys("\ue007").perform()  # enter
+    assert browser.execute_script("return location.hash") == "#_content"
+    assert browser.execute_script(f"{active}.id") == "_content"
+    for link in browser.find_elements("css selector", "nav a"):
+        target = link.get_attribute("href").split("#")[1]
+        browser.execute_script("arguments[0].focus()", link)
+        link.send_keys("\ue007")
+        assert browser.execute_script("return location.hash") == f"#{target}"
+        box = f"return document.getElementById('{target}').getBoundingClientRect()"
+        assert browser.execute_script(f"{box}.top") < 900
+        assert browser.execute_script(f"{box}.bottom") > 0
+
+
+@pytest.mark.browser
+def test_texts_have_contrast(browser, pages):
+    opened(browser, pages["marks"])
+    pairs = browser.execute_script(
+        """
+        const pairs = new Set();
+        for (const node of document.querySelectorAll("h1,h2,h3,p,a,td,th,caption,figcaption,span,code,button,li")) {
+          if (!node.offsetHeight || !node.textContent.trim()) continue;
+          let ground = node, colour = "rgba(0, 0, 0, 0)";
+          while (ground && colour === "rgba(0, 0, 0, 0)") {
+            colour = getComputedStyle(ground).backgroundColor;
+            ground = ground.parentElement;
+          }
+          pairs.add(getComputedStyle(node).color + "|" + colour);
+        }
+        return [...pairs];
+        """
+    )
+    assert len(pairs) > 4
+    for pair in pairs:
+        one, other = (
+            [int(v) / 255 for v in re.findall(r"\d+", shade)[:3]] for shade in pair.split("|")
+        )
+        dark, light = sorted(_luminance(shade) for shade in (one, other))
+        assert (light + 0.05) / (dark + 0.05) >= 4.5, pair
+
+
+def _luminance(shade):
+    linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in shade]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.browser
+def test_the_accessibility_tree_names_what_matters(browser, pages):
+    opened(browser, pages["marks"])
+    nodes = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    named = {}
+    for node in nodes:
+        if not node.get("ignored"):
+            role = node["role"]["value"]
+            named.setdefault(role, []).append(node.get("name", {}).get("value", ""))
+    for role in ("figure", "table", "button", "link", "heading", "main", "navigation"):
+        assert named[role], role
+        assert all(name.strip() for name in named[role] if role != "main"), role
+    assert set(named["figure"]) >= {chart.title for chart in every_mark()}

@@ -1,0 +1,47 @@
+"""Pages and a browser that the tests of pages share."""
+
+from __future__ import annotations
+
+import pytest
+from support.browser import OPTIONS
+from support.pages import HOSTILE, whole_page
+from support.plants import LBT_YAML
+from support.study_pages import page_of, results
+
+import lbt_synth as lbt
+from lbt_synth.report.page.html import page_html
+
+
+@pytest.fixture(scope="session")
+def pages(tmp_path_factory):
+    """Addresses of a real report, a study, and a page with every kind of mark and hostile names."""
+    folder = tmp_path_factory.mktemp("browser")
+    config = lbt.load_config(LBT_YAML)
+    designs = {
+        "kalman": lbt.kalman(config.plant),
+        "integrator with a rather long name of its file": lbt.integrator(config.hardware, gain=0.4),
+    }
+    lbt.report.write_report(lbt.report.design_report(config, designs), folder / "report.html")
+    (folder / "study.html").write_bytes(page_html(page_of(results())))
+    (folder / "marks.html").write_bytes(page_html(whole_page()))
+    (folder / "hostile.html").write_bytes(page_html(whole_page(HOSTILE)))
+    return {path.stem: path.as_uri() for path in folder.glob("*.html")}
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    webdriver = pytest.importorskip("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = "/usr/bin/chromium"
+    profile = tmp_path_factory.mktemp("profile")
+    for option in (*OPTIONS, f"--user-data-dir={profile}"):
+        options.add_argument(option)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    service = webdriver.ChromeService(executable_path="/usr/bin/chromedriver")
+    driver = webdriver.Chrome(options=options, service=service)
+    driver.execute_cdp_cmd("Network.enable", {})
+    driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": ["http://*", "https://*", "ws://*"]})
+    offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+    driver.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
+    yield driver
+    driver.quit()
