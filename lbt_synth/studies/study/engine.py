@@ -14,7 +14,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -115,78 +115,105 @@ def run_batches(
     When a process dies, all batches in flight run again, each alone. One that kills its process
     again is halved, down to single rows, which fail.
     """
-    count = workers or jobs
-    batches = BatchQueue(ranges, count)
-    most = 1 if executor is None and jobs == 1 else _IN_FLIGHT * count
-    running: dict[Future[TimedBatch], _Task] = {}
-    suspects: deque[RowRange] = deque()
-    deaths = 0
+    run = _BatchRun(study, evaluate, BatchQueue(ranges, workers or jobs))
+    most = 1 if executor is None and jobs == 1 else _IN_FLIGHT * (workers or jobs)
     with _open_workers(jobs, executor) as engine:
         try:
-            while batches.left or suspects or running:
-                broken: BaseException | None = None
-                try:
-                    while (batches.left and not suspects and len(running) < most) or (
-                        suspects and not running
-                    ):
-                        rows = suspects[0] if suspects else batches.take()
-                        task = _Task(rows=rows, alone=bool(suspects))
-                        values = study.values(*rows)
-                        try:
-                            future = engine.executor.submit(
-                                evaluate_timed, evaluate, study, values, rows[0]
-                            )
-                        except BrokenExecutor:
-                            if not suspects:
-                                suspects.append(rows)  # taken from the queue, but not run
-                            raise
-                        if suspects:
-                            suspects.popleft()
-                        running[future] = task
-                except BrokenExecutor as error:
-                    broken = error
-                done, _ = wait(running, return_when=FIRST_COMPLETED) if running else (set(), set())
+            while run.unfinished:
+                broken = run.submit(engine.executor, most)
                 dead: list[_Task] = []
-                for future in done:
-                    task = running.pop(future)
+                for task, future in run.wait():
                     raised = _future_error(future)
                     if raised is None:
-                        deaths = 0
-                        batch, seconds = future.result()
-                        _require_whole(batch, task.rows, study)
-                        batches.learn(task.rows[1] - task.rows[0], seconds)
-                        yield batch, seconds
-                    elif isinstance(raised, BrokenExecutor):
+                        yield run.receive(task, future)
+                        continue
+                    if isinstance(raised, BrokenExecutor):
                         broken = raised
-                        dead.append(task)
-                    elif is_death_of_workers(raised):
-                        dead.append(task)
-                    else:
+                    elif not is_death_of_workers(raised):
                         raise _error_to_raise(raised, task.rows)
+                    dead.append(task)
                 if broken is not None:
-                    dead += running.values()
-                    running.clear()
+                    dead += run.running.values()
+                    run.running.clear()
                     engine.renew(broken)
                 if dead or broken is not None:
-                    deaths += 1
-                    if deaths > _MOST_DEATHS:
-                        raise NumericalError(
-                            f"{deaths} times one after the other a process ended without a word, "
-                            "for want of memory perhaps. What is finished is kept: start again, "
-                            "with fewer jobs."
-                        )
-                for task in sorted(dead, key=lambda task: task.rows):
-                    start, stop = task.rows
-                    if not task.alone:
-                        suspects.append(task.rows)
-                    elif stop - start == 1:
-                        yield _failed_row(study, start), 0.0
-                    else:
-                        middle = (start + stop) // 2
-                        suspects.extendleft([(middle, stop), (start, middle)])
+                    run.count_death()
+                for row in run.suspect(dead):
+                    yield _failed_row(study, row), 0.0
         finally:
-            for future in running:
+            for future in run.running:
                 future.cancel()
+
+
+@dataclass(slots=True)
+class _BatchRun:
+    """Where the batches of a run are: in the queue, on a worker, or suspected of killing it."""
+
+    study: Study
+    evaluate: Evaluate
+    queue: BatchQueue
+    running: dict[Future[TimedBatch], _Task] = field(default_factory=dict)
+    suspects: deque[RowRange] = field(default_factory=deque)
+    deaths: int = 0  # since a batch came back
+
+    @property
+    def unfinished(self) -> bool:
+        return bool(self.queue.left or self.suspects or self.running)
+
+    def submit(self, executor: Executor, most: int) -> BrokenExecutor | None:
+        """Keep the workers busy, or run one suspect alone; return what broke the executor."""
+        while (self.queue.left and not self.suspects and len(self.running) < most) or (
+            self.suspects and not self.running
+        ):
+            alone = bool(self.suspects)
+            rows = self.suspects[0] if alone else self.queue.take()
+            values = self.study.values(*rows)
+            try:
+                future = executor.submit(evaluate_timed, self.evaluate, self.study, values, rows[0])
+            except BrokenExecutor as error:
+                if not alone:
+                    self.suspects.append(rows)  # taken from the queue, but not run
+                return error
+            if alone:
+                self.suspects.popleft()
+            self.running[future] = _Task(rows=rows, alone=alone)
+        return None
+
+    def wait(self) -> Iterator[tuple[_Task, Future[TimedBatch]]]:
+        """Wait for a batch, and yield each one that has ended."""
+        if self.running:
+            done, _ = wait(self.running, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield self.running.pop(future), future
+
+    def receive(self, task: _Task, future: Future[TimedBatch]) -> TimedBatch:
+        """Return a batch that came back, with its seconds."""
+        self.deaths = 0
+        batch, seconds = future.result()
+        _require_whole(batch, task.rows, self.study)
+        self.queue.learn(task.rows[1] - task.rows[0], seconds)
+        return batch, seconds
+
+    def count_death(self) -> None:
+        """Count the death of a process, and refuse to go on after too many in a row."""
+        self.deaths += 1
+        if self.deaths > _MOST_DEATHS:
+            raise NumericalError(
+                f"{self.deaths} times one after the other a process ended without a word, for want "
+                "of memory perhaps. What is finished is kept: start again, with fewer jobs."
+            )
+
+    def suspect(self, dead: Sequence[_Task]) -> Iterator[int]:
+        """Let batches run again, each alone, or in halves; yield single rows that failed alone."""
+        for task in sorted(dead, key=lambda task: task.rows):
+            start, stop = task.rows
+            if not task.alone:
+                self.suspects.append(task.rows)
+            elif stop - start == 1:
+                yield start
+            else:
+                middle = (start + stop) // 2
+                self.suspects.extendleft([(middle, stop), (start, middle)])
 
 
 def _future_error(future: Future[TimedBatch]) -> BaseException | None:
