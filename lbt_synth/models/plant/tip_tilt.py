@@ -271,8 +271,7 @@ def tip_tilt_plant(
     factor = noise_factor(noise_nm, hardware.n_measurements)
 
     n, p, order = hardware.modes, len(lines), max(model.order for model in models)
-    ceil_delay = max(int(np.ceil(hardware.delay_frames)), 2)
-    chain = ceil_delay - 1
+    chain = _held_frames(hardware)
     ar2 = [line.ar_model(hardware.frame_rate_hz) for line in lines]
     embedding = np.array([line.direction for line in lines]).reshape(p, n).T
     coefficients = np.zeros((n, order))
@@ -300,7 +299,7 @@ def tip_tilt_plant(
     C[:, size - n :] = hardware.sensor
     D = np.hstack([np.zeros((q, p + n)), factor])
 
-    late = ceil_delay - hardware.delay_frames  # weight of the frame before
+    late = chain + 1 - hardware.delay_frames  # weight of the frame before
     L = np.zeros((n, size))
     L[:, vib : vib + p] = (1 - late) * embedding
     L[:, tur : tur + n] = (1 - late) * np.eye(n)
@@ -318,12 +317,16 @@ def tip_tilt_plant(
     )
 
 
+def _held_frames(hardware: LoopHardware) -> int:
+    """Return how many frames of the total phase the state of a plant holds."""
+    return max(int(np.ceil(hardware.delay_frames)), 2) - 1
+
+
 def require_no_memory(plant: TipTiltPlant) -> None:
     """Refuse a plant with the past innovations of a filter, which cannot be assembled again."""
     hw = plant.hardware
     order = max(model.order for model in plant.turbulence)
-    chain = max(int(np.ceil(hw.delay_frames)), 2) - 1
-    if plant.n_states != 2 * len(plant.vibrations) + (order + chain) * hw.modes:
+    if plant.n_states != 2 * len(plant.vibrations) + (order + _held_frames(hw)) * hw.modes:
         raise ProblemError(
             "this plant holds the memory of a mixed filter, and cannot be assembled again; take "
             "the plant that the filter was designed for."
