@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -14,9 +14,10 @@ from lbt_synth import studies
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
+from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models.truth import stationary_vibrations
 from lbt_synth.report.designs.assessment import DesignAssessment, assess_design, require_compatible
-from lbt_synth.report.designs.simulation import DesignSimulation, common_settling, simulate_design
+from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
 from lbt_synth.report.frequency_grid import frequency_grid
 from lbt_synth.report.provenance import (
     SourceFile,
@@ -151,7 +152,6 @@ def design_report(
     errors = frequency_errors(config)
     lines_hz = sorted({line.frequency_hz for line in stationary_vibrations(truth.vibrations)})
     grid = frozen_copy(frequency_grid(hardware.frame_rate_hz, lines_hz))
-    settings = config.settings
     assessments = []
     for name, design in designs.items():
         assessments.append(
@@ -163,29 +163,16 @@ def design_report(
                 config.imaging,
                 frequency_hz=grid,
                 errors_hz=errors,
-                sensor_gains=np.unique(settings.robustness.sensor_gains),
+                sensor_gains=np.unique(config.settings.robustness.sensor_gains),
                 assumed_gain=config.sensor_gain,
             )
         )
         count(1)
     limits = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
     count(1)
-    stable = [one for one in assessments if one.stable]
-    settle = common_settling(
-        [one.design for one in stable], hardware, truth, settings.simulation.settle_frames
-    )
     simulations = {}
-    for one in stable:
-        simulations[one.name] = simulate_design(
-            one.design,
-            hardware,
-            truth,
-            config.imaging,
-            frames=min(settings.simulation.frames, _MOST_FRAMES),
-            cases=settings.simulation.cases,
-            seed=settings.simulation.seed,
-            settle_frames=settle,
-        )
+    for name, simulation in _simulate_stable(config, assessments):
+        simulations[name] = simulation
         count(1)
     solved = any(design.solver.route in _CONVEX_ROUTES for design in designs.values())
     return DesignReport(
@@ -200,6 +187,29 @@ def design_report(
         versions=program_versions(("cvxpy", "clarabel") if solved else ()),
         made=made,
     )
+
+
+def _simulate_stable(
+    config: Config, assessments: Sequence[DesignAssessment]
+) -> Iterator[tuple[str, DesignSimulation]]:
+    """Simulate each stable loop; all settle as the slowest, so that one seed is one weather."""
+    settings = config.settings.simulation
+    stable = [one for one in assessments if one.stable]
+    settle = [settling_frames(one.spectral_radius) for one in stable]
+    for one in stable:
+        yield (
+            one.name,
+            simulate_design(
+                one.design,
+                config.hardware,
+                config.truth,
+                config.imaging,
+                frames=min(settings.frames, _MOST_FRAMES),
+                cases=settings.cases,
+                seed=settings.seed,
+                settle_frames=max(settings.settle_frames, *settle),
+            ),
+        )
 
 
 def count_steps(designs: int) -> int:

@@ -8,7 +8,6 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, filter_series, simulate
-from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import LoopHardware, Truth, Vibration
 from lbt_synth.models.truth import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy
@@ -88,15 +87,6 @@ def simulate_design(
         step_residual_nm=step_residual,
         step_command_nm=step_command,
     )
-
-
-def common_settling(designs: list[Design], hardware: LoopHardware, truth: Truth, least: int) -> int:
-    """Frames in which all loops settle, so that one seed is the same weather for all."""
-    radii = [
-        close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain).spectral_radius
-        for design in designs
-    ]
-    return max([least, *map(settling_frames, radii)])
 
 
 def step_response(loop: ClosedLoop) -> tuple[FloatArray, FloatArray, FloatArray]:

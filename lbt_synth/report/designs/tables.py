@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from lbt_synth.loop import BandLimit, ResidualLimit
 from lbt_synth.report.designs.assessment import DesignAssessment
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.number_text import DASH, MINUS, fixed_text, interval_text, number_text
@@ -39,30 +40,17 @@ def summary_table(report: DesignReport) -> Table:
         ("Strehl ratio, exact [%]", lambda one, _: fixed_text(100 * one.strehl, 2)),
         ("Strehl ratio, simulated [%]", lambda one, _: _simulated_text(report, one)),
     ]
-    if report.limits.limit is not None and report.limits.limit.rms_nm > 0:
-        rows += [
-            "Distance to the limit of any linear controller",
-            (
-                f"above the limit of {fixed_text(report.limits.limit.rms_nm, 1)} nm, "
-                "frequency known [%]",
-                lambda _, row: fixed_text(row.above_limit_percent, 0),
-            ),
-        ]
+    above = _limit_rows(report.limits.limit, ", frequency known", "above_limit_percent")
+    if above:
+        rows += ["Distance to the limit of any linear controller", *above]
     if report.errors_hz.size > 1:
         ends = interval_text(float(report.errors_hz[0]), float(report.errors_hz[-1]))
         rows += [
             f"Over frequency errors of {ends} Hz",
             ("worst residual [nm rms]", lambda _, row: fixed_text(row.worst_nm, 1)),
             ("worst Strehl ratio [%]", lambda one, _: fixed_text(_worst_percent(one), 2)),
+            *_limit_rows(report.limits.band, " for this range", "above_band_limit_percent"),
         ]
-        if report.limits.band is not None and report.limits.band.rms_nm > 0:
-            rows.append(
-                (
-                    f"above the limit of {fixed_text(report.limits.band.rms_nm, 1)} nm for this "
-                    "range [%]",
-                    lambda _, row: fixed_text(row.above_band_limit_percent, 0),
-                )
-            )
     rows += [
         "Margins at the real sensor gain",
         ("modulus margin", lambda one, _: _margin_text(one, "modulus", 3)),
@@ -82,6 +70,16 @@ def summary_table(report: DesignReport) -> Table:
             for entry in rows
         ),
     )
+
+
+def _limit_rows(
+    limit: ResidualLimit | BandLimit | None, where: str, field: str
+) -> list[tuple[str, Value]]:
+    """Return the row of percents above a limit, or none where the limit says nothing."""
+    if limit is None or not limit.rms_nm > 0:
+        return []
+    title = f"above the limit of {fixed_text(limit.rms_nm, 1)} nm{where} [%]"
+    return [(title, lambda _, row: fixed_text(getattr(row, field), 0))]
 
 
 def certificate_table(one: DesignAssessment) -> Table:
