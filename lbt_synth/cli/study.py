@@ -21,6 +21,7 @@ from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies import (
     Failure,
     Study,
+    StudyRun,
     StudyStatistics,
     estimate_study,
     load_study,
@@ -54,31 +55,8 @@ def run(arguments: Namespace) -> Report:
 
 
 def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
-    found: list[tuple[StudyStatistics, bool]] = []
     files = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
-    with _engine(arguments) as (executor, workers):
-        make_directory(folder)
-        with count_progress(
-            total=loaded.samples, what="samples", quiet=arguments.json, rate=True
-        ) as count:
-            try:
-                study_run = run_study(
-                    loaded,
-                    folder,
-                    executor=executor,
-                    jobs=arguments.jobs,
-                    workers=workers,
-                    progress=count,
-                    whole=lambda results: found.append(
-                        (_summarise(loaded, files, results), results.new)
-                    ),
-                )
-            except KeyboardInterrupt:
-                note = (
-                    f"lbt-synth: what is finished is kept in {folder}; start it again to continue"
-                )
-                print(note, file=sys.stderr)
-                raise
+    study_run, statistics, new = _compute(loaded, folder, files, arguments)
     report = Report(
         data={
             "samples": study_run.samples,
@@ -90,7 +68,6 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             "files": [str(path) for path in (study_run.results, study_run.failed, *files)],
         }
     )
-    [(statistics, new)] = found
     varying = [p.name for p in loaded.parameters if p.distribution.varies]
     report.data["statistics"] = asdict(statistics)
     report.tables = [_printed_table(table) for table in summary_tables(statistics)]
@@ -117,6 +94,40 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     words = "written" if new else "there"
     report.notes += [f"{words}: {path}" for path in report.data["files"]]
     return report
+
+
+def _compute(
+    loaded: Study, folder: Path, files: Sequence[Path], arguments: Namespace
+) -> tuple[StudyRun, StudyStatistics, bool]:
+    """Run a study and write its page; return also whether anything was left to compute."""
+    found: list[tuple[StudyStatistics, bool]] = []
+
+    def summarise(results: FinishedStudy) -> None:
+        found.append((_summarise(loaded, files, results), results.new))
+
+    with _engine(arguments) as (executor, workers):
+        make_directory(folder)
+        with count_progress(
+            total=loaded.samples, what="samples", quiet=arguments.json, rate=True
+        ) as count:
+            try:
+                study_run = run_study(
+                    loaded,
+                    folder,
+                    executor=executor,
+                    jobs=arguments.jobs,
+                    workers=workers,
+                    progress=count,
+                    whole=summarise,
+                )
+            except KeyboardInterrupt:
+                note = (
+                    f"lbt-synth: what is finished is kept in {folder}; start it again to continue"
+                )
+                print(note, file=sys.stderr)
+                raise
+    [(statistics, new)] = found
+    return study_run, statistics, new
 
 
 @contextlib.contextmanager
