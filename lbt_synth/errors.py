@@ -198,3 +198,8 @@ class TelemetryError(FileError):
 
 class OutputError(FileError):
     """A result cannot be written."""
+
+
+def __dir__() -> list[str]:
+    """Show the exceptions alone."""
+    return sorted(name for name in globals() if name.endswith("Error"))

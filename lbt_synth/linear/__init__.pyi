@@ -1,12 +1,16 @@
 from .estimation_problem import EstimationProblem as EstimationProblem
 from .infeasibility_proof import Witness as Witness
 from .infeasibility_proof import infeasible_level as infeasible_level
+from .lyapunov import stationary_covariance as stationary_covariance
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
 from .riccati.dare import Attempt as Attempt
 from .riccati.dare import DareSolution as DareSolution
 from .riccati.dare import solve_dare as solve_dare
+from .riccati.filtering import FilterRiccati as FilterRiccati
+from .riccati.filtering import kalman_riccati as kalman_riccati
+from .riccati.gamma import gamma_riccati as gamma_riccati
 from .state_space import Controller as Controller
 from .state_space import RunningController as RunningController
 from .state_space import StateSpace as StateSpace

@@ -19,11 +19,23 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     By squaring, or by a bilinear transformation if that leaves a smaller residual. The latter
     inverts ``A + I``, which is all but singular for states in very different units.
 
+    Parameters
+    ----------
+    A : (n, n) ndarray
+        State matrix, spectral radius below 1 (not checked here).
+    Q : (n, n) ndarray
+        Symmetric covariance of the driving noise.
+
+    Returns
+    -------
+    (n, n) ndarray
+        The covariance of ``x(k+1) = A x(k) + v(k)``.
+
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.linear.lyapunov import stationary_covariance
-    >>> float(stationary_covariance(np.array([[0.6]]), np.array([[64.0]]))[0, 0])
+    >>> import lbt_synth as lbt
+    >>> float(lbt.linear.stationary_covariance(np.array([[0.6]]), np.array([[64.0]]))[0, 0])
     100.0
     """
     squared, residuals = stationary_covariances(A[None], Q[None])

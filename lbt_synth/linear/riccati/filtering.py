@@ -16,14 +16,29 @@ from lbt_synth.validation import FloatArray, frozen_copy
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterRiccati:
-    """A solved filter equation, with its gains (n, q)."""
+    """A solved filter equation.
 
-    P: FloatArray  # (n, n): error covariance (Kalman), or its H-infinity counterpart
-    gain_predictor: FloatArray  # of the measurement and the time update together
-    gain_filter: FloatArray  # of the measurement update alone
-    residual: float  # relative
-    iterations: int  # doublings
-    status: str  # the route that gave P
+    Attributes
+    ----------
+    P : (n, n) ndarray
+        Covariance of the prediction error (Kalman), or its H-infinity counterpart.
+    gain_predictor, gain_filter : (n, q) ndarray
+        Gains of the measurement and the time update together, and of the measurement update
+        alone.
+    residual : float
+        Relative residual of the equation.
+    iterations : int
+        Number of doublings.
+    status : str
+        The route that gave P.
+    """
+
+    P: FloatArray
+    gain_predictor: FloatArray
+    gain_filter: FloatArray
+    residual: float
+    iterations: int
+    status: str
 
 
 def require_detectable(problem: EstimationProblem) -> None:
@@ -48,12 +63,30 @@ def require_detectable(problem: EstimationProblem) -> None:
 def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     """Solve ``P = A P A' + Q - (A P C' + S)(R + C P C')^-1 (C P A' + S')``.
 
+    ``lbt_synth.design.kalman`` returns the same filter as a certified design.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+
+    Returns
+    -------
+    FilterRiccati
+        The stabilising solution and its gains.
+
+    Raises
+    ------
+    DetectabilityError
+        If there is no stabilising solution.
+    NumericalError
+        If the equation was not solved.
+
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.linear.riccati.filtering import kalman_riccati
     >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> round(float(kalman_riccati(p).P[0, 0]), 12)
+    >>> round(float(lbt.linear.kalman_riccati(p).P[0, 0]), 12)
     1.61803398875
     """
     require_detectable(problem)

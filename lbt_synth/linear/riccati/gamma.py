@@ -138,14 +138,36 @@ class GammaEquation:
 def gamma_riccati(
     problem: EstimationProblem, gamma: float, *, start: FilterRiccati | None = None
 ) -> FilterRiccati | None:
-    """Central predictor of a level of gamma, by the gamma-Riccati equation.
+    """Central H-infinity predictor of a level of gamma, by the gamma-Riccati equation.
+
+    ``lbt_synth.design.hinf`` finds the least gamma and returns a certified design.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    gamma : float
+        The level of the norm that the filter has to meet.
+    start : FilterRiccati, optional
+        The Kalman filter's solution, if it is at hand.
+
+    Returns
+    -------
+    FilterRiccati or None
+        None where no such filter exists.
+
+    Raises
+    ------
+    DetectabilityError
+        If no stable filter exists at all.
+    NumericalError
+        If the equation has a solution that was not reached accurately.
 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.linear.riccati.gamma import gamma_riccati
     >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> gamma_riccati(p, 1.0) is None, gamma_riccati(p, 2.5) is None
+    >>> lbt.linear.gamma_riccati(p, 1.0) is None, lbt.linear.gamma_riccati(p, 2.5) is None
     (True, False)
     """
     equation = GammaEquation(problem, kalman_riccati(problem) if start is None else start)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 
@@ -13,7 +14,14 @@ from lbt_synth.loop.least_residuals.mode_spectra import (
 )
 from lbt_synth.loop.least_residuals.plant_modes import plant_modes
 from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
-from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant, Truth, Vibration
+from lbt_synth.models import (
+    FullStatePlant,
+    LoopHardware,
+    SinusoidalVibration,
+    TipTiltPlant,
+    Truth,
+    Vibration,
+)
 from lbt_synth.models.truth import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
@@ -108,6 +116,8 @@ def truth_modes(
         along = checked_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
             lines.append((along, vibration))
+        elif not isinstance(vibration, SinusoidalVibration):
+            assert_never(vibration)  # a random vibration of a new kind counts, too
     noise = np.diag((truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain) ** 2)
     return decoupled_modes(
         hardware,
