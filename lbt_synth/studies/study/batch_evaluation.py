@@ -12,7 +12,7 @@ from lbt_synth.loop import EnsembleResiduals
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.studies.study import reference_evaluation as reference
 from lbt_synth.studies.study.batch_result import BatchResult, Failure
-from lbt_synth.studies.study.config_paths import Keys
+from lbt_synth.studies.study.config_keys import Keys
 from lbt_synth.studies.study.sample import make_sample
 from lbt_synth.studies.study.sample_arrays import (
     ASSUMED_DELAY,

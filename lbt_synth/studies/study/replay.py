@@ -16,7 +16,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.studies.study.batch_result import Failure
-from lbt_synth.studies.study.config_paths import nested_copy
+from lbt_synth.studies.study.config_keys import nested_copy
 from lbt_synth.studies.study.output_files import read_row
 from lbt_synth.studies.study.reference_evaluation import (
     EXPECTED_ERRORS,

@@ -10,7 +10,7 @@ from lbt_synth.config.load import build_config, validate_sections
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.studies.study.config_paths import nested_copy, set_number
+from lbt_synth.studies.study.config_keys import nested_copy, set_number
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray
 

@@ -24,7 +24,7 @@ from lbt_synth.config.schema import SensorSection
 from lbt_synth.config.telescope_and_atmosphere import convert_mas_to_nm
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
 from lbt_synth.models import FrozenFlows, Vibration
-from lbt_synth.studies.study.config_paths import Keys
+from lbt_synth.studies.study.config_keys import Keys
 from lbt_synth.studies.study.sample import Sample
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import BoolArray, FloatArray, IntArray

@@ -10,7 +10,7 @@ from lbt_synth.config.schema import Ar1Section
 from lbt_synth.design.modal import ModalFilters, modal_filters
 from lbt_synth.models import ModalTurbulence, Vibration
 from lbt_synth.models.turbulence.ar_models import ar1_flows
-from lbt_synth.studies.study.config_paths import Keys
+from lbt_synth.studies.study.config_keys import Keys
 from lbt_synth.studies.study.sample_arrays import (
     ASSUMED_GAIN,
     WEATHER,

@@ -18,7 +18,7 @@ def parse_path(path: str) -> Keys:
 
     Examples
     --------
-    >>> from lbt_synth.studies.study.config_paths import parse_path
+    >>> from lbt_synth.studies.study.config_keys import parse_path
     >>> parse_path("truth.vibrations[0].frequency_hz")
     ('truth', 'vibrations', 0, 'frequency_hz')
     """
