@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lbt_synth.config import Config
 from lbt_synth.design import Check, Design, EstimatorDesign
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.interop import FrameCost, frame_cost
@@ -14,7 +14,6 @@ from lbt_synth.linear import Controller, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import (
     ClosedLoop,
-    Imaging,
     LoopMargins,
     ResidualBudget,
     close_loop,
@@ -24,7 +23,7 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, spectral_radii
-from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
@@ -127,17 +126,14 @@ class DesignAssessment:
 def assess_design(
     name: str,
     design: Design,
-    hardware: LoopHardware,
-    truth: Truth,
-    imaging: Imaging,
+    config: Config,
     *,
     frequency_hz: FloatArray,
-    errors_hz: Sequence[float] | FloatArray,
-    sensor_gains: Sequence[float] | FloatArray,
-    assumed_gain: float,
+    errors_hz: FloatArray,
 ) -> DesignAssessment:
     """Assess a design; its transfer functions are taken at frequency_hz (f,)."""
-    require_compatible(name, design, hardware)
+    hardware, truth, assumed_gain = config.hardware, config.truth, config.sensor_gain
+    sensor_gains = np.unique(config.settings.robustness.sensor_gains)
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     budget = residual_budget(loop, truth) if loop.is_stable else None
     margins = loop_margins(loop) if loop.is_stable else None
@@ -151,8 +147,8 @@ def assess_design(
         loop_hardware=hardware,
     )
     curve, found = (
-        robustness_map(carrier, truth, imaging, errors_hz=errors_hz, sensor_gains=gains)
-        for gains in ([truth.sensor_gain], np.asarray(sensor_gains) / assumed_gain)
+        robustness_map(carrier, truth, config.imaging, errors_hz=errors_hz, sensor_gains=gains)
+        for gains in ([truth.sensor_gain], sensor_gains / assumed_gain)
     )
     return DesignAssessment(
         name=name,
@@ -165,7 +161,7 @@ def assess_design(
         gamma=design.gamma if isinstance(design, EstimatorDesign) else float("nan"),
         estimation_rms=design.rms if isinstance(design, EstimatorDesign) else float("nan"),
         budget=budget,
-        strehl=float("nan") if budget is None else strehl(budget, imaging),
+        strehl=float("nan") if budget is None else strehl(budget, config.imaging),
         margins=margins,
         sensor_gains=tuple(
             (low * assumed_gain, high * assumed_gain)
@@ -180,9 +176,7 @@ def assess_design(
         rejection=_response_norms(loop, frequency_hz, noise=False),
         noise_transfer=_response_norms(loop, frequency_hz, noise=True),
         curve=curve,
-        map=replace(
-            found, sensor_gains=frozen_copy(np.asarray(sensor_gains))
-        ),  # the real ones again
+        map=replace(found, sensor_gains=frozen_copy(sensor_gains)),  # the real ones again
     )
 
 

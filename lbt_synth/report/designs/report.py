@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -30,7 +30,6 @@ from lbt_synth.studies import LimitRow, LimitStudy
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")
-_MOST_FRAMES = 8192  # of a simulated run
 _MOST_DESIGNS = 36  # more lines cannot be distinguished
 
 
@@ -154,25 +153,15 @@ def design_report(
     grid = frozen_copy(frequency_grid(hardware.frame_rate_hz, lines_hz))
     assessments = []
     for name, design in designs.items():
-        assessments.append(
-            assess_design(
-                name,
-                design,
-                hardware,
-                truth,
-                config.imaging,
-                frequency_hz=grid,
-                errors_hz=errors,
-                sensor_gains=np.unique(config.settings.robustness.sensor_gains),
-                assumed_gain=config.sensor_gain,
-            )
-        )
+        assessments.append(assess_design(name, design, config, frequency_hz=grid, errors_hz=errors))
         count(1)
     limits = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
     count(1)
+    stable = [one for one in assessments if one.stable]
+    settle = [settling_frames(one.spectral_radius) for one in stable]
     simulations = {}
-    for name, simulation in _simulate_stable(config, assessments):
-        simulations[name] = simulation
+    for one in stable:  # all settle as the slowest, so that one seed is the same weather for all
+        simulations[one.name] = simulate_design(one.design, config, settle_frames=max(settle))
         count(1)
     solved = any(design.solver.route in _CONVEX_ROUTES for design in designs.values())
     return DesignReport(
@@ -187,29 +176,6 @@ def design_report(
         versions=program_versions(("cvxpy", "clarabel") if solved else ()),
         made=made,
     )
-
-
-def _simulate_stable(
-    config: Config, assessments: Sequence[DesignAssessment]
-) -> Iterator[tuple[str, DesignSimulation]]:
-    """Simulate each stable loop; all settle as the slowest, so that one seed is one weather."""
-    settings = config.settings.simulation
-    stable = [one for one in assessments if one.stable]
-    settle = [settling_frames(one.spectral_radius) for one in stable]
-    for one in stable:
-        yield (
-            one.name,
-            simulate_design(
-                one.design,
-                config.hardware,
-                config.truth,
-                config.imaging,
-                frames=min(settings.frames, _MOST_FRAMES),
-                cases=settings.cases,
-                seed=settings.seed,
-                settle_frames=max(settings.settle_frames, *settle),
-            ),
-        )
 
 
 def count_steps(designs: int) -> int:

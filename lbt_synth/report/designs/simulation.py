@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.loop import ClosedLoop, Imaging, close_loop, filter_series, simulate
-from lbt_synth.models import LoopHardware, Truth, Vibration
+from lbt_synth.loop import ClosedLoop, close_loop, filter_series, simulate
+from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.truth import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy
 
 STEP_NM = 100.0
+_MOST_FRAMES = 8192  # of a run
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
 _EXCERPT = 400  # frames that are drawn
 _STEP_FRAMES = 120
@@ -40,28 +42,20 @@ class DesignSimulation:
     step_command_nm: FloatArray
 
 
-def simulate_design(
-    design: Design,
-    hardware: LoopHardware,
-    truth: Truth,
-    imaging: Imaging,
-    *,
-    frames: int,
-    cases: int,
-    seed: int,
-    settle_frames: int,
-) -> DesignSimulation:
-    """Run a design in a loop."""
+def simulate_design(design: Design, config: Config, *, settle_frames: int) -> DesignSimulation:
+    """Run a design in the loop of a configuration, which settles for so many frames at least."""
     from scipy.signal import welch  # slow to import
 
+    settings, hardware, truth = config.settings.simulation, config.hardware, config.truth
+    frames = min(settings.frames, _MOST_FRAMES)
     run = simulate(
         design.controller,
         truth,
         hardware=hardware,
         frames=frames,
-        cases=cases,
-        seed=seed,
-        settle_frames=settle_frames,
+        cases=settings.cases,
+        seed=settings.seed,
+        settle_frames=max(settings.settle_frames, settle_frames),
     )
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     rate, length = hardware.frame_rate_hz, min(frames, _SEGMENT)
@@ -69,13 +63,13 @@ def simulate_design(
     for series in (run.total_nm, run.residual_nm):
         frequency, density = welch(series, fs=rate, nperseg=length, axis=1, detrend=False)
         spectra.append(density.mean(axis=0).sum(axis=1))
-    strehls = run.strehl(imaging)
+    strehls = run.strehl(config.imaging)
     shown = min(frames, _EXCERPT)
     step_time_s, step_residual, step_command = step_response(loop)
     return DesignSimulation(
         strehl=float(np.mean(strehls)),
         residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
-        scatter=float(np.std(strehls, ddof=1)) if cases > 1 else float("nan"),
+        scatter=float(np.std(strehls, ddof=1)) if settings.cases > 1 else float("nan"),
         frames=frames,
         time_s=frozen_copy(np.arange(shown) / rate),
         series_nm=frozen_copy(run.residual_nm[0, :shown]),
