@@ -13,7 +13,7 @@ from concurrent.futures import (
     Future,
     wait,
 )
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,25 +73,14 @@ class _Workers:
         self._pool = WorkerPool(self._jobs)
         self.executor = self._pool.executor
 
-    def end(self, *, at_once: bool) -> None:
-        """End the processes, if they are ours."""
-        if self._pool is not None and at_once:
+    def __enter__(self) -> _Workers:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._pool is not None and kind is not None:
             self._pool.kill()
         elif self._pool is not None:
             self._pool.close()
-
-
-@contextmanager
-def _open_workers(jobs: int, executor: Executor | None) -> Iterator[_Workers]:
-    own = executor is None and jobs > 1
-    with limit_threads() if own else nullcontext():
-        workers = _Workers(jobs, executor)
-        try:
-            yield workers
-        except BaseException:
-            workers.end(at_once=True)
-            raise
-        workers.end(at_once=False)
 
 
 def evaluate_timed(evaluate: Evaluate, study: Study, values: FloatArray, start: int) -> TimedBatch:
@@ -117,9 +106,10 @@ def run_batches(
     """
     run = _BatchRun(study, evaluate, BatchQueue(ranges, workers or jobs))
     most = 1 if executor is None and jobs == 1 else _IN_FLIGHT * (workers or jobs)
-    with _open_workers(jobs, executor) as engine:
+    own = executor is None and jobs > 1
+    with limit_threads() if own else nullcontext(), _Workers(jobs, executor) as engine:
         try:
-            while run.unfinished:
+            while run.queue.left or run.suspects or run.running:
                 broken = run.submit(engine.executor, most)
                 dead: list[_Task] = []
                 for task, future in run.wait():
@@ -155,10 +145,6 @@ class _BatchRun:
     running: dict[Future[TimedBatch], _Task] = field(default_factory=dict)
     suspects: deque[RowRange] = field(default_factory=deque)
     deaths: int = 0  # since a batch came back
-
-    @property
-    def unfinished(self) -> bool:
-        return bool(self.queue.left or self.suspects or self.running)
 
     def submit(self, executor: Executor, most: int) -> BrokenExecutor | None:
         """Keep the workers busy, or run one suspect alone; return what broke the executor."""
