@@ -135,6 +135,7 @@ def identify(
         ),
         options={**options, "assumed_gain": assumed_gain},
         progress=progress,
+        total=2 * count,
     )
     _require_signal(record)
     notes: list[str] = []
@@ -182,12 +183,8 @@ class _AxisFitter:
     pieces: list[tuple[int, int]]
     options: dict[str, Any]  # of identify_axis
     progress: Callable[[int, int], None] | None
+    total: int  # most fits that the record takes
     done: int = 0
-
-    @property
-    def total(self) -> int:
-        """Most fits that a record takes."""
-        return 2 * self.record.axes
 
     def fit(
         self, i: int, gain: float | None, start: IdentifiedAxis | None, error: float = 0.0
