@@ -37,9 +37,7 @@ def run(arguments: Namespace) -> Report:
     limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
     records = [asdict(row) for row in rows]
     taps = hardware.mirror_taps
-    shown = ", ".join(f"{tap:.4f}" for tap in taps[:_SHOWN_TAPS]) + (
-        ", ..." if taps.size > _SHOWN_TAPS else ""
-    )
+    shown = [f"{tap:.4f}" for tap in taps[:_SHOWN_TAPS]] + ["..."] * (taps.size > _SHOWN_TAPS)
     report = Report(
         data={
             "rise_s": step.rise_s,
@@ -67,7 +65,7 @@ def run(arguments: Namespace) -> Report:
             _design_table(rows),
         ],
         notes=[
-            f"weights of u(k), u(k-1), ... in exposure k: {shown}",
+            f"weights of u(k), u(k-1), ... in exposure k: {', '.join(shown)}",
             f"least residual of any linear controller: {format_fixed(limit_nm, 2)} nm rms",
         ],
     )

@@ -16,7 +16,7 @@ from lbt_synth.interop.specula.simulation import RAMP_FRAMES, checked_seed, run_
 from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.models.truth import TrueVibration
-from lbt_synth.validation import FloatArray, integer, number, require_instance
+from lbt_synth.validation import FloatArray, integer, number, require_instance, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,14 +64,16 @@ class EndToEndSetup:
 
     def __post_init__(self) -> None:
         require_instance(self.system, EndToEndSystem)
-        object.__setattr__(self, "vibrations", tuple(self.vibrations))
-        for name, least in (("frames", 2), ("settle_frames", RAMP_FRAMES)):
-            object.__setattr__(self, name, integer(getattr(self, name), name, at_least=least))
-        object.__setattr__(self, "seed", checked_seed(self.seed))
-        object.__setattr__(self, "gain", number(self.gain, "gain", at_least=0))
-        object.__setattr__(self, "leak", number(self.leak, "leak", at_least=0, at_most=1))
-        first = integer(self.leak_from_mode, "leak_from_mode", at_least=2)
-        object.__setattr__(self, "leak_from_mode", first)
+        set_fields(
+            self,
+            vibrations=tuple(self.vibrations),
+            frames=integer(self.frames, "frames", at_least=2),
+            settle_frames=integer(self.settle_frames, "settle_frames", at_least=RAMP_FRAMES),
+            seed=checked_seed(self.seed),
+            gain=number(self.gain, "gain", at_least=0),
+            leak=number(self.leak, "leak", at_least=0, at_most=1),
+            leak_from_mode=integer(self.leak_from_mode, "leak_from_mode", at_least=2),
+        )
 
     @property
     def leaks(self) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import integer, number, require_instance
+from lbt_synth.validation import integer, number, require_instance, set_fields
 
 _REFERENCE_UM = 0.5  # wavelength at which SPECULA takes the seeing
 _MOST_PIXELS = 1024
@@ -29,6 +29,7 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "read_noise_electrons": {"at_least": 0},
     "wind_direction_deg": {},
 }
+_LEAST = {"subapertures_across": 2, "modes": 3, "actuators_across": 3, "pixels": 8}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,14 +120,9 @@ class EndToEndSystem:
                     f"identity as its {name}, for the optics take its place; got {matrix.shape}."
                 )
         for name, limits in _LIMITS.items():
-            object.__setattr__(self, name, number(getattr(self, name), name, **limits))
-        for name, least in (
-            ("subapertures_across", 2),
-            ("modes", 3),
-            ("actuators_across", 3),
-            ("pixels", 8),
-        ):
-            object.__setattr__(self, name, integer(getattr(self, name), name, at_least=least))
+            set_fields(self, **{name: number(getattr(self, name), name, **limits)})
+        for name, least in _LEAST.items():
+            set_fields(self, **{name: integer(getattr(self, name), name, at_least=least)})
         if self.pixels % 2 or self.pixels < self.subapertures_across or self.pixels > _MOST_PIXELS:
             raise ProblemError(
                 f"pixels must be even, at least subapertures_across ({self.subapertures_across}) "
