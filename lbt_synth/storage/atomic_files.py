@@ -9,7 +9,20 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from lbt_synth.errors import OutputError
+from lbt_synth.errors import FileError, OutputError
+
+
+def require_ending(
+    path: str | os.PathLike[str],
+    what: str,
+    endings: Iterable[str],
+    error: type[FileError] = OutputError,
+) -> Path:
+    """Return the path of a file; refuse it where it has none of the endings."""
+    target = Path(path)
+    if target.suffix.lower() not in endings:
+        raise error(f"{what} must end in {', '.join(endings)}; got {target.name!r}.", path=target)
+    return target
 
 
 def require_writable(

@@ -15,7 +15,7 @@ from lbt_synth.files.gain_file.contents import SCHEMA, SCHEMA_VERSION, pack_desi
 from lbt_synth.files.gain_file.fits_layout import write_fits
 from lbt_synth.files.gain_file.json_format import read_json, write_json
 from lbt_synth.storage.array_file import digest, npz_bytes, read_fits, read_npz
-from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.validation import frozen_copy
 
 _READERS = {".fits": read_fits, ".npz": read_npz, ".json": read_json}
@@ -31,12 +31,7 @@ _KIND = FileKind(
 
 def require_gain_name(path: str | os.PathLike[str]) -> Path:
     """Refuse a file name that is not that of a gain file."""
-    target = Path(path)
-    if target.suffix.lower() not in _READERS:
-        raise OutputError(
-            f"a gain file must end in {', '.join(_READERS)}; got {target.name!r}.", path=target
-        )
-    return target
+    return require_ending(path, "a gain file", _READERS)
 
 
 def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
@@ -119,11 +114,7 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
 
 def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
     """Read a gain file as :func:`load_gain` does, and return its digest beside the design."""
-    source = Path(path)
-    if source.suffix.lower() not in _READERS:
-        raise GainFileError(
-            f"a gain file must end in {', '.join(_READERS)}; got {source.name!r}.", path=source
-        )
+    source = require_ending(path, "a gain file", _READERS, GainFileError)
     content = _KIND.read_bytes(source)
     arrays, meta = _KIND.decode(content, _READERS[source.suffix.lower()], source)
     for name, array in arrays.items():

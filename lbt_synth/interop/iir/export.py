@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Design, certify_loop
-from lbt_synth.errors import NumericalError, OutputError
+from lbt_synth.errors import NumericalError
 from lbt_synth.interop.export_checks import rehearsal_error, require_exportable
 from lbt_synth.interop.exported_files import Exported
 from lbt_synth.interop.iir.polynomials import axis_polynomials
 from lbt_synth.interop.provenance import join_labels, provenance_lines
 from lbt_synth.linear import Controller
-from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.storage.fits import fits_bytes
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
@@ -98,11 +97,7 @@ def export_iir(
     ...     lbt.interop.export_iir(pathlib.Path(folder) / "slow.fits", slow).error < 1e-12
     True
     """
-    target = Path(path)
-    if target.suffix.lower() != ".fits":
-        raise OutputError(
-            f"an IIR filter file must end in .fits; got {target.name!r}.", path=target
-        )
+    target = require_ending(path, "an IIR filter file", (".fits",))
     tolerance = number(tolerance, "tolerance", above=0)
     require_exportable(design)
     lines = provenance_lines(design, gain_digest)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import io
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Design
-from lbt_synth.errors import OutputError
 from lbt_synth.interop.export_checks import MatrixForm, rehearsal_error, require_exportable
 from lbt_synth.interop.exported_files import Exported
 from lbt_synth.interop.provenance import join_labels, provenance_lines
 from lbt_synth.linear import StateSpace
-from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.validation import FloatArray
 
 _TEXT_BYTES = 116  # of the header of a version 5 file; scipy writes the date there
@@ -85,9 +83,7 @@ def export_mat(
     ...     scipy.io.loadmat(file, simplify_cells=True)["textbook"]["D"].tolist()
     [[0.5, 0.0], [0.0, 0.5]]
     """
-    target = Path(path)
-    if target.suffix.lower() != ".mat":
-        raise OutputError(f"a MATLAB file must end in .mat; got {target.name!r}.", path=target)
+    target = require_ending(path, "a MATLAB file", (".mat",))
     require_exportable(design)
     textbook = design.controller.to_statespace()
     content: dict[str, Any] = {

@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.errors import OutputError
-from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.atomic_files import require_ending, write_atomically
 
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 METHOD_LABELS = {"kalman": "Kalman", "hinf": r"H$_\infty$"}
@@ -72,12 +71,7 @@ def number_ticks(scale: Any) -> None:
 
 def require_figure_name(path: str | os.PathLike[str]) -> Path:
     """Refuse a file name that is not that of a figure."""
-    target = Path(path)
-    if target.suffix.lower() not in FIGURE_ENDINGS:
-        raise OutputError(
-            f"a figure must end in {', '.join(FIGURE_ENDINGS)}; got {target.name!r}.", path=target
-        )
-    return target
+    return require_ending(path, "a figure", FIGURE_ENDINGS)
 
 
 def save_figure(figure: Any, path: str | os.PathLike[str]) -> Path:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from lbt_synth.errors import OutputError
 from lbt_synth.report.page.blocks import Page
 from lbt_synth.report.page.html import page_html
 from lbt_synth.report.page.pdf import page_pdf
-from lbt_synth.storage.atomic_files import require_writable, write_together
+from lbt_synth.storage.atomic_files import require_ending, require_writable, write_together
 
 
 def require_page_names(
@@ -23,9 +22,7 @@ def require_page_names(
     if pdf is not None:
         given.append((pdf, ".pdf"))
     for name, ending in given:
-        target = Path(name)
-        if target.suffix.lower() != ending:
-            raise OutputError(f"a page must end in {ending}; got {target.name!r}.", path=target)
+        require_ending(name, "a page", (ending,))
     require_writable(*(name for name, _ in given), inputs=inputs)
 
 
