@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
-from support.intervals import interval_designs, predictor
+from support.intervals import IntervalDesigns, predictor
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -23,7 +23,7 @@ def plant():
 
 @pytest.fixture(scope="module")
 def made():
-    return interval_designs()
+    return IntervalDesigns()
 
 
 @pytest.mark.parametrize("norm", ["hinf", "h2"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from support.intervals import interval_designs, predictor
+from support.intervals import IntervalDesigns, predictor
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -22,7 +22,7 @@ def plant():
 
 @pytest.fixture(scope="module")
 def made():
-    return interval_designs()
+    return IntervalDesigns()
 
 
 @pytest.mark.parametrize("modes", [1, 2])

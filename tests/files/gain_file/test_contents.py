@@ -7,7 +7,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
-from support.intervals import interval_designs
+from support.intervals import IntervalDesigns
 from support.lqg import shell, slow_plant
 from support.shaping import (
     shaped_design,
@@ -19,7 +19,7 @@ from lbt_synth.storage.array_file import digest
 
 @pytest.fixture(scope="module")
 def made():
-    return interval_designs()
+    return IntervalDesigns()
 
 
 @pytest.mark.parametrize("ending", ["fits", "npz", "json"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from support.figures import legend
-from support.intervals import interval_designs
+from support.intervals import IntervalDesigns
 
 import lbt_synth as lbt
 
@@ -50,7 +50,7 @@ def test_empty_figures_are_refused():
 
 @pytest.fixture(scope="module")
 def made():
-    return interval_designs()
+    return IntervalDesigns()
 
 
 def test_the_sigma_figure_draws_its_error(made):
