@@ -9,6 +9,7 @@ import lbt_synth as lbt
 from lbt_synth.studies.study.summary import (
     comparison_table,
     sensitivity_table,
+    short_names,
     worst_table,
 )
 
@@ -74,3 +75,8 @@ def test_tables_of_one_controller_have_no_comparison():
     assert index.rows[0][1] == "100.0 ± 0.0"
     named = sensitivity_table(found, names={"p": "short"})
     assert named.rows[0][0] == "short"
+
+
+def test_short_names_are_different():
+    names = ["a.b.c", "d.b.c", "d.e", "e", "f.g"]
+    assert list(short_names(names).values()) == ["a.b.c", "d.b.c", "d.e", "e", "g"]
