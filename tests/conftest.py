@@ -60,3 +60,13 @@ def air():
 @pytest.fixture
 def config():
     return lbt.load_config(LBT_YAML)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two Dask workers of one thread each, on this machine."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+    ) as made:
+        yield made

@@ -188,15 +188,6 @@ def test_two_in_one_directory(tmp_path, capsys):
         first.communicate()
 
 
-@pytest.fixture(scope="module")
-def cluster():
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as made:
-        yield made
-
-
 @pytest.mark.e2e
 def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     path = study_file(tmp_path, samples="40", parameters=PARAMETERS)

@@ -20,15 +20,6 @@ PARAMETERS = (
 )
 
 
-@pytest.fixture(scope="module")
-def cluster():
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as made:
-        yield made
-
-
 def waits(study, values, start):
     time.sleep(0.02 * len(values))
     return evaluate_quickly(study, values, start)
