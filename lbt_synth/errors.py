@@ -6,6 +6,8 @@ message are on the exception, so that a script need not parse text.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -203,3 +205,23 @@ class OutputError(FileError):
 def __dir__() -> list[str]:
     """Show the exceptions alone."""
     return sorted(name for name in globals() if name.endswith("Error"))
+
+
+@contextmanager
+def name_key(key: str) -> Iterator[None]:
+    """Turn a ProblemError into a ConfigError on a key; one that names its key passes."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except ProblemError as error:
+        raise ConfigError(f"{key}: {error}", path=key) from error
+
+
+@contextmanager
+def name_file(source: Path) -> Iterator[None]:
+    """Put the name of the file before the message of a ConfigError."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}", path=error.path) from error

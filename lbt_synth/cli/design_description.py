@@ -19,9 +19,9 @@ from lbt_synth.design import (
     PolytopicDesign,
     ShapedDesign,
 )
+from lbt_synth.design.model_limits import model_limit, shaped_limit
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.models import LoopHardware
-from lbt_synth.studies.limits import model_limit, shaped_limit
 
 Data: TypeAlias = dict[str, Any]
 
@@ -219,8 +219,7 @@ def _shaping_tables(data: Data) -> list[TableText]:
 def _loop_notes(design: Design, hardware: LoopHardware, data: Data) -> list[str]:
     notes = []
     modulus, alone = data["margins"]["modulus"], data["controller_spectral_radius"]
-    commands_mirror = isinstance(design, LqgDesign) or not isinstance(design, EstimatorDesign)
-    if hardware.mirror is not None and not commands_mirror:
+    if hardware.mirror is not None and not design.knows_mirror:
         notes.append(
             "note: this filter commands its estimate as if the mirror settled at once, so that its "
             "estimation error is not the residual; --method lqg commands for the mirror's dynamics."

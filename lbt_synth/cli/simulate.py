@@ -15,6 +15,7 @@ from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
+from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
@@ -34,7 +35,6 @@ from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
-from lbt_synth.studies.limits import above_percent, limit_or_nan
 from lbt_synth.validation import FloatArray
 
 

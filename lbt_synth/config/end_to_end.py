@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lbt_synth.config.error_context import name_key
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.telescope_and_atmosphere import require_atmosphere, require_telescope
-from lbt_synth.errors import ConfigError
+from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.interop import EndToEndSetup, EndToEndSystem
 from lbt_synth.models import LoopHardware, Truth
 

@@ -13,7 +13,6 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from lbt_synth.config.end_to_end import build_end_to_end_setup
-from lbt_synth.config.error_context import name_file
 from lbt_synth.config.plant_and_truth import (
     build_plant,
     build_truth,
@@ -23,7 +22,7 @@ from lbt_synth.config.plant_and_truth import (
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.telescope_and_atmosphere import build_atmosphere, require_atmosphere
-from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.errors import ConfigError, ProblemError, name_file
 from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth

@@ -12,7 +12,6 @@ from lbt_synth.config.axes import (
     require_length,
     vibration_directions,
 )
-from lbt_synth.config.error_context import name_key
 from lbt_synth.config.schema import (
     Ar1Section,
     Ar2Section,
@@ -28,7 +27,7 @@ from lbt_synth.config.telescope_and_atmosphere import (
     require_atmosphere,
     require_telescope,
 )
-from lbt_synth.errors import ConfigError
+from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.models import (
     ARModel,
     Atmosphere,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from lbt_synth.config.error_context import name_file, name_key
 from lbt_synth.config.load import Config
 from lbt_synth.config.plant_and_truth import vibration_rms_nm
 from lbt_synth.config.schema import RobustSection
@@ -21,7 +20,7 @@ from lbt_synth.design.shaping import (
     VibrationBand,
 )
 from lbt_synth.design.shaping.demand_types import Demand
-from lbt_synth.errors import ConfigError
+from lbt_synth.errors import ConfigError, name_file, name_key
 from lbt_synth.models import Spectrum
 from lbt_synth.models.spectra import spectrum_key
 

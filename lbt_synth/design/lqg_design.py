@@ -60,6 +60,11 @@ class LqgDesign(EstimatorDesign):
     objective_nm: float
 
     @property
+    def knows_mirror(self) -> bool:
+        """True: the regulator knows the mirror."""
+        return True
+
+    @property
     def estimation(self) -> TipTiltPlant:
         """The plant of the filter: its z is the phase that the next command first acts on."""
         return estimation_plant(self.problem)

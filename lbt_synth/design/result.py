@@ -70,6 +70,11 @@ class Design:
         return None
 
     @property
+    def knows_mirror(self) -> bool:
+        """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
+        return True
+
+    @property
     def poles(self) -> ComplexArray:
         """Poles that the design places, (n,)."""
         return np.linalg.eigvals(self.controller.A).astype(np.complex128)
@@ -123,6 +128,11 @@ class EstimatorDesign(Design, ABC):
         if isinstance(self.problem, TipTiltPlant | FullStatePlant):
             return self.problem.hardware
         return None
+
+    @property
+    def knows_mirror(self) -> bool:
+        """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
+        return False
 
     @abstractmethod
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
-from lbt_synth.design import Design, EstimatorDesign, LqgDesign, ShapedDesign
-from lbt_synth.design.shaping import ResidualVariance, VibrationBand
-from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.single_mode_loop import mode_hardware, mode_loop
-from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.design import Design
+from lbt_synth.design.model_limits import above_percent, limit_or_none
+from lbt_synth.errors import ProblemError
 from lbt_synth.loop import (
     BandLimit,
     ClosedLoop,
@@ -25,12 +21,10 @@ from lbt_synth.loop import (
     residual_budget,
     strehl,
 )
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
-from lbt_synth.models import FullStatePlant, LoopHardware, SinusoidalVibration, TipTiltPlant, Truth
+from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.truth import stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
-T = TypeVar("T")
 _GRID = 65  # shifts over the range of errors, at least
 
 
@@ -157,12 +151,12 @@ def limits(
         raise ProblemError("errors_hz must hold at least one error; got none.")
     vibrations = stationary_vibrations(truth.vibrations)
     shifts = _frequency_shifts(truth, errors)
-    limit = _limit_or_none(lambda: least_residual(hardware, truth))
+    limit = limit_or_none(lambda: least_residual(hardware, truth))
     band_hz = _error_band(truth, shifts)
     band = None
     if band_hz is not None:
         line = vibrations[0]
-        band = _limit_or_none(
+        band = limit_or_none(
             lambda: least_worst_residual(
                 hardware, truth, band_hz=band_hz, rms_nm=line.rms_nm, direction=line.direction
             )
@@ -233,76 +227,3 @@ def _evaluate_loop(
         own = residual_budget(loop, replace(still, vibrations=moved))
         variance[i] = rest + np.trace(own.vibration_nm2)
     return budget.rms_nm, strehl(budget, imaging), np.sqrt(variance)
-
-
-def above_percent(rms_nm: float, limit_nm: float) -> float:
-    """Return how far a residual is above a limit [%]; nan where the limit is 0 or nan."""
-    return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else np.nan
-
-
-def limit_or_nan(limit: Callable[[], ResidualLimit | BandLimit]) -> float:
-    """Return the least residual [nm rms], nan where it cannot be computed."""
-    found = _limit_or_none(limit)
-    return np.nan if found is None else found.rms_nm
-
-
-def _limit_or_none(limit: Callable[[], T]) -> T | None:
-    try:
-        return limit()
-    except LbtSynthError:
-        return None
-
-
-def model_limit(design: EstimatorDesign) -> tuple[float, float]:
-    """Return the limit of a filter's own model [nm rms], and how far its error is above it [%].
-
-    Both are nan where the limit cannot be computed. The second is nan also for a fractional
-    delay or a moving mirror: there only an LQG's estimation error is its residual.
-    """
-    plant = design.problem
-    if not isinstance(plant, TipTiltPlant | FullStatePlant):
-        return np.nan, np.nan
-    limit_nm = limit_or_nan(lambda: least_model_residual(plant))
-    delay = plant.hardware.delay_frames
-    settled = delay == round(delay) and plant.hardware.mirror is None
-    exact = settled or isinstance(design, LqgDesign)
-    return limit_nm, above_percent(design.rms, limit_nm) if exact else np.nan
-
-
-def shaped_limit(design: ShapedDesign) -> tuple[float, float]:
-    """Return the limit of a shaped design's own spectra [nm rms], and its residual above it [%].
-
-    Both are over all modes at unit sensor gain: the variance plus the worst of the band. They
-    are nan where a mode has no variance at unit gain, or several bands, as the limit of their
-    sum is not known.
-    """
-    limit_nm2, residual_nm2 = 0.0, 0.0
-    for spec, parameter in zip(design.specifications, design.parameters, strict=True):
-        at_unit = [leaf for leaf in leaves(spec.objective) if leaf.sensor_gain == 1]
-        variances = [leaf for leaf in at_unit if isinstance(leaf, ResidualVariance)]
-        bands = [leaf for leaf in at_unit if isinstance(leaf, VibrationBand)]
-        if len(variances) != 1 or len(bands) > 1:
-            return np.nan, np.nan
-        hardware = mode_hardware(design.loop_hardware)
-        truth = Truth(turbulence=variances[0].turbulence, noise_nm=variances[0].noise_nm)
-        found = limit_or_nan(partial(_mode_limit, hardware, truth, bands))
-        loop = mode_loop(design.loop_hardware, parameter)
-        limit_nm2 += found**2
-        residual_nm2 += variances[0].measured_nm2(loop)
-        residual_nm2 += sum(band.measured_nm2(loop) for band in bands)
-    limit_nm = float(np.sqrt(limit_nm2))
-    return limit_nm, above_percent(float(np.sqrt(residual_nm2)), limit_nm)
-
-
-def _mode_limit(
-    hardware: LoopHardware, truth: Truth, bands: list[VibrationBand]
-) -> ResidualLimit | BandLimit:
-    if not bands:
-        return least_residual(hardware, truth)
-    return least_worst_residual(
-        hardware,
-        truth,
-        band_hz=(bands[0].low_hz, bands[0].high_hz),
-        rms_nm=bands[0].rms_nm,
-        direction=(1.0,),
-    )

@@ -13,8 +13,8 @@ from support.limits import RATE, Anonymous, ar, budget, path, variance
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.design.model_limits import model_limit
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
-from lbt_synth.studies.limits import model_limit
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3, 6, 20])
