@@ -1,0 +1,166 @@
+"""Rows of tables: dataclasses whose fields say how their values are printed.
+
+The same rows make a table for a terminal or a page, a list of facts, a CSV file and JSON.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Sequence
+from typing import Any, TypeVar, dataclass_transform
+
+import numpy as np
+
+from lbt_synth.storage.tables import Table, csv_bytes
+
+Row = TypeVar("Row")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """How the values of one field are printed."""
+
+    heading: str = ""  # over the cells of a table; a field without one is in CSV and JSON only
+    unit: str = ""  # of the numbers in tables
+    format: str = ""  # of numbers, as ".1f"; by default six significant digits
+    help: str = ""  # what the value is, without its unit and a full stop
+    scale: float = (
+        1.0  # from the value, which CSV and JSON hold, to that in tables: 100 for percent
+    )
+    missing: str = "-"  # the cell of nan or None
+    key: str = ""  # the name in CSV and JSON; by default that of the field
+    name: str = ""  # of the field
+
+    @property
+    def title(self) -> str:
+        """The heading with the unit."""
+        return f"{self.heading} [{self.unit}]" if self.unit else self.heading
+
+    @property
+    def raw_unit(self) -> str:
+        """The unit of the value in CSV and JSON."""
+        return self.unit if self.scale == 1 else ""
+
+    def text(self, row: Any) -> str:
+        """Return the cell of a row."""
+        value = getattr(row, self.name)
+        if self.scale != 1 and value is not None:
+            value = self.scale * value
+        return cell_text(value, self.format, missing=self.missing)
+
+
+def column(
+    heading: str = "", *, default: Any = dataclasses.MISSING, init: bool = True, **printing: Any
+) -> Any:
+    """Return a field of a :func:`table_row`, printed as the attributes of :class:`Column` say."""
+    printed = Column(heading=heading, **printing)
+    return dataclasses.field(default=default, init=init, metadata={"column": printed})
+
+
+@dataclass_transform(
+    kw_only_default=True, frozen_default=True, field_specifiers=(column, dataclasses.field)
+)
+def table_row(kind: type[Row]) -> type[Row]:
+    r"""Make a frozen dataclass of columns, whose docstring lists them.
+
+    Examples
+    --------
+    >>> from lbt_synth.storage.rows import column, fact_table, json_record, row_table, table_row
+    >>> @table_row
+    ... class Result:
+    ...     '''One design.'''
+    ...
+    ...     design: str = column("design", help="Name of the design")
+    ...     strehl: float = column("Strehl", unit="%", scale=100, format=".1f")
+    ...     residual_nm: float = column("residual", unit="nm rms", format=".1f")
+    >>> row = Result(design="kalman", strehl=0.8, residual_nm=float("nan"))
+    >>> table = row_table("Designs", [row])
+    >>> table.headings, table.rows
+    (('design', 'Strehl [%]', 'residual [nm rms]'), (('kalman', '80.0', '-'),))
+    >>> fact_table("Design", row).rows[1]
+    ('Strehl', '80.0', '%')
+    >>> json_record(row)
+    {'design': 'kalman', 'strehl': 0.8, 'residual_nm': nan}
+    >>> csv_rows([row])
+    b'design,strehl,residual_nm\nkalman,0.8,\n'
+    """
+    made = dataclasses.dataclass(frozen=True, slots=True, kw_only=True)(kind)
+    lines = [f"{kind.__doc__}\n", "Attributes", "----------"]
+    for each in columns(made):
+        unit = f" [{each.raw_unit}]" if each.raw_unit else ""
+        lines += [f"{each.name} : {kind.__annotations__[each.name]}", f"    {each.help}{unit}."]
+    made.__doc__ = "\n".join(lines)
+    return made
+
+
+def columns(kind: Any) -> tuple[Column, ...]:
+    """Return the columns of a row or a row type, in the order of its fields."""
+    return tuple(
+        dataclasses.replace(given, name=field.name, key=given.key or field.name)
+        for field in dataclasses.fields(kind)
+        if (given := field.metadata.get("column"))
+    )
+
+
+def json_record(row: Any, *, without: Collection[str] = ()) -> dict[str, Any]:
+    """Return the values of a row by their keys, but for the fields left out."""
+    kept = [each for each in columns(row) if each.name not in without]
+    return {each.key: getattr(row, each.name) for each in kept}
+
+
+def json_units(kind: Any) -> dict[str, str]:
+    """Return the units of the values in CSV and JSON, by their keys."""
+    return {each.key: each.raw_unit for each in columns(kind) if each.raw_unit}
+
+
+def csv_rows(rows: Sequence[Any], *, without: Collection[str] = ()) -> bytes:
+    """Return rows of one type as a CSV file, with empty cells for nan."""
+    records = [json_record(row, without=without) for row in rows]
+    cells = [
+        ["" if isinstance(v, float) and math.isnan(v) else v for v in record.values()]
+        for record in records
+    ]
+    return csv_bytes(list(records[0]), cells)
+
+
+def row_table(caption: str, rows: Sequence[Any], *, without: Collection[str] = ()) -> Table:
+    """Return a table with one line per row, all of one type; words are flush left."""
+    shown = [c for c in columns(rows[0]) if c.heading and c.name not in without]
+    return Table(
+        caption=caption,
+        headings=tuple(each.title for each in shown),
+        rows=tuple(tuple(each.text(row) for each in shown) for row in rows),
+        words=tuple(
+            i for i, each in enumerate(shown) if i and isinstance(getattr(rows[0], each.name), str)
+        ),
+    )
+
+
+def fact_table(caption: str, *rows: Any) -> Table:
+    """Return a table with one line per value of the rows; None does not apply and is left out."""
+    return Table(
+        caption=caption,
+        headings=("quantity", "value", "unit"),
+        rows=tuple(
+            (each.heading, each.text(row), each.unit)
+            for row in rows
+            for each in columns(row)
+            if each.heading and getattr(row, each.name) is not None
+        ),
+        words=(2,),
+    )
+
+
+def cell_text(value: Any, spec: str = "", *, missing: str = "-") -> str:
+    """Return the text of a cell: six significant digits of a float unless a format is given."""
+    if value is None or (isinstance(value, float | np.floating) and math.isnan(value)):
+        return missing
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        spec = spec or ".6g"
+    if isinstance(value, str) or not spec:
+        return str(value)
+    text = f"{value:{spec}}"
+    return f"{0.0:{spec}}" if float(text) == 0 else text  # never minus zero

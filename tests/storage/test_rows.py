@@ -1,0 +1,143 @@
+"""Rows print themselves as tables, facts, CSV and JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from lbt_synth.storage.rows import (
+    cell_text,
+    column,
+    columns,
+    csv_rows,
+    fact_table,
+    json_record,
+    json_units,
+    row_table,
+    table_row,
+)
+
+
+@table_row
+class Loop:
+    """One loop."""
+
+    name: str = column("loop", key="row", help="Name of the loop")
+    method: str = column("method", help="How it was designed")
+    error_hz: float = column("error", unit="Hz", format="+.2f", help="Model less truth")
+    strehl: float = column("Strehl", unit="%", scale=100, format=".1f", help="Strehl ratio")
+    residual_nm: float = column("residual", unit="nm", format=".1f", missing="unstable")
+    gamma: float = column(unit="nm", help="Norm")
+    limit_nm: float | None = column("limit", unit="nm", default=None)
+    stable: bool = column("stable", default=True)
+    design: object = dataclasses.field(default=None, compare=False)
+
+
+ROWS = [
+    Loop(name="a", method="kalman", error_hz=-0.001, strehl=0.8, residual_nm=12.34, gamma=1 / 3),
+    Loop(
+        name="b",
+        method="hinf",
+        error_hz=1,
+        strehl=math.nan,
+        residual_nm=math.nan,
+        gamma=2.0,
+        limit_nm=9.0,
+        stable=False,
+    ),
+]
+
+
+def test_a_table_has_headings_with_units_and_formatted_cells():
+    table = row_table("Loops", ROWS)
+    assert table.headings == (
+        "loop",
+        "method",
+        "error [Hz]",
+        "Strehl [%]",
+        "residual [nm]",
+        "limit [nm]",
+        "stable",
+    )
+    assert table.rows == (
+        ("a", "kalman", "+0.00", "80.0", "12.3", "-", "yes"),
+        ("b", "hinf", "+1.00", "-", "unstable", "9", "no"),
+    )
+    assert table.words == (1,)
+    assert row_table("Loops", ROWS, without=["limit_nm", "stable"]).headings[-1] == "residual [nm]"
+
+
+def test_csv_and_json_hold_the_values_themselves():
+    first, second = csv_rows(ROWS, without=["stable"]).decode().splitlines()[1:]
+    assert first == "a,kalman,-0.001,0.8,12.34,0.3333333333333333,"
+    assert second == "b,hinf,1,,,2.0,9.0"
+    record = json_record(ROWS[0])
+    assert list(record) == [
+        "row",
+        "method",
+        "error_hz",
+        "strehl",
+        "residual_nm",
+        "gamma",
+        "limit_nm",
+        "stable",
+    ]
+    assert record["gamma"] == 1 / 3
+    assert "limit_nm" not in json_record(ROWS[0], without=["limit_nm"])
+    # a scaled value has the unit of tables in tables only
+    assert json_units(Loop) == {
+        "error_hz": "Hz",
+        "residual_nm": "nm",
+        "gamma": "nm",
+        "limit_nm": "nm",
+    }
+
+
+def test_facts_leave_out_what_does_not_apply():
+    table = fact_table("Loop", ROWS[0], ROWS[1])
+    assert table.headings == ("quantity", "value", "unit")
+    assert table.rows[:5] == (
+        ("loop", "a", ""),
+        ("method", "kalman", ""),
+        ("error", "+0.00", "Hz"),
+        ("Strehl", "80.0", "%"),
+        ("residual", "12.3", "nm"),
+    )
+    assert [row[0] for row in table.rows].count("limit") == 1
+    assert table.rows[-2:] == (("limit", "9", "nm"), ("stable", "no", ""))
+
+
+def test_the_docstring_lists_the_columns():
+    assert Loop.__doc__.startswith("One loop.\n\nAttributes\n----------\nname : str\n    Name of")
+    assert "error_hz : float\n    Model less truth [Hz].\n" in Loop.__doc__
+    assert "strehl : float\n    Strehl ratio.\n" in Loop.__doc__
+    assert "design" not in [each.name for each in columns(Loop)]
+
+
+def test_rows_are_frozen_and_compared_by_value():
+    assert ROWS[0] == dataclasses.replace(ROWS[0], design="another")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        ROWS[0].gamma = 1.0
+    with pytest.raises(TypeError, match="missing 5 required keyword-only arguments"):
+        Loop(name="a")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "-"),
+        (math.nan, "-"),
+        (np.float64(-0.0), "0"),
+        (math.inf, "inf"),
+        (1234567.0, "1.23457e+06"),
+        (np.bool_(True), "yes"),
+        (False, "no"),
+        (12345678, "12345678"),
+        ("word", "word"),
+    ],
+)
+def test_cells(value, text):
+    assert cell_text(value) == text
