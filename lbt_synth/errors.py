@@ -6,6 +6,7 @@ message are on the exception, so that a script need not parse text.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,18 +16,12 @@ from typing import Any
 class LbtSynthError(Exception):
     """Base class of every error that this package raises on purpose."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle with the data, whatever the constructor needs, for errors of other processes."""
-        return _rebuild, (type(self), self.args, self.__dict__)
-
-
-def _rebuild(
-    kind: type[LbtSynthError], args: tuple[Any, ...], data: dict[str, Any]
-) -> LbtSynthError:
-    error = kind.__new__(kind)
-    error.args = args
-    error.__dict__.update(data)
-    return error
+    def __init__(self, message: str = "", **data: Any) -> None:
+        super().__init__(message)
+        for name, value in data.items():
+            if not hasattr(type(self), name):
+                raise TypeError(f"{type(self).__name__} has no attribute {name!r}.")
+            setattr(self, name, value)
 
 
 # --------------------------------------------------------------------------
@@ -57,9 +52,7 @@ class DetectabilityError(ProblemError):
         The offending eigenvalue of the state matrix.
     """
 
-    def __init__(self, message: str, *, eigenvalue: complex | None = None) -> None:
-        super().__init__(message)
-        self.eigenvalue = eigenvalue
+    eigenvalue: complex | None = None
 
 
 class ConfigError(ProblemError):
@@ -71,9 +64,7 @@ class ConfigError(ProblemError):
         Path of the offending key, for example ``model.vibrations[0].damping``.
     """
 
-    def __init__(self, message: str, *, path: str = "") -> None:
-        super().__init__(message)
-        self.path = path
+    path: str = ""
 
 
 # --------------------------------------------------------------------------
@@ -96,18 +87,9 @@ class InfeasibleError(SynthesisError):
         Demands that cannot hold together; without any one of them the rest can.
     """
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        gamma: float | None = None,
-        gamma_least: float | None = None,
-        conflict: tuple[str, ...] = (),
-    ) -> None:
-        super().__init__(message)
-        self.gamma = gamma
-        self.gamma_least = gamma_least
-        self.conflict = conflict
+    gamma: float | None = None
+    gamma_least: float | None = None
+    conflict: tuple[str, ...] = ()
 
 
 class NumericalError(SynthesisError):
@@ -121,10 +103,8 @@ class NumericalError(SynthesisError):
         The residual reached.
     """
 
-    def __init__(self, message: str, *, status: str = "", residual: float | None = None) -> None:
-        super().__init__(message)
-        self.status = status
-        self.residual = residual
+    status: str = ""
+    residual: float | None = None
 
 
 class CertificateError(SynthesisError):
@@ -136,9 +116,7 @@ class CertificateError(SynthesisError):
         Names of the checks that failed.
     """
 
-    def __init__(self, message: str, *, failed: tuple[str, ...] = ()) -> None:
-        super().__init__(message)
-        self.failed = failed
+    failed: tuple[str, ...] = ()
 
 
 class UnstableLoopError(SynthesisError):
@@ -150,9 +128,7 @@ class UnstableLoopError(SynthesisError):
         Largest modulus of the closed loop's poles.
     """
 
-    def __init__(self, message: str, *, spectral_radius: float) -> None:
-        super().__init__(message)
-        self.spectral_radius = spectral_radius
+    spectral_radius: float = math.nan
 
 
 class MissingExtraError(LbtSynthError, ImportError):
@@ -164,9 +140,7 @@ class MissingExtraError(LbtSynthError, ImportError):
         The extra that brings it: ``pip install "lbt-synth[extra]"``.
     """
 
-    def __init__(self, message: str, *, extra: str) -> None:
-        super().__init__(message)
-        self.extra = extra
+    extra: str = ""
 
 
 # --------------------------------------------------------------------------
@@ -181,9 +155,7 @@ class FileError(LbtSynthError):
         The file.
     """
 
-    def __init__(self, message: str, *, path: Path | None = None) -> None:
-        super().__init__(message)
-        self.path = path
+    path: Path | None = None
 
 
 class GainFileError(FileError):

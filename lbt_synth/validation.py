@@ -8,8 +8,10 @@ that names the argument.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
-from typing import Any, TypeAlias, TypeVar, cast
+from functools import cache
+from typing import Annotated, Any, TypeAlias, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,18 @@ ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Entry = TypeVar("Entry", bound=np.generic)
+# Types of fields that `check_fields` checks: the metadata are keywords of `number` or `integer`.
+Finite: TypeAlias = Annotated[float, ("at_least", -math.inf)]
+Positive: TypeAlias = Annotated[float, ("above", 0)]
+NotNegative: TypeAlias = Annotated[float, ("at_least", 0)]
+Obstruction: TypeAlias = Annotated[float, ("at_least", 0), ("below", 1)]
+Count: TypeAlias = Annotated[int, ("at_least", 1)]
+_RELATIONS = {
+    "above": operator.gt,
+    "at_least": operator.ge,
+    "below": operator.lt,
+    "at_most": operator.le,
+}
 
 
 def read_only(array: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
@@ -151,17 +165,8 @@ def _extreme_eigenvalues(symmetric_matrix: FloatArray) -> tuple[FloatArray, Floa
     return values[..., 0], np.max(np.abs(values), axis=-1)
 
 
-def number(
-    value: Any,
-    name: str,
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
-    hint: str = "",
-) -> float:
-    """Return a finite float within its bounds."""
+def number(value: Any, name: str, *, hint: str = "", **bounds: float) -> float:
+    """Return a finite float ``above``, ``at_least``, ``below`` or ``at_most`` its bounds."""
     if isinstance(value, bool | str | bytes) or value is None:
         raise ProblemError(f"{name} must be a number; got {value!r}.")
     try:
@@ -170,27 +175,67 @@ def number(
         raise ProblemError(f"{name} must be a number; got {value!r}.") from error
     if not math.isfinite(out):
         raise NonFiniteError(f"{name} must be finite; got {out}.")
-    bounds = (
-        (above, "above", above is not None and not out > above),
-        (at_least, "at least", at_least is not None and not out >= at_least),
-        (below, "below", below is not None and not out < below),
-        (at_most, "at most", at_most is not None and not out <= at_most),
-    )
-    for bound, word, broken in bounds:
-        if broken:
-            raise ProblemError(
-                f"{name} must be {word} {bound:.12g}; got {out:.12g}. {hint}".strip()
-            )
+    for relation, bound in bounds.items():
+        if not _RELATIONS[relation](out, bound):
+            wanted = f"{relation.replace('_', ' ')} {bound:.12g}"
+            raise ProblemError(f"{name} must be {wanted}; got {out:.12g}. {hint}".strip())
     return out
 
 
-def integer(value: Any, name: str, *, at_least: int) -> int:
-    """Return an integer that is at least a bound."""
+def positive(values: Any, name: str) -> FloatArray:
+    """Return a finite array whose entries are all above 0."""
+    out = real_array(values, name)
+    if np.any(out <= 0):
+        raise ProblemError(f"{name} must be above 0; got {out.min():.6g}.")
+    return out
+
+
+def one_or_each(value: Any, name: str, size: int | None = None, **bounds: Any) -> FloatArray:
+    """Return one number (), or a list of one per measurement (size,), all within bounds."""
+    out = real_array(value, name) if np.ndim(value) else np.asarray(number(value, name, **bounds))
+    if out.ndim > 1 or out.size == 0 or (out.ndim == 1 and size not in (None, out.size)):
+        wanted = "" if size is None else f" ({size})"
+        raise DimensionError(
+            f"{name} must be one number, or one per measurement{wanted}; got shape {out.shape}."
+        )
+    for entry in out.ravel():
+        number(entry, name, **bounds)
+    return out
+
+
+def integer(value: Any, name: str, *, at_least: int, at_most: float = math.inf) -> int:
+    """Return an integer within its bounds."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ProblemError(f"{name} must be an integer; got {value!r}.")
-    if value < at_least:
-        raise ProblemError(f"{name} must be at least {at_least}; got {value}.")
+    for word, bound, broken in (
+        ("least", at_least, value < at_least),
+        ("most", at_most, value > at_most),
+    ):
+        if broken:
+            raise ProblemError(f"{name} must be at {word} {bound}; got {value}.")
     return int(value)
+
+
+def check_fields(target: Any) -> None:
+    """Check the fields of a frozen dataclass whose types hold bounds, such as ``Positive``."""
+    for name, kind, bounds, optional in _bounded_fields(target.__class__):
+        value = getattr(target, name)
+        if not (optional and value is None):
+            check: Any = integer if kind is int else number
+            object.__setattr__(target, name, check(value, name, **bounds))
+
+
+@cache
+def _bounded_fields(kind: Any) -> list[tuple[str, type, dict[str, Any], bool]]:
+    """Name, type, bounds of each bounded field, and whether it may be None."""
+    found = []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        options = (hint,) if hasattr(hint, "__metadata__") else get_args(hint)
+        for option in options:
+            if hasattr(option, "__metadata__"):
+                bounds = dict(option.__metadata__)
+                found.append((name, option.__origin__, bounds, type(None) in options))
+    return found
 
 
 def choice(value: Any, name: str, options: Sequence[str]) -> str:

@@ -18,7 +18,6 @@ from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import stable_sensor_gains
-from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.studies.robustness import METHODS
@@ -270,7 +269,7 @@ def _map_notes(
                 f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
                 f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
             )
-        if not have_same_mirror(own, config.hardware):
+        if own.mirror != config.hardware.mirror:
             notes.append(
                 f"note: {name} was designed for another mirror than the configuration's, and its "
                 "map is that of its own."

@@ -31,7 +31,6 @@ from lbt_synth.loop import (
 )
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import Truth
-from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
@@ -166,7 +165,7 @@ def _require_stable(loop: ClosedLoop, design: Design, reference_gain: float) -> 
         return
     own, here = design.hardware, loop.hardware
     low, high = stable_sensor_gains(here, design.controller)
-    if own is not None and not have_same_mirror(own, here):
+    if own is not None and own.mirror != here.mirror:
         reason = (
             "The file was designed for another mirror than that of the configuration. Design for "
             "mirror.local_loop of the configuration, best with --method lqg."

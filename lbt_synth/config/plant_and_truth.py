@@ -45,7 +45,7 @@ from lbt_synth.models import (
     tip_tilt_plant,
 )
 from lbt_synth.models.plant.frequency_prior import line_frequencies, spread_lines
-from lbt_synth.models.truth import TrueVibration
+from lbt_synth.models.vibration.in_a_loop import TrueVibration
 from lbt_synth.validation import FloatArray, frozen_copy
 
 

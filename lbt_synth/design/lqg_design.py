@@ -21,8 +21,8 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop import close_loop
-from lbt_synth.models import TipTiltPlant, tip_tilt_plant
-from lbt_synth.models.plant.tip_tilt import require_no_memory
+from lbt_synth.models import TipTiltPlant
+from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _SAME = 1e-9
@@ -218,16 +218,8 @@ def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:
     delay = hardware.mirror_system.lead + 1
     if hardware.mirror is None and hardware.delay_frames == delay:
         return plant
-    require_no_memory(plant)
-    return tip_tilt_plant(
-        frame_rate_hz=hardware.frame_rate_hz,
-        turbulence=plant.turbulence,
-        noise_nm=plant.R,
-        vibrations=plant.vibrations or None,
-        delay_frames=delay,
-        sensor_matrix=hardware.sensor,
-        influence_matrix=hardware.influence,
-    )
+    waiting = replace(hardware, delay_frames=delay, mirror=None)
+    return assemble(replace(plant.parts(), hardware=waiting))
 
 
 def loop_variances(

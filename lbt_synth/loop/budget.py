@@ -16,9 +16,8 @@ from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
-from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.models.truth import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
@@ -189,7 +188,7 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
     alike = (
         all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=0) for a, b in pairs)
         and one.delay_frames == other.delay_frames
-        and have_same_mirror(one, other)
+        and one.mirror == other.mirror
     )
     if not alike:
         raise ProblemError(

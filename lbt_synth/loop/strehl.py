@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.special import j0
@@ -24,8 +24,10 @@ from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     IntArray,
+    Obstruction,
+    Positive,
+    check_fields,
     matrix,
-    number,
     real_array,
     semidefinite,
 )
@@ -66,18 +68,13 @@ class Imaging:
     2.2
     """
 
-    diameter_m: float | None = None
-    obstruction: float = 0.0
-    wavelength_um: float = 2.2
-    other_modes: float = 1.0
+    diameter_m: Positive | None = None
+    obstruction: Obstruction = 0.0
+    wavelength_um: Positive = 2.2
+    other_modes: Annotated[float, ("above", 0), ("at_most", 1)] = 1.0
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        if self.diameter_m is not None:
-            set_(self, "diameter_m", number(self.diameter_m, "diameter_m", above=0))
-        set_(self, "obstruction", number(self.obstruction, "obstruction", at_least=0, below=1))
-        set_(self, "wavelength_um", number(self.wavelength_um, "wavelength_um", above=0))
-        set_(self, "other_modes", number(self.other_modes, "other_modes", above=0, at_most=1))
+        check_fields(self)
 
     @property
     def cycles_per_nm(self) -> float:

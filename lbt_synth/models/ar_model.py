@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.validation import FloatArray, frozen_copy, number, real_array, set_fields
+from lbt_synth.validation import (
+    FloatArray,
+    Positive,
+    check_fields,
+    frozen_copy,
+    real_array,
+    set_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,8 +45,8 @@ class ARModel:
     """
 
     coefficients: FloatArray
-    driving_rms_nm: float
-    frame_rate_hz: float
+    driving_rms_nm: Positive
+    frame_rate_hz: Positive
 
     def __post_init__(self) -> None:
         a = np.atleast_1d(real_array(self.coefficients, "coefficients"))
@@ -47,9 +54,8 @@ class ARModel:
             raise DimensionError(
                 f"coefficients must be a list of at least one number; got shape {a.shape}."
             )
-        driving = number(self.driving_rms_nm, "driving_rms_nm", above=0)
-        rate = number(self.frame_rate_hz, "frame_rate_hz", above=0)
-        set_fields(self, coefficients=frozen_copy(a), driving_rms_nm=driving, frame_rate_hz=rate)
+        check_fields(self)
+        set_fields(self, coefficients=frozen_copy(a))
         radius = float(np.max(np.abs(np.linalg.eigvals(self.companion))))
         if not radius < 1:
             raise ProblemError(
@@ -65,14 +71,12 @@ class ARModel:
     @property
     def companion(self) -> FloatArray:
         """State matrix (order, order) of the state [x(k), x(k-1), ...]."""
-        A = np.eye(self.order, k=-1)
-        A[0] = self.coefficients
-        return A
+        return companions(self.coefficients)
 
     @property
     def rms_nm(self) -> float:
         """Stationary standard deviation [nm]."""
-        return self.driving_rms_nm * float(np.sqrt(variance_ratio(self.coefficients)))
+        return self.driving_rms_nm * float(np.sqrt(variance_ratios(self.coefficients)))
 
     def psd(self, frequency_hz: Any) -> FloatArray:
         """One-sided power spectrum [nm^2/Hz] at frequencies up to Nyquist.
@@ -100,16 +104,27 @@ class ARModel:
         9.0
         """
         frequency = real_array(frequency_hz, "frequency_hz")
-        delay = np.exp(-2j * np.pi * frequency / self.frame_rate_hz)
-        lags = np.arange(1, self.order + 1)
-        response = 1 - np.sum(self.coefficients * delay[..., None] ** lags, axis=-1)
-        density = 2 * self.driving_rms_nm**2 / self.frame_rate_hz / np.abs(response) ** 2
-        return np.asarray(density)
+        density = densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)
+        return density.reshape(frequency.shape)
 
 
-def variance_ratio(coefficients: FloatArray) -> float:
-    """Variance of a stationary AR process over that of its driving noise."""
-    return float(variance_ratios(coefficients))
+def companions(coefficients: FloatArray) -> FloatArray:
+    """State matrices (..., order, order) of AR processes with coefficients (..., order)."""
+    order = coefficients.shape[-1]
+    A = np.zeros((*coefficients.shape, order))
+    A[..., 0, :] = coefficients
+    A[..., 1:, :-1] = np.eye(order - 1)
+    return A
+
+
+def densities(
+    coefficients: FloatArray, driving_rms: FloatArray | float, rate_hz: float, frequency: FloatArray
+) -> FloatArray:
+    """One-sided power spectra (..., f) of AR processes (..., order) at f frequencies."""
+    delay = np.exp(-2j * np.pi * frequency.ravel() / rate_hz)
+    lags = delay ** np.arange(1, coefficients.shape[-1] + 1)[:, None]
+    drive = np.asarray(2 * np.square(driving_rms) / rate_hz)
+    return np.asarray(drive[..., None] / np.abs(1 - coefficients @ lags) ** 2)
 
 
 def variance_ratios(coefficients: FloatArray) -> FloatArray:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, instant_mirror, lifted_mirror
+from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_system
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.validation import (
     FloatArray,
+    Positive,
+    check_fields,
     frozen_copy,
     matrix,
-    number,
     require_instance,
     set_fields,
 )
@@ -72,14 +74,20 @@ class LoopHardware:
     [0.0, 0.631, 0.387]
     """
 
-    frame_rate_hz: float
-    delay_frames: float = 2.0
+    frame_rate_hz: Positive
+    delay_frames: Annotated[
+        float,
+        ("at_least", 1),
+        ("at_most", 100),
+        ("hint", "One frame is the exposure itself: no loop is faster."),
+    ] = 2.0
     sensor_matrix: FloatArray | None = None
     influence_matrix: FloatArray | None = None
     modes: int = 2
     mirror: PositionLoop | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         sensor, influence, n = self.sensor_matrix, self.influence_matrix, self.modes
         if sensor is not None:
             sensor = matrix(sensor, "sensor_matrix")
@@ -98,18 +106,10 @@ class LoopHardware:
             modes=n,
             sensor_matrix=frozen_copy(np.eye(n)) if sensor is None else sensor,
             influence_matrix=frozen_copy(np.eye(n)) if influence is None else influence,
-            frame_rate_hz=number(self.frame_rate_hz, "frame_rate_hz", above=0),
-            delay_frames=number(
-                self.delay_frames,
-                "delay_frames",
-                at_least=1,
-                at_most=100,
-                hint="One frame is the exposure itself: no loop is faster.",
-            ),
         )
         if self.mirror is not None:
             require_instance(self.mirror, PositionLoop)
-            lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
+            _ = self.mirror_system  # refuses a mirror that does not fit the frame rate
 
     @property
     def sensor(self) -> FloatArray:
@@ -146,21 +146,12 @@ class LoopHardware:
     @property
     def mirror_system(self) -> MirrorSystem:
         """Mirror and delay as a system at the frame rate, of one command."""
-        if self.mirror is None:
-            return instant_mirror(self.delay_frames)
-        return lifted_mirror(self.mirror, self.frame_rate_hz, self.delay_frames)
+        return mirror_system(self.mirror, self.frame_rate_hz, self.delay_frames)
 
     @property
     def mirror_taps(self) -> FloatArray:
         """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``, to rounding."""
         return self.mirror_system.taps
-
-
-def have_same_mirror(one: LoopHardware, other: LoopHardware) -> bool:
-    """Whether two loops have the same dynamics of the mirror."""
-    if one.mirror is None or other.mirror is None:
-        return one.mirror is other.mirror
-    return astuple(one.mirror) == astuple(other.mirror)
 
 
 def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
@@ -174,16 +165,14 @@ def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
         np.array_equal(own.sensor, here.sensor) and np.array_equal(own.influence, here.influence)
     ):
         notes.append("designed for another sensor or influence matrix than it is run with.")
-    if not have_same_mirror(own, here):
+    if own.mirror != here.mirror:
         kinds = [
             "a mirror that settles at once" if h.mirror is None else "a mirror with dynamics"
             for h in (own, here)
         ]
-        notes.append(
-            f"designed for {kinds[0]}, run with {kinds[1]}."
-            if kinds[0] != kinds[1]
-            else "designed for other dynamics of the mirror than it is run with."
-        )
+        other = "other dynamics of the mirror than it is run with."
+        differ = kinds[0] != kinds[1]
+        notes.append(f"designed for {f'{kinds[0]}, run with {kinds[1]}.' if differ else other}")
     return notes
 
 

@@ -2,57 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
-from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.models.vibration.sinusoid import SinusoidalVibration
-from lbt_synth.validation import FloatArray, frozen_copy, number, real_array, set_fields
-
-TrueVibration: TypeAlias = Vibration | SinusoidalVibration | DriftingVibration
-
-
-def checked_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
-    """Return the direction (n,) of a vibration, which must fit the loop."""
-    if isinstance(vibration, DriftingVibration):
-        frequency_hz = vibration.highest_hz
-    else:
-        frequency_hz = vibration.frequency_hz
-    if len(vibration.direction) != hardware.modes:
-        raise DimensionError(
-            f"the direction of a vibration must have {hardware.modes} components, one per mode; "
-            f"got {len(vibration.direction)} at {frequency_hz:.6g} Hz."
-        )
-    nyquist = hardware.frame_rate_hz / 2
-    if not frequency_hz < nyquist:
-        raise ProblemError(
-            f"a vibration must lie below the Nyquist frequency {nyquist:.6g} Hz; "
-            f"got {frequency_hz:.6g} Hz."
-        )
-    return np.array(vibration.direction)
-
-
-def stationary_vibrations(
-    vibrations: Iterable[TrueVibration],
-) -> tuple[Vibration | SinusoidalVibration, ...]:
-    """Return the vibrations; refuse one that drifts."""
-    still = []
-    for vibration in vibrations:
-        if isinstance(vibration, DriftingVibration):
-            raise ProblemError(
-                "this needs a truth that is stationary; got a vibration that drifts from "
-                f"{vibration.start_hz:.6g} to {vibration.end_hz:.6g} Hz. Simulate it, or take a "
-                "Vibration or SinusoidalVibration at the frequencies in question."
-            )
-        still.append(vibration)
-    return tuple(still)
+from lbt_synth.models.vibration.in_a_loop import TrueVibration
+from lbt_synth.validation import (
+    FloatArray,
+    Positive,
+    check_fields,
+    frozen_copy,
+    one_or_each,
+    set_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,26 +67,30 @@ class Truth:
     turbulence: Spectrum | Sequence[Spectrum | None] | None
     vibrations: tuple[TrueVibration, ...] = ()
     noise_nm: float | FloatArray = 0.0
-    sensor_gain: float = 1.0
+    sensor_gain: Positive = 1.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         given = self.turbulence
-        if isinstance(given, Sequence):
-            set_fields(self, turbulence=tuple(given))
-            if len(given) == 0:
-                raise DimensionError(
-                    "turbulence must be one spectrum, or one per mode; got an empty sequence. For "
-                    "no turbulence give None."
-                )
-        for part in self._per_mode or (self.turbulence,):
+        parts = tuple(given) if isinstance(given, Sequence) else (given,)
+        if not parts:
+            raise DimensionError(
+                "turbulence must be one spectrum, or one per mode; got an empty sequence. For no "
+                "turbulence give None."
+            )
+        for part in parts:
             if part is not None and not isinstance(part, Spectrum):
                 raise ProblemError(
                     "turbulence must have a method psd(frequency_hz), or be None, or a sequence "
                     f"of these, one per mode; got {type(part).__name__}."
                 )
-        gain = number(self.sensor_gain, "sensor_gain", above=0)
-        noise = _deviations(self.noise_nm)
-        set_fields(self, vibrations=tuple(self.vibrations), noise_nm=noise, sensor_gain=gain)
+        noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
+        set_fields(
+            self,
+            turbulence=parts if isinstance(given, Sequence) else given,
+            vibrations=tuple(self.vibrations),
+            noise_nm=float(noise) if noise.ndim == 0 else noise,
+        )
 
     @property
     def drifts(self) -> bool:
@@ -128,14 +98,9 @@ class Truth:
         return any(isinstance(line, DriftingVibration) for line in self.vibrations)
 
     @property
-    def _per_mode(self) -> tuple[Spectrum | None, ...] | None:
-        """Spectra of each mode, None if one serves all modes."""
-        return self.turbulence if isinstance(self.turbulence, tuple) else None
-
-    @property
     def is_uniform(self) -> bool:
         """Whether one spectrum serves all modes."""
-        return self._per_mode is None
+        return not isinstance(self.turbulence, tuple)
 
     def turbulence_per_mode(self, modes: int) -> tuple[Spectrum | None, ...]:
         """Return the turbulence of each mode.
@@ -155,14 +120,14 @@ class Truth:
         DimensionError
             If there are spectra for another number of modes.
         """
-        given = self._per_mode
-        if given is None:
+        if not isinstance(self.turbulence, tuple):
             return (self.turbulence,) * modes  # type: ignore[return-value]
-        if len(given) != modes:
+        if len(self.turbulence) != modes:
             raise DimensionError(
-                f"turbulence must be one spectrum, or one per mode ({modes}); got {len(given)}."
+                f"turbulence must be one spectrum, or one per mode ({modes}); got "
+                f"{len(self.turbulence)}."
             )
-        return given
+        return self.turbulence
 
     def turbulence_groups(self, modes: int) -> tuple[tuple[Spectrum, tuple[int, ...]], ...]:
         """Return the different spectra, each with the modes that have it.
@@ -212,17 +177,3 @@ class Truth:
                 f"got {np.size(self.noise_nm)}."
             )
         return frozen_copy(np.broadcast_to(self.noise_nm, (measurements,)))
-
-
-def _deviations(noise_nm: Any) -> float | FloatArray:
-    """Return one deviation for all measurements, or one per measurement."""
-    if np.ndim(noise_nm) == 0:
-        return number(noise_nm, "noise_nm", at_least=0)
-    out = real_array(noise_nm, "noise_nm")
-    if out.ndim != 1 or out.size == 0:
-        raise DimensionError(
-            f"noise_nm must be one number, or a list of one per measurement; got shape {out.shape}."
-        )
-    for value in out:
-        number(value, "noise_nm", at_least=0)
-    return out

@@ -22,7 +22,7 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
-from lbt_synth.models.truth import stationary_vibrations
+from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _GRID = 65  # shifts over the range of errors, at least

@@ -12,7 +12,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop import EnsembleVibration, Imaging, LoopEnsemble, ensemble_residuals
 from lbt_synth.models import LoopHardware, Truth, Vibration
-from lbt_synth.models.truth import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,

@@ -7,7 +7,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.tracking.line_fit import LineFit, LineSearch
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.models.plant.tip_tilt import require_no_memory, with_vibrations
+from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.validation import FloatArray, number, require_instance
 
 _LEAST_BINS = 8
@@ -56,7 +56,7 @@ class LineFollower:
 
     def __init__(self, plant: TipTiltPlant, *, span_hz: float = 4.0) -> None:
         require_instance(plant, TipTiltPlant)
-        require_no_memory(plant)
+        plant.parts()  # refuses the memory of a mixed filter
         if not plant.vibrations:
             raise ProblemError("there must be a vibration to follow; got a plant without any.")
         sensor = plant.hardware.sensor

@@ -19,7 +19,6 @@ from lbt_synth.design import FilterDesign
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.simulation.block_filtering import last_state
 from lbt_synth.models import LoopHardware, TipTiltPlant
-from lbt_synth.models.loop_hardware import have_same_mirror
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 
@@ -271,7 +270,7 @@ def require_same_loop(plant: TipTiltPlant, hardware: LoopHardware) -> None:
     mine, theirs = hardware, plant.hardware
     if (
         (theirs.frame_rate_hz, theirs.delay_frames) != (mine.frame_rate_hz, mine.delay_frames)
-        or not have_same_mirror(theirs, mine)
+        or theirs.mirror != mine.mirror
         or not np.array_equal(theirs.influence, mine.influence)
         or theirs.sensor.shape != mine.sensor.shape
     ):

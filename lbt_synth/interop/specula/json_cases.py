@@ -20,7 +20,7 @@ from lbt_synth.models import (
     SinusoidalVibration,
     Vibration,
 )
-from lbt_synth.models.truth import TrueVibration
+from lbt_synth.models.vibration.in_a_loop import TrueVibration
 
 _SETUP = ("frames", "settle_frames", "seed", "gain", "leak", "leak_from_mode")
 _MATRICES = ("A", "B", "C", "D")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -12,11 +12,17 @@ from lbt_synth.design.modal import MixedController
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.specula.calibration import Calibration
 from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
-from lbt_synth.interop.specula.simulation import RAMP_FRAMES, checked_seed, run_end_to_end
+from lbt_synth.interop.specula.simulation import LARGEST_SEED, RAMP_FRAMES, run_end_to_end
 from lbt_synth.interop.specula.system import EndToEndSystem
-from lbt_synth.models.loop_hardware import have_same_mirror
-from lbt_synth.models.truth import TrueVibration
-from lbt_synth.validation import FloatArray, integer, number, require_instance, set_fields
+from lbt_synth.models.vibration.in_a_loop import TrueVibration
+from lbt_synth.validation import (
+    FloatArray,
+    NotNegative,
+    check_fields,
+    number,
+    require_instance,
+    set_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,25 +61,17 @@ class EndToEndSetup:
 
     system: EndToEndSystem
     vibrations: tuple[TrueVibration, ...] = ()
-    frames: int = 1600
-    settle_frames: int = 400
-    seed: int = 0
-    gain: float = 0.5
-    leak: float = 0.97
-    leak_from_mode: int = 50
+    frames: Annotated[int, ("at_least", 2)] = 1600
+    settle_frames: Annotated[int, ("at_least", RAMP_FRAMES)] = 400
+    seed: Annotated[int, ("at_least", 0), ("at_most", LARGEST_SEED)] = 0
+    gain: NotNegative = 0.5
+    leak: Annotated[float, ("at_least", 0), ("at_most", 1)] = 0.97
+    leak_from_mode: Annotated[int, ("at_least", 2)] = 50
 
     def __post_init__(self) -> None:
         require_instance(self.system, EndToEndSystem)
-        set_fields(
-            self,
-            vibrations=tuple(self.vibrations),
-            frames=integer(self.frames, "frames", at_least=2),
-            settle_frames=integer(self.settle_frames, "settle_frames", at_least=RAMP_FRAMES),
-            seed=checked_seed(self.seed),
-            gain=number(self.gain, "gain", at_least=0),
-            leak=number(self.leak, "leak", at_least=0, at_most=1),
-            leak_from_mode=integer(self.leak_from_mode, "leak_from_mode", at_least=2),
-        )
+        check_fields(self)
+        set_fields(self, vibrations=tuple(self.vibrations))
 
     @property
     def leaks(self) -> FloatArray:
@@ -114,7 +112,7 @@ class EndToEndSetup:
                 f"and {mine.delay_frames:g} frames; got one for {hardware.frame_rate_hz:g} Hz and "
                 f"{hardware.delay_frames:g} frames. Design it from this configuration."
             )
-        if hardware is not None and not have_same_mirror(hardware, mine):
+        if hardware is not None and hardware.mirror != mine.mirror:
             raise ProblemError(
                 "the filter was designed for another mirror than that of the configuration. Design "
                 "for its mirror.local_loop, best with --method lqg."

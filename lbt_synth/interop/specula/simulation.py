@@ -16,11 +16,11 @@ from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.loop.simulation.run import SteppedController, step_controller
 from lbt_synth.models import Truth
-from lbt_synth.models.truth import TrueVibration
+from lbt_synth.models.vibration.in_a_loop import TrueVibration
 from lbt_synth.validation import FloatArray, integer, require_instance
 
 RAMP_FRAMES = 200
-_LARGEST_SEED = 2**31 - 2  # the detector doubles it, in 32 bits
+LARGEST_SEED = 2**31 - 2  # the detector doubles it, in 32 bits
 
 
 def run_end_to_end(
@@ -108,7 +108,7 @@ has; got FilterDesign.
         )
     frames = integer(frames, "frames", at_least=2)
     settle = integer(settle_frames, "settle_frames", at_least=RAMP_FRAMES)
-    seed = checked_seed(seed)
+    seed = integer(seed, "seed", at_least=0, at_most=LARGEST_SEED)
     shaken = Truth(turbulence=None, vibrations=tuple(vibrations))
     total = settle + frames
     tilts = draw_disturbance(
@@ -133,14 +133,6 @@ has; got FilterDesign.
         settle_frames=settle,
         seconds=time.perf_counter() - started,
     )
-
-
-def checked_seed(seed: int) -> int:
-    """Return a seed that every part of the optics accepts."""
-    checked = integer(seed, "seed", at_least=0)
-    if checked > _LARGEST_SEED:
-        raise ProblemError(f"seed must be at most {_LARGEST_SEED}; got {checked}.")
-    return checked
 
 
 def _run_frames(

@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Annotated, Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import integer, number, require_instance, set_fields
+from lbt_synth.validation import (
+    Finite,
+    NotNegative,
+    Obstruction,
+    Positive,
+    check_fields,
+    require_instance,
+)
 
 _REFERENCE_UM = 0.5  # wavelength at which SPECULA takes the seeing
 _MOST_PIXELS = 1024
-_LIMITS: dict[str, dict[str, Any]] = {
-    "diameter_m": {"above": 0},
-    "seeing_arcsec": {"above": 0},
-    "outer_scale_m": {"above": 0},
-    "wind_speed_m_s": {"above": 0},
-    "photons": {"above": 0},
-    "sensing_wavelength_um": {"above": 0},
-    "modulation_lambda_over_d": {"above": 0},
-    "seeing_wavelength_um": {"above": 0},
-    "imaging_wavelength_um": {"above": 0},
-    "calibration_nm": {"above": 0},
-    "obstruction": {"at_least": 0, "below": 1},
-    "read_noise_electrons": {"at_least": 0},
-    "wind_direction_deg": {},
+_UNCALIBRATED = {  # fields on which the modes and the interaction matrix do not depend
+    "hardware",
+    "seeing_arcsec",
+    "seeing_wavelength_um",
+    "wind_speed_m_s",
+    "wind_direction_deg",
+    "photons",
+    "read_noise_electrons",
+    "imaging_wavelength_um",
 }
-_LEAST = {"subapertures_across": 2, "modes": 3, "actuators_across": 3, "pixels": 8}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,23 +91,23 @@ class EndToEndSystem:
     """
 
     hardware: LoopHardware
-    diameter_m: float
-    obstruction: float
-    seeing_arcsec: float
-    outer_scale_m: float
-    wind_speed_m_s: float
-    sensing_wavelength_um: float
-    modulation_lambda_over_d: float
-    subapertures_across: int
-    photons: float
-    read_noise_electrons: float
-    modes: int = 672
-    actuators_across: int = 31
-    seeing_wavelength_um: float = _REFERENCE_UM
-    imaging_wavelength_um: float = 2.2
-    wind_direction_deg: float = 0.0
-    pixels: int = 60
-    calibration_nm: float = 20.0
+    diameter_m: Positive
+    obstruction: Obstruction
+    seeing_arcsec: Positive
+    outer_scale_m: Positive
+    wind_speed_m_s: Positive
+    sensing_wavelength_um: Positive
+    modulation_lambda_over_d: Positive
+    subapertures_across: Annotated[int, ("at_least", 2)]
+    photons: Positive
+    read_noise_electrons: NotNegative
+    modes: Annotated[int, ("at_least", 3)] = 672
+    actuators_across: Annotated[int, ("at_least", 3)] = 31
+    seeing_wavelength_um: Positive = _REFERENCE_UM
+    imaging_wavelength_um: Positive = 2.2
+    wind_direction_deg: Finite = 0.0
+    pixels: Annotated[int, ("at_least", 8)] = 60
+    calibration_nm: Positive = 20.0
 
     def __post_init__(self) -> None:
         require_instance(self.hardware, LoopHardware)
@@ -119,10 +120,7 @@ class EndToEndSystem:
                     f"the hardware of an end-to-end simulation must have two modes and the "
                     f"identity as its {name}, for the optics take its place; got {matrix.shape}."
                 )
-        for name, limits in _LIMITS.items():
-            set_fields(self, **{name: number(getattr(self, name), name, **limits)})
-        for name, least in _LEAST.items():
-            set_fields(self, **{name: integer(getattr(self, name), name, at_least=least)})
+        check_fields(self)
         if self.pixels % 2 or self.pixels < self.subapertures_across or self.pixels > _MOST_PIXELS:
             raise ProblemError(
                 f"pixels must be even, at least subapertures_across ({self.subapertures_across}) "
@@ -165,18 +163,5 @@ class EndToEndSystem:
 
     def calibration_facts(self) -> dict[str, Any]:
         """Return what the modes and the interaction matrix depend on."""
-        return {
-            name: getattr(self, name)
-            for name in (
-                "diameter_m",
-                "obstruction",
-                "outer_scale_m",
-                "sensing_wavelength_um",
-                "modulation_lambda_over_d",
-                "subapertures_across",
-                "modes",
-                "actuators_across",
-                "pixels",
-                "calibration_nm",
-            )
-        }
+        names = [field.name for field in fields(self) if field.name not in _UNCALIBRATED]
+        return {name: getattr(self, name) for name in names}

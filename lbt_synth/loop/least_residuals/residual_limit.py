@@ -22,7 +22,7 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.truth import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 

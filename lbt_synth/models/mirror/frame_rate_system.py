@@ -11,9 +11,8 @@ C. Kulcsar, J.-M. Conan, J. Opt. Soc. Am. A 27, 333 (2010), doi:10.1364/JOSAA.27
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -73,6 +72,15 @@ class MirrorSystem:
     taps: FloatArray  # (t,): impulse response of ``whole``, to rounding, with the sum 1
 
 
+def mirror_system(
+    loop: PositionLoop | None, frame_rate_hz: float, delay_frames: float
+) -> MirrorSystem:
+    """Mirror and delay at the frame rate; without a local loop the mirror settles at once."""
+    if loop is None:
+        return instant_mirror(delay_frames)
+    return lifted_mirror(loop, frame_rate_hz, delay_frames)
+
+
 @lru_cache(maxsize=64)
 def instant_mirror(delay_frames: float) -> MirrorSystem:
     """System of a mirror that settles at once; its states are past commands, newest first."""
@@ -90,21 +98,13 @@ def instant_mirror(delay_frames: float) -> MirrorSystem:
     )
 
 
+@lru_cache(maxsize=64)
 def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float) -> MirrorSystem:
     """Exact system of a mirror in its local loop.
 
     The samples of the local loop are counted from the arrival of each command; the edges of
     an exposure may lie between them.
     """
-    return _lift(tuple(asdict(loop).items()), frame_rate_hz, delay_frames)
-
-
-@lru_cache(maxsize=64)
-def _lift(
-    loop_fields: tuple[tuple[str, Any], ...], frame_rate_hz: float, delay_frames: float
-) -> MirrorSystem:
-    """Lift a loop, given by its fields so that equal loops share one answer."""
-    loop = PositionLoop(**dict(loop_fields))
     samples = samples_per_frame(loop, frame_rate_hz)
     lead = int(np.floor(delay_frames - 1))
     fraction = delay_frames - 1 - lead

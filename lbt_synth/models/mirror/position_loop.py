@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from scipy.linalg import expm
@@ -20,12 +20,19 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number, set_fields
+from lbt_synth.validation import (
+    Count,
+    FloatArray,
+    NotNegative,
+    Positive,
+    check_fields,
+    frozen_copy,
+    number,
+)
 
 _STABLE = 1 - 1e-9
 _MOST_SAMPLES = 500_000
 _POINTS = 8  # of a step response per sample
-_LONGEST_DELAY = 64  # samples
 _BLOCK = 64  # samples of a step response that are computed at once
 
 
@@ -57,7 +64,7 @@ class StepResponse:
     settling_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PositionLoop:
     """One mode of an adaptive secondary mirror in its local position loop.
 
@@ -106,32 +113,17 @@ class PositionLoop:
     '0.81 ms, overshoot 4 %'
     """
 
-    natural_frequency_hz: float
-    damping: float
-    proportional_per_s2: float
-    derivative_per_s: float
-    feed_forward: float = 1.0
-    sampling_hz: float = 72_000.0
-    delay_samples: int = 1
-    ramp_samples: int = 1
+    natural_frequency_hz: Positive
+    damping: NotNegative
+    proportional_per_s2: NotNegative
+    derivative_per_s: NotNegative
+    feed_forward: Annotated[float, ("at_least", 0), ("at_most", 10)] = 1.0
+    sampling_hz: Positive = 72_000.0
+    delay_samples: Annotated[int, ("at_least", 0), ("at_most", 64)] = 1
+    ramp_samples: Count = 1
 
     def __post_init__(self) -> None:
-        bounds: dict[str, dict[str, Any]] = {
-            "natural_frequency_hz": {"above": 0},
-            "damping": {"at_least": 0},
-            "proportional_per_s2": {"at_least": 0},
-            "derivative_per_s": {"at_least": 0},
-            "feed_forward": {"at_least": 0, "at_most": 10},
-            "sampling_hz": {"above": 0},
-        }
-        set_fields(self, **{n: number(getattr(self, n), n, **bounds[n]) for n in bounds})
-        delay = integer(self.delay_samples, "delay_samples", at_least=0)
-        ramp = integer(self.ramp_samples, "ramp_samples", at_least=1)
-        set_fields(self, delay_samples=delay, ramp_samples=ramp)
-        if self.delay_samples > _LONGEST_DELAY:
-            raise ProblemError(
-                f"delay_samples must be at most {_LONGEST_DELAY}; got {self.delay_samples}."
-            )
+        check_fields(self)
         if not self.natural_frequency_hz < self.sampling_hz / 2:
             raise ProblemError(
                 "natural_frequency_hz must lie below half of sampling_hz, "

@@ -12,7 +12,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.models.plant.tip_tilt import TipTiltPlant, require_no_memory
+from lbt_synth.models.plant.tip_tilt import TipTiltPlant
 from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.validation import FloatArray, number, set_fields
 
@@ -31,7 +31,7 @@ class FrequencyInterval:
                 "an interval of frequencies needs a TipTiltPlant; got "
                 f"{type(plant).__name__}. Try tip_tilt_plant(...)."
             )
-        require_no_memory(plant)
+        plant.parts()  # refuses the memory of a mixed filter
         if not plant.vibrations:
             raise ProblemError(
                 "an interval of frequencies needs a vibration; got a plant without any. Try "

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.plant.tip_tilt import TipTiltPlant, require_no_memory, with_vibrations
+from lbt_synth.models.plant.tip_tilt import TipTiltPlant, with_vibrations
 from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.validation import FloatArray, integer, number, real_array
 
@@ -68,7 +68,7 @@ def spread_plant(
     >>> [line.frequency_hz for line in spread.vibrations]
     [19.25, 19.75, 20.25, 20.75]
     """
-    require_no_memory(plant)
+    plant.parts()  # refuses the memory of a mixed filter
     if not plant.vibrations:
         raise ProblemError(
             "a frequency prior needs a plant with a vibration; got one without any. Try "
@@ -106,9 +106,7 @@ def line_frequencies(
         below=frequency_hz,
         hint="All frequencies must stay above 0 Hz.",
     )
-    count = integer(lines, "lines", at_least=1)
-    if count > _MOST_LINES:
-        raise ProblemError(f"lines must be at most {_MOST_LINES}; got {count}.")
+    count = integer(lines, "lines", at_least=1, at_most=_MOST_LINES)
     return frequency_hz + half * ((2 * np.arange(count) + 1) / count - 1)
 
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
@@ -26,14 +27,9 @@ from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.full_state import FullStatePlant
-from lbt_synth.models.plant.part_checks import (
-    checked_turbulence,
-    checked_vibrations,
-    measurement_gains,
-    noise_factor,
-)
+from lbt_synth.models.plant.parts import PlantParts, held_frames, noise_factor
 from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number, one_or_each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -173,7 +169,6 @@ class TipTiltPlant(EstimationProblem):
         steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
         if steps == 1:
             return self
-        require_no_memory(self)
         hw = self.hardware
         delay = hw.delay_frames + steps - 1
         if not 1 <= delay <= LONGEST_HORIZON:
@@ -182,14 +177,39 @@ class TipTiltPlant(EstimationProblem):
                 f"{steps}, which makes {delay:g}. For an estimate without a loop, make an "
                 "EstimationProblem of the plant's matrices."
             )
-        return _assemble_again(self, self.vibrations, delay)
+        return assemble(replace(self.parts(), hardware=replace(hw, delay_frames=delay)))
+
+    def parts(self) -> PlantParts:
+        """Return what the plant was assembled from.
+
+        Returns
+        -------
+        PlantParts
+            Loop, turbulence, vibrations and noise.
+
+        Raises
+        ------
+        ProblemError
+            If the plant holds the memory of a mixed filter.
+        """
+        q = self.hardware.n_measurements
+        parts = PlantParts(
+            hardware=self.hardware,
+            turbulence=self.turbulence,
+            vibrations=self.vibrations,
+            noise_factor=self.D[:, -q:],
+        )
+        if self.n_states != parts.size:
+            raise ProblemError(
+                "this plant holds the memory of a mixed filter, and cannot be assembled again; "
+                "take the plant that the filter was designed for."
+            )
+        return parts
 
     def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
         """Gain over the full state; the known input has no error and needs no gain."""
         gain = self._checked_gain(gain_predictor)
-        padded = np.zeros((full.A.shape[0], gain.shape[1]))
-        padded[: gain.shape[0]] = gain
-        return padded
+        return np.vstack([gain, np.zeros((len(full.A) - len(gain), gain.shape[1]))])
 
 
 def tip_tilt_plant(
@@ -263,74 +283,68 @@ def tip_tilt_plant(
         modes=modes,
         mirror=mirror,
     )
-    gains = measurement_gains(sensor_gain, hardware.n_measurements)
+    gains = one_or_each(sensor_gain, "sensor_gain", hardware.n_measurements, above=0)
     if np.any(gains != 1):
-        hardware = replace(hardware, sensor_matrix=gains[:, None] * hardware.sensor)
-    models = checked_turbulence(turbulence, hardware)
-    lines = checked_vibrations(vibrations, hardware)
-    factor = noise_factor(noise_nm, hardware.n_measurements)
+        sensor = np.reshape(gains, (-1, 1)) * hardware.sensor
+        hardware = replace(hardware, sensor_matrix=sensor)
+    if vibrations is not None and not tuple(vibrations):
+        raise ProblemError(
+            "vibrations is empty; expected at least one Vibration, or None (leave it out) "
+            "for a plant without vibrations."
+        )
+    models = (turbulence,) * hardware.modes if isinstance(turbulence, ARModel) else turbulence
+    return assemble(
+        PlantParts(
+            hardware=hardware,
+            turbulence=tuple(models),
+            vibrations=tuple(vibrations or ()),
+            noise_factor=noise_factor(noise_nm, hardware.n_measurements),
+        )
+    )
 
-    n, p, order = hardware.modes, len(lines), max(model.order for model in models)
-    chain = _held_frames(hardware)
-    ar2 = [line.ar_model(hardware.frame_rate_hz) for line in lines]
-    embedding = np.array([line.direction for line in lines]).reshape(p, n).T
-    coefficients = np.zeros((n, order))
-    for row, model in zip(coefficients, models, strict=True):
+
+def assemble(parts: PlantParts) -> TipTiltPlant:
+    """Assemble a plant from its parts."""
+    hardware, p, n = parts.hardware, len(parts.vibrations), parts.hardware.modes
+    ar2 = [line.ar_model(hardware.frame_rate_hz) for line in parts.vibrations]
+    lines = np.array([model.coefficients for model in ar2]).reshape(p, 2)
+    air = np.zeros((n, parts.order))
+    for row, model in zip(air, parts.turbulence, strict=True):
         row[: model.order] = model.coefficients
 
-    vib, tur, tot = 0, 2 * p, 2 * p + order * n  # where each part of the state begins
-    size = tot + chain * n
-    A = np.zeros((size, size))
-    A[vib : vib + p, vib : vib + p] = np.diag([m.coefficients[0] for m in ar2])
-    A[vib : vib + p, vib + p : vib + 2 * p] = np.diag([m.coefficients[1] for m in ar2])
-    A[vib + p : vib + 2 * p, vib : vib + p] = np.eye(p)
-    for lag in range(order):
-        A[tur : tur + n, tur + lag * n : tur + (lag + 1) * n] = np.diag(coefficients[:, lag])
-    A[tur + n : tot, tur : tot - n] = np.eye((order - 1) * n)
-    A[tot : tot + n, vib : vib + p] = embedding
-    A[tot : tot + n, tur : tur + n] = np.eye(n)
-    A[tot + n :, tot : size - n] = np.eye((chain - 1) * n)
+    tur, tot, size = 2 * p, 2 * p + air.size, parts.size  # where parts of the state begin, and end
+    total = np.zeros((n, size))
+    total[:, :p] = np.array([line.direction for line in parts.vibrations]).reshape(p, n).T
+    total[:, tur : tur + n] = np.eye(n)
+    A = block_diag(_companion(lines), _companion(air), np.eye(size - tot, k=-n))
+    A[tot : tot + n] = total
 
     q = hardware.n_measurements
     B = np.zeros((size, p + n + q))
-    B[vib : vib + p, :p] = np.diag([m.driving_rms_nm for m in ar2])
-    B[tur : tur + n, p : p + n] = np.diag([m.driving_rms_nm for m in models])
+    B[:p, :p] = np.diag([m.driving_rms_nm for m in ar2])
+    B[tur : tur + n, p : p + n] = np.diag([m.driving_rms_nm for m in parts.turbulence])
     C = np.zeros((q, size))
     C[:, size - n :] = hardware.sensor
-    D = np.hstack([np.zeros((q, p + n)), factor])
-
-    late = chain + 1 - hardware.delay_frames  # weight of the frame before
-    L = np.zeros((n, size))
-    L[:, vib : vib + p] = (1 - late) * embedding
-    L[:, tur : tur + n] = (1 - late) * np.eye(n)
-    L[:, tot : tot + n] += late * np.eye(n)
+    late = held_frames(hardware) + 1 - hardware.delay_frames  # weight of the frame before
     return TipTiltPlant(
         A=A,
         B=B,
         C=C,
-        D=D,
-        L=L,
+        D=np.hstack([np.zeros((q, p + n)), parts.noise_factor]),
+        L=(1 - late) * total + late * np.eye(n, size, k=tot),
         dt_s=hardware.dt_s,
         hardware=hardware,
-        turbulence=models,
-        vibrations=lines,
+        turbulence=parts.turbulence,
+        vibrations=parts.vibrations,
     )
 
 
-def _held_frames(hardware: LoopHardware) -> int:
-    """Return how many frames of the total phase the state of a plant holds."""
-    return max(int(np.ceil(hardware.delay_frames)), 2) - 1
-
-
-def require_no_memory(plant: TipTiltPlant) -> None:
-    """Refuse a plant with the past innovations of a filter, which cannot be assembled again."""
-    hw = plant.hardware
-    order = max(model.order for model in plant.turbulence)
-    if plant.n_states != 2 * len(plant.vibrations) + (order + _held_frames(hw)) * hw.modes:
-        raise ProblemError(
-            "this plant holds the memory of a mixed filter, and cannot be assembled again; take "
-            "the plant that the filter was designed for."
-        )
+def _companion(coefficients: FloatArray) -> FloatArray:
+    """State matrix (k order, k order) of k AR processes with coefficients (k, order)."""
+    k, order = coefficients.shape
+    A = np.eye(k * order, k=-k)
+    A[:k] = np.hstack([np.diag(lag) for lag in coefficients.T])
+    return A
 
 
 def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") -> TipTiltPlant:
@@ -379,21 +393,4 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
 
 def with_vibrations(plant: TipTiltPlant, vibrations: Sequence[Vibration]) -> TipTiltPlant:
     """Return a plant with other vibrations, all else being the same."""
-    require_no_memory(plant)
-    return _assemble_again(plant, vibrations, plant.hardware.delay_frames)
-
-
-def _assemble_again(
-    plant: TipTiltPlant, vibrations: Sequence[Vibration], delay_frames: float
-) -> TipTiltPlant:
-    hw = plant.hardware
-    return tip_tilt_plant(
-        frame_rate_hz=hw.frame_rate_hz,
-        turbulence=plant.turbulence,
-        noise_nm=plant.R,
-        vibrations=vibrations or None,
-        delay_frames=delay_frames,
-        sensor_matrix=hw.sensor,
-        influence_matrix=hw.influence,
-        mirror=hw.mirror,
-    )
+    return assemble(replace(plant.parts(), vibrations=tuple(vibrations)))

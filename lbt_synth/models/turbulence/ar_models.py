@@ -57,10 +57,11 @@ def le_roux_pole(
     speed = number(wind_speed_m_s, "wind_speed_m_s", above=0)
     diameter = number(diameter_m, "diameter_m", above=0)
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    return float(_pole(speed, diameter, rate, order))
+    return float(pole(speed, diameter, rate, order))
 
 
-def _pole(speed: Any, diameter: float, rate: float, order: int = 1) -> Any:
+def pole(speed: Any, diameter: float, rate: float, order: Any = 1) -> Any:
+    """Pole for one or many wind speeds [m/s] or radial orders."""
     return np.exp(-2 * np.pi * 0.3 * (order + 1) * speed / diameter / rate)
 
 
@@ -94,15 +95,10 @@ def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
     >>> round(float(model.coefficients[0]), 5), round(model.rms_nm, 1)
     (0.9886, 591.6)
     """
-    pole = le_roux_pole(
-        wind_speed_m_s=atmosphere.wind_speed_m_s,
-        diameter_m=atmosphere.diameter_m,
-        frame_rate_hz=frame_rate_hz,
-    )
-    driving = atmosphere.tilt_rms_nm * np.sqrt(1 - pole**2)
-    return ARModel(
-        coefficients=frozen_copy([pole]), driving_rms_nm=float(driving), frame_rate_hz=frame_rate_hz
-    )
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    a = pole(atmosphere.wind_speed_m_s, atmosphere.diameter_m, rate)
+    driving = atmosphere.tilt_rms_nm * np.sqrt(1 - a**2)
+    return ARModel(coefficients=frozen_copy([a]), driving_rms_nm=driving, frame_rate_hz=rate)
 
 
 def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, FloatArray]:
@@ -120,7 +116,7 @@ def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, 
     ([[0.9886]], [89.08])
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    poles = _pole(flows.wind_speed_m_s, flows.atmosphere.diameter_m, rate)
+    poles = pole(flows.wind_speed_m_s, flows.atmosphere.diameter_m, rate)
     return poles[:, None], flows.tilt_rms_nm * np.sqrt(1 - poles**2)
 
 

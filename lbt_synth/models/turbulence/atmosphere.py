@@ -17,7 +17,7 @@ from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.validation import FloatArray, number, real_array, set_fields
+from lbt_synth.validation import FloatArray, Obstruction, Positive, check_fields, real_array
 
 ARCSEC_RAD = np.pi / 180 / 3600
 LOWEST = 1e-4  # spectra are constant below this frequency, in units of V / D
@@ -60,19 +60,15 @@ class Atmosphere:
     591.6
     """
 
-    seeing_arcsec: float
-    outer_scale_m: float | None
-    wind_speed_m_s: float
-    diameter_m: float
-    obstruction: float = 0.0
-    seeing_wavelength_um: float = 0.5
+    seeing_arcsec: Positive
+    outer_scale_m: Positive | None
+    wind_speed_m_s: Positive
+    diameter_m: Positive
+    obstruction: Obstruction = 0.0
+    seeing_wavelength_um: Positive = 0.5
 
     def __post_init__(self) -> None:
-        positive = ["seeing_arcsec", "wind_speed_m_s", "diameter_m", "seeing_wavelength_um"]
-        if self.outer_scale_m is not None:
-            positive.append("outer_scale_m")
-        set_fields(self, **{name: number(getattr(self, name), name, above=0) for name in positive})
-        set_fields(self, obstruction=number(self.obstruction, "obstruction", at_least=0, below=1))
+        check_fields(self)
 
     @property
     def fried_parameter_m(self) -> float:

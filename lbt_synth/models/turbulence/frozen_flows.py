@@ -22,7 +22,14 @@ from lbt_synth.models.turbulence.atmosphere import (
     tilt_strength_nm2,
     tilt_variance,
 )
-from lbt_synth.validation import FloatArray, IntArray, real_array, require_instance, set_fields
+from lbt_synth.validation import (
+    FloatArray,
+    IntArray,
+    positive,
+    real_array,
+    require_instance,
+    set_fields,
+)
 
 _TERMS = 12  # of the polynomial over an octave of the outer scale
 _FEW_SCALES = 16  # up to this many outer scales have a table each
@@ -71,9 +78,7 @@ class FrozenFlows:
             value = getattr(self.atmosphere, name) if value is None else value
             if value is None:  # Kolmogorov
                 continue
-            given[name] = np.atleast_1d(real_array(value, name))
-            if np.any(given[name] <= 0):
-                raise ProblemError(f"{name} must be above 0; got {given[name].min():.6g}.")
+            given[name] = np.atleast_1d(positive(value, name))
         try:
             arrays = np.broadcast_arrays(*given.values())
         except ValueError as error:

@@ -9,16 +9,19 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.ar_model import ARModel, variance_ratios
-from lbt_synth.models.turbulence.ar_models import le_roux_pole
+from lbt_synth.models.ar_model import ARModel, companions, densities, variance_ratios
+from lbt_synth.models.turbulence.ar_models import pole
 from lbt_synth.models.turbulence.atmosphere import Atmosphere
 from lbt_synth.models.turbulence.zernike import noll_orders, zernike_variances
 from lbt_synth.validation import (
     FloatArray,
+    Positive,
+    check_fields,
     frozen_copy,
     integer,
     matrix,
     number,
+    positive,
     real_array,
     require_instance,
     sequence,
@@ -56,7 +59,7 @@ class ModalTurbulence:
 
     coefficients: FloatArray
     driving_rms_nm: FloatArray
-    frame_rate_hz: float
+    frame_rate_hz: Positive
 
     def __post_init__(self) -> None:
         a = matrix(self.coefficients, "coefficients")
@@ -64,16 +67,14 @@ class ModalTurbulence:
             raise DimensionError(
                 f"coefficients must be (modes, order) with at least one of each; got {a.shape}."
             )
-        driving = real_array(self.driving_rms_nm, "driving_rms_nm")
+        check_fields(self)
+        driving = positive(self.driving_rms_nm, "driving_rms_nm")
         if driving.shape != (len(a),):
             raise DimensionError(
                 f"driving_rms_nm must have shape ({len(a)},) to match coefficients {a.shape}; got "
                 f"{driving.shape}."
             )
-        if np.any(driving <= 0):
-            raise ProblemError(f"driving_rms_nm must be above 0; got {driving.min():.6g}.")
-        rate = number(self.frame_rate_hz, "frame_rate_hz", above=0)
-        set_fields(self, coefficients=a, driving_rms_nm=driving, frame_rate_hz=rate)
+        set_fields(self, coefficients=a, driving_rms_nm=driving)
         radii = np.abs(np.linalg.eigvals(self.companions)).max(axis=1)
         if not np.all(radii < 1):
             worst = int(np.argmax(radii))
@@ -137,11 +138,7 @@ class ModalTurbulence:
     @property
     def companions(self) -> FloatArray:
         """State matrices (n, order, order) of the states [x(k), x(k-1), ...]."""
-        n, order = self.coefficients.shape
-        A = np.zeros((n, order, order))
-        A[:, 0] = self.coefficients
-        A[:, 1:, :-1] = np.eye(order - 1)
-        return A
+        return companions(self.coefficients)
 
     @property
     def rms_nm(self) -> FloatArray:
@@ -166,9 +163,7 @@ class ModalTurbulence:
         ProblemError
             If there is no such mode.
         """
-        i = integer(mode, "mode", at_least=0)
-        if i >= self.n_modes:
-            raise ProblemError(f"mode must be from 0 to {self.n_modes - 1}; got {i}.")
+        i = integer(mode, "mode", at_least=0, at_most=self.n_modes - 1)
         return ARModel(
             coefficients=self.coefficients[i],
             driving_rms_nm=float(self.driving_rms_nm[i]),
@@ -194,11 +189,7 @@ class ModalTurbulence:
             If a frequency is not finite.
         """
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
-        delay = np.exp(-2j * np.pi * frequency / self.frame_rate_hz)
-        lags = delay ** np.arange(1, self.order + 1)[:, None]
-        response = 1 - self.coefficients @ lags
-        drive = 2 * self.driving_rms_nm**2 / self.frame_rate_hz
-        return np.asarray(drive[:, None] / np.abs(response) ** 2)
+        return densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)
 
 
 def modal_turbulence(
@@ -246,18 +237,8 @@ def modal_turbulence(
     """
     require_instance(atmosphere, Atmosphere)
     radial, _ = noll_orders(modes)
-    orders = range(1, int(radial[-1]) + 1)
-    poles = np.array(
-        [
-            le_roux_pole(
-                wind_speed_m_s=atmosphere.wind_speed_m_s,
-                diameter_m=atmosphere.diameter_m,
-                frame_rate_hz=frame_rate_hz,
-                radial_order=order,
-            )
-            for order in orders
-        ]
-    )[radial - 1]
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    poles = pole(atmosphere.wind_speed_m_s, atmosphere.diameter_m, rate, radial)
     variances = zernike_variances(atmosphere, int(radial[-1]))[radial - 1]
     return ModalTurbulence(
         coefficients=poles[:, None],

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar_model import variance_ratios
-from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, number, real_array, set_fields
+from lbt_synth.models.vibration.resonance import Vibration, unit_direction
+from lbt_synth.validation import FloatArray, Positive, check_fields, real_array, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,26 +50,19 @@ class DriftingVibration:
     [17.0, 17.0, 20.0, 23.0, 23.0]
     """
 
-    start_hz: float
-    end_hz: float
-    duration_s: float
-    rms_nm: float
-    damping: float | None = None
+    start_hz: Positive
+    end_hz: Positive
+    duration_s: Positive
+    rms_nm: Positive
+    damping: Annotated[float, ("above", 0), ("below", 1)] | None = None
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        positive = ("start_hz", "end_hz", "duration_s")
-        set_fields(self, **{name: number(getattr(self, name), name, above=0) for name in positive})
-        line = Vibration(
-            frequency_hz=self.start_hz,
-            damping=0.5 if self.damping is None else self.damping,
-            rms_nm=self.rms_nm,
-            direction=self.direction,
-        )
+        check_fields(self)
+        set_fields(self, direction=unit_direction(self.direction))
         if self.damping is not None:
-            set_fields(self, damping=line.damping)
-            line.at_frequency(self.end_hz)
-        set_fields(self, rms_nm=line.rms_nm, direction=line.direction)
+            start = Vibration(frequency_hz=self.start_hz, damping=self.damping, rms_nm=self.rms_nm)
+            start.at_frequency(self.end_hz)
 
     @property
     def highest_hz(self) -> float:

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar_model import ARModel, variance_ratios
 from lbt_synth.models.resonance_spectrum import coefficient_rows
-from lbt_synth.validation import FloatArray, choice, number, real_array, set_fields
+from lbt_synth.validation import (
+    FloatArray,
+    Positive,
+    check_fields,
+    choice,
+    number,
+    real_array,
+    set_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,23 +49,14 @@ class Vibration:
     [1.972279, -0.996863]
     """
 
-    frequency_hz: float
-    damping: float
-    rms_nm: float
+    frequency_hz: Positive
+    damping: Annotated[float, ("above", 0), ("below", 1)]
+    rms_nm: Positive
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        frequency = number(self.frequency_hz, "frequency_hz", above=0)
-        damping = number(self.damping, "damping", above=0, below=1)
-        rms = number(self.rms_nm, "rms_nm", above=0)
-        vector = np.atleast_1d(real_array(self.direction, "direction"))
-        length = float(np.linalg.norm(vector))
-        if vector.ndim != 1 or length == 0:
-            raise ProblemError(
-                f"direction must be a vector over the modes, not zero; got {self.direction!r}."
-            )
-        unit = tuple(float(v) for v in vector / length)
-        set_fields(self, frequency_hz=frequency, damping=damping, rms_nm=rms, direction=unit)
+        check_fields(self)
+        set_fields(self, direction=unit_direction(self.direction))
 
     def ar_model(self, frame_rate_hz: float) -> ARModel:
         """Return the AR2 process sampled at a frame rate.
@@ -164,16 +164,31 @@ class Vibration:
         return replace(self, frequency_hz=frequency, damping=rate / frequency)
 
 
+def unit_direction(direction: Any) -> tuple[float, ...]:
+    """Return a direction over the modes as a vector of length one."""
+    vector = np.atleast_1d(real_array(direction, "direction"))
+    length = float(np.linalg.norm(vector))
+    if vector.ndim != 1 or length == 0:
+        raise ProblemError(
+            f"direction must be a vector over the modes, not zero; got {direction!r}."
+        )
+    return tuple(float(v) for v in vector / length)
+
+
+def require_below_nyquist(frequency_hz: float, frame_rate_hz: float) -> None:
+    """Refuse a vibration that a frame rate does not sample."""
+    if not frequency_hz < frame_rate_hz / 2:
+        raise ProblemError(
+            f"a vibration must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "
+            f"got {frequency_hz:.6g} Hz. Give the frequency it is aliased to."
+        )
+
+
 def sampled_lines(
     frequency_hz: FloatArray, damping: FloatArray, rms_nm: FloatArray | float, frame_rate_hz: float
 ) -> tuple[FloatArray, FloatArray]:
     """Coefficients (p, 2) and driving noise (p,) [nm] of p vibrations at a frame rate."""
-    highest = float(np.max(frequency_hz, initial=0.0))
-    if not highest < frame_rate_hz / 2:
-        raise ProblemError(
-            f"a vibration must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "
-            f"got {highest:.6g} Hz. Give the frequency it is aliased to."
-        )
+    require_below_nyquist(float(np.max(frequency_hz, initial=0.0)), frame_rate_hz)
     a = coefficient_rows(2 * np.pi * frequency_hz / frame_rate_hz, damping)
     # by the rounded coefficients, so that the process has exactly this rms
     return a, np.asarray(rms_nm / np.sqrt(variance_ratios(a)))

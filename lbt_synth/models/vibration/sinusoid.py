@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import set_fields
+from lbt_synth.models.vibration.resonance import unit_direction
+from lbt_synth.validation import Positive, check_fields, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,20 +35,13 @@ class SinusoidalVibration:
     1127.1
     """
 
-    frequency_hz: float
-    rms_nm: float
+    frequency_hz: Positive
+    rms_nm: Positive
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        # checked as those of a resonance, whose damping plays no part
-        line = Vibration(
-            frequency_hz=self.frequency_hz,
-            damping=0.5,
-            rms_nm=self.rms_nm,
-            direction=self.direction,
-        )
-        names = ("frequency_hz", "rms_nm", "direction")
-        set_fields(self, **{name: getattr(line, name) for name in names})
+        check_fields(self)
+        set_fields(self, direction=unit_direction(self.direction))
 
     @property
     def amplitude_nm(self) -> float:

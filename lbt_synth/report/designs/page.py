@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import SinusoidalVibration
-from lbt_synth.models.truth import stationary_vibrations
+from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.report.designs.pole_and_step_charts import pole_and_step_charts
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.robustness_charts import robustness_charts

@@ -56,7 +56,7 @@ def test_bad_arrays_are_refused():
         with pytest.raises(error, match=words):
             lbt.models.ModalTurbulence(**(ok | change))
     air = lbt.models.ModalTurbulence(**ok)
-    with pytest.raises(lbt.errors.ProblemError, match="from 0 to 1"):
+    with pytest.raises(lbt.errors.ProblemError, match="at most 1; got 2"):
         air.model(2)
     with pytest.raises(lbt.errors.ProblemError, match="one ARModel a mode"):
         lbt.models.ModalTurbulence.of([])
