@@ -258,8 +258,9 @@ def set_fields(target: object, **values: Any) -> None:
         object.__setattr__(target, name, value)
 
 
-def require_instance(value: object, kind: type[Any]) -> None:
-    """Refuse anything that is not an instance of a class."""
+def require_instance(value: object, kind: type[Any], name: str = "") -> None:
+    """Refuse anything that is not an instance of a class; the message names the argument."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise ProblemError(f"expected {article} {kind.__name__}; got {type(value).__name__}.")
+        start = f"{name} must be" if name else "expected"
+        raise ProblemError(f"{start} {article} {kind.__name__}; got {type(value).__name__}.")

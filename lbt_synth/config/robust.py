@@ -19,7 +19,7 @@ from lbt_synth.design.shaping import (
     NoisePeak,
     VibrationBand,
 )
-from lbt_synth.design.shaping.demand_types import Demand
+from lbt_synth.design.shaping.specification import Demand
 from lbt_synth.errors import ConfigError, name_file, name_key
 from lbt_synth.models import Spectrum
 from lbt_synth.models.spectra import spectrum_key

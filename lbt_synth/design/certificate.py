@@ -32,7 +32,7 @@ VARIANCE_TOLERANCE = 1e-6
 _GRID = 513
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Check:
     """One check: passed when ``value < limit``.
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from lbt_synth.design.result import UNCERTIFIED, SolverReport, with_certificate
 from lbt_synth.design.shaped_design import (
@@ -14,13 +13,12 @@ from lbt_synth.design.shaped_design import (
 )
 from lbt_synth.design.shaping.basis import laguerre_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.reduction import reduce_poles, solve_mode
+from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
 from lbt_synth.design.shaping.single_mode_loop import mode_hardware
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import integer, number
+from lbt_synth.validation import integer, number, require_instance
 
 _MOST_FUNCTIONS = 400
 _ROUNDED = 5e-7
@@ -109,13 +107,15 @@ def shape(
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
     for spec in specifications:
         spec.require_fitting(hardware.frame_rate_hz)
-
-    designs: dict[int, _ModeDesign] = {}  # equal modes share a specification
+    solved: dict[int, tuple[ModeSolution, ModeSolution]] = {}  # equal modes share a specification
     for spec in specifications:
-        if id(spec) not in designs:
-            channel = Channel(hardware=single, basis=laguerre_basis(size, common, dt_s=single.dt_s))
-            designs[id(spec)] = _design_mode(spec, channel, order, tolerance)
-    modes = [designs[id(spec)] for spec in specifications]
+        if id(spec) not in solved:
+            basis = laguerre_basis(size, common, dt_s=single.dt_s)
+            chosen = long = solve_mode(spec, Channel(hardware=single, basis=basis))
+            if order is not None and order < size:
+                chosen = reduce_poles(spec, long, order, tolerance)
+            solved[id(spec)] = long, chosen
+    longs, modes = zip(*(solved[id(spec)] for spec in specifications), strict=True)
     parameters = tuple(mode.parameter for mode in modes)
     design = ShapedDesign(
         method="shaped",
@@ -123,59 +123,28 @@ def shape(
         certificate=UNCERTIFIED,
         solver=SolverReport(
             route="youla",
-            status=modes[0].status,
-            iterations=max(mode.programmes for mode in modes),
+            status=modes[0].sequence.status,
+            iterations=max(long.sequence.programmes for long in longs),
         ),
         loop_hardware=hardware,
         specifications=specifications,
         parameters=parameters,
-        objective_nm=tuple(mode.objective_nm for mode in modes),
-        long_objective_nm=tuple(mode.long_objective_nm for mode in modes),
+        objective_nm=tuple(mode.objective_nm * (1 + _ROUNDED) for mode in modes),
+        long_objective_nm=tuple(long.objective_nm for long in longs),
         long_functions=size,
     )
     return with_certificate(design, "Try more functions, or looser demands.")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ModeDesign:
-    """Youla parameter of one mode, with its objective and that of the long parameter."""
-
-    parameter: Controller
-    objective_nm: float
-    long_objective_nm: float
-    status: str
-    programmes: int
-
-
 def _specification_per_mode(
     specification: Specification | Sequence[Specification], modes: int
 ) -> tuple[Specification, ...]:
-    given: tuple[Any, ...] = (
-        tuple(specification)
-        if isinstance(specification, list | tuple)
-        else (specification,) * modes
-    )
+    given: Any = specification
+    given = tuple(given) if isinstance(given, list | tuple) else (given,) * modes
     for spec in given:
-        if not isinstance(spec, Specification):
-            raise ProblemError(f"expected a Specification; got {type(spec).__name__}.")
+        require_instance(spec, Specification)
     if len(given) != modes:
         raise ProblemError(
             f"give one specification, or one for each of {modes} modes; got {len(given)}."
         )
-    return given
-
-
-def _design_mode(
-    spec: Specification, channel: Channel, order: int | None, tolerance: float
-) -> _ModeDesign:
-    """Solve for a long parameter, and reduce it where it has more states than allowed."""
-    chosen = long = solve_mode(spec, channel)
-    if order is not None and order < channel.basis.size:
-        chosen = reduce_poles(spec, long, order, tolerance)
-    return _ModeDesign(
-        parameter=chosen.parameter,
-        objective_nm=chosen.objective_nm * (1 + _ROUNDED),
-        long_objective_nm=long.objective_nm,
-        status=chosen.sequence.status,
-        programmes=long.sequence.programmes,
-    )
+    return cast(tuple[Specification, ...], given)

@@ -8,13 +8,12 @@ from dataclasses import replace
 from lbt_synth.design.loop_shaping import shape
 from lbt_synth.design.shaped_design import ShapedDesign, noise_per_mode
 from lbt_synth.design.shaping.bounds import ModulusMargin
-from lbt_synth.design.shaping.demand_types import Demand
-from lbt_synth.design.shaping.objectives import ResidualVariance, Term, Total, VibrationBand
-from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.design.shaping.objectives import ResidualVariance, Total, VibrationBand
+from lbt_synth.design.shaping.specification import Demand, Specification
 from lbt_synth.design.shaping.uncertainty import SensorGainRange
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import Spectrum, TipTiltPlant
-from lbt_synth.validation import number, sequence
+from lbt_synth.validation import number, require_instance, sequence
 
 
 def robust(
@@ -83,12 +82,10 @@ def robust(
     >>> low < 0.5 and high > 1.2
     True
     """
-    if not isinstance(plant, TipTiltPlant):
-        raise ProblemError(f"plant must be a TipTiltPlant; got {type(plant).__name__}.")
+    require_instance(plant, TipTiltPlant, "plant")
     lines = sequence(bands, "bands")
     for line in lines:
-        if not isinstance(line, VibrationBand):
-            raise ProblemError(f"bands must be VibrationBands; got {type(line).__name__}.")
+        require_instance(line, VibrationBand, "each of bands")
     gains = tuple(number(g, "scenarios", above=0) for g in sequence(scenarios, "scenarios"))
     if not gains:
         raise ProblemError("scenarios must name at least one sensor gain; got none.")
@@ -103,22 +100,14 @@ def robust(
     deviations = noise_per_mode(plant.hardware, plant.R)
     by_mode: dict[tuple[str, int], Specification] = {}
     specifications = []
-    for noise_nm, model in zip(deviations, plant.turbulence, strict=True):
+    for noise_nm, model in zip(deviations.tolist(), plant.turbulence, strict=True):
+        spectrum = model if turbulence is None else turbulence
         # equal modes share one specification, and are solved once
-        key = f"{noise_nm:.9g}", 0 if turbulence is not None else id(model)
+        key = f"{noise_nm:.9g}", id(spectrum)
         if key not in by_mode:
-            spectrum = model if turbulence is None else turbulence
-            terms: list[Term] = []
-            for gain in gains:
-                terms.append(
-                    ResidualVariance(
-                        turbulence=spectrum, noise_nm=float(noise_nm), sensor_gain=gain
-                    )
-                )
-                terms += [replace(line, sensor_gain=gain) for line in lines]
-            by_mode[key] = Specification(
-                objective=Total(terms=tuple(terms)), demands=(*fixed, *further)
-            )
+            air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
+            terms = tuple(replace(term, sensor_gain=g) for g in gains for term in (air, *lines))
+            by_mode[key] = Specification(objective=Total(terms=terms), demands=(*fixed, *further))
         specifications.append(by_mode[key])
     design = shape(
         plant.hardware, specifications, functions=functions, pole=pole, states=states, loss=loss

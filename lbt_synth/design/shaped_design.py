@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lbt_synth.design.certificate import Certificate, Check, certify_loop, controller_difference
 from lbt_synth.design.result import UNCERTIFIED, Design
 from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.single_mode_loop import mode_loop
+from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, mode_loop
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import DimensionError, UnstableLoopError
 from lbt_synth.linear import Controller
@@ -57,13 +58,16 @@ class ShapedDesign(Design):
     @property
     def poles(self) -> ComplexArray:
         """Poles of the closed loop: those of the parameters, and the delays."""
-        parts = [np.linalg.eigvals(p.A) for p in self.parameters]
-        return np.concatenate(parts).astype(np.complex128)
+        return np.concatenate([p.to_statespace().poles for p in self.parameters])
 
     @property
     def states_per_mode(self) -> int:
         """Largest number of states of one mode's controller, its past commands included."""
-        return max(mode_loop(self.loop_hardware, p).controller.n_states for p in self.parameters)
+        return max(loop.controller.n_states for loop in self._loops)
+
+    @property
+    def _loops(self) -> list[SingleModeLoop]:
+        return [mode_loop(self.loop_hardware, parameter) for parameter in self.parameters]
 
     @property
     def loss(self) -> float:
@@ -94,41 +98,27 @@ class ShapedDesign(Design):
 
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
         """Residual of each term in the real loop: mode, what it is, [nm rms]."""
-        out = []
-        for mode, (spec, parameter) in enumerate(
-            zip(self.specifications, self.parameters, strict=True)
-        ):
-            loop = mode_loop(self.loop_hardware, parameter)
-            out += [
-                (mode, leaf.label, float(np.sqrt(leaf.measured_nm2(loop))))
-                for leaf in leaves(spec.objective)
-            ]
-        return tuple(out)
+        return tuple(
+            (mode, leaf.label, float(np.sqrt(leaf.measured_nm2(loop))))
+            for mode, (spec, loop) in enumerate(zip(self.specifications, self._loops, strict=True))
+            for leaf in leaves(spec.objective)
+        )
 
     def recertify(self) -> Certificate:
         """Compute the certificate again from the matrices."""
-        hardware = self.loop_hardware
-        checks: list[Check] = []
-        examined: list[tuple[Specification, Controller, float]] = []
-        for mode, (spec, parameter) in enumerate(
-            zip(self.specifications, self.parameters, strict=True)
-        ):
-            claimed = self.objective_nm[mode]
-            if any(spec is s and parameter is p and claimed == c for s, p, c in examined):
+        hardware, checks = self.loop_hardware, []
+        claims = list(zip(self.specifications, self.parameters, self.objective_nm, strict=True))
+        kinds = [(id(spec), id(parameter), claimed) for spec, parameter, claimed in claims]
+        for mode, claim in enumerate(claims):
+            if kinds.index(kinds[mode]) < mode:
                 continue
-            examined.append((spec, parameter, claimed))
-            prefix = f"mode {mode + 1}: " if len(self.specifications) > 1 else ""
-            checks += [
-                replace(check, name=prefix + check.name)
-                for check in _mode_checks(hardware, spec, parameter, claimed)
-            ]
+            prefix = f"mode {mode + 1}: " if len(claims) > 1 else ""
+            checks += [replace(c, name=prefix + c.name) for c in _mode_checks(hardware, *claim)]
         whole = controller_from_parameters(hardware, self.parameters)
+        difference = controller_difference(self.controller, whole)
         checks += [
             Check(
-                name="controller against its parameters",
-                value=controller_difference(self.controller, whole),
-                limit=_SAME,
-                computed_by="matrices assembled again",
+                "controller against its parameters", difference, _SAME, "matrices assembled again"
             ),
             certify_loop(hardware, self.controller),
         ]
@@ -141,59 +131,42 @@ class ShapedDesign(Design):
         f = np.array(_TEST_HZ) * self.loop_hardware.frame_rate_hz
         whole = close_loop(self.loop_hardware, self.controller).sensitivity(f)
         single = np.zeros_like(whole)
-        for mode, parameter in enumerate(self.parameters):
-            loop = mode_loop(self.loop_hardware, parameter).at(1.0)
-            single[:, mode, mode] = loop.sensitivity(f)[:, 0, 0]
-        return Check(
-            name="whole loop against its modes",
-            value=float(np.max(np.abs(whole - single))),
-            limit=1e-6,
-            computed_by=f"sensitivity at {f.size} frequencies",
-        )
+        for mode, loop in enumerate(self._loops):
+            single[:, mode, mode] = loop.at(1.0).sensitivity(f)[:, 0, 0]
+        apart = float(np.max(np.abs(whole - single)))
+        how = f"sensitivity at {f.size} frequencies"
+        return Check("whole loop against its modes", apart, 1e-6, how)
 
 
 def _mode_checks(
     hardware: LoopHardware, spec: Specification, parameter: Controller, objective_nm: float
 ) -> list[Check]:
     """Check the parameter of one mode: stable, its demands met, its objective as claimed."""
-    checks = [
-        Check(
-            name="spectral radius of the parameter",
-            value=parameter.to_statespace().spectral_radius,
-            limit=1 - 1e-9,
-            computed_by="eigenvalues",
-        )
-    ]
-    if not checks[0].passed:
-        return checks
+    radius = parameter.to_statespace().spectral_radius
+    stable = Check("spectral radius of the parameter", radius, 1 - 1e-9, "eigenvalues")
+    if not stable.passed:
+        return [stable]
     loop = mode_loop(hardware, parameter)
-    checks += spec.checks(loop)
+    checks = spec.checks(loop)
     try:
         found = float(np.sqrt(spec.objective.measured_nm2(loop)))
     except UnstableLoopError:
         found = np.inf
-    checks.append(
-        Check(
-            name="root of the objective, against the one claimed [nm]",
-            value=found,
-            limit=objective_nm * (1 + _RMS_TOLERANCE),
-            computed_by="closed loops in state space",
-        )
-    )
-    return checks
+    name = "root of the objective, against the one claimed [nm]"
+    limit = objective_nm * (1 + _RMS_TOLERANCE)
+    return [stable, *checks, Check(name, found, limit, "closed loops in state space")]
 
 
 def require_separable(hardware: LoopHardware) -> None:
     """Refuse a loop whose modes cannot be controlled one by one."""
     n = hardware.modes
-    for name, response in (
-        ("sensor_matrix", hardware.sensor),
-        ("influence_matrix", hardware.influence),
-    ):
-        if np.linalg.matrix_rank(response) < n:
+    named = {"sensor_matrix": hardware.sensor, "influence_matrix": hardware.influence}
+    for name, response in named.items():
+        rank = np.linalg.matrix_rank(response)
+        if rank < n:
             raise DimensionError(
                 f"{name} must have rank {n}, one for each mode, for a loop that is shaped mode by "
-                f"mode; got {response.shape} of rank {np.linalg.matrix_rank(response)}."
+                f"mode; got {response.shape} of rank {rank}."
             )
 
 
@@ -202,16 +175,7 @@ def controller_from_parameters(
 ) -> Controller:
     """Join the Youla parameters of all modes in the controller of the whole loop."""
     back = np.linalg.pinv(hardware.sensor)
-    sizes = [p.n_states for p in parameters]
-    n, modes = sum(sizes), len(parameters)
-    A, B, C = np.zeros((n, n)), np.zeros((n, modes)), np.zeros((modes, n))
-    D = np.zeros((modes, modes))
-    at = 0
-    for mode, (p, size) in enumerate(zip(parameters, sizes, strict=True)):
-        part = slice(at, at + size)
-        A[part, part], B[part, mode], C[mode, part] = p.A, p.B[:, 0], p.C[0]
-        D[mode, mode] = p.D[0, 0]
-        at += size
+    A, B, C, D = (block_diag(*(getattr(p, name) for p in parameters)) for name in "ABCD")
     whole = Controller(
         A=A,
         B=B @ back,

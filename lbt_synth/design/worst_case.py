@@ -9,6 +9,7 @@ the curvature.
 from __future__ import annotations
 
 import heapq
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -80,17 +81,14 @@ def _greatest_variance(interval: FrequencyInterval, estimator: Controller) -> fl
     count = 1 + int(np.ceil((high - low) * np.sqrt(curvature / 4)))
     if count > _MOST_PARTS:
         raise _unbounded_error()
-    points = np.linspace(low, high, count + 1)
-    values = [variance(float(a)) for a in points]
-    best = max(values)
+    ends = [(a, variance(a)) for a in np.linspace(low, high, count + 1).tolist()]
+    best = max(value for _, value in ends)
 
     def part(a: float, b: float, at_a: float, at_b: float) -> tuple[float, ...]:
         bound = max(at_a, at_b) / (1 - curvature * (b - a) ** 2 / 8)
         return -bound, a, b, at_a, at_b
 
-    parts = [
-        part(float(points[i]), float(points[i + 1]), values[i], values[i + 1]) for i in range(count)
-    ]
+    parts = [part(a, b, at_a, at_b) for (a, at_a), (b, at_b) in pairwise(ends)]
     heapq.heapify(parts)
     for _ in range(_MOST_PARTS):
         bound, a, b, at_a, at_b = parts[0]

@@ -264,7 +264,7 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
         (lambda: lbt.robust(3, bands=[]), "plant must be a TipTiltPlant"),
         (
             lambda: lbt.robust(replace_sensor(plant_of_one()), bands=[3]),
-            "bands must be VibrationBands",
+            "each of bands must be a VibrationBand",
         ),
         (lambda: lbt.robust(plant_of_one(), bands=[], scenarios=[]), "at least one sensor gain"),
     ],

@@ -11,20 +11,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.band import Band
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, discs
+from lbt_synth.design.shaping.frequency_bounds import (
+    BAND_LEVEL_SETS,
+    LEVEL_SETS,
+    ROOM,
+    Band,
+    discs,
+)
 from lbt_synth.design.shaping.frequency_grid import Grid, spectrum_edges
 from lbt_synth.design.shaping.objectives import ResidualVariance
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBound
-from lbt_synth.linear.norms import band_norm
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.models import Spectrum
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import FloatArray, number, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,8 +55,7 @@ class ModulusMargin:
     at_least: float
 
     def __post_init__(self) -> None:
-        margin = number(self.at_least, "at_least", above=0, below=1)
-        object.__setattr__(self, "at_least", margin)
+        set_fields(self, at_least=number(self.at_least, "at_least", above=0, below=1))
 
     @property
     def label(self) -> str:
@@ -62,19 +65,12 @@ class ModulusMargin:
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.points_hz
-        rows = channel.complementary_rows(f)
-        return (discs(f, -rows, np.ones(len(rows)), (1 - ROOM) / self.at_least),)
+        return (discs(f, -channel.complementary_rows(f), 1.0, (1 - ROOM) / self.at_least),)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        return (
-            Check(
-                name="peak of the sensitivity",
-                value=hinf_norm(loop.sensitivity).upper,
-                limit=1 / self.at_least,
-                computed_by=LEVEL_SETS,
-            ),
-        )
+        peak = hinf_norm(loop.sensitivity).upper
+        return (Check("peak of the sensitivity", peak, 1 / self.at_least, LEVEL_SETS),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +97,7 @@ class NoisePeak:
     at_most: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "at_most", number(self.at_most, "at_most", above=0))
+        set_fields(self, at_most=number(self.at_most, "at_most", above=0))
 
     @property
     def label(self) -> str:
@@ -111,19 +107,12 @@ class NoisePeak:
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.points_hz
-        rows = channel.noise_rows(f)
-        return (discs(f, rows, np.zeros(len(rows)), (1 - ROOM) * self.at_most),)
+        return (discs(f, channel.noise_rows(f), 0.0, (1 - ROOM) * self.at_most),)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        return (
-            Check(
-                name="peak of the noise transfer",
-                value=hinf_norm(loop.at(1.0).noise_propagation()).upper,
-                limit=self.at_most,
-                computed_by=LEVEL_SETS,
-            ),
-        )
+        peak = hinf_norm(loop.at(1.0).noise_propagation()).upper
+        return (Check("peak of the noise transfer", peak, self.at_most, LEVEL_SETS),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,9 +148,8 @@ class Attenuation(Band):
 
     def __post_init__(self) -> None:
         Band.__post_init__(self)
-        set_ = object.__setattr__
-        set_(self, "at_most", number(self.at_most, "at_most", above=0))
-        set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+        gain = number(self.sensor_gain, "sensor_gain", above=0)
+        set_fields(self, at_most=number(self.at_most, "at_most", above=0), sensor_gain=gain)
         if not self.at_most * abs(1 - self.sensor_gain) < 1:
             raise ProblemError(
                 f"at_most must be below {1 / abs(1 - self.sensor_gain):.6g} at sensor gain "
@@ -179,26 +167,20 @@ class Attenuation(Band):
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.within(self.low_hz, self.high_hz)
-        rows = channel.complementary_rows(f)
         rest = 1 - self.sensor_gain
         # near the edge of convexity a small part of the disc's radius is a large one of the bound
         stretch = (1 + self.at_most * abs(rest)) / (1 - self.at_most * abs(rest))
         a = (1 - min(ROOM * stretch, 0.05)) * self.at_most
         curvature = 1 - (a * rest) ** 2
         centre = (1 - a**2 * rest) / curvature
-        return (discs(f, -rows, np.full(f.size, centre), a * self.sensor_gain / curvature),)
+        radius = a * self.sensor_gain / curvature
+        return (discs(f, -channel.complementary_rows(f), centre, radius),)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        rejection = loop.at(self.sensor_gain).rejection()
-        return (
-            Check(
-                name=f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}",
-                value=band_norm(rejection, self.low_hz, self.high_hz).upper,
-                limit=self.at_most,
-                computed_by="level sets, all of the band",
-            ),
-        )
+        name = f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}"
+        peak = self.peak(loop.at(self.sensor_gain).rejection())
+        return (Check(name, peak, self.at_most, BAND_LEVEL_SETS),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -237,31 +219,25 @@ class CommandRms:
     rate: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "at_most_nm", number(self.at_most_nm, "at_most_nm", above=0))
+        limit = number(self.at_most_nm, "at_most_nm", above=0)
         if not isinstance(self.rate, bool):
             raise ProblemError(f"rate must be True or False; got {self.rate!r}.")
         # the same disturbances as those of a variance
         disturbance = ResidualVariance(turbulence=self.turbulence, noise_nm=self.noise_nm)
-        object.__setattr__(self, "noise_nm", disturbance.noise_nm)
+        set_fields(self, at_most_nm=limit, noise_nm=disturbance.noise_nm)
 
     @property
     def label(self) -> str:
         """What a message calls it."""
-        what = "step" if self.rate else "stroke"
-        return f"command {what} of at most {self.at_most_nm:g} nm rms"
+        return f"command {self._what} of at most {self.at_most_nm:g} nm rms"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints over the nodes of a grid."""
         f, w = grid.nodes_hz, grid.weights_hz
         density = self._density(f, channel.nyquist_hz, channel.hardware.dt_s)
         rows = np.sqrt(w * density)[:, None, None] * channel.command_rows(f)[:, None, :]
-        function = Fractions(
-            frequency_hz=f,
-            rows=rows,
-            centres=np.zeros((f.size, 1), np.complex128),
-            steering=None,
-            worst=False,
-        )
+        centres = np.zeros((f.size, 1), np.complex128)
+        function = Fractions(frequency_hz=f, rows=rows, centres=centres, steering=None, worst=False)
         return (FunctionBound(function=function, limit=((1 - ROOM) * self.at_most_nm) ** 2),)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
@@ -273,20 +249,14 @@ class CommandRms:
             response = np.abs(parameter.frequency_response(f)[:, 0, 0]) ** 2
             return np.asarray((response * self._density(f, nyquist, dt_s))[:, None, None])
 
-        edges = [
-            np.asarray(resonance_edges(loop.at(1.0))),
-            spectrum_edges(self.turbulence, nyquist),
-        ]
-        edges_hz = np.unique(np.concatenate(edges))
-        variance = float(adaptive_integral(power, edges_hz)[0, 0])
-        return (
-            Check(
-                name=f"command {'step' if self.rate else 'stroke'} [nm rms]",
-                value=float(np.sqrt(variance)),
-                limit=self.at_most_nm,
-                computed_by="adaptive quadrature",
-            ),
-        )
+        edges = [resonance_edges(loop.at(1.0)), spectrum_edges(self.turbulence, nyquist)]
+        variance = adaptive_integral(power, np.unique(np.concatenate(edges)))[0, 0]
+        name = f"command {self._what} [nm rms]"
+        return (Check(name, float(np.sqrt(variance)), self.at_most_nm, "adaptive quadrature"),)
+
+    @property
+    def _what(self) -> str:
+        return "step" if self.rate else "stroke"
 
     def _density(self, f: FloatArray, nyquist_hz: float, dt_s: float) -> FloatArray:
         """Spectrum of what drives Q, and of its steps where those are bounded [nm^2/Hz]."""

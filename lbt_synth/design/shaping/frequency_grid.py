@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lbt_synth.design.shaping.channel import Channel
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, Spectrum
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.validation import FloatArray
 
 _ORDER = 5
 _BAND_POINTS = 15
@@ -35,31 +37,29 @@ class Grid:
 
 
 def first_grid(
-    frame_rate_hz: float,
+    channel: Channel,
+    bands_hz: Sequence[tuple[float, float]],
+    spectra: Sequence[Spectrum],
     *,
-    bands_hz: tuple[tuple[float, float], ...],
-    poles: ComplexArray,
-    breakpoints_hz: FloatArray,
     fineness: int = 1,
 ) -> Grid:
-    """Lay panels: geometric at low frequencies, finer in the bands and at slow poles (n,)."""
-    nyquist = frame_rate_hz / 2
+    """Lay panels: geometric at low frequencies, finer in the bands and at slow poles."""
+    rate, nyquist = channel.hardware.frame_rate_hz, channel.nyquist_hz
     edges = [
         np.array([0.0]),
-        np.geomspace(6e-5, 0.01, 13 * fineness + 1) * frame_rate_hz,
-        np.geomspace(0.0125, 0.5, 24 * fineness + 1) * frame_rate_hz,
-        breakpoints_hz,
+        np.geomspace(6e-5, 0.01, 13 * fineness + 1) * rate,
+        np.geomspace(0.0125, 0.5, 24 * fineness + 1) * rate,
+        *(_thin_spectrum_edges(spectrum, nyquist) for spectrum in spectra),
     ]
     for low, high in bands_hz:
         width = high - low
-        edges.append(
-            np.linspace(max(low - width, 0), min(high + width, nyquist), 12 * fineness + 1)
-        )
-    for pole in poles:
+        ends = max(low - width, 0), min(high + width, nyquist)
+        edges.append(np.linspace(*ends, 12 * fineness + 1))
+    for pole in channel.basis.poles:
         centre, width = abs(np.angle(pole)), 1 - abs(pole)
         if width < 0.05:
             offsets = np.array([-4.0, -1.0, 1.0, 4.0]) * width
-            edges.append((centre + offsets) / (2 * np.pi) * frame_rate_hz)
+            edges.append((centre + offsets) / (2 * np.pi) * rate)
     every = np.unique(np.clip(np.concatenate(edges), 0, nyquist))
     every = every[np.concatenate([[True], np.diff(every) > 1e-8 * nyquist])]
     nodes, weights = gauss_panels(every, _ORDER)
@@ -67,14 +67,17 @@ def first_grid(
     return Grid(nodes_hz=nodes, weights_hz=weights, points_hz=points)
 
 
-def fine_frequencies(frame_rate_hz: float, poles: ComplexArray, count: int) -> FloatArray:
+def fine_frequencies(channel: Channel, count: int) -> FloatArray:
     """Frequencies at which the bounds are checked between the points [Hz]."""
-    even = np.linspace(0, 0.5, count)
+    poles, even = channel.basis.poles, np.linspace(0, 0.5, count)
     low = np.geomspace(1e-5, 0.1, count // 2)
     centres, widths = np.abs(np.angle(poles)) / (2 * np.pi), (1 - np.abs(poles)) / (2 * np.pi)
     offsets = np.linspace(-3, 3, 13)
     near = (centres[:, None] + widths[:, None] * offsets).ravel()
-    return np.unique(np.clip(np.concatenate([even, low, near]), 0, 0.5)) * frame_rate_hz
+    return (
+        np.unique(np.clip(np.concatenate([even, low, near]), 0, 0.5))
+        * channel.hardware.frame_rate_hz
+    )
 
 
 def spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
@@ -90,10 +93,10 @@ def spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
     return breakpoints_below(spectrum, nyquist_hz)
 
 
-def thin_spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:
+def _thin_spectrum_edges(spectrum: Spectrum, nyquist_hz: float) -> FloatArray:
     """Return these edges, of many only as many as a programme can carry: the highest [Hz]."""
     edges = spectrum_edges(spectrum, nyquist_hz)
-    if spectrum is None or edges.size <= _MOST_EDGES:
+    if edges.size <= _MOST_EDGES:
         return edges
     power = np.asarray(spectrum.psd(edges)) * np.gradient(edges)
     high = np.argsort(power)[-_MOST_EDGES // 2 :]

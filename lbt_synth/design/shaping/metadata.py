@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
-from lbt_synth.design.shaping.demand_types import DEMANDS
 from lbt_synth.design.shaping.objectives import ResidualVariance, Total, VibrationBand, Worst
-from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.design.shaping.specification import Demand, Specification
 from lbt_synth.models import ARModel, Atmosphere, TabulatedSpectrum
 
 _KINDS: dict[str, type[Any]] = {
     kind.__name__: kind
     for kind in (
-        *DEMANDS,
-        Specification,
-        ResidualVariance,
-        VibrationBand,
-        Total,
-        Worst,
-        Atmosphere,
-        ARModel,
-        TabulatedSpectrum,
+        *get_args(Demand),
+        *(Specification, ResidualVariance, VibrationBand, Total, Worst),
+        *(Atmosphere, ARModel, TabulatedSpectrum),
     )
 }
 
@@ -32,10 +25,8 @@ def to_metadata(value: Any) -> Any:
     """Return a specification, or a part of it, as plain values for JSON."""
     name = type(value).__name__
     if name in _KINDS:
-        return {
-            "kind": name,
-            **{f.name: to_metadata(getattr(value, f.name)) for f in fields(value)},
-        }
+        named = {f.name: to_metadata(getattr(value, f.name)) for f in fields(value)}
+        return {"kind": name, **named}
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, list | tuple):

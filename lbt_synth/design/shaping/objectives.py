@@ -7,16 +7,15 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 
-from lbt_synth.design.shaping.band import Band
 from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.frequency_bounds import Band
 from lbt_synth.design.shaping.frequency_grid import Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function
-from lbt_synth.linear.norms import band_norm
 from lbt_synth.loop import residual_budget
 from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth
-from lbt_synth.validation import ComplexArray, FloatArray, number, sequence
+from lbt_synth.validation import ComplexArray, FloatArray, number, sequence, set_fields
 
 
 def require_spectrum(value: object, name: str) -> None:
@@ -59,9 +58,8 @@ class ResidualVariance:
 
     def __post_init__(self) -> None:
         require_spectrum(self.turbulence, "turbulence")
-        set_ = object.__setattr__
-        set_(self, "noise_nm", number(self.noise_nm, "noise_nm", at_least=0))
-        set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+        gain = number(self.sensor_gain, "sensor_gain", above=0)
+        set_fields(self, noise_nm=number(self.noise_nm, "noise_nm", at_least=0), sensor_gain=gain)
         if self.turbulence is None and self.noise_nm == 0:
             raise ProblemError("a variance needs turbulence or noise; got neither.")
 
@@ -69,11 +67,6 @@ class ResidualVariance:
     def label(self) -> str:
         """What a table calls it."""
         return f"turbulence and noise at sensor gain {self.sensor_gain:g}"
-
-    @property
-    def bands_hz(self) -> tuple[tuple[float, float], ...]:
-        """Bands that the grid should resolve."""
-        return ()
 
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the variance over a grid as a function of the coefficients [nm^2]."""
@@ -96,10 +89,9 @@ class ResidualVariance:
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the variance in the real loop, exactly."""
-        truth = Truth(
-            turbulence=self.turbulence, noise_nm=self.noise_nm, sensor_gain=self.sensor_gain
-        )
-        return residual_budget(loop.at(self.sensor_gain), truth).rms_nm ** 2
+        gain = self.sensor_gain
+        truth = Truth(turbulence=self.turbulence, noise_nm=self.noise_nm, sensor_gain=gain)
+        return residual_budget(loop.at(gain), truth).rms_nm ** 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,9 +124,8 @@ class VibrationBand(Band):
 
     def __post_init__(self) -> None:
         Band.__post_init__(self)
-        set_ = object.__setattr__
-        set_(self, "rms_nm", number(self.rms_nm, "rms_nm", above=0))
-        set_(self, "sensor_gain", number(self.sensor_gain, "sensor_gain", above=0))
+        gain = number(self.sensor_gain, "sensor_gain", above=0)
+        set_fields(self, rms_nm=number(self.rms_nm, "rms_nm", above=0), sensor_gain=gain)
 
     @property
     def label(self) -> str:
@@ -143,7 +134,7 @@ class VibrationBand(Band):
 
     @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:
-        """Bands that the grid should resolve."""
+        """The band, as the one that the grid should resolve."""
         return ((self.low_hz, self.high_hz),)
 
     def function(self, channel: Channel, grid: Grid) -> Fractions:
@@ -160,8 +151,7 @@ class VibrationBand(Band):
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets."""
-        rejection = loop.at(self.sensor_gain).rejection()
-        return (self.rms_nm * band_norm(rejection, self.low_hz, self.high_hz).upper) ** 2
+        return (self.rms_nm * self.peak(loop.at(self.sensor_gain).rejection())) ** 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -182,19 +172,13 @@ class _CombinedTerms:
         given = (1.0,) * len(terms) if self.weights is None else sequence(self.weights, "weights")
         if len(given) != len(terms):
             raise ProblemError(f"weights must be one per term, {len(terms)}; got {len(given)}.")
-        object.__setattr__(self, "terms", terms)
-        object.__setattr__(self, "weights", tuple(number(w, "weights", above=0) for w in given))
+        set_fields(self, terms=terms, weights=tuple(number(w, "weights", above=0) for w in given))
 
     @property
     def factors(self) -> tuple[float, ...]:
         """Weights of the terms."""
         assert self.weights is not None  # set by __post_init__
         return self.weights
-
-    @property
-    def bands_hz(self) -> tuple[tuple[float, float], ...]:
-        """Bands that the grid should resolve."""
-        return tuple(band for term in self.terms for band in term.bands_hz)
 
     def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the objective over a grid as a function of the coefficients [nm^2]."""
@@ -206,10 +190,8 @@ class _CombinedTerms:
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the objective of the real loop [nm^2]."""
-        values = [
-            weight * term.measured_nm2(loop)
-            for weight, term in zip(self.factors, self.terms, strict=True)
-        ]
+        pairs = zip(self.factors, self.terms, strict=True)
+        values = [weight * term.measured_nm2(loop) for weight, term in pairs]
         return max(values) if self.largest else sum(values)
 
 
@@ -274,7 +256,7 @@ Term: TypeAlias = ResidualVariance | VibrationBand | _CombinedTerms
 
 def require_term(term: object) -> None:
     """Refuse anything that is not a term of an objective."""
-    if not isinstance(term, ResidualVariance | VibrationBand | _CombinedTerms):
+    if not isinstance(term, Term):
         raise ProblemError(
             "an objective is made of ResidualVariance, VibrationBand, Total and Worst; got "
             f"{type(term).__name__}."
@@ -292,6 +274,12 @@ def _steering(complementary: ComplexArray, sensor_gain: float) -> ComplexArray |
     return None if sensor_gain == 1 else (1 - sensor_gain) * complementary
 
 
+def vibration_bands(term: Term) -> tuple[tuple[float, float], ...]:
+    """Return the different bands (low, high) of an objective's vibrations, in order [Hz]."""
+    lines = [leaf for leaf in leaves(term) if isinstance(leaf, VibrationBand)]
+    return tuple(dict.fromkeys((line.low_hz, line.high_hz) for line in lines))
+
+
 def frequency_costs(term: Term, frequency_hz: FloatArray) -> FloatArray:
     """Cost of an error of T at each frequency, up to a factor: spectra and bands."""
     cost = np.zeros(frequency_hz.size)
@@ -306,6 +294,5 @@ def frequency_costs(term: Term, frequency_hz: FloatArray) -> FloatArray:
 
 def noise_level(term: Term) -> float:
     """Largest noise of an objective [nm]."""
-    return max(
-        (leaf.noise_nm for leaf in leaves(term) if isinstance(leaf, ResidualVariance)), default=0.0
-    )
+    found = [leaf.noise_nm for leaf in leaves(term) if isinstance(leaf, ResidualVariance)]
+    return max(found, default=0.0)

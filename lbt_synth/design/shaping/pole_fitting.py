@@ -7,6 +7,8 @@ V. Pereyra, SIAM J. Numer. Anal. 10, 413 (1973), doi:10.1137/0710036).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -16,55 +18,61 @@ _EVALUATIONS = 60
 _STEEPEST = 9.0  # largest log(r / (1 - r)) of a modulus r: 1 - 1e-4
 
 
-def fit_poles(
-    angles: FloatArray, target: ComplexArray, weight: FloatArray, start: ComplexArray
-) -> tuple[ComplexArray, float]:
-    """Fit the poles (n,) of functions ``z (z I - A)^-1 B`` to a response, and its misfit.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WeightedResponse:
+    """A response over frequency, and the weight of an error of it."""
 
-    Shapes: angles, target, weight (f,), start (n,).
-    """
-    z = np.exp(1j * angles)
-    pairs = start[start.imag > 0]
-    real = start[start.imag == 0].real
-    goal = weight * target
-    size = float(np.linalg.norm(goal))
+    angles: FloatArray  # (f,) [radians per frame]
+    target: ComplexArray  # (f,)
+    weight: FloatArray  # (f,)
+
+    @property
+    def goal(self) -> ComplexArray:
+        """The weighted response, (f,)."""
+        return self.weight * self.target
+
+    def coefficients(self, rows: ComplexArray) -> FloatArray:
+        """Return the coefficients (n,) of functions (f, n) that fit the response best."""
+        columns = _real_rows(self.weight[:, None] * rows)
+        return np.asarray(np.linalg.lstsq(columns, _real_rows(self.goal), rcond=None)[0])
+
+    def residual(self, upper: ComplexArray, single: FloatArray) -> FloatArray:
+        """Weighted error of the best fit with poles, real parts first, (2 f,)."""
+        functions = _basis_responses(np.exp(1j * self.angles), upper, single)
+        q, _ = np.linalg.qr(_real_rows(self.weight[:, None] * functions))
+        goal = _real_rows(self.goal)
+        return np.asarray(goal - q @ (q.T @ goal))
+
+
+def fit_poles(response: WeightedResponse, start: ComplexArray) -> tuple[ComplexArray, float]:
+    """Fit the poles (n,) of functions ``z (z I - A)^-1 B`` to a response; return the misfit too."""
+    pairs, real = start[start.imag > 0], start[start.imag == 0].real
+    size = float(np.linalg.norm(response.goal))
+    x0 = [np.log(np.abs(pairs) / (1 - np.abs(pairs))), np.angle(pairs), np.arctanh(real)]
+
+    def each(modulus: float, angle: float, single: float) -> FloatArray:
+        return np.repeat([modulus, angle, single], [pairs.size, pairs.size, real.size])
+
+    low, high = each(-3.0, 0.0, -4.0), each(_STEEPEST, np.pi, 4.0)
 
     def misfit(x: FloatArray) -> FloatArray:
-        upper, single = _poles_from_vector(x, pairs.size)
-        return _fit_residual(goal, weight, _basis_responses(z, upper, single)) / size
+        return response.residual(*_poles_from_vector(x, pairs.size)) / size
 
-    x0 = np.concatenate(
-        [np.log(np.abs(pairs) / (1 - np.abs(pairs))), np.angle(pairs), np.arctanh(real)]
-    )
-    bound = np.concatenate(
-        [np.full(pairs.size, _STEEPEST), np.full(pairs.size, np.pi), np.full(real.size, 4.0)]
-    )
-    lower = np.concatenate(
-        [np.full(pairs.size, -3.0), np.zeros(pairs.size), -bound[2 * pairs.size :]]
-    )
     found = least_squares(
         misfit,
-        np.clip(x0, lower + 1e-6, bound - 1e-6),
-        bounds=(lower, bound),
+        np.clip(np.concatenate(x0), low + 1e-6, high - 1e-6),
+        bounds=(low, high),
         max_nfev=_EVALUATIONS,
-        x_scale=np.concatenate(
-            [np.ones(pairs.size), np.full(pairs.size, 0.02), np.ones(real.size)]
-        ),
+        x_scale=each(1.0, 0.02, 1.0),
     )
     upper, single = _poles_from_vector(found.x, pairs.size)
-    poles = np.concatenate([upper, upper.conj(), single.astype(np.complex128)])
-    return poles, float(np.linalg.norm(found.fun))
+    return np.concatenate([upper, upper.conj(), single]), float(np.linalg.norm(found.fun))
 
 
-def starting_poles(
-    count: int, *, bands: tuple[tuple[float, float], ...], noise_rad: float
-) -> ComplexArray:
+def starting_poles(count: int, *, bands: FloatArray, noise_rad: float) -> ComplexArray:
     """Poles to start the fit from: some in each band (low, high), some below and above."""
-    pairs: list[complex] = [
-        (1 - 0.8 * noise_rad) * np.exp(1j * noise_rad),
-        0.62 * np.exp(0.5j),
-        0.8 * np.exp(1.0j),
-    ]
+    slow = (1 - 0.8 * noise_rad) * np.exp(1j * noise_rad)
+    pairs: list[complex] = [slow, 0.62 * np.exp(0.5j), 0.8 * np.exp(1.0j)]
     number = count // 2
     each = max((number - 3) // max(len(bands), 1), 1)
     for low, high in bands:
@@ -78,30 +86,18 @@ def starting_poles(
     return np.concatenate([upper, upper.conj(), single])
 
 
-def drop_cheapest_pair(poles: ComplexArray, costs: FloatArray) -> ComplexArray:
-    """Return the poles without the pair that costs least to drop."""
-    upper = poles[poles.imag > 0]
-    kept = np.delete(upper, int(np.argmin(costs)))
-    return np.concatenate([kept, kept.conj(), poles[poles.imag == 0]])
+def drop_cheapest_pair(response: WeightedResponse, poles: ComplexArray) -> ComplexArray:
+    """Return the poles without the pair whose loss costs the fit least."""
+    upper, single = poles[poles.imag > 0], poles[poles.imag == 0]
+    fewer = [np.delete(upper, i) for i in range(upper.size)]
+    costs = [np.linalg.norm(response.residual(each, single.real)) for each in fewer]
+    kept = fewer[int(np.argmin(costs))]
+    return np.concatenate([kept, kept.conj(), single])
 
 
-def misfit_without_each_pair(
-    angles: FloatArray, target: ComplexArray, weight: FloatArray, poles: ComplexArray
-) -> FloatArray:
-    """Misfit of the response when each pair of poles is dropped, (pairs,)."""
-    z = np.exp(1j * angles)
-    upper, single = poles[poles.imag > 0], poles[poles.imag == 0].real
-    goal = weight * target
-    functions = (_basis_responses(z, np.delete(upper, i), single) for i in range(upper.size))
-    return np.array([np.linalg.norm(_fit_residual(goal, weight, each)) for each in functions])
-
-
-def _fit_residual(goal: ComplexArray, weight: FloatArray, functions: ComplexArray) -> FloatArray:
-    """Rest of a goal beside real multiples of weighted functions, real parts first."""
-    columns = weight[:, None] * functions
-    q, _ = np.linalg.qr(np.vstack([columns.real, columns.imag]))
-    stacked = np.concatenate([goal.real, goal.imag])
-    return np.asarray(stacked - q @ (q.T @ stacked))
+def _real_rows(rows: ComplexArray) -> FloatArray:
+    """Stack the real parts upon the imaginary parts."""
+    return np.concatenate([rows.real, rows.imag])
 
 
 def _poles_from_vector(x: FloatArray, pairs: int) -> tuple[ComplexArray, FloatArray]:
@@ -117,10 +113,8 @@ def _basis_responses(z: ComplexArray, upper: ComplexArray, single: FloatArray) -
     for pole in upper:
         denominator = (z - pole) * (z - pole.conjugate())
         size = abs(1 - abs(pole))
-        columns += [
-            passed * z * size / denominator,
-            passed * z * (z - pole.real) * size / denominator,
-        ]
+        columns.append(passed * z * size / denominator)
+        columns.append(passed * z * (z - pole.real) * size / denominator)
         passed = passed * (1 - pole * z) * (1 - pole.conjugate() * z) / denominator
     for pole in single:
         columns.append(passed * z / (z - pole))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,122 +58,143 @@ def solve_sequence(
     start: FloatArray | None = None,
     fineness: int = 1,
 ) -> SequenceSolution:
-    """Minimise the objective of a specification in a basis.
+    """Minimise the objective of a specification in a basis, from coefficients (n,) if given.
 
     A convex specification takes one programme, and another for each time that a bound is exceeded
     between its frequencies. One with terms at other sensor gains is solved for unit gain first,
     until the demands hold at all frequencies, and goes on with upper bounds that touch the
-    objective; none of these steps makes it larger or leaves the demands. ``start`` is (n,).
+    objective; none of these steps makes it larger or leaves the demands.
     """
-    from lbt_synth.linear.lmi.conic_program import minimize
-
-    grid = specification.grid(channel, fineness=fineness)
-    points = fine_frequencies(channel.hardware.frame_rate_hz, channel.basis.poles, _FINE * fineness)
-    fine = _FineGrid.build(specification, channel, grid, points)
-    function, groups = specification.compile(channel, grid)
-    convex = is_convex(function)
-    scale = _objective_scale(specification, function, channel.basis.size)
+    programme = _Programme(specification, channel, fineness)
+    convex, values = is_convex(programme.function), []
     # the upper bounds need coefficients whose loops are stable at all sensor gains
-    c = start if start is not None and fine.is_stable(start) else None
-    aware = convex or c is not None
-    values: list[float] = []
-    for programmes in range(1, _STEPS + 1):
-        constraints = merge_constraints(tuple(x for group in groups for x in group))
-        goal = function if aware else without_denominators(function)
-        solution = minimize(goal, constraints, size=channel.basis.size, scale=scale, start=c)
-        if solution.coefficients is None:
-            raise _infeasibility_error(specification, groups, channel.basis.size, solution.status)
-        c = solution.coefficients
-        values.append(function.value(c))
-        excess = fine.excess(function, c)
-        settled = convex or (len(values) > 1 and values[-2] - values[-1] <= _DECREASE * values[-1])
-        if not aware:
-            aware, settled, values = excess.size == 0, False, values[-1:]
-        if excess.size == 0 and settled:
-            return SequenceSolution(
-                channel=channel,
-                grid=grid,
-                coefficients=c,
-                objectives_nm2=tuple(values),
-                programmes=programmes,
-                status=solution.status,
-            )
-        if excess.size:
-            grid = grid.with_points(excess)
-            function, groups = specification.compile(channel, grid)
-    raise NumericalError(
-        f"the shaped loop exceeds its bounds between the {grid.points_hz.size} frequencies of its "
-        f"programme, or does not settle, after {_STEPS} programmes. Try fewer functions, or "
-        "looser bounds.",
-        status="frequencies",
-        residual=float(excess.size),
+    if convex or start is None or not programme.is_stable(start):
+        c = _minimize_at_unit_gain(programme)
+        values.append(programme.function.value(c))
+    else:
+        c = start
+    if not convex:
+        c = _lower_objective(programme, c, values)
+    return SequenceSolution(
+        channel=channel,
+        grid=programme.grid,
+        coefficients=c,
+        objectives_nm2=tuple(values),
+        programmes=programme.solved,
+        status=programme.status,
     )
 
 
-def _objective_scale(specification: Specification, function: Function, size: int) -> float:
-    """Guess the final size of the objective, within a few powers of ten [nm^2]."""
-    return max(4 * noise_level(specification.objective) ** 2, 1e-4 * function.value(np.zeros(size)))
+def _minimize_at_unit_gain(programme: _Programme) -> FloatArray:
+    """Minimise the objective at unit sensor gain, until the demands hold at all frequencies."""
+    while True:
+        c = programme.solve(without_denominators(programme.function))
+        if not programme.refine(c):
+            return c
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _FineGrid:
-    """Bounds and worst cases at frequencies between those of the programme."""
+def _lower_objective(programme: _Programme, c: FloatArray, values: list[float]) -> FloatArray:
+    """Minimise upper bounds that touch the objective, until it settles; append its values."""
+    while True:
+        c = programme.solve(programme.function, start=c)
+        values.append(programme.function.value(c))
+        settled = len(values) > 1 and values[-2] - values[-1] <= _DECREASE * values[-1]
+        if not programme.refine(c) and settled:
+            return c
 
-    specification: Specification
-    channel: Channel
-    grid: Grid
-    function: Function
-    constraints: tuple[Constraint, ...]
 
-    @classmethod
-    def build(
-        cls, specification: Specification, channel: Channel, grid: Grid, points_hz: FloatArray
-    ) -> _FineGrid:
-        fine = replace(grid, points_hz=points_hz)
-        function, groups = specification.compile(channel, fine)
-        return cls(
-            specification=specification,
-            channel=channel,
-            grid=fine,
-            function=function,
-            constraints=merge_constraints(tuple(c for group in groups for c in group)),
-        )
+class _Programme:
+    """The conic programme of a specification, on a grid that grows where bounds are exceeded."""
+
+    def __init__(self, specification: Specification, channel: Channel, fineness: int) -> None:
+        self.specification, self.channel = specification, channel
+        self.grid = specification.grid(channel, fineness=fineness)
+        self.function, self.groups = specification.compile(channel, self.grid)
+        self.size, self.solved, self.status = channel.basis.size, 0, ""
+        # a guess of the final objective, within a few powers of ten
+        zero = 1e-4 * self.function.value(np.zeros(self.size))
+        self.scale = max(4 * noise_level(specification.objective) ** 2, zero)
+        self._excess = np.zeros(0)
+        self._fine = self._between(fine_frequencies(channel, _FINE * fineness))
+
+    def solve(self, function: Function, start: FloatArray | None = None) -> FloatArray:
+        """Minimise a function under all demands; return the coefficients (n,)."""
+        from lbt_synth.linear.lmi.conic_program import minimize
+
+        if self.solved == _STEPS:
+            raise NumericalError(
+                f"the shaped loop exceeds its bounds between the {self.grid.points_hz.size} "
+                f"frequencies of its programme, or does not settle, after {_STEPS} programmes. Try "
+                "fewer functions, or looser bounds.",
+                status="frequencies",
+                residual=float(self._excess.size),
+            )
+        self.solved += 1
+        constraints = _merged(self.groups)
+        found = minimize(function, constraints, size=self.size, scale=self.scale, start=start)
+        self.status = found.status
+        if found.coefficients is None:
+            raise _infeasibility_error(self.specification, self.groups, self.size, self.status)
+        return found.coefficients
 
     def is_stable(self, c: FloatArray) -> bool:
-        """Whether the half-planes of the sensor gains hold, without the room."""
-        planes = [x for x in self.constraints if isinstance(x, HalfPlanes)]
+        """Whether the half-planes of the sensor gains hold at all frequencies, without the room."""
+        planes = [x for x in self._fine[1] if isinstance(x, HalfPlanes)]
         return all(float(np.max(plane.use(c))) * (1 - ROOM) < 1 for plane in planes)
 
-    def excess(self, function: Function, c: FloatArray) -> FloatArray:
+    def refine(self, c: FloatArray) -> bool:
+        """Add the frequencies at which coefficients exceed bounds; return whether there are any."""
+        self._excess = self._find_excess(c)
+        if self._excess.size:
+            self.grid = self.grid.with_points(self._excess)
+            self.function, self.groups = self.specification.compile(self.channel, self.grid)
+        return self._excess.size > 0
+
+    def _find_excess(self, c: FloatArray) -> FloatArray:
         """Frequencies at which bounds, or the programme's own worst cases, are exceeded [Hz]."""
         limits = tuple(
             leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf
-            for leaf in leaf_fractions(function)
+            for leaf in leaf_fractions(self.function)
         )
-        found = self._peaks_above(limits, c, 1 + ROOM / 2)
+        found = _peaks_above(self._fine, limits, c, 1 + ROOM / 2)
         if found.size:
             return found[:, 1]
         # between the neighbours of what comes close
-        close = self._peaks_above(limits, c, _CLOSE)
+        close = _peaks_above(self._fine, limits, c, _CLOSE)
         if not close.size:
             return np.zeros(0)
-        points = np.unique(np.linspace(close[:, 0], close[:, 2], _BETWEEN))
-        finer = self.build(self.specification, self.channel, self.grid, points)
-        return finer._peaks_above(limits, c, 1 + ROOM / 2)[:, 1]
+        finer = self._between(np.unique(np.linspace(close[:, 0], close[:, 2], _BETWEEN)))
+        return _peaks_above(finer, limits, c, 1 + ROOM / 2)[:, 1]
 
-    def _peaks_above(self, limits: tuple[float, ...], c: FloatArray, level: float) -> FloatArray:
-        """Local peaks above a level of their limits, each between its neighbours, (k, 3)."""
-        bounds = [
-            _local_peaks(constraint.frequency_hz, constraint.use(c), level)
-            for constraint in self.constraints
-            if isinstance(constraint, Discs | HalfPlanes)
-        ]
-        worst = [
-            _local_peaks(leaf.frequency_hz, leaf.values(c), limit * level)
-            for leaf, limit in zip(leaf_fractions(self.function), limits, strict=True)
-            if leaf.worst
-        ]
-        return np.unique(np.concatenate([np.zeros((0, 3)), *bounds, *worst]), axis=0)
+    def _between(self, points_hz: FloatArray) -> tuple[Function, tuple[Constraint, ...]]:
+        """Return the objective and the constraints at other points."""
+        grid = replace(self.grid, points_hz=points_hz)
+        function, groups = self.specification.compile(self.channel, grid)
+        return function, _merged(groups)
+
+
+def _merged(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
+    return merge_constraints(tuple(constraint for group in groups for constraint in group))
+
+
+def _peaks_above(
+    fine: tuple[Function, tuple[Constraint, ...]],
+    limits: tuple[float, ...],
+    c: FloatArray,
+    level: float,
+) -> FloatArray:
+    """Local peaks above a level of their limits, each between its neighbours, (k, 3)."""
+    bounds = [
+        _local_peaks(constraint.frequency_hz, constraint.use(c), level)
+        for constraint in fine[1]
+        if isinstance(constraint, Discs | HalfPlanes)
+    ]
+    worst = [
+        _local_peaks(leaf.frequency_hz, leaf.values(c), limit * level)
+        for leaf, limit in zip(leaf_fractions(fine[0]), limits, strict=True)
+        if leaf.worst
+    ]
+    return np.unique(np.concatenate([np.zeros((0, 3)), *bounds, *worst]), axis=0)
 
 
 def _local_peaks(frequency_hz: FloatArray, values: FloatArray, limit: float) -> FloatArray:
@@ -194,30 +216,25 @@ def _infeasibility_error(
     """Error that names a smallest set of demands that cannot hold, and how far each is off."""
     from lbt_synth.linear.lmi.conic_program import minimize_relaxation
 
+    def relaxations(chosen: list[int], relaxed: Container[int]) -> FloatArray:
+        rigid = tuple(i not in relaxed for i in chosen)
+        return minimize_relaxation(tuple(groups[i] for i in chosen), size=size, rigid=rigid)
+
     labels = [demand.label for demand in specification.demands]
-    free = (False,) * len(groups)
-    if not groups or np.max(minimize_relaxation(groups, size=size, rigid=free)) <= _RELAXED:
+    core = list(range(len(groups)))
+    if not groups or np.max(relaxations(core, core)) <= _RELAXED:
         return NumericalError(
             f"the programme of the shaped loop ended as {status!r}; expected an optimum. Try "
             "another number of functions.",
             status=status,
         )
-    core = list(range(len(groups)))
     for candidate in range(len(groups)):  # a demand without which the rest still clashes may go
         rest = [i for i in core if i != candidate]
-        if not rest:
-            continue
-        relaxed = minimize_relaxation(
-            tuple(groups[i] for i in rest), size=size, rigid=(False,) * len(rest)
-        )
-        if np.max(relaxed) > _RELAXED:
+        if rest and np.max(relaxations(rest, rest)) > _RELAXED:
             core = rest
     listing = []
-    for i in core:
-        relaxed = minimize_relaxation(
-            tuple(groups[j] for j in core), size=size, rigid=tuple(j != i for j in core)
-        )
-        factor = 1 + float(relaxed[core.index(i)])
+    for place, i in enumerate(core):
+        factor = 1 + float(relaxations(core, [i])[place])
         size_text = f"{factor:.4g}" if factor > 1.001 else f"1 + {factor - 1:.1g}"
         amount = f"alone it must be relaxed by a factor of {size_text}"
         listing.append(f"{labels[i]} ({amount if np.isfinite(factor) else 'no relaxation helps'})")

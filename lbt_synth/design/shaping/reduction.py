@@ -8,11 +8,11 @@ import numpy as np
 
 from lbt_synth.design.shaping.basis import orthonormal_basis
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.objectives import frequency_costs, noise_level
+from lbt_synth.design.shaping.objectives import frequency_costs, noise_level, vibration_bands
 from lbt_synth.design.shaping.pole_fitting import (
+    WeightedResponse,
     drop_cheapest_pair,
     fit_poles,
-    misfit_without_each_pair,
     starting_poles,
 )
 from lbt_synth.design.shaping.programme_sequence import SequenceSolution, solve_sequence
@@ -65,33 +65,17 @@ def reduce_poles(
     spec: Specification, long: ModeSolution, order: int, tolerance: float, *, fewest: bool = True
 ) -> ModeSolution:
     """Find the fewest poles whose programme keeps the objective within a tolerance."""
-    sequence = long.sequence
-    hardware, f = sequence.channel.hardware, sequence.grid.nodes_hz
-    angles = 2 * np.pi * f * hardware.dt_s
-    target = sequence.channel.command_rows(f) @ sequence.coefficients
-    weight = _fit_weight(spec, sequence)
-    bands = tuple(
-        (2 * np.pi * low * hardware.dt_s, 2 * np.pi * high * hardware.dt_s)
-        for low, high in spec.objective.bands_hz
-    )
-    starts = [
-        fit_poles(
-            angles,
-            target,
-            weight,
-            starting_poles(order, bands=tuple(dict.fromkeys(bands)), noise_rad=2 * np.pi * slow),
-        )
-        for slow in _SLOW_HZ
-    ]
-    candidates = [min(starts, key=lambda start: start[1])[0]]
+    hardware, response = long.sequence.channel.hardware, _response_to_fit(spec, long.sequence)
+    bands = 2 * np.pi * np.array(vibration_bands(spec.objective)).reshape(-1, 2) * hardware.dt_s
+    starts = [starting_poles(order, bands=bands, noise_rad=2 * np.pi * slow) for slow in _SLOW_HZ]
+    fits = [fit_poles(response, start) for start in starts]
+    candidates = [min(fits, key=lambda fit: fit[1])[0]]
     while fewest and candidates[-1].size > 2 and np.any(candidates[-1].imag):
-        fewer = drop_cheapest_pair(
-            candidates[-1], misfit_without_each_pair(angles, target, weight, candidates[-1])
-        )
-        candidates.append(fit_poles(angles, target, weight, fewer)[0])
+        fewer = drop_cheapest_pair(response, candidates[-1])
+        candidates.append(fit_poles(response, fewer)[0])
 
     def attempt(index: int) -> tuple[ModeSolution | None, float]:
-        found = _solve_with_poles(spec, sequence, candidates[index], target, weight)
+        found = _solve_with_poles(spec, long.sequence, candidates[index], response)
         return found, np.inf if found is None else found.objective_nm / long.objective_nm - 1
 
     accepted, loss = attempt(0)
@@ -115,30 +99,24 @@ def reduce_poles(
 
 
 def _solve_with_poles(
-    spec: Specification,
-    long: SequenceSolution,
-    poles: ComplexArray,
-    target: ComplexArray,
-    weight: FloatArray,
+    spec: Specification, long: SequenceSolution, poles: ComplexArray, response: WeightedResponse
 ) -> ModeSolution | None:
-    """Solve the specification with given poles; None if that fails."""
+    """Solve the specification with given poles, from the fit of a response; None if it fails."""
     hardware = long.channel.hardware
     channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
-    # start from the fit of the long response
-    rows = weight[:, None] * channel.command_rows(long.grid.nodes_hz)
-    goal = weight * target
-    start = np.linalg.lstsq(
-        np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
-    )[0]
+    start = response.coefficients(channel.command_rows(long.grid.nodes_hz))
     try:
         return solve_mode(spec, channel, start=start)
     except (InfeasibleError, NumericalError):
         return None
 
 
-def _fit_weight(spec: Specification, sequence: SequenceSolution) -> FloatArray:
-    """Weight of an error of the parameter at the nodes: spectra, and some everywhere."""
-    f, w = sequence.grid.nodes_hz, sequence.grid.weights_hz
-    nyquist = sequence.channel.nyquist_hz
+def _response_to_fit(spec: Specification, long: SequenceSolution) -> WeightedResponse:
+    """Response of the long parameter at the nodes; the weight is spectra, and some everywhere."""
+    f, w, nyquist = long.grid.nodes_hz, long.grid.weights_hz, long.channel.nyquist_hz
     cost = w * (frequency_costs(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
-    return np.asarray(np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist))
+    return WeightedResponse(
+        angles=2 * np.pi * f * long.channel.hardware.dt_s,
+        target=long.channel.command_rows(f) @ long.coefficients,
+        weight=np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist),
+    )

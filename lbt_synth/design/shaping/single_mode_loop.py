@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
 from lbt_synth.models import LoopHardware
+from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
 from lbt_synth.validation import FloatArray
 
 
@@ -36,21 +37,14 @@ class SingleModeLoop:
     @property
     def parameter(self) -> StateSpace:
         """The Youla parameter: from the noise to the command at unit sensor gain."""
-        commanding = self.at(1.0).commanding()
-        modes = self.hardware.modes
-        return StateSpace(
-            A=commanding.A,
-            B=commanding.B[:, modes:],
-            C=commanding.C,
-            D=commanding.D[:, modes:],
-            dt_s=commanding.dt_s,
-        )
+        commanding, modes = self.at(1.0).commanding(), self.hardware.modes
+        return replace(commanding, B=commanding.B[:, modes:], D=commanding.D[:, modes:])
 
     @property
     def complementary(self) -> StateSpace:
         """``T = 1 - S`` at unit sensor gain."""
         s = self.sensitivity
-        return StateSpace(A=s.A, B=s.B, C=-s.C, D=1 - s.D, dt_s=s.dt_s)
+        return replace(s, C=-s.C, D=1 - s.D)
 
 
 def mode_loop(hardware: LoopHardware, parameter: Controller) -> SingleModeLoop:
@@ -61,23 +55,18 @@ def mode_loop(hardware: LoopHardware, parameter: Controller) -> SingleModeLoop:
 
 def mode_hardware(hardware: LoopHardware) -> LoopHardware:
     """Return the hardware of one mode, with unit sensor and mirror."""
-    return LoopHardware(
-        frame_rate_hz=hardware.frame_rate_hz,
-        delay_frames=hardware.delay_frames,
-        modes=1,
-        mirror=hardware.mirror,
-    )
+    rate, delay = hardware.frame_rate_hz, hardware.delay_frames
+    return LoopHardware(frame_rate_hz=rate, delay_frames=delay, modes=1, mirror=hardware.mirror)
 
 
 def append_taps(system: StateSpace, taps: FloatArray) -> StateSpace:
     """Return a system of one output followed by ``taps[0] + taps[1] z^-1 + ...``."""
-    n, m = system.B.shape
-    late = len(taps) - 1
-    A = np.zeros((n + late, n + late))
-    B = np.zeros((n + late, m))
-    A[:n, :n], B[:n] = system.A, system.B
-    if late:
-        A[n, :n], B[n] = system.C[0], system.D[0]
-        A[n + 1 :, n:-1] = np.eye(late - 1)
-    C = np.hstack([taps[0] * system.C, taps[None, 1:]])
-    return StateSpace(A=A, B=B, C=C, D=taps[0] * system.D, dt_s=system.dt_s)
+    late = tapped_mirror(taps)
+    entry, none = late.B[:, None], np.zeros((system.n_states, late.n_states))
+    return StateSpace(
+        A=np.block([[system.A, none], [entry @ system.C, late.A]]),
+        B=np.vstack([system.B, entry @ system.D]),
+        C=np.hstack([late.D * system.C, late.C[None]]),
+        D=late.D * system.D,
+        dt_s=system.dt_s,
+    )

@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias, get_args
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
+from lbt_synth.design.shaping.bounds import Attenuation, CommandRms, ModulusMargin, NoisePeak
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.demand_types import DEMANDS, Demand
-from lbt_synth.design.shaping.frequency_grid import Grid, first_grid, thin_spectrum_edges
-from lbt_synth.design.shaping.objectives import ResidualVariance, Term, leaves, require_term
+from lbt_synth.design.shaping.frequency_grid import Grid, first_grid
+from lbt_synth.design.shaping.objectives import (
+    ResidualVariance,
+    Term,
+    leaves,
+    require_term,
+    vibration_bands,
+)
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
-from lbt_synth.design.shaping.uncertainty import MirrorUncertainty, SensorGainRange
+from lbt_synth.design.shaping.uncertainty import DelayError, MirrorUncertainty, SensorGainRange
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, Function
 from lbt_synth.models import ARModel, Spectrum
-from lbt_synth.validation import sequence
+from lbt_synth.validation import sequence, set_fields
+
+Demand: TypeAlias = (
+    ModulusMargin
+    | NoisePeak
+    | Attenuation
+    | SensorGainRange
+    | DelayError
+    | MirrorUncertainty
+    | CommandRms
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,8 +74,8 @@ class Specification:
         require_term(self.objective)
         demands: list[Any] = list(sequence(self.demands, "demands"))
         for demand in demands:
-            if not isinstance(demand, DEMANDS):
-                known = ", ".join(kind.__name__ for kind in DEMANDS)
+            if not isinstance(demand, Demand):
+                known = ", ".join(kind.__name__ for kind in get_args(Demand))
                 raise ProblemError(f"a demand must be one of {known}; got {type(demand).__name__}.")
         gains = [leaf.sensor_gain for leaf in leaves(self.objective)]
         gains += [d.sensor_gain for d in demands if isinstance(d, Attenuation)]
@@ -68,21 +83,20 @@ class Specification:
         ranges = [d for d in demands if isinstance(d, SensorGainRange)]
         if not any(r.low <= low and r.high >= high for r in ranges) and low < high:
             demands.append(SensorGainRange(low=low, high=high))
-        object.__setattr__(self, "demands", tuple(demands))
+        set_fields(self, demands=tuple(demands))
 
     @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:
         """Bands of the objective and of the demands [Hz]."""
         masks = [d for d in self.demands if isinstance(d, Attenuation | MirrorUncertainty)]
-        named = [*self.objective.bands_hz, *((d.low_hz, d.high_hz) for d in masks)]
-        return tuple(dict.fromkeys(named))
+        named = ((mask.low_hz, mask.high_hz) for mask in masks)
+        return tuple(dict.fromkeys([*vibration_bands(self.objective), *named]))
 
     @property
     def spectra(self) -> tuple[Spectrum, ...]:
         """Spectra of the objective and of the demands."""
-        named = [leaf for leaf in leaves(self.objective) if isinstance(leaf, ResidualVariance)]
-        bounded = [demand for demand in self.demands if isinstance(demand, CommandRms)]
-        found = [*(part.turbulence for part in named), *(part.turbulence for part in bounded)]
+        parts = [*leaves(self.objective), *self.demands]
+        found = [p.turbulence for p in parts if isinstance(p, ResidualVariance | CommandRms)]
         return tuple(spectrum for spectrum in found if spectrum is not None)
 
     def require_fitting(self, frame_rate_hz: float) -> None:
@@ -110,25 +124,14 @@ class Specification:
 
     def grid(self, channel: Channel, *, fineness: int = 1) -> Grid:
         """Return the first grid of frequencies for a channel."""
-        nyquist = channel.nyquist_hz
-        edges = [thin_spectrum_edges(spectrum, nyquist) for spectrum in self.spectra]
-        return first_grid(
-            channel.hardware.frame_rate_hz,
-            bands_hz=self.bands_hz,
-            poles=channel.basis.poles,
-            breakpoints_hz=np.unique(np.concatenate([np.zeros(0), *edges])),
-            fineness=fineness,
-        )
+        return first_grid(channel, self.bands_hz, self.spectra, fineness=fineness)
 
     def compile(
         self, channel: Channel, grid: Grid
     ) -> tuple[Function, tuple[tuple[Constraint, ...], ...]]:
         """Return the objective, and the constraints of each demand, over a grid."""
-        return self.objective.function(channel, grid), self.constraints(channel, grid)
-
-    def constraints(self, channel: Channel, grid: Grid) -> tuple[tuple[Constraint, ...], ...]:
-        """Return the constraints of each demand over a grid."""
-        return tuple(demand.constraints(channel, grid) for demand in self.demands)
+        groups = tuple(demand.constraints(channel, grid) for demand in self.demands)
+        return self.objective.function(channel, grid), groups
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check each demand on the real loop."""

@@ -5,19 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.band import Band
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, discs
+from lbt_synth.design.shaping.frequency_bounds import (
+    BAND_LEVEL_SETS,
+    LEVEL_SETS,
+    ROOM,
+    Band,
+    discs,
+)
 from lbt_synth.design.shaping.frequency_grid import Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, append_taps
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import StateSpace, hinf_norm
+from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
-from lbt_synth.linear.norms import band_norm, largest_real_part
+from lbt_synth.linear.norms import largest_real_part
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import FloatArray, number, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,9 +55,8 @@ class SensorGainRange:
 
     def __post_init__(self) -> None:
         hint = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
-        set_ = object.__setattr__
-        set_(self, "low", number(self.low, "low", above=0, at_most=1, hint=hint))
-        set_(self, "high", number(self.high, "high", at_least=1, hint=hint))
+        low = number(self.low, "low", above=0, at_most=1, hint=hint)
+        set_fields(self, low=low, high=number(self.high, "high", at_least=1, hint=hint))
 
     @property
     def label(self) -> str:
@@ -74,16 +79,13 @@ class SensorGainRange:
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        T = loop.complementary
+        T, name = loop.complementary, "real part of the complementary sensitivity, "
         return tuple(
             Check(
-                name="real part of the complementary sensitivity, "
-                + ("largest" if sign > 0 else "least, negated"),
-                value=largest_real_part(
-                    StateSpace(A=T.A, B=T.B, C=sign * T.C, D=sign * T.D, dt_s=T.dt_s)
-                ),
-                limit=bound,
-                computed_by=LEVEL_SETS,
+                name + ("largest" if sign > 0 else "least, negated"),
+                largest_real_part(replace(T, C=sign * T.C, D=sign * T.D)),
+                bound,
+                LEVEL_SETS,
             )
             for sign, bound in self._bounds()
         )
@@ -119,7 +121,7 @@ class DelayError:
     frames: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frames", number(self.frames, "frames", above=0, at_most=1))
+        set_fields(self, frames=number(self.frames, "frames", above=0, at_most=1))
 
     @property
     def label(self) -> str:
@@ -137,15 +139,10 @@ class DelayError:
         d = hardware.delay_frames
         low, high = max(d - self.frames, 1.0), d + self.frames
         whole = np.arange(np.ceil(low), np.floor(high) + 1)
-        out = []
-        for other in np.unique(np.concatenate([[low, high], whole])):
-            if other != d:
-                there = replace(hardware, delay_frames=float(other)).mirror_taps
-                taps = np.zeros(max(there.size, hardware.mirror_taps.size))
-                taps[: there.size] += there
-                taps[: hardware.mirror_taps.size] -= hardware.mirror_taps
-                out.append((float(other), taps))
-        return out
+        others = [float(other) for other in np.setdiff1d([low, high, *whole], d)]
+        there = [replace(hardware, delay_frames=other).mirror_taps for other in others]
+        taps = [polysub(one, hardware.mirror_taps).astype(np.float64) for one in there]
+        return list(zip(others, taps, strict=True))
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
@@ -153,7 +150,7 @@ class DelayError:
         rows = channel.command_rows(f)
         powers = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None] ** np.arange(102)
         return tuple(
-            discs(f, (powers[:, : taps.size] @ taps)[:, None] * rows, np.zeros(f.size), 1 - ROOM)
+            discs(f, (powers[:, : taps.size] @ taps)[:, None] * rows, 0.0, 1 - ROOM)
             for _, taps in self._differences(channel.hardware)
         )
 
@@ -161,10 +158,10 @@ class DelayError:
         """Check the real loop."""
         return tuple(
             Check(
-                name=f"loop change by a delay of {other:g} frames",
-                value=hinf_norm(append_taps(loop.parameter, taps)).upper,
-                limit=1.0,
-                computed_by=LEVEL_SETS,
+                f"loop change by a delay of {other:g} frames",
+                hinf_norm(append_taps(loop.parameter, taps)).upper,
+                1.0,
+                LEVEL_SETS,
             )
             for other, taps in self._differences(loop.hardware)
         )
@@ -200,7 +197,7 @@ class MirrorUncertainty(Band):
 
     def __post_init__(self) -> None:
         Band.__post_init__(self)
-        object.__setattr__(self, "relative", number(self.relative, "relative", above=0))
+        set_fields(self, relative=number(self.relative, "relative", above=0))
 
     @property
     def label(self) -> str:
@@ -210,17 +207,9 @@ class MirrorUncertainty(Band):
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.within(self.low_hz, self.high_hz)
-        rows = channel.complementary_rows(f)
-        return (discs(f, rows, np.zeros(f.size), (1 - ROOM) / self.relative),)
+        return (discs(f, channel.complementary_rows(f), 0.0, (1 - ROOM) / self.relative),)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        return (
-            Check(
-                name=f"|T| in {self.band_text} times the mirror's error",
-                value=self.relative
-                * band_norm(loop.complementary, self.low_hz, self.high_hz).upper,
-                limit=1.0,
-                computed_by="level sets, all of the band",
-            ),
-        )
+        name = f"|T| in {self.band_text} times the mirror's error"
+        return (Check(name, self.relative * self.peak(loop.complementary), 1.0, BAND_LEVEL_SETS),)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lbt_synth.design.shaping.pole_fitting import fit_poles
+from lbt_synth.design.shaping.pole_fitting import WeightedResponse, fit_poles
 
 
 def test_poles_of_a_response_are_found():
@@ -11,6 +11,7 @@ def test_poles_of_a_response_are_found():
     z = np.exp(1j * angles)
     target = z**2 * (z + 0.3) * z / np.prod(z[:, None] - poles, axis=1)
     start = np.array([0.9 * np.exp(0.3j), 0.9 * np.exp(-0.3j), 0.1, 0.7])
-    found, misfit = fit_poles(angles, target, np.ones(400), start)
+    response = WeightedResponse(angles=angles, target=target, weight=np.ones(400))
+    found, misfit = fit_poles(response, start)
     assert misfit < 1e-6
     np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(poles), atol=1e-4)
