@@ -13,7 +13,6 @@ from .prediction.predictor import LeastSquaresPredictor as LeastSquaresPredictor
 from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import replayed_residual as replayed_residual
 from .prediction.residual_estimate import ResidualEstimate as ResidualEstimate
-from .prediction.stretches import split_halves as split_halves
 from .prediction.table import PredictionRow as PredictionRow
 from .prediction.table import PredictionTable as PredictionTable
 from .records.from_arrays import loop_record as loop_record
@@ -27,6 +26,7 @@ from .records.line_priors import load_lines as load_lines
 from .records.record import LoopRecord as LoopRecord
 from .records.required_length import require_length as require_length
 from .records.spectrum import SpectrumRecord as SpectrumRecord
+from .stretches import split_halves as split_halves
 from .tracking.line_follower import LineFollower as LineFollower
 from .tracking.loop_identifier import LoopIdentifier as LoopIdentifier
 from .tracking.switching import SwitchedController as SwitchedController

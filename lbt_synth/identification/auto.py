@@ -13,11 +13,11 @@ from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.comparison import prediction_against_data
-from lbt_synth.identification.prediction.stretches import split_halves
 from lbt_synth.identification.prediction.table import PredictionTable
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.required_length import require_length
+from lbt_synth.identification.stretches import split_halves
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.validation import choice, number, require_instance

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.fit.fitting import GAINS, LOWEST_LINE_HZ, MOST_LINES, Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.model_fitter import Rules
 from lbt_synth.identification.fit.order_search import gain_ambiguity, search_model
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
@@ -21,17 +21,16 @@ from lbt_synth.identification.fit.physical_parameters import (
     WIDE_DAMPING,
     describe_axis,
     parameter_covariance,
+    standard_errors,
 )
-from lbt_synth.identification.fit.whittle import GAIN
-from lbt_synth.validation import FloatArray, integer, number, real_array, require_instance
+from lbt_synth.identification.fit.whittle import FittedModel
+from lbt_synth.identification.stretches import checked_stretches
+from lbt_synth.validation import FloatArray, number, real_array, require_instance
 
-LOWEST_LINE_HZ = 3.0
-MOST_LINES = 20
 GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
 _POOR_GAIN = 0.1  # relative error from which a note says so
 _APART = 3.0  # standard errors
-_GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}
-_MOST_AVERAGES = 1000.0
+_LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0
 
 
 def identify_axis(
@@ -125,13 +124,8 @@ def identify_axis(
                 f"correction must have shape {y.shape} like measurement; got {c.shape}."
             )
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    pieces = [(0, y.size)] if stretches is None else [(int(a), int(b)) for a, b in stretches]
-    for begin, stop in pieces:
-        if not 0 <= begin < stop <= y.size:
-            raise ProblemError(
-                f"stretches must lie within the {y.size} frames; got ({begin}, {stop})."
-            )
-    longest = max((stop - begin for begin, stop in pieces), default=0)
+    pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
+    longest = max(stop - begin for begin, stop in pieces)
     if longest < 2 * SHORTEST_SEGMENT:
         raise ProblemError(
             f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "
@@ -147,16 +141,35 @@ def identify_axis(
             "the spectrum of the series overflows or vanishes; got values up to "
             f"{np.max(np.abs(y)):.6g} nm. Check the units."
         )
-    return identify_periodogram(
-        data,
-        sensor_gain=sensor_gain,
-        sensor_gain_error=sensor_gain_error,
-        assumed_gain=assumed_gain,
+    search = Search(
+        data=data,
+        gain=sensor_gain,
         announced=announced,
         lowest_line_hz=lowest_line_hz,
         most_lines=most_lines,
-        start=start,
     )
+    given_error = number(sensor_gain_error, "sensor_gain_error", at_least=0)
+    assumed = number(assumed_gain, "assumed_gain", **GAINS)
+    if start is not None:
+        require_instance(start, IdentifiedAxis)
+    model = search_model(search, None if start is None else start.fitted_model.spectrum)
+    if sensor_gain is not None:
+        relative = given_error / sensor_gain
+        note = "given" if data.closed else "given: the series is divided by it"
+        return describe_axis(search, model, relative or None, note, known=relative)
+    if not data.closed:
+        return describe_axis(search, model, None, "1: of an open loop it has no meaning", known=0.0)
+    error = _gain_error(search, model)
+    if error <= GAIN_ERROR:
+        poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
+        return describe_axis(search, model, error, f"found in the closed loop's data{poor}")
+    search = replace(search, gain=assumed)
+    by = f" by {100 * error:.0f} %" if error < 1 else ""
+    note = (
+        f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
+        "hardly acts where the noise shows). Give it, or record with a higher loop gain"
+    )
+    return describe_axis(search, search_model(search, model.spectrum), None, note, known=0.0)
 
 
 def identify_spectrum(
@@ -244,7 +257,9 @@ def identify_spectrum(
         frame_rate_hz=rate,
         resolution_hz=float(np.median(steps)),
     )
-    return identify_periodogram(data, sensor_gain=1.0, **options)
+    search = Search(data=data, gain=1.0, **options)
+    note = "1: of a spectrum it has no meaning"
+    return describe_axis(search, search_model(search), None, note, known=0.0)
 
 
 def estimate_averages(density: FloatArray) -> float | None:
@@ -255,79 +270,27 @@ def estimate_averages(density: FloatArray) -> float | None:
     """
     from scipy.optimize import brentq
     from scipy.special import polygamma
+    from scipy.stats import median_abs_deviation
 
     log = np.log(density)
     # a second difference at a distance hardly sees a curve, and not what neighbours share
     bend = log[6:] - 2 * log[3:-3] + log[:-6]
-    scatter = (np.median(np.abs(bend - np.median(bend))) / 0.6745) ** 2 / 6
-    low, high = 0.25, _MOST_AVERAGES
-    if scatter < polygamma(1, high):
+    scatter = median_abs_deviation(bend, scale=0.6745) ** 2 / 6
+    if scatter < polygamma(1, _MOST_AVERAGES):
         return None
-    scatter = float(min(scatter, polygamma(1, low)))
-    return float(
-        np.exp(
-            brentq(
-                lambda x: float(polygamma(1, np.exp(x))) - scatter,
-                np.log(low) - 1e-6,
-                np.log(high) + 1e-6,
-            )
-        )
-    )
+    scatter = min(scatter, polygamma(1, _LEAST_AVERAGES))
+    low, high = np.log(_LEAST_AVERAGES) - 1e-6, np.log(_MOST_AVERAGES) + 1e-6
+    return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))
 
 
-def identify_periodogram(
-    data: LoopPeriodogram,
-    *,
-    sensor_gain: float | None = None,
-    sensor_gain_error: float = 0.0,
-    assumed_gain: float = 1.0,
-    announced: Sequence[tuple[float, float]] = (),
-    lowest_line_hz: float = LOWEST_LINE_HZ,
-    most_lines: int = MOST_LINES,
-    start: IdentifiedAxis | None = None,
-) -> IdentifiedAxis:
-    """Identify one axis from its periodogram; the arguments are those of :func:`identify_axis`."""
-    if sensor_gain is not None:
-        sensor_gain = number(sensor_gain, "sensor_gain", **_GAINS)
-    given_error = number(sensor_gain_error, "sensor_gain_error", at_least=0)
-    assumed = number(assumed_gain, "assumed_gain", **_GAINS)
-    if start is not None:
-        require_instance(start, IdentifiedAxis)
-    nyquist = data.frame_rate_hz / 2
-    for frequency, error in announced:
-        number(frequency, "an announced frequency", above=0, below=nyquist)
-        number(error, "the error of an announced frequency", at_least=0)
-    rules = Rules(
-        gain=sensor_gain,
-        lowest_line_hz=number(lowest_line_hz, "lowest_line_hz", at_least=0, below=nyquist),
-        most_lines=integer(most_lines, "most_lines", at_least=0),
-        announced=tuple(announced),
-    )
-    model = search_model(data, rules, None if start is None else start.fitted_model)
-    if sensor_gain is not None:
-        relative = given_error / sensor_gain
-        note = "given" if data.closed else "given: the series is divided by it"
-        if data.duration_s is None:
-            note = "1: of a spectrum it has no meaning"
-        return describe_axis(data, rules, model, relative or None, note, known=relative)
-    if not data.closed:
-        note = "1: of an open loop it has no meaning"
-        return describe_axis(data, rules, model, None, note, known=0.0)
-    variance = float(parameter_covariance(model)[GAIN, GAIN])
-    error = float(np.sqrt(variance)) if variance > 0 else float("inf")
-    narrow = model.drop_wide(WIDE_DAMPING)
-    if len(narrow.parts) < len(model.parts) and error <= GAIN_ERROR:
+def _gain_error(search: Search, model: FittedModel) -> float:
+    """Return the standard error of the logarithm of the gain, infinite where it is unknown."""
+    errors = standard_errors(model.spectrum, parameter_covariance(model))
+    error = errors.log_gain or float("inf")
+    narrow = model.spectrum.drop_wide(WIDE_DAMPING)
+    if error <= GAIN_ERROR and narrow != model.spectrum:
         # such a model may stand for another gain
-        away = gain_ambiguity(data, rules, model)
+        away = gain_ambiguity(search, model)
         if away > _APART * error:
-            error = away
-    if error <= GAIN_ERROR:
-        poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
-        return describe_axis(data, rules, model, error, f"found in the closed loop's data{poor}")
-    rules = replace(rules, gain=assumed)
-    by = f" by {100 * error:.0f} %" if error < 1 else ""
-    note = (
-        f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
-        "hardly acts where the noise shows). Give it, or record with a higher loop gain"
-    )
-    return describe_axis(data, rules, search_model(data, rules, model), None, note, known=0.0)
+            return away
+    return error

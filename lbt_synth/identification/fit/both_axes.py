@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import count
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.fit.axis import (
-    LOWEST_LINE_HZ,
-    MOST_LINES,
-    estimate_averages,
-    identify_axis,
-    identify_spectrum,
-)
+from lbt_synth.identification.fit.axis import estimate_averages, identify_axis, identify_spectrum
 from lbt_synth.identification.fit.delay import better_delay
+from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
-from lbt_synth.identification.fit.jumps import (
-    MOST_JUMPS,
-    cut_at_jumps,
-    describe_jumps,
-    find_correction_jumps,
-    find_jumps,
-)
+from lbt_synth.identification.fit.jumps import cut_at_jumps, find_correction_jumps, find_jumps
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
-from lbt_synth.validation import FloatArray, require_instance
+from lbt_synth.identification.stretches import Stretches, checked_stretches
+from lbt_synth.validation import real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
@@ -124,95 +116,76 @@ def identify(
     if isinstance(record, SpectrumRecord):
         return _identify_spectra(record, frame_rate_hz, delay_frames, options)
     require_instance(record, LoopRecord)
-    _require_agreement(record, frame_rate_hz, delay_frames, start)
-    count = record.axes
-    gains = _gain_per_axis(sensor_gain, count)
-    fitter = _AxisFitter(
-        record=record,
-        corrections=_known_corrections(record),
-        pieces=list(
-            record.stretches() if stretches is None else _check_stretches(stretches, record)
-        ),
-        options={**options, "assumed_gain": assumed_gain},
-        progress=progress,
-        total=2 * count,
-    )
-    _require_signal(record)
-    notes: list[str] = []
-    if fitter.corrections is not None:
-        early = find_correction_jumps(fitter.corrections, fitter.pieces)
-        if early:
-            notes.append(describe_jumps(early, "commands"))
-            fitter.pieces = cut_at_jumps(fitter.pieces, early)
-    axes = [fitter.fit(i, gains[i], None if start is None else start.axes[i]) for i in range(count)]
+    _check_record(record, frame_rate_hz, delay_frames, start)
+    gains = _gain_per_axis(sensor_gain, record.axes)
+    pieces = record.stretches() if stretches is None else _usable_stretches(stretches, record)
+    fits, total = count(1), 2 * record.axes
+
+    def step() -> None:
+        if progress is not None:
+            progress(next(fits), total)
+
+    fit = partial(_fit_axes, record, step, {**options, "assumed_gain": assumed_gain})
+    early = find_correction_jumps(record.corrections(), pieces)
+    pieces, notes = cut_at_jumps(pieces, early, "commands")
+    axes = fit(pieces, gains, [None] * record.axes if start is None else start.axes)
     series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
-    late = find_jumps(series, axes, fitter.pieces)
-    if late:
-        notes.append(describe_jumps(late, "pseudo-open loop"))
-        if len(late) <= MOST_JUMPS:
-            fitter.pieces = cut_at_jumps(fitter.pieces, late)
-            axes = [fitter.fit(i, gains[i], axes[i]) for i in range(count)]
-    found_gain = [i for i in range(count) if axes[i].sensor_gain_error is not None]
-    if count > 1 and found_gain and all(gain is None for gain in gains):
-        axes, note = _pool_gains(axes, found_gain, fitter)
+    late = find_jumps(series, axes, pieces)
+    cut, late_notes = cut_at_jumps(pieces, late, "pseudo-open loop")
+    if cut != pieces:
+        axes = fit(cut, gains, axes)
+    found_gain = [i for i, axis in enumerate(axes) if axis.sensor_gain_error is not None]
+    notes += late_notes
+    if len(axes) > 1 and found_gain and gains == [None] * len(axes):
+        axes, note = _pool_gains(axes, found_gain, partial(fit, cut))
         notes.append(note)
-    notes += _find_doubts(record, axes, found_gain, fitter.pieces)
-    notes += [
-        f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and the "
-        "rest of the model suffers"
-        for i, axis in enumerate(axes)
-        if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0
-    ]
-    if progress is not None and fitter.done < fitter.total:
-        progress(fitter.total, fitter.total)
+    if progress is not None and next(fits) <= total:
+        progress(total, total)
     return IdentifiedModel(
         axes=tuple(axes),
         frame_rate_hz=record.frame_rate_hz,
         delay_frames=next(d for d in (record.delay_frames, delay_frames, _DELAY) if d is not None),
         mirror=record.mirror,
-        notes=tuple(notes),
+        notes=(*notes, *_find_doubts(record, axes, found_gain, cut, most_lines)),
     )
 
 
-@dataclass(slots=True, kw_only=True)
-class _AxisFitter:
-    """Fits single axes of a record, and counts the fits."""
-
-    record: LoopRecord
-    corrections: FloatArray | None
-    pieces: list[tuple[int, int]]
-    options: dict[str, Any]  # of identify_axis
-    progress: Callable[[int, int], None] | None
-    total: int  # most fits that the record takes
-    done: int = 0
-
-    def fit(
-        self, i: int, gain: float | None, start: IdentifiedAxis | None, error: float = 0.0
-    ) -> IdentifiedAxis:
-        """Identify axis i, at a known gain with its standard error or with a free one."""
-        found = identify_axis(
-            self.record.measurements[:, i],
-            None if self.corrections is None else self.corrections[:, i],
-            frame_rate_hz=self.record.frame_rate_hz,
-            stretches=self.pieces,
-            sensor_gain=gain,
-            sensor_gain_error=error,
-            start=start,
-            **self.options,
+def _fit_axes(
+    record: LoopRecord,
+    step: Callable[[], None],
+    options: dict[str, Any],
+    stretches: Stretches,
+    gains: Sequence[float | None],
+    starts: Sequence[IdentifiedAxis | None],
+    gain_error: float = 0.0,
+) -> list[IdentifiedAxis]:
+    """Identify each axis, at its gain or at a free one, and from its start."""
+    series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
+    axes = []
+    for y, c, gain, start in series:
+        axes.append(
+            identify_axis(
+                y,
+                c,
+                frame_rate_hz=record.frame_rate_hz,
+                stretches=stretches,
+                sensor_gain=gain,
+                sensor_gain_error=gain_error,
+                start=start,
+                **options,
+            )
         )
-        self.done += 1
-        if self.progress is not None:
-            self.progress(self.done, self.total)
-        return found
+        step()
+    return axes
 
 
-def _require_agreement(
+def _check_record(
     record: LoopRecord,
     frame_rate_hz: float | None,
     delay_frames: float | None,
     start: IdentifiedModel | None,
 ) -> None:
-    """Refuse a frame rate, a delay or a start that contradicts the record."""
+    """Refuse what contradicts a record, and a record that cannot be identified."""
     if frame_rate_hz is not None and frame_rate_hz != record.frame_rate_hz:
         raise ProblemError(
             f"the record has {record.frame_rate_hz:.9g} frames a second; got frame_rate_hz="
@@ -224,30 +197,93 @@ def _require_agreement(
             f"the record has a delay of {delay:g} frames; got {delay_frames!r}. Try "
             "record.with_delay(...)."
         )
-    if start is not None and len(start.axes) != record.axes:
-        raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
-
-
-def _known_corrections(record: LoopRecord) -> FloatArray | None:
-    """Return what the mirror did, None in open loop."""
-    if record.commands is None:
-        return None
-    if record.delay_frames is None:
+    if record.commands is not None and delay is None:
         raise ProblemError(
             "the delay of a closed loop is needed to know what the mirror did; got a record "
             "without one. Try record.with_delay(...)."
         )
-    return record.corrections()
-
-
-def _require_signal(record: LoopRecord) -> None:
-    """Refuse a record with an axis that is constant."""
-    usable = record.measurements[record.usable]
-    for i in range(record.axes):
-        if len(usable) and np.ptp(usable[:, i]) == 0:
+    if start is not None and len(start.axes) != record.axes:
+        raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
+    for i, series in enumerate(record.measurements[record.usable].T):
+        if series.size and np.ptp(series) == 0:
             raise ProblemError(
                 f"axis {i} of the record is constant: there is nothing to identify. Choose the "
                 "other axis."
+            )
+
+
+def _usable_stretches(stretches: Sequence[tuple[int, int]], record: LoopRecord) -> Stretches:
+    """Return given stretches in order; refuse those with frames that are not usable."""
+    out = checked_stretches(sorted(stretches), record.frames)
+    for a, b in out:
+        if not np.all(record.usable[a:b]):
+            raise ProblemError(f"stretches must lie within the usable frames; got ({a}, {b}).")
+    return out
+
+
+def _gain_per_axis(given: Any, count: int) -> list[float | None]:
+    """Return the given gain of each axis, None for one to be found."""
+    if given is None:
+        return [None] * count
+    values = np.atleast_1d(real_array(given, "sensor_gain"))
+    if values.shape not in ((1,), (count,)):
+        raise ProblemError(f"sensor_gain must be one number, or {count}; got {given!r}.")
+    return [float(v) for v in np.broadcast_to(values, (count,))]
+
+
+def _pool_gains(
+    axes: list[IdentifiedAxis],
+    found_gain: list[int],
+    fit: Callable[..., list[IdentifiedAxis]],
+) -> tuple[list[IdentifiedAxis], str]:
+    """Fit the axes again with the mean of the gains that were found, if they agree."""
+    gains = np.array([axes[i].sensor_gain for i in found_gain])
+    errors = np.array([axes[i].sensor_gain_error for i in found_gain], dtype=float)
+    log, weight = np.log(gains), (gains / errors) ** 2
+    mean = float(np.sum(weight * log) / np.sum(weight))
+    if np.any(np.abs(log - mean) * gains > _APART * errors):
+        values = ", ".join(f"{g:.3f} +- {e:.3f}" for g, e in zip(gains, errors, strict=True))
+        return axes, f"warning: the axes have different sensor gains, {values}"
+    gain = float(np.exp(mean))
+    pooled = fit([gain] * len(axes), axes, gain / float(np.sqrt(np.sum(weight))))
+    for i, axis in enumerate(pooled):
+        note = "found in the closed loop's data" if i in found_gain else "that of the other axis"
+        if len(found_gain) == len(axes):
+            note = "mean of the axes"
+        pooled[i] = replace(axis, sensor_gain_note=note)
+    return pooled, "one sensor gain for all axes"
+
+
+def _find_doubts(
+    record: LoopRecord,
+    axes: Sequence[IdentifiedAxis],
+    found_gain: Sequence[int],
+    stretches: Stretches,
+    most_lines: int,
+) -> Iterator[str]:
+    """Yield notes on a delay that fits badly, odd gains, hidden noise, and the limit of lines."""
+    if found_gain and record.commands is not None:
+        first = found_gain[0]
+        other = better_delay(record, first, axes[first], stretches)
+        if other is not None:
+            yield (
+                f"warning: a delay of {other[0]:g} frames fits better than {record.delay_frames:g} "
+                f"(its criterion is better by {other[1]:.0f}). Check the delay"
+            )
+    for i in found_gain:
+        if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN:
+            yield (
+                f"warning: axis {i} has a sensor gain of {axes[i].sensor_gain:.3g}: are the units, "
+                "signs and axes of the commands right?"
+            )
+    for i, axis in enumerate(axes):
+        if axis.noise_error_nm > _UNSEEN * axis.noise_nm:
+            yield f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
+    for i, axis in enumerate(axes):
+        if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0:
+            yield (
+                f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and "
+                "the rest of the model suffers"
             )
 
 
@@ -264,109 +300,21 @@ def _identify_spectra(
             "the frame rate of the loop is needed to sample a spectrum's processes; got a record "
             "without one. Give frame_rate_hz."
         )
-    f = record.frequency_hz
-    inside = (f > 0) & (f < rate / 2)
-    axes = [
-        identify_spectrum(
-            f[inside], column[inside], frame_rate_hz=rate, averages=record.averages, **options
-        )
-        for column in record.density_nm2_hz.T
-    ]
-    left = int(np.sum(f >= rate / 2))
+    inside = (record.frequency_hz > 0) & (record.frequency_hz < rate / 2)
+    f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
+    options |= {"frame_rate_hz": rate, "averages": record.averages}
+    axes = [identify_spectrum(f, density, **options) for density in densities]
+    left = int(np.sum(record.frequency_hz >= rate / 2))
     notes = [f"{left} frequencies beyond {rate / 2:g} Hz were left out"] if left else []
-    if record.averages is None:
-        notes += [
-            f"the density of axis {i} does not scatter as periodograms do (smoothed, interpolated "
-            "or computed?) and was taken for one of them. Give averages to find weaker lines"
-            for i, column in enumerate(record.density_nm2_hz.T)
-            if estimate_averages(column[inside]) is None
-        ]
+    notes += [
+        f"the density of axis {i} does not scatter as periodograms do (smoothed, interpolated "
+        "or computed?) and was taken for one of them. Give averages to find weaker lines"
+        for i, density in enumerate(densities)
+        if record.averages is None and estimate_averages(density) is None
+    ]
     return IdentifiedModel(
         axes=tuple(axes),
         frame_rate_hz=rate,
         delay_frames=_DELAY if delay_frames is None else delay_frames,
         notes=tuple(notes),
     )
-
-
-def _check_stretches(
-    stretches: Sequence[tuple[int, int]], record: LoopRecord
-) -> list[tuple[int, int]]:
-    """Return stretches that lie apart and hold usable frames only."""
-    out = sorted((int(a), int(b)) for a, b in stretches)
-    for i, (a, b) in enumerate(out):
-        after = out[i - 1][1] if i else 0
-        if not after <= a < b <= record.frames or not np.all(record.usable[a:b]):
-            raise ProblemError(
-                f"stretches must lie apart and within the usable frames; got ({a}, {b})."
-            )
-    return out
-
-
-def _find_doubts(
-    record: LoopRecord,
-    axes: Sequence[IdentifiedAxis],
-    found_gain: Sequence[int],
-    pieces: Sequence[tuple[int, int]],
-) -> list[str]:
-    """Return warnings of a delay that fits badly, odd sensor gains, and hidden noise."""
-    out = []
-    if found_gain and record.commands is not None:
-        first = found_gain[0]
-        other = better_delay(record, first, axes[first], pieces)
-        if other is not None:
-            out.append(
-                f"warning: a delay of {other[0]:g} frames fits better than {record.delay_frames:g} "
-                f"(its criterion is better by {other[1]:.0f}). Check the delay"
-            )
-    out += [
-        f"warning: axis {i} has a sensor gain of {axes[i].sensor_gain:.3g}: are the units, signs "
-        "and axes of the commands right?"
-        for i in found_gain
-        if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN
-    ]
-    out += [
-        f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
-        for i, axis in enumerate(axes)
-        if axis.noise_error_nm > _UNSEEN * axis.noise_nm
-    ]
-    return out
-
-
-def _gain_per_axis(given: Any, count: int) -> list[float | None]:
-    """Return the given gain of each axis, None for one to be found."""
-    if given is None:
-        return [None] * count
-    try:
-        values = np.atleast_1d(np.asarray(given, dtype=float))
-    except (TypeError, ValueError) as error:
-        raise ProblemError(f"sensor_gain must be numbers; got {given!r}.") from error
-    if values.shape not in ((1,), (count,)):
-        raise ProblemError(f"sensor_gain must be one number, or {count}; got {given!r}.")
-    return [float(v) for v in np.broadcast_to(values, (count,))]
-
-
-def _pool_gains(
-    axes: list[IdentifiedAxis],
-    found_gain: list[int],
-    fitter: _AxisFitter,
-) -> tuple[list[IdentifiedAxis], str]:
-    """Fit the axes again with the mean of the gains that were found, if they agree."""
-    log = np.array([np.log(axes[i].sensor_gain) for i in found_gain])
-    error = np.array([axes[i].sensor_gain_error or 0.0 for i in found_gain]) / np.exp(log)
-    weight = 1 / error**2
-    mean = float(np.sum(weight * log) / np.sum(weight))
-    if np.any(np.abs(log - mean) > _APART * error):
-        values = ", ".join(
-            f"{np.exp(v):.3f} +- {np.exp(v) * e:.3f}" for v, e in zip(log, error, strict=True)
-        )
-        return axes, f"warning: the axes have different sensor gains, {values}"
-    gain = float(np.exp(mean))
-    spread = gain / float(np.sqrt(np.sum(weight)))
-    out = []
-    for i, axis in enumerate(axes):
-        note = "found in the closed loop's data" if i in found_gain else "that of the other axis"
-        if len(found_gain) == len(axes):
-            note = "mean of the axes"
-        out.append(replace(fitter.fit(i, gain, axis, spread), sensor_gain_note=note))
-    return out, "one sensor gain for all axes"

@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from lbt_synth.identification.fit.parameters import FittedModel
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whiteness import Whiteness
+from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.models import (
     ARModel,
     LoopHardware,

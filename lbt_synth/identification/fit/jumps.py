@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, half_angle_square
 from lbt_synth.identification.fit.taper import tukey
+from lbt_synth.identification.stretches import Stretches
 from lbt_synth.validation import FloatArray, IntArray
 
 _LARGE = 12.0  # standard deviations of the change of a correction
@@ -18,11 +20,10 @@ _EDGE = 0.06  # of a stretch, at either end, where the taper hides jumps
 _CLUSTER = 20  # frames within which outliers are one jump
 _AROUND = 3  # frames left out on either side
 _SAME_JUMP = 50  # frames within which the axes have one jump
-MOST_JUMPS = 20  # at which a record is cut
+_MOST_JUMPS = 20  # at which a record is cut
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Jump:
+class Jump(NamedTuple):
     """A place where a series goes on elsewhere."""
 
     frame: int  # of the largest innovation
@@ -30,16 +31,14 @@ class Jump:
 
 
 def find_jumps(
-    series: FloatArray, axes: Sequence[IdentifiedAxis], stretches: Sequence[tuple[int, int]]
+    series: FloatArray, axes: Sequence[IdentifiedAxis], stretches: Stretches
 ) -> list[Jump]:
     """Find where the innovations of pseudo-open-loop series (frames, axes) are far too large."""
     each = zip(series.T, axes, strict=True)
     return _merge_jumps([jump for one, axis in each for jump in _axis_jumps(one, axis, stretches)])
 
 
-def _axis_jumps(
-    series: FloatArray, axis: IdentifiedAxis, stretches: Sequence[tuple[int, int]]
-) -> list[Jump]:
+def _axis_jumps(series: FloatArray, axis: IdentifiedAxis, stretches: Stretches) -> list[Jump]:
     """Find the jumps of one axis.
 
     The innovations are differences divided by the root of the fitted spectrum, without a shift
@@ -65,9 +64,7 @@ def _axis_jumps(
     return out
 
 
-def find_correction_jumps(
-    corrections: FloatArray, stretches: Sequence[tuple[int, int]]
-) -> list[Jump]:
+def find_correction_jumps(corrections: FloatArray, stretches: Stretches) -> list[Jump]:
     """Find where the corrections (frames, axes) go on elsewhere.
 
     A fit would choose a sensor gain at which a jump of the commands does not show: they are
@@ -104,32 +101,30 @@ def _merge_jumps(found: Sequence[Jump]) -> list[Jump]:
     return out
 
 
-def describe_jumps(jumps: Sequence[Jump], series: str) -> str:
-    """Return a note on the jumps of some series."""
-    first = max(jumps, key=lambda jump: jump.size)
-    text = (
+def cut_at_jumps(
+    stretches: Stretches, jumps: Sequence[Jump], series: str
+) -> tuple[Stretches, list[str]]:
+    """Return stretches without the neighbourhood of the jumps of some series, and a note.
+
+    Nothing is cut if there are too many jumps.
+    """
+    if not jumps:
+        return stretches, []
+    largest = max(jumps, key=lambda jump: jump.size)
+    note = (
         f"warning: {len(jumps)} jump{'s' if len(jumps) > 1 else ''} of the {series}, the largest "
-        f"at frame {first.frame} with {first.size:.0f} standard deviations"
+        f"at frame {largest.frame} with {largest.size:.0f} standard deviations"
     )
-    if len(jumps) <= MOST_JUMPS:
-        return f"{text}; the record was cut there"
-    return f"{text}; too many to cut the record there, and the model suffers"
+    if len(jumps) > _MOST_JUMPS:
+        return stretches, [f"{note}; too many to cut the record there, and the model suffers"]
+    cut = cut_around(stretches, [jump.frame for jump in jumps])
+    return cut, [f"{note}; the record was cut there"]
 
 
-def cut_at_jumps(stretches: list[tuple[int, int]], jumps: Sequence[Jump]) -> list[tuple[int, int]]:
-    """Return stretches without the neighbourhood of jumps; as they are if there are too many."""
-    if len(jumps) > MOST_JUMPS:
-        return stretches
-    return cut_around(stretches, [jump.frame for jump in jumps])
-
-
-def cut_around(
-    stretches: Sequence[tuple[int, int]], frames: Sequence[int]
-) -> list[tuple[int, int]]:
+def cut_around(stretches: Stretches, frames: Sequence[int]) -> Stretches:
     """Return stretches without the neighbourhood of some frames."""
-    out = list(stretches)
     for frame in frames:
         low, high = frame - _AROUND, frame + _AROUND
-        pieces = [((a, min(b, low)), (max(a, high), b)) for a, b in out]
-        out = [(a, b) for pair in pieces for a, b in pair if b > a]
-    return out
+        pieces = chain(*(((a, min(b, low)), (max(a, high), b)) for a, b in stretches))
+        stretches = tuple((a, b) for a, b in pieces if b > a)
+    return stretches

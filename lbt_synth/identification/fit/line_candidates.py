@@ -31,7 +31,7 @@ def find_candidates(
     Bands of 1, 2, 4, ... bins are tried everywhere, at steps of a quarter of their width. A band of
     n values with the mean ratio R of power to model would gain ``n (R - 1 - log R)``.
     """
-    f, step = data.frequency_hz, float(np.median(np.diff(data.frequency_hz)))
+    f, step = data.frequency_hz, data.step_hz
     ratio = np.concatenate([[0.0], np.cumsum(power / model)])
     weight = np.concatenate([[0.0], np.cumsum(data.count)])
     found: list[tuple[float, int, int]] = []
@@ -71,7 +71,7 @@ def measure_excess(
     gain: float = 0.0,
 ) -> Candidate:
     """Measure place, half width and variance of the highest excess between two bins."""
-    f, step = data.frequency_hz, float(np.median(np.diff(data.frequency_hz)))
+    f, step = data.frequency_hz, data.step_hz
     excess = power[start:stop] - model[start:stop]
     best = -np.inf
     place = half = height = 0.0
@@ -107,9 +107,10 @@ def smooth_background(
     edges = np.unique(np.append(edges, frequency_hz.size))
     shape = max(float(np.median(count)), 0.5)
     to_mean = shape / float(gammaincinv(shape, 0.5))
-    f, d, w = [], [], []
-    for a, b in pairwise(edges):
-        f.append(float(np.mean(frequency_hz[a:b])))
-        d.append(float(np.median(power[a:b])) * (to_mean if b - a > 2 else 1.0))
-        w.append(float(np.sum(count[a:b])))
-    return np.array(f), np.array(d), np.array(w)
+    bands = [(slice(a, b), to_mean if b - a > 2 else 1.0) for a, b in pairwise(edges)]
+    rows = [
+        (np.mean(frequency_hz[band]), np.median(power[band]) * factor, np.sum(count[band]))
+        for band, factor in bands
+    ]
+    f, d, w = np.array(rows).T
+    return f, d, w

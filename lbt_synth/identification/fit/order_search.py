@@ -9,257 +9,241 @@ Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from lbt_synth.errors import NumericalError
+from lbt_synth.identification.fit.fitting import (
+    STARTING_CORNER_HZ,
+    Search,
+    add_evidence,
+    centre_line,
+    cost,
+    drop_roll_off,
+    fit,
+    likeliest,
+    prune,
+    refit,
+)
 from lbt_synth.identification.fit.line_candidates import (
     Candidate,
     find_candidates,
     measure_excess,
     smooth_background,
 )
-from lbt_synth.identification.fit.model_fitter import ModelFitter, Rules, likeliest
 from lbt_synth.identification.fit.parameters import (
-    FittedModel,
-    Part,
-    has_corner,
-    promote_component,
-    remove_component,
-    strongest,
+    Kind,
+    SpectrumModel,
 )
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whittle import (
-    DAMPING,
-    FREQUENCY,
-    GAIN,
-    Likelihood,
-    component,
-    damping_parameter,
-    damping_ratio,
-    minimise,
-)
-from lbt_synth.validation import FloatArray
+from lbt_synth.identification.fit.whittle import FittedModel, density, minimise
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)
 _STARTING_FREQUENCIES_HZ = (0.5, 5.0)  # of the turbulence
+_STARTING_DAMPING = 0.55
 _FEW_ROUNDS = 3
 _MOST_ROUNDS = 12
+_HALF = float(np.log(0.5))
 _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
 
 
-def search_model(
-    data: LoopPeriodogram, rules: Rules, start: FittedModel | None = None
-) -> FittedModel:
+def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
     """Find the model of one axis."""
-    search = _Search(data, rules)
-    return search.add_evidence(search.run(start))
+    return add_evidence(search, _find_components(search, start))
 
 
-def gain_ambiguity(data: LoopPeriodogram, rules: Rules, best: FittedModel) -> float:
+def gain_ambiguity(search: Search, best: FittedModel) -> float:
     """Return how far the gain of another, nearly as likely model is, as a logarithm.
 
     Wide resonances can stand for what a wrong gain leaves. Models are searched for at other
     gains, which are then set free.
     """
-    free = _Search(data, rules)
-    least, gain = free.cost(best), float(best.theta[GAIN])
+    least, gain = cost(search, best), best.spectrum.log_gain
     away = 0.0
     for trial in _STARTING_GAINS:
         if abs(float(np.log(trial)) - gain) < _SAME_GAIN:
             continue
-        fixed = _Search(data, replace(rules, gain=trial))
         try:
-            other = fixed.run(None, rounds=_FEW_ROUNDS)
+            other = _find_components(replace(search, gain=trial), None, rounds=_FEW_ROUNDS)
         except NumericalError:
             continue
-        made = free.try_fit(other.theta, other.parts)
-        if made is not None and free.cost(made) < least + free.price:
-            away = max(away, abs(float(made.theta[GAIN]) - gain))
+        made = fit(search, other.spectrum)
+        if made is not None and cost(search, made) < least + search.price:
+            away = max(away, abs(made.spectrum.log_gain - gain))
     return away
 
 
-class _Search(ModelFitter):
-    def run(self, start: FittedModel | None, *, rounds: int = _MOST_ROUNDS) -> FittedModel:
-        """Find the model: add components, move them, prune them."""
-        model = None if start is None else self.refit(start)
-        if model is None:
-            gains = _STARTING_GAINS if self.free_gain else (self.rules.gain or 1.0,)
-            model = likeliest(partial(self._begin, gain) for gain in gains)
-        model = self._add_announced(self.prune(model))
-        for _ in range(rounds):
-            better = self._extend(model, self._find_excesses(model)) or self._move_line(model)
-            if better is None:
-                break
-            model = better
-        return self._restore_turbulence(self.prune(self.drop_roll_off(model)))
-
-    def _begin(self, gain: float) -> FittedModel:
-        """Fit the background and the first lines at a sensor gain."""
-        ground = self._fit_background(gain)
-        found = self._find_excesses(ground)
-        clear = [c for c in found if c.gain > max(2 * self.price, 0.02 * found[0].gain)]
-        return self.fit(*self._add_candidates(ground, clear))
-
-    def _fit_background(self, gain: float) -> FittedModel:
-        """Fit turbulence and noise to medians over bands, which lines hardly touch."""
-        data = self.data
-        f, d, weight = smooth_background(data.power(gain), data.frequency_hz, data.count)
-        zero = np.zeros_like(f)
-        smooth = Likelihood(
-            replace(data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight)
+def _find_components(
+    search: Search, start: SpectrumModel | None, *, rounds: int = _MOST_ROUNDS
+) -> FittedModel:
+    """Find the model: add components, move them, prune them."""
+    model = None if start is None else refit(search, start)
+    if model is None:
+        gains = _STARTING_GAINS if search.finds_gain else (search.gain or 1.0,)
+        model = likeliest(_begin(search, gain) for gain in gains)
+    if model is None:
+        raise NumericalError(
+            "the likelihood of the spectrum is not finite. Check the units of the series."
         )
-        white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
-        total = float(np.sum(np.diff(f) * (d[1:] + d[:-1]) / 2))
-        slow = max(total - white, 0.1 * white)
-        parts = (Part(line=False),)
+    model = _add_announced(search, prune(search, model))
+    for _ in range(rounds):
+        better = _extend(search, model) or _move_line(search, model)
+        if better is None:
+            break
+        model = better
+    return _restore_turbulence(search, prune(search, drop_roll_off(search, model)))
 
-        def fit_from(frequency_hz: float) -> FittedModel:
-            theta = np.array(
-                [
-                    np.log(gain),
-                    np.log(white),
-                    self.layout.starting_corner(),
-                    np.log(frequency_hz * self.layout.angle),
-                    np.log(0.5),
-                    np.log(slow),
-                ]
-            )
-            free = np.ones(theta.size, dtype=bool)
-            free[GAIN] = False
-            priors = self.layout.priors(theta, parts)
-            return FittedModel(minimum=minimise(smooth, theta, priors, free=free), parts=parts)
 
-        return likeliest(partial(fit_from, f_hz) for f_hz in _STARTING_FREQUENCIES_HZ)
-
-    def _add_candidates(
-        self, model: FittedModel, found: list[Candidate]
-    ) -> tuple[FloatArray, tuple[Part, ...]]:
-        """Return parameters and parts with candidates added."""
-        theta, parts = [model.theta], list(model.parts)
-        for c in found:
-            line = c.frequency_hz >= self.rules.lowest_line_hz
-            damping = np.clip(c.half_width_hz / c.frequency_hz, 1e-4, 0.3) if line else 0.3
-            theta.append(self.layout.new_component(c.frequency_hz, float(damping), c.variance_nm2))
-            parts.append(Part(line=line))
-        whole = np.concatenate(theta)
-        for i in range(len(model.parts), len(parts)):
-            whole = self.centre_line(whole, i)
-        return whole, tuple(parts)
-
-    def _add_announced(self, model: FittedModel) -> FittedModel:
-        """Return the model with those announced lines that add enough.
-
-        A line of the model within three errors of an announced one is taken for it.
-        """
-        if not self.rules.announced:
-            return model
-        step, angle = self.layout.step, self.layout.angle
-        theta, parts = [model.theta], list(model.parts)
-        density = self.full.model(model.theta)
-        for f, error in self.rules.announced:
-            known = (float(np.log(f * angle)), max(error, 0.1 * step) / f)
-            near = [
-                i
-                for i, part in enumerate(model.parts)
-                if part.line
-                and abs(self.layout.place(model.theta, i)[0] - f) < 3 * max(error, step)
-            ]
-            if near:
-                parts[near[0]] = Part(line=True, frequency=known)
-                continue
-            level = float(np.interp(f, self.data.frequency_hz, density))
-            theta.append(self.layout.new_component(f, 0.01, level * max(0.01 * f, step)))
-            parts.append(Part(line=True, frequency=known))
-        made = self.try_fit(np.concatenate(theta), tuple(parts))
-        return model if made is None else self.prune(made)
-
-    def _find_excesses(self, model: FittedModel) -> list[Candidate]:
-        """Find bands with too much power, as many as there may be more lines."""
-        room = self._room(model)
-        if room <= 0:
-            return []
-        power = self.data.power(float(np.exp(model.theta[GAIN])))
-        density = self.full.model(model.theta)
-        found = find_candidates(self.data, power, density, least=self.price, most=room)
-        if sum(not part.line for part in model.parts) >= _MOST_TURBULENCES:
-            found = [c for c in found if c.frequency_hz >= self.rules.lowest_line_hz]
-        return found
-
-    def _room(self, model: FittedModel) -> int:
-        """Return how many more lines there may be."""
-        return self.rules.most_lines - sum(part.line for part in model.parts)
-
-    def _extend(self, model: FittedModel, found: list[Candidate]) -> FittedModel | None:
-        """Return the model with the best candidates, those that pay; None if none does."""
-        found = [c for c in found if c.gain > 0.25 * found[0].gain]
-        while found:
-            made = self.try_fit(*self._add_candidates(model, found))
-            if made is not None:
-                made = self.prune(made)
-                if self.cost(made) < self.cost(model):
-                    return made
-            found = found[: len(found) // 2]
+def _begin(search: Search, gain: float) -> FittedModel | None:
+    """Fit the background and the first lines at a sensor gain."""
+    ground = _fit_background(search, gain)
+    if ground is None:
         return None
+    found = _find_excesses(search, ground.spectrum)
+    clear = [c for c in found if c.gain > max(2 * search.price, 0.02 * found[0].gain)]
+    return fit(search, _add_candidates(search, ground.spectrum, clear))
 
-    def _restore_turbulence(self, model: FittedModel) -> FittedModel:
-        """Make a slow component the turbulence, where a resonance took its place."""
-        theta, lowest = model.theta, self.rules.lowest_line_hz * self.layout.angle
-        frequencies = [np.exp(component(theta, i)[FREQUENCY]) for i in range(len(model.parts))]
-        slow = [i for i, f in enumerate(frequencies) if i and f < lowest]
-        ratio = damping_ratio(component(theta, 0)[DAMPING], first=True)
-        if frequencies[0] < lowest or not slow or has_corner(theta) or ratio > 0.98:
-            return model
-        i = strongest(theta, slow)
-        swapped = promote_component(theta, i)
-        component(swapped, i)[:] = component(theta, 0)
-        component(swapped, i)[DAMPING] = damping_parameter(ratio, first=False)
-        parts = (*model.parts[:i], Part(line=True), *model.parts[i + 1 :])
-        made = self.try_fit(swapped, parts)
-        if made is not None and self.cost(made) < self.cost(model) + self.price:
-            return made
+
+def _fit_background(search: Search, gain: float) -> FittedModel | None:
+    """Fit turbulence and noise to medians over bands, which lines hardly touch."""
+    data = search.data
+    f, d, weight = smooth_background(data.power(gain), data.frequency_hz, data.count)
+    zero = np.zeros_like(f)
+    smooth = replace(data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight)
+    white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
+    slow = max(float(np.trapezoid(d, f)) - white, 0.1 * white)
+    known = replace(search, gain=gain)
+    ground = SpectrumModel(
+        float(np.log(gain)), float(np.log(white)), known.log_angle(STARTING_CORNER_HZ), ()
+    )
+    starts = [
+        ground.add(known.component("turbulence", hz, _STARTING_DAMPING, slow))
+        for hz in _STARTING_FREQUENCIES_HZ
+    ]
+    return likeliest(minimise(smooth, start, known.priors(start)) for start in starts)
+
+
+def _add_candidates(
+    search: Search, spectrum: SpectrumModel, found: list[Candidate]
+) -> SpectrumModel:
+    """Return the model with candidates as components."""
+    whole = spectrum
+    for c in found:
+        line = c.frequency_hz >= search.lowest_line_hz
+        ratio = np.clip(c.half_width_hz / c.frequency_hz, 1e-4, 0.3) if line else 0.3
+        kind: Kind = "line" if line else "slow"
+        whole = whole.add(search.component(kind, c.frequency_hz, ratio, c.variance_nm2))
+    for i in range(len(spectrum.components), len(whole.components)):
+        whole = centre_line(search, whole, i)
+    return whole
+
+
+def _add_announced(search: Search, model: FittedModel) -> FittedModel:
+    """Return the model with those announced lines that add enough.
+
+    A line of the model within three errors of an announced one is taken for it.
+    """
+    if not search.announced:
         return model
+    step, spectrum = search.data.step_hz, model.spectrum
+    seen = density(search.data, spectrum)
+    for f, error in search.announced:
+        known = (search.log_angle(f), max(error, 0.1 * step) / f)
+        near = [
+            (i, c)
+            for i, c in enumerate(model.spectrum.components)
+            if c.kind == "line" and abs(search.place(c)[0] - f) < 3 * max(error, step)
+        ]
+        if near:
+            i, line = near[0]
+            spectrum = spectrum.exchange(i, replace(line, announced=known))
+        else:
+            level = float(np.interp(f, search.data.frequency_hz, seen))
+            line = search.component("line", f, 0.01, level * max(0.01 * f, step))
+            spectrum = spectrum.add(replace(line, announced=known))
+    made = fit(search, spectrum)
+    return model if made is None else prune(search, made)
 
-    def _move_line(self, model: FittedModel) -> FittedModel | None:
-        """Return the model with a line moved, or split in two; None if none is better."""
-        for i, part in enumerate(model.parts):
-            for trial in self._line_moves(model, i) if part.line else ():
-                made = self.try_fit(*trial)
-                if made is not None:
-                    made = self.prune(made)
-                    if self.cost(made) < self.cost(model) - 1:
-                        return made
+
+def _find_excesses(search: Search, spectrum: SpectrumModel) -> list[Candidate]:
+    """Find bands with too much power, as many as there may be more lines."""
+    room = search.most_lines - len(spectrum.lines)
+    if room <= 0:
+        return []
+    data = search.data
+    power, model = data.power(spectrum.gain), density(data, spectrum)
+    found = find_candidates(data, power, model, least=search.price, most=room)
+    if len(spectrum.components) - len(spectrum.lines) >= _MOST_TURBULENCES:
+        found = [c for c in found if c.frequency_hz >= search.lowest_line_hz]
+    return found
+
+
+def _extend(search: Search, model: FittedModel) -> FittedModel | None:
+    """Return the model with the best candidates, those that pay; None if none does."""
+    found = _find_excesses(search, model.spectrum)
+    found = [c for c in found if c.gain > 0.25 * found[0].gain]
+    while found:
+        better = _improve(search, model, _add_candidates(search, model.spectrum, found), 0)
+        if better is not None:
+            return better
+        found = found[: len(found) // 2]
+    return None
+
+
+def _move_line(search: Search, model: FittedModel) -> FittedModel | None:
+    """Return the model with a line moved, or split in two; None if none is better."""
+    for i, component in enumerate(model.spectrum.components):
+        for trial in _line_moves(search, model.spectrum, i) if component.kind == "line" else ():
+            better = _improve(search, model, trial, 1)
+            if better is not None:
+                return better
+    return None
+
+
+def _improve(
+    search: Search, model: FittedModel, trial: SpectrumModel, least: float
+) -> FittedModel | None:
+    """Fit and prune a model; None if it costs not less than another by more than ``least``."""
+    made = fit(search, trial)
+    if made is None:
         return None
+    made = prune(search, made)
+    return made if cost(search, made) < cost(search, model) - least else None
 
-    def _line_moves(self, model: FittedModel, i: int) -> list[tuple[FloatArray, tuple[Part, ...]]]:
-        """Return other beginnings for a line: elsewhere in its band, or as two lines."""
-        data, theta, step = self.data, model.theta, self.layout.step
-        centre, half = self.layout.place(theta, i)
-        reach = max(10 * half, 20 * step)
-        start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
-        rest = self.full.model(remove_component(theta, i))
-        power = data.power(float(np.exp(theta[GAIN])))
-        seen = measure_excess(data, power, rest, int(start), int(stop))
-        moves = []
-        centred = self.centre_line(theta, i)
-        moved_by = component(centred, i)[FREQUENCY] - component(theta, i)[FREQUENCY]
-        if abs(moved_by) * centre > 0.4 * step:
-            moves.append((centred, model.parts))
-        if abs(seen.frequency_hz - centre) > 0.5 * half + step:
-            damping = min(seen.half_width_hz / seen.frequency_hz, 0.5)
-            again = theta.copy()
-            component(again, i)[:] = self.layout.new_component(
-                seen.frequency_hz, damping, seen.variance_nm2
-            )
-            moves.append((again, model.parts))
-        if half > 3 * step and self._room(model) > 0:
-            pair = component(theta, i) + np.log(
-                [[1 - half / centre, 0.5, 0.5], [1 + half / centre, 0.5, 0.5]]
-            )
-            split = np.concatenate([theta, pair[1]])
-            component(split, i)[:] = pair[0]
-            moves.append((split, (*model.parts, Part(line=True))))
-        return moves
+
+def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[SpectrumModel]:
+    """Yield other beginnings for a line: elsewhere in its band, or as two lines."""
+    data, line, step = search.data, spectrum.components[i], search.data.step_hz
+    centre, half = search.place(line)
+    centred = centre_line(search, spectrum, i)
+    moved_by = centred.components[i].log_frequency - line.log_frequency
+    if abs(moved_by) * centre > 0.4 * step:
+        yield centred
+    reach = max(10 * half, 20 * step)
+    start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
+    rest = density(data, spectrum.exchange(i))
+    seen = measure_excess(data, data.power(spectrum.gain), rest, int(start), int(stop))
+    if abs(seen.frequency_hz - centre) > 0.5 * half + step:
+        ratio = min(seen.half_width_hz / seen.frequency_hz, 0.5)
+        again = search.component("line", seen.frequency_hz, ratio, seen.variance_nm2)
+        yield spectrum.exchange(i, replace(again, announced=line.announced))
+    if half > 3 * step and len(spectrum.lines) < search.most_lines:
+        lower, upper = (
+            line.shift(float(np.log(1 + side * half / centre)), _HALF, _HALF) for side in (-1, 1)
+        )
+        yield spectrum.exchange(i, lower).add(replace(upper, announced=None))
+
+
+def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
+    """Make a slow component the turbulence, where a resonance took its place."""
+    spectrum, lowest = model.spectrum, search.lowest_line_hz * search.data.angle_s
+    first, *others = spectrum.components
+    slow = [i for i, c in enumerate(others, 1) if c.frequency < lowest]
+    if first.frequency < lowest or not slow or spectrum.rolls_off or first.damping_ratio > 0.98:
+        return model
+    made = fit(search, spectrum.promote(spectrum.strongest(slow), first.convert("line")))
+    if made is not None and cost(search, made) < cost(search, model) + search.price:
+        return made
+    return model

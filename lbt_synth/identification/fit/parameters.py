@@ -1,176 +1,150 @@
-"""The components of a model: their meaning, their priors, and the bins that they need."""
+"""The parameters of a spectrum: sensor gain, noise, turbulence and lines."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Literal
 
 import numpy as np
 
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whittle import (
-    CORNER,
-    DAMPING,
-    FREQUENCY,
-    GAIN,
-    VARIANCE,
-    Minimum,
-    Priors,
-    component,
-    component_slice,
-    damping_parameter,
-    damping_ratio,
-)
-from lbt_synth.models.resonance_spectrum import PARAMETERS
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.validation import FloatArray
 
-_GAIN_PRIOR = (np.log(0.7), 1.0)
-_TURBULENCE_DAMPING = (np.log(0.45), 0.7)  # of the first component; for the others, of the odds
-_PART_DAMPING = (0.0, 1.0)
-_LINE_DAMPING = (np.log(0.01 / 0.99), 4.0)
-_UNKNOWN_TAPER = 2.0  # width of that prior where the taper is not known
+GAIN = 0  # place of the sensor gain in a packed vector
 NO_CORNER = 50.0  # angle per frame; a corner above it is none
-_CORNER = (np.log(50.0), 2.0)  # of its frequency [Hz]
-_SLOWEST = 1.5  # width of the prior on the logarithm of a turbulence's frequency
-_FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
-_WIDEST_HZ = 3.0
-_BINS = 10  # on either side of a line that stay single
-_SIDELOBES = 64  # the same for a line narrower than _SMEARED bins, with the taper's sidelobes
-_SMEARED = 3
+_LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
+_JUST_ABOVE = 1e-3
+
+Kind = Literal["turbulence", "slow", "line"]  # "slow": another part of the turbulence
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
-    """What a component of the model is."""
+@dataclass(frozen=True, slots=True)
+class Component:
+    """A resonance, by the numbers that a fit varies.
 
-    line: bool  # a line, or else a part of the turbulence
-    frequency: tuple[float, float] | None = None  # prior: mean and deviation of its log angle
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FittedModel:
-    """A fitted model with the meaning of its parts."""
-
-    minimum: Minimum  # its contrast is that of all values
-    parts: tuple[Part, ...]  # one per component
-    evidence: tuple[float, ...] = ()  # what each component adds to the log-likelihood
-
-    @property
-    def theta(self) -> FloatArray:
-        """The parameters."""
-        return self.minimum.parameters
-
-    @property
-    def contrast(self) -> float:
-        """Minus the logarithm of the likelihood, without the priors."""
-        return self.minimum.contrast
-
-    def drop_wide(self, most: float) -> FittedModel:
-        """Return the model without lines of a larger damping ratio, without another fit."""
-        theta, parts = self.theta, list(self.parts)
-        for i in reversed(range(1, len(parts))):
-            ratio = damping_ratio(component(self.theta, i)[DAMPING], first=False)
-            if parts[i].line and ratio > most:
-                theta = remove_component(theta, i)
-                del parts[i]
-        return replace(self, minimum=replace(self.minimum, parameters=theta), parts=tuple(parts))
-
-
-def has_corner(theta: FloatArray) -> bool:
-    """Whether the turbulence rolls off behind a corner."""
-    return bool(theta[CORNER] < np.log(NO_CORNER))
-
-
-def remove_component(theta: FloatArray, i: int) -> FloatArray:
-    """Return the parameters without those of a component."""
-    return np.delete(theta, component_slice(i))
-
-
-def promote_component(theta: FloatArray, i: int) -> FloatArray:
-    """Return the parameters with those of a component in the place of the first."""
-    out = theta.copy()
-    component(out, 0)[:] = component(theta, i)
-    ratio = damping_ratio(component(theta, i)[DAMPING], first=False)
-    component(out, 0)[DAMPING] = damping_parameter(ratio, first=True)
-    return out
-
-
-def strongest(theta: FloatArray, candidates: Sequence[int]) -> int:
-    """Return the component of the largest variance."""
-    return max(candidates, key=lambda i: float(component(theta, i)[VARIANCE]))
-
-
-def drop_part(model: FittedModel, i: int) -> tuple[FloatArray, tuple[Part, ...]] | None:
-    """Return parameters and parts without a component.
-
-    Another part of the turbulence takes the place of the first; None if there is no other.
+    The damping ratio zeta of the turbulence is above 0.05, that of all others below 1: their
+    ``damping`` is ``log(zeta - 0.05)`` and ``log(zeta / (1 - zeta))``.
     """
-    theta, parts = model.theta, model.parts
-    if i == 0:
-        others = [j for j, part in enumerate(parts) if j > 0 and not part.line]
-        if not others:
-            return None
-        i = strongest(theta, others)
-        theta = promote_component(theta, i)
-    return remove_component(theta, i), parts[:i] + parts[i + 1 :]
+
+    kind: Kind
+    log_frequency: float  # of the natural frequency, an angle per frame
+    damping: float
+    log_power: float  # of the variance, in units of the measurement
+    announced: tuple[float, float] | None = None  # log_frequency known beforehand, and its error
+
+    @property
+    def frequency(self) -> float:
+        """Natural frequency, an angle per frame."""
+        return float(np.exp(self.log_frequency))
+
+    @property
+    def damping_ratio(self) -> float:
+        """Damping ratio."""
+        if self.kind == "turbulence":
+            return float(_LEAST + np.exp(self.damping))
+        return float(1 / (1 + np.exp(-self.damping)))
+
+    @property
+    def damping_slope(self) -> float:
+        """Derivative of the logarithm of the damping ratio by ``damping``."""
+        ratio = self.damping_ratio
+        return 1 - _LEAST / ratio if self.kind == "turbulence" else 1 - ratio
+
+    def convert(self, kind: Kind) -> Component:
+        """Return a component of another kind with the same spectrum, as far as it can have that."""
+        ratio = self.damping_ratio
+        return replace(self, kind=kind, damping=damping_parameter(kind, ratio), announced=None)
+
+    def shift(self, log_frequency: float, damping: float, log_power: float) -> Component:
+        """Return the component with its numbers changed by these."""
+        return replace(
+            self,
+            log_frequency=self.log_frequency + log_frequency,
+            damping=self.damping + damping,
+            log_power=self.log_power + log_power,
+        )
 
 
-class Layout:
-    """How components lie on the frequencies of one periodogram."""
+def damping_parameter(kind: Kind, ratio: float) -> float:
+    """Return the ``damping`` of a component with a damping ratio."""
+    if kind == "turbulence":
+        return float(np.log(max(ratio - _LEAST, _JUST_ABOVE)))
+    return float(np.log(ratio / (1 - ratio)))
 
-    def __init__(self, data: LoopPeriodogram) -> None:
-        self.data = data
-        self.angle = 2 * np.pi / data.frame_rate_hz
-        self.step = float(np.median(np.diff(data.frequency_hz)))
-        # what a component must add to the logarithm of the likelihood
-        self.price = 0.5 * PARAMETERS * float(np.log(max(2.0, np.sum(data.count))))
 
-    def place(self, theta: FloatArray, i: int) -> tuple[float, float]:
-        """Return the frequency and the half width of a component [Hz], at least a bin wide."""
-        frequency, damping, _ = component(theta, i)
-        centre = float(np.exp(frequency)) / self.angle
-        ratio = damping_ratio(damping, first=i == 0)
-        return centre, max(centre * ratio, self.step)
+@dataclass(frozen=True, slots=True)
+class SpectrumModel:
+    """White noise and resonances; the first component is the turbulence behind its roll-off.
 
-    def new_component(self, frequency_hz: float, damping: float, variance: float) -> FloatArray:
-        """Return the parameters of a component that is not the first."""
-        odds = damping_parameter(damping, first=False)
-        return np.array([np.log(frequency_hz * self.angle), odds, np.log(variance)])
+    A vector with a number for each parameter, such as standard errors, unpacks into the same
+    fields.
+    """
 
-    def starting_corner(self) -> float:
-        """Return the parameter of a corner to start from."""
-        return float(_CORNER[0] + np.log(self.angle))
+    log_gain: float  # of the sensor
+    log_noise: float  # of its variance
+    log_corner: float  # of the roll-off of the turbulence, an angle per frame
+    components: tuple[Component, ...]
 
-    def priors(self, theta: FloatArray, parts: tuple[Part, ...]) -> Priors:
-        """Return weak priors: what the data leave open stays where it makes sense."""
-        centre, width = theta.copy(), np.full(theta.size, np.inf)
-        centre[GAIN], width[GAIN] = _GAIN_PRIOR
-        if has_corner(theta):
-            centre[CORNER], width[CORNER] = _CORNER[0] + np.log(self.angle), _CORNER[1]
-        for i, part in enumerate(parts):
-            mean, deviation = component(centre, i), component(width, i)
-            slow = _PART_DAMPING if i else _TURBULENCE_DAMPING
-            mean[DAMPING], deviation[DAMPING] = _LINE_DAMPING if part.line else slow
-            if part.line and self.data.duration_s is None:
-                deviation[DAMPING] = _UNKNOWN_TAPER
-            if part.frequency is not None:
-                mean[FREQUENCY], deviation[FREQUENCY] = part.frequency
-            elif not part.line:
-                mean[FREQUENCY], deviation[FREQUENCY] = np.log(self.angle), _SLOWEST
-        return Priors(centre=centre, width=width)
+    def pack(self) -> FloatArray:
+        """Return all parameters as a vector (p,)."""
+        rows = ((c.log_frequency, c.damping, c.log_power) for c in self.components)
+        return np.array([self.log_gain, self.log_noise, self.log_corner, *chain(*rows)])
 
-    def groups(self, theta: FloatArray, parts: tuple[Part, ...]) -> IntArray:
-        """Return where groups of bins begin over which the model is nearly constant."""
-        f = self.data.frequency_hz
-        size = np.maximum(self.step, np.minimum(_FINE * f, _WIDEST_HZ))
-        for i, part in enumerate(parts):
-            if not part.line:
-                continue
-            centre, half_width = self.place(theta, i)
-            fine = _SIDELOBES if half_width < _SMEARED * self.step else _BINS
-            away = np.maximum(np.abs(f - centre) - fine * self.step, 0)
-            np.minimum(
-                size, np.maximum(self.step, 0.1 * np.maximum(half_width, 2 * away)), out=size
-            )
-        place = np.floor(np.cumsum(self.step / size) - 1e-9)
-        return np.flatnonzero(np.concatenate([[True], np.diff(place) > 0]))
+    def unpack(self, vector: FloatArray) -> SpectrumModel:
+        """Return components of the same kinds with the numbers of a vector (p,)."""
+        gain, noise, corner, *rest = vector.tolist()
+        rows = zip(self.components, rest[::3], rest[1::3], rest[2::3], strict=True)
+        each = (Component(c.kind, f, damping, power, c.announced) for c, f, damping, power in rows)
+        return SpectrumModel(gain, noise, corner, tuple(each))
+
+    @property
+    def gain(self) -> float:
+        """The sensor gain."""
+        return float(np.exp(self.log_gain))
+
+    @property
+    def lines(self) -> tuple[Component, ...]:
+        """The components that are lines."""
+        return tuple(c for c in self.components if c.kind == "line")
+
+    @property
+    def rolls_off(self) -> bool:
+        """Whether the turbulence rolls off behind a corner."""
+        return bool(self.log_corner < np.log(NO_CORNER))
+
+    def keep(self, wanted: Callable[[Component], bool]) -> SpectrumModel:
+        """Return the model with the turbulence and those of the other components."""
+        first, *others = self.components
+        return replace(self, components=(first, *filter(wanted, others)))
+
+    def add(self, *new: Component) -> SpectrumModel:
+        """Return the model with more components."""
+        return replace(self, components=(*self.components, *new))
+
+    def exchange(self, i: int, *new: Component) -> SpectrumModel:
+        """Return the model with others in the place of a component, or without it."""
+        before, after = self.components[:i], self.components[i + 1 :]
+        return replace(self, components=(*before, *new, *after))
+
+    def strongest(self, candidates: Sequence[int]) -> int:
+        """Return the component of the largest variance among some."""
+        return max(candidates, key=lambda i: self.components[i].log_power)
+
+    def promote(self, i: int, *old: Component) -> SpectrumModel:
+        """Return the model with component i as the turbulence, and another in its own place."""
+        return self.exchange(0, self.components[i].convert("turbulence")).exchange(i, *old)
+
+    def drop(self, i: int) -> SpectrumModel | None:
+        """Return the model without a component; None if that is its only turbulence.
+
+        Another part of the turbulence takes the place of the first.
+        """
+        if i > 0:
+            return self.exchange(i)
+        slow = [j for j, c in enumerate(self.components) if c.kind == "slow"]
+        return self.promote(self.strongest(slow)) if slow else None
+
+    def drop_wide(self, most: float) -> SpectrumModel:
+        """Return the model without lines of a larger damping ratio."""
+        return self.keep(lambda c: c.kind != "line" or c.damping_ratio <= most)

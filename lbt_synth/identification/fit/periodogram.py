@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,7 +25,7 @@ LONGEST_SEGMENT = 1 << 16
 SHORTEST_SEGMENT = 256
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LoopPeriodogram:
     """One-sided densities over frequency, of the measurement and of the correction in it."""
 
@@ -41,6 +42,21 @@ class LoopPeriodogram:
     def closed(self) -> bool:
         """Whether there are corrections."""
         return bool(np.any(self.corrected > 0))
+
+    @cached_property
+    def half_angle_square(self) -> FloatArray:
+        """``4 sin^2(pi f / f_s)``, (f,)."""
+        return half_angle_square(self.frequency_hz, self.frame_rate_hz)
+
+    @cached_property
+    def step_hz(self) -> float:
+        """Distance of neighbouring frequencies."""
+        return float(np.median(np.diff(self.frequency_hz)))
+
+    @property
+    def angle_s(self) -> float:
+        """Angle per frame of 1 Hz."""
+        return 2 * np.pi / self.frame_rate_hz
 
     def power(self, gain: float) -> FloatArray:
         """Return the density of ``y + gain c`` [nm^2/Hz], (f,)."""

@@ -23,8 +23,8 @@ from lbt_synth.identification.prediction.residual_estimate import (
     ResidualEstimate,
     estimate_residual,
 )
-from lbt_synth.identification.prediction.stretches import Stretches, checked_stretches, split_halves
 from lbt_synth.identification.prediction.table import PredictionRow, PredictionTable
+from lbt_synth.identification.stretches import Stretches, checked_stretches, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual

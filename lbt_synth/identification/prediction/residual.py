@@ -13,7 +13,7 @@ from lbt_synth.identification.prediction.residual_estimate import (
     ResidualEstimate,
     estimate_residual,
 )
-from lbt_synth.identification.prediction.stretches import Stretches, checked_stretches
+from lbt_synth.identification.stretches import Stretches, checked_stretches
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, close_loop, filter_series
 from lbt_synth.loop.simulation.run import settling_frames

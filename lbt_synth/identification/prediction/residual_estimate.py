@@ -14,7 +14,7 @@ import numpy as np
 from scipy.fft import rfft
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.prediction.stretches import Stretches
+from lbt_synth.identification.stretches import Stretches
 from lbt_synth.loop import Imaging, jitter_strehl
 from lbt_synth.validation import FloatArray, frozen_copy
 

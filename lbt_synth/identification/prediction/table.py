@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.prediction.residual_estimate import ResidualEstimate
-from lbt_synth.identification.prediction.stretches import Stretches
+from lbt_synth.identification.stretches import Stretches
 from lbt_synth.validation import FloatArray, frozen_copy
 
 _AXES = ("tip", "tilt")

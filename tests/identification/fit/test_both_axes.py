@@ -130,10 +130,10 @@ def test_the_limit_of_lines_is_kept_and_noted() -> None:
     ("options", "words"),
     [
         ({"sensor_gain": 1e300}, "sensor_gain must be"),
-        ({"sensor_gain": "x"}, "sensor_gain must be numbers"),
+        ({"sensor_gain": "x"}, "sensor_gain must be an array of numbers"),
         ({"announced": [31.0]}, "LinePrior"),
         ({"start": 3}, "IdentifiedModel"),
-        ({"stretches": [(2, 4000), (3000, 5000)]}, "lie apart"),
+        ({"stretches": [(2, 4000), (3000, 5000)]}, "in order, apart"),
         ({"stretches": [(0, 4000)]}, "usable"),
         ({"frame_rate_hz": 900.0}, "for spectra only"),
         ({"delay_frames": 3.0}, "with_delay"),

@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import approx_fprime
 from support.recorded_loops import integrator_loop
 
-from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.whittle import GAIN, Likelihood
+from lbt_synth.identification.fit.parameters import GAIN, Component, SpectrumModel
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
+from lbt_synth.identification.fit.whittle import contrast, density, derivatives
 
 RATE = 1000.0
 
@@ -18,52 +19,57 @@ RATE = 1000.0
 FRAMES = 16_384
 
 
-def likelihood() -> tuple[Likelihood, np.ndarray]:
+def case() -> tuple[LoopPeriodogram, SpectrumModel]:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=4096)
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
     w = 2 * np.pi / RATE
-    theta = np.array(
-        [
-            np.log(0.7),
-            np.log(30),
-            np.log(20 * w),
-            np.log(1.1 * w),
-            np.log(0.5),
-            np.log(200.0**2),
-            np.log(39 * w),
-            np.log(0.02 / 0.98),
-            np.log(15.0**2),
-        ]
-    )
-    return Likelihood(data), theta
+    turbulence = Component("turbulence", np.log(1.1 * w), np.log(0.5), np.log(200.0**2))
+    line = Component("line", np.log(39 * w), np.log(0.02 / 0.98), np.log(15.0**2))
+    return data, SpectrumModel(np.log(0.7), np.log(30), np.log(20 * w), (turbulence, line))
+
+
+def test_parameters_keep_their_names_in_a_vector() -> None:
+    _, spectrum = case()
+    theta = spectrum.pack()
+    assert spectrum.unpack(theta) == spectrum
+    named = spectrum.unpack(np.arange(9.0))
+    assert (named.log_gain, named.log_noise, named.log_corner) == (0, 1, 2)
+    turbulence, line = named.components
+    assert (turbulence.log_frequency, turbulence.damping, turbulence.log_power) == (3, 4, 5)
+    assert (line.log_frequency, line.damping, line.log_power) == (6, 7, 8)
+    with pytest.raises(ValueError, match="zip"):
+        spectrum.unpack(theta[:-3])
 
 
 def test_gradient_and_information_of_the_likelihood() -> None:
-    like, theta = likelihood()
-    value, gradient, information = like.derivatives(theta)
-    assert value == pytest.approx(like.contrast(theta), rel=1e-12)
-    numeric = approx_fprime(theta, like.contrast, 1e-6)
-    assert gradient == pytest.approx(numeric, rel=2e-3, abs=1e-3 * np.max(np.abs(numeric)))
+    data, spectrum = case()
+    theta = spectrum.pack()
+
+    def gradient(theta: np.ndarray, data: LoopPeriodogram = data) -> np.ndarray:
+        return derivatives(data, spectrum.unpack(theta))[1]
+
+    value, slope, information = derivatives(data, spectrum)
+    assert value == pytest.approx(contrast(data, spectrum), rel=1e-12)
+    numeric = approx_fprime(theta, lambda x: contrast(data, spectrum.unpack(x)), 1e-6)
+    assert slope == pytest.approx(numeric, rel=2e-3, abs=1e-3 * np.max(np.abs(numeric)))
     # the rows of the gain are exact second derivatives
     for h in (1e-5,):
         step = np.zeros(theta.size)
         step[GAIN] = h
-        row = (like.derivatives(theta + step)[1] - like.derivatives(theta - step)[1]) / (2 * h)
+        row = (gradient(theta + step) - gradient(theta - step)) / (2 * h)
         assert information[GAIN] == pytest.approx(row, rel=1e-4, abs=1e-4 * np.max(np.abs(row)))
     # the others are those of the model where the data are the model
-    pure = Likelihood(
-        dataclasses.replace(
-            like.data,
-            measured=like.model(theta),
-            crossed=np.zeros_like(like.data.crossed),
-            corrected=np.zeros_like(like.data.corrected),
-        )
+    pure = dataclasses.replace(
+        data,
+        measured=density(data, spectrum),
+        crossed=np.zeros_like(data.crossed),
+        corrected=np.zeros_like(data.corrected),
     )
-    _, flat, expected = pure.derivatives(theta)
+    _, flat, expected = derivatives(pure, spectrum)
     assert flat == pytest.approx(0, abs=1e-8)
     rows = np.array(
         [
-            (pure.derivatives(theta + h)[1] - pure.derivatives(theta - h)[1]) / 2e-5
+            (gradient(theta + h, pure) - gradient(theta - h, pure)) / 2e-5
             for h in 1e-5 * np.eye(theta.size)[1:]
         ]
     )

@@ -1,0 +1,237 @@
+"""Fits of given components to one periodogram, and what each component must add to stay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.identification.fit.parameters import (
+    NO_CORNER,
+    Component,
+    Kind,
+    SpectrumModel,
+    damping_parameter,
+)
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.whittle import (
+    FittedModel,
+    Priors,
+    contrast,
+    minimise,
+    observe_information,
+)
+from lbt_synth.models.resonance_spectrum import PARAMETERS
+from lbt_synth.validation import integer, number
+
+LOWEST_LINE_HZ = 3.0
+MOST_LINES = 20
+GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
+_ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
+_SPLIT = 9.0  # the same of the second of two lines that lie in each other's skirts
+_HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
+_SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
+_POWERS = (0.0, float(np.log(4)), float(-np.log(4)))
+
+# Priors: mean and standard deviation. What the data leave open stays where it makes sense.
+_FIXED, _NONE = (0.0, 0.0), (0.0, np.inf)
+_GAIN_PRIOR = (np.log(0.7), 1.0)
+STARTING_CORNER_HZ, _CORNER_WIDTH = 50.0, 2.0
+_SLOWEST = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
+_DAMPING_PRIORS = {  # of the odds, but for the turbulence
+    "turbulence": (np.log(0.45), 0.7),
+    "slow": (0.0, 1.0),
+    "line": (np.log(0.01 / 0.99), 4.0),
+}
+_UNKNOWN_TAPER = 2.0  # width of the prior of a line where the taper is not known
+
+_FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
+_WIDEST_HZ = 3.0
+_BINS = 10  # on either side of a line that stay single
+_SIDELOBES = 64  # the same for a line narrower than _SMEARED bins, with the taper's sidelobes
+_SMEARED = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Search:
+    """A periodogram, and the models that may be fitted to it."""
+
+    data: LoopPeriodogram
+    gain: float | None = None  # sensor gain; None to find it
+    lowest_line_hz: float = LOWEST_LINE_HZ  # below, a component belongs to the turbulence
+    most_lines: int = MOST_LINES
+    announced: Sequence[tuple[float, float]] = ()  # (frequency, error) of known lines [Hz]
+
+    def __post_init__(self) -> None:
+        nyquist = self.data.frame_rate_hz / 2
+        if self.gain is not None:
+            number(self.gain, "sensor_gain", **GAINS)
+        number(self.lowest_line_hz, "lowest_line_hz", at_least=0, below=nyquist)
+        integer(self.most_lines, "most_lines", at_least=0)
+        for frequency, error in self.announced:
+            number(frequency, "an announced frequency", above=0, below=nyquist)
+            number(error, "the error of an announced frequency", at_least=0)
+
+    @property
+    def finds_gain(self) -> bool:
+        """Whether the sensor gain is fitted."""
+        return self.gain is None and self.data.closed
+
+    @property
+    def price(self) -> float:
+        """What a component must add to the logarithm of the likelihood."""
+        return 0.5 * PARAMETERS * float(np.log(max(2.0, np.sum(self.data.count))))
+
+    def log_angle(self, frequency_hz: float) -> float:
+        """Return the logarithm of a frequency as an angle per frame."""
+        return float(np.log(frequency_hz * self.data.angle_s))
+
+    def component(self, kind: Kind, frequency_hz: float, ratio: float, power: float) -> Component:
+        """Return a component of a frequency, a damping ratio and a variance."""
+        damping = damping_parameter(kind, ratio)
+        return Component(kind, self.log_angle(frequency_hz), damping, float(np.log(power)))
+
+    def priors(self, spectrum: SpectrumModel) -> Priors:
+        """Return the priors of a fit."""
+        corner = (
+            (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH) if spectrum.rolls_off else _FIXED
+        )
+        rows = [_GAIN_PRIOR if self.finds_gain else _FIXED, _NONE, corner]
+        for c in spectrum.components:
+            frequency, damping = (self.log_angle(1.0), _SLOWEST), _DAMPING_PRIORS[c.kind]
+            if c.kind == "line":
+                frequency = _NONE
+                if self.data.duration_s is None:
+                    damping = damping[0], _UNKNOWN_TAPER
+            rows += [c.announced or frequency, damping, _NONE]
+        centre, width = np.array(rows).T
+        return Priors(centre=centre, width=width)
+
+    def place(self, component: Component) -> tuple[float, float]:
+        """Return the frequency and the half width of a component [Hz], at least a bin wide."""
+        centre = component.frequency / self.data.angle_s
+        return centre, max(centre * component.damping_ratio, self.data.step_hz)
+
+    def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
+        """Return means over groups of bins within which a model is nearly constant."""
+        f, step = self.data.frequency_hz, self.data.step_hz
+        size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
+        for line in spectrum.lines:
+            centre, half_width = self.place(line)
+            fine = _SIDELOBES if half_width < _SMEARED * step else _BINS
+            away = np.maximum(np.abs(f - centre) - fine * step, 0)
+            size = np.minimum(size, np.maximum(step, 0.1 * np.maximum(half_width, 2 * away)))
+        group = np.floor(np.cumsum(step / size) - 1e-9)
+        return self.data.merge(np.flatnonzero(np.diff(group, prepend=-np.inf) > 0))
+
+
+def fit(search: Search, start: SpectrumModel) -> FittedModel | None:
+    """Fit all parameters; None if no fit settles.
+
+    Components that leave the band below the Nyquist frequency are dropped.
+    """
+    found = minimise(search.merge(start), start, search.priors(start))
+    if found is None:
+        return None
+    inside = found.spectrum.keep(lambda c: c.log_frequency < _HIGHEST)
+    if len(inside.components) < len(start.components):
+        return fit(search, inside)
+    return replace(found, contrast=contrast(search.data, found.spectrum))
+
+
+def refit(search: Search, start: SpectrumModel) -> FittedModel | None:
+    """Fit a model of other data to these; None if no fit settles."""
+    if not search.finds_gain:
+        start = replace(start, log_gain=float(np.log(search.gain or 1.0)))
+    if not start.rolls_off:
+        start = replace(start, log_corner=search.log_angle(STARTING_CORNER_HZ))
+    return fit(search, start)
+
+
+def likeliest(fits: Iterable[FittedModel | None]) -> FittedModel | None:
+    """Return the likeliest of several fits; None if none of them settled."""
+    settled = (model for model in fits if model is not None)
+    return min(settled, key=lambda model: model.contrast, default=None)
+
+
+def drop_roll_off(search: Search, model: FittedModel) -> FittedModel:
+    """Return the model without the roll-off of its turbulence, if that adds too little."""
+    if model.spectrum.rolls_off:
+        less = fit(search, replace(model.spectrum, log_corner=float(np.log(2 * NO_CORNER))))
+        if less is not None and less.contrast - model.contrast < search.price / PARAMETERS:
+            return less
+    return model
+
+
+def prune(search: Search, model: FittedModel) -> FittedModel:
+    """Drop the components that add less than they must, the least first."""
+    trials = []
+    for i in range(len(model.spectrum.components)):
+        less = model.spectrum.drop(i)
+        if less is not None:
+            required = required_gain(search, model.spectrum, i)
+            spare = contrast(search.data, less) - model.contrast - 4 * required
+            trials.append((spare, required, less))
+    for spare, required, less in sorted(trials, key=lambda trial: trial[0]):
+        made = fit(search, less) if spare <= 0 else None
+        if made is not None and made.contrast - model.contrast < required:
+            return prune(search, made)
+    return model
+
+
+def required_gain(
+    search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
+) -> float:
+    """Return what a component must add to the logarithm of the likelihood.
+
+    Less where its place was not searched for: an announced line, or one of a close pair
+    (with ``earlier``, of a pair with one of the components before it).
+    """
+    component = spectrum.components[i]
+    if component.announced is not None:
+        return _ANNOUNCED
+    if component.kind == "line":
+        centre, half = search.place(component)
+        for other in spectrum.components[: i if earlier else None]:
+            if other.kind == "line" and other is not component:
+                its_centre, its_half = search.place(other)
+                if abs(centre - its_centre) < 4 * (half + its_half):
+                    return _SPLIT
+    return search.price
+
+
+def cost(search: Search, model: FittedModel) -> float:
+    """Return the contrast of a model plus what the criterion asks for its components."""
+    others = range(1, len(model.spectrum.components))
+    return model.contrast + sum(
+        required_gain(search, model.spectrum, i, earlier=True) for i in others
+    )
+
+
+def add_evidence(search: Search, model: FittedModel) -> FittedModel:
+    """Return the model with what each component adds, and its exact information."""
+    spectrum = model.spectrum
+    exact = observe_information(search.merge(spectrum), model, search.priors(spectrum))
+    evidence = [
+        contrast(search.data, spectrum.exchange(i)) - model.contrast
+        for i in range(1, len(spectrum.components))
+    ]
+    return replace(exact, evidence=(float("inf"), *evidence))
+
+
+def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumModel:
+    """Put a line that is hardly resolved where it fits best within two bins.
+
+    The sidelobes of the taper make as many places where a fit would stay.
+    """
+    step, line = search.data.step_hz, spectrum.components[i]
+    centre, half = search.place(line)
+    if half > 2 * step or centre <= 3 * step:
+        return spectrum
+    moves = product(np.log1p(_SHIFTS * step / centre), _POWERS)
+    # the width stays
+    trials = [spectrum.exchange(i, line.shift(move, -move, power)) for move, power in moves]
+    return min([spectrum, *trials], key=lambda trial: contrast(search.data, trial))
