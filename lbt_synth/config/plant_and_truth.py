@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
 
 import numpy as np
 
@@ -50,8 +51,8 @@ from lbt_synth.validation import FloatArray, frozen_copy
 
 
 def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
-    """Return the noise per frame [nm], of all measurements or of each."""
-    sensor = settings.sensor
+    """Return the noise per frame [nm], of all measurements or of each; (b,) of samples."""
+    sensor = settings.sensor.per_sample
     if isinstance(sensor.noise_nm, list):
         count = count_measurements(settings)
         return frozen_copy(require_length(sensor.noise_nm, count, "sensor.noise_nm", "measurement"))
@@ -59,30 +60,47 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
         return sensor.noise_nm
     if sensor.noise_mas is not None:
         return convert_mas_to_nm(settings, sensor.noise_mas, "sensor.noise_mas")
-    pyramid = sensor.pyramid
+    pyramid = settings.sensor.pyramid
     assert pyramid is not None  # the schema wants exactly one of the three
     telescope = require_telescope(
         settings, "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm"
     )
-    return pyramid_tilt_noise_nm(
+    varying = ("photons", "read_noise_electrons", "modulation_lambda_over_d")
+    return map_distinct(
+        pyramid_tilt_noise_nm,
         subapertures=illuminated_subapertures(pyramid.subapertures_across, telescope.obstruction),
         diameter_m=telescope.diameter_m,
-        **pyramid.model_dump(exclude={"subapertures_across"}),
+        **pyramid.model_dump(exclude={"subapertures_across", *varying}),
+        **{name: getattr(pyramid.per_sample, name) for name in varying},
     )
 
 
+def map_distinct(function: Callable[..., float], **numbers: Any) -> float | FloatArray:
+    """Apply a function of numbers to each distinct combination of those that are arrays (b,)."""
+    arrays = {name: value for name, value in numbers.items() if np.ndim(value)}
+    if not arrays:
+        return function(**numbers)
+    distinct, which = np.unique(np.stack([*arrays.values()], axis=1), axis=0, return_inverse=True)
+    rows = (dict(zip(arrays, row, strict=True)) for row in distinct.tolist())
+    found = np.array([function(**numbers | row) for row in rows])
+    return np.asarray(found[which.reshape(-1)])
+
+
 def assumed_gains(settings: FileSection) -> FloatArray:
-    """Return the sensor gains that the design assumes, one per measurement, (q,)."""
-    given = settings.model.sensor_gain
+    """Return the sensor gains that the design assumes, one per measurement, (q,) or (b, q)."""
+    return _gain_per_measurement(settings, settings.model.per_sample.sensor_gain)
+
+
+def _gain_per_measurement(settings: FileSection, given: Any) -> FloatArray:
     count = count_measurements(settings)
     if isinstance(given, list):
         return frozen_copy(require_length(given, count, "model.sensor_gain", "measurement"))
-    return frozen_copy(np.full(count, given))
+    return frozen_copy(np.repeat(np.expand_dims(given, -1), count, axis=-1))
 
 
 def reference_gain(settings: FileSection) -> float:
     """Return the assumed gain with which a single number is compared: the mean of the gains."""
-    given = settings.model.sensor_gain
+    given = settings.model.per_sample.sensor_gain
     return float(np.mean(assumed_gains(settings))) if isinstance(given, list) else given
 
 
@@ -90,44 +108,74 @@ def build_plant(
     settings: FileSection, atmosphere: Atmosphere | None, noise_nm: float | FloatArray
 ) -> TipTiltPlant:
     """Build the plant of the design."""
-    loop, model, axes = settings.loop, settings.model, count_axes(settings)
-    lines: list[Vibration] | None = None
-    if model.vibrations is not None:
-        lines = []
-        for i, section in enumerate(model.vibrations):
-            key = f"model.vibrations[{i}]"
-            _require_below_nyquist(section.frequency_hz, loop.frame_rate_hz, f"{key}.frequency_hz")
-            for direction in vibration_directions(section, axes, key):
-                line = Vibration(
-                    frequency_hz=section.frequency_hz,
-                    damping=section.damping,
-                    rms_nm=vibration_rms_nm(section, settings, key),
-                    direction=direction,
-                )
-                lines += spread_vibration(line, section, loop.frame_rate_hz, i)
+    loop = settings.loop
+    lines: list[Vibration] | None = None if settings.model.vibrations is None else []
+    for section, key, numbers in vibration_numbers(settings, "model"):
+        assert lines is not None  # there are vibrations
+        lines += spread_vibration(Vibration(**numbers), section, loop.frame_rate_hz, key)
     return tip_tilt_plant(
         frame_rate_hz=loop.frame_rate_hz,
-        delay_frames=loop.delay_frames,
+        delay_frames=loop.per_sample.delay_frames,
         turbulence=_build_turbulence(settings, atmosphere, noise_nm),
         vibrations=lines,
         noise_nm=noise_nm,
         sensor_matrix=settings.sensor.matrix,
         influence_matrix=settings.mirror.influence_matrix,
         sensor_gain=assumed_gains(settings),
-        modes=axes,
+        modes=count_axes(settings),
         mirror=_build_mirror(settings.mirror.local_loop),
     )
+
+
+def vibration_numbers(
+    settings: FileSection, owner: Literal["model", "truth"]
+) -> Iterator[tuple[Any, str, dict[str, Any]]]:
+    """Yield each vibration of the model or of the truth: its section, its key, its numbers."""
+    rate, axes = settings.loop.frame_rate_hz, count_axes(settings)
+    for i, section in enumerate(getattr(settings, owner).vibrations or ()):
+        key = f"{owner}.vibrations[{i}]"
+        # the lines of a spread vibration are chosen for one frequency, damping and size
+        numbers = section if getattr(section, "spread_hz", None) else section.per_sample
+        _require_below_nyquist(numbers.frequency_hz, rate, f"{key}.frequency_hz")
+        for direction in vibration_directions(section, axes, key):
+            rms_nm = vibration_rms_nm(numbers, settings, key)
+            given = {"frequency_hz": numbers.frequency_hz, "damping": numbers.damping}
+            yield section, key, {**given, "rms_nm": rms_nm, "direction": direction}
+
+
+def true_vibrations_owner(settings: FileSection) -> Literal["model", "truth"]:
+    """Return which section has the vibrations that the real loop meets."""
+    return "truth" if isinstance(settings.truth.vibrations, list) else "model"
+
+
+def turbulence_sections(settings: FileSection) -> list[Ar1Section | Ar2Section | ArSection]:
+    """Return the section of the assumed turbulence of each axis."""
+    given, axes = settings.model.turbulence, count_axes(settings)
+    if isinstance(given, list):
+        return require_length(given, axes, "model.turbulence", "axis")
+    return [given] * axes
+
+
+def require_one_model_turbulence(settings: FileSection, *, but_flows: bool = False) -> None:
+    """Declare that samples evaluated together share what the model's turbulence is computed from.
+
+    With ``but_flows`` the models of kind ar1 are computed for each sample.
+    """
+    for section in turbulence_sections(settings):
+        if isinstance(section, Ar2Section):  # fitted above the noise
+            settings.sensor.require_one_value()
+        if settings.atmosphere is not None and (
+            isinstance(section, Ar2Section) or (isinstance(section, Ar1Section) and not but_flows)
+        ):
+            settings.atmosphere.require_one_value()
 
 
 def _build_turbulence(
     settings: FileSection, atmosphere: Atmosphere | None, noise_nm: float | FloatArray
 ) -> ARModel | list[ARModel]:
     """Return one model for all axes, or one per axis where sections or noise differ."""
-    given, axes, key = settings.model.turbulence, count_axes(settings), "model.turbulence"
-    if isinstance(given, list):
-        sections = require_length(given, axes, key, "axis")
-    else:
-        sections = [given] * axes
+    axes, key = count_axes(settings), "model.turbulence"
+    sections, listed = turbulence_sections(settings), isinstance(settings.model.turbulence, list)
     noisy = np.ndim(noise_nm) == 1 and any(isinstance(s, Ar2Section) for s in sections)
     if noisy and count_measurements(settings) != axes:
         raise ConfigError(
@@ -136,15 +184,14 @@ def _build_turbulence(
             "kind ar.",
             path=key,
         )
-    if not isinstance(given, list) and not noisy:
-        noise = float(np.ravel(noise_nm)[0])  # only ar2 uses it
-        return _build_turbulence_model(given, settings, atmosphere, noise, key)
-    noises = np.broadcast_to(noise_nm if noisy else np.ravel(noise_nm)[0], (axes,))
+    noises = np.broadcast_to(noise_nm if noisy else np.ravel(noise_nm)[0], (axes,)).tolist()
+    if not listed and not noisy:
+        return _build_turbulence_model(sections[0], settings, atmosphere, noises[0], key)
     return [
         _build_turbulence_model(
-            section, settings, atmosphere, noise, f"{key}[{i}]" if isinstance(given, list) else key
+            section, settings, atmosphere, noise, f"{key}[{i}]" if listed else key
         )
-        for i, (section, noise) in enumerate(zip(sections, noises.tolist(), strict=True))
+        for i, (section, noise) in enumerate(zip(sections, noises, strict=True))
     ]
 
 
@@ -183,12 +230,12 @@ def _build_mirror(section: LocalLoopSection | None) -> PositionLoop | None:
 
 
 def spread_vibration(
-    line: Vibration, section: VibrationSection, frame_rate_hz: float, index: int
+    line: Vibration, section: VibrationSection, frame_rate_hz: float, key: str
 ) -> list[Vibration]:
     """Return the lines that represent a vibration of the model: several if it is spread."""
     if section.spread_hz is None:
         return [line]
-    with name_key(f"model.vibrations[{index}].spread_hz"):
+    with name_key(f"{key}.spread_hz"):
         frequencies = line_frequencies(
             line.frequency_hz, section.spread_hz, section.lines or 5, name="the half width"
         )
@@ -210,6 +257,8 @@ def build_truth(
             settings,
             "truth.turbulence: frozen_flow is its spectrum. Give it, or truth.turbulence: model",
         )
+    if kind == "model":
+        require_one_model_turbulence(settings)
     one = plant.turbulence[0]
     same = all(model is one for model in plant.turbulence)
     spectra: dict[str, Spectrum | tuple[ARModel, ...] | None] = {
@@ -221,56 +270,38 @@ def build_truth(
         turbulence=spectra[kind],
         vibrations=_build_true_vibrations(settings, plant),
         noise_nm=noise_nm,
-        sensor_gain=_relative_gain(settings),
+        sensor_gain=relative_gain(settings, reference_gain(settings)),
     )
 
 
 def _build_true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVibration, ...]:
-    if not isinstance(settings.truth.vibrations, list):
+    if true_vibrations_owner(settings) == "model":
         return plant.vibrations
     rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
-    for i, section in enumerate(settings.truth.vibrations):
-        key = f"truth.vibrations[{i}]"
-        _require_below_nyquist(section.frequency_hz, rate, f"{key}.frequency_hz")
-        for direction in vibration_directions(section, count_axes(settings), key):
-            size: dict[str, Any] = {
-                "frequency_hz": section.frequency_hz,
-                "rms_nm": vibration_rms_nm(section, settings, key),
-                "direction": direction,
-            }
-            if section.kind == "drift":
-                lines.append(_build_drifting_vibration(section, size, rate, key))
-            elif section.damping is None:
-                lines.append(SinusoidalVibration(**size))
-            else:
-                lines.append(Vibration(**size, damping=section.damping))
+    for section, key, numbers in vibration_numbers(settings, "truth"):
+        if section.kind == "drift":
+            start_hz = numbers.pop("frequency_hz")
+            _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
+            with name_key(key):
+                ends = {"start_hz": start_hz, "end_hz": section.end_hz}
+                lines.append(DriftingVibration(**numbers, **ends, duration_s=section.duration_s))
+        elif section.kind == "resonance":
+            lines.append(Vibration(**numbers))
+        else:
+            del numbers["damping"]
+            lines.append(SinusoidalVibration(**numbers))
     return tuple(lines)
 
 
-def _build_drifting_vibration(
-    section: TrueVibrationSection, size: dict[str, Any], frame_rate_hz: float, key: str
-) -> DriftingVibration:
-    """Build a vibration that drifts from ``frequency_hz`` to ``end_hz``."""
-    assert section.end_hz is not None  # the schema wants both with this kind
-    assert section.duration_s is not None
-    _require_below_nyquist(section.end_hz, frame_rate_hz, f"{key}.end_hz")
-    given = {name: value for name, value in size.items() if name != "frequency_hz"}
-    with name_key(key):
-        return DriftingVibration(
-            **given,
-            start_hz=section.frequency_hz,
-            end_hz=section.end_hz,
-            duration_s=section.duration_s,
-            damping=section.damping,
-        )
+def relative_gain(settings: FileSection, reference: float) -> Any:
+    """Return the real sensor gain divided by that in the plant's sensor matrix; (b,) of samples.
 
-
-def _relative_gain(settings: FileSection) -> float:
-    """Return the real sensor gain divided by that in the plant's sensor matrix."""
-    assumed, given = assumed_gains(settings), settings.truth.sensor_gain
+    ``reference`` is the :func:`reference_gain` of that matrix.
+    """
+    given, key = settings.truth.per_sample.sensor_gain, "truth.sensor_gain"
     if not isinstance(given, list):
-        return given / reference_gain(settings)
-    key = "truth.sensor_gain"
+        return given / reference
+    assumed = _gain_per_measurement(settings, settings.model.sensor_gain)
     ratios = np.array(require_length(given, assumed.size, key, "measurement")) / assumed
     if np.ptp(ratios) > 1e-9 * ratios[0]:
         text = ", ".join(f"{ratio:.4g}" for ratio in ratios)
@@ -293,10 +324,11 @@ def vibration_rms_nm(
     return convert_mas_to_nm(settings, section.rms_mas, f"{key}.rms_mas")
 
 
-def _require_below_nyquist(frequency_hz: float, frame_rate_hz: float, key: str) -> None:
-    if not frequency_hz < frame_rate_hz / 2:
+def _require_below_nyquist(frequency_hz: Any, frame_rate_hz: float, key: str) -> None:
+    highest_hz = np.max(frequency_hz)
+    if not highest_hz < frame_rate_hz / 2:
         raise ConfigError(
             f"{key}: must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "
-            f"got {frequency_hz:.6g}.",
+            f"got {highest_hz:.6g}.",
             path=key,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
@@ -28,6 +28,17 @@ class Section(BaseModel):
     """What all sections share: strict types, no unknown keys, read-only."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+    @property
+    def per_sample(self) -> Self:
+        """The same section, read by a builder that takes its numbers for each of many samples.
+
+        Builders declare thus which numbers may be arrays; see ``config.samples``.
+        """
+        return self
+
+    def require_one_value(self) -> None:
+        """Declare that samples evaluated together must have the same numbers in this section."""
 
 
 class TelescopeSection(Section):

@@ -6,6 +6,8 @@ from lbt_synth.config.schema import AtmosphereSection, FileSection, TelescopeSec
 from lbt_synth.errors import ConfigError
 from lbt_synth.models import Atmosphere, nm_per_mas
 
+WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # keys of FrozenFlows
+
 
 def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
     """Return the section ``telescope``; raise ConfigError with the reason if it is missing."""
@@ -36,4 +38,6 @@ def build_atmosphere(settings: FileSection) -> Atmosphere | None:
     telescope = require_telescope(
         settings, "the turbulence of atmosphere is that over its diameter"
     )
-    return Atmosphere(diameter_m=telescope.diameter_m, **air.model_dump())
+    weather = {name: getattr(air.per_sample, name) for name in WEATHER}
+    rest = air.model_dump(exclude=set(WEATHER))
+    return Atmosphere(diameter_m=telescope.diameter_m, **rest, **weather)

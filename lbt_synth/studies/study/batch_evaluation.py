@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from lbt_synth.config.ensemble import (
+    EXPECTED_ERRORS,
+    Samples,
+    accepted_samples,
+    build_ensemble,
+    read_config,
+)
+from lbt_synth.config.samples import Reads
 from lbt_synth.errors import CertificateError
 from lbt_synth.loop import EnsembleResiduals
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.studies.study import reference_evaluation as reference
-from lbt_synth.studies.study.batch_result import BatchResult, Failure
-from lbt_synth.studies.study.config_keys import Keys
-from lbt_synth.studies.study.sample import make_sample
-from lbt_synth.studies.study.sample_arrays import (
-    ASSUMED_DELAY,
-    changes_assumptions_only,
-    changes_numbers_only,
-    make_sample_arrays,
-)
+from lbt_synth.studies.study.batch_result import BatchResult
+from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.sample_designs import (
-    changes_design_numbers_only,
     design_for_samples,
     has_independent_axes,
     is_kalman_for_sample,
 )
-from lbt_synth.studies.study.study import Study, StudyController
+from lbt_synth.studies.study.study import (
+    DELAY_ERROR,
+    EXACT_COLUMNS,
+    NOISE_FACTOR,
+    Study,
+    StudyController,
+)
 from lbt_synth.validation import FloatArray, IntArray
 
 _AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
@@ -36,8 +42,8 @@ _FEWEST = 4  # samples in a group that is worth an ensemble
 def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResult:
     """Evaluate consecutive samples.
 
-    Samples whose configurations differ by numbers only are evaluated together by
-    :func:`ensemble_residuals`; Kalman filters for samples are designed together by
+    Samples whose configurations differ by numbers that its builders take as arrays are evaluated
+    together by :func:`ensemble_residuals`; Kalman filters for samples are designed together by
     :func:`modal_filters`. Other designs, simulations, and samples that the configuration refuses
     are evaluated one by one. So is one sample of each group that is evaluated together, and the
     two answers must agree.
@@ -70,104 +76,102 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     >>> batch.columns["kalman.strehl"].round(3).tolist(), batch.columns["kalman.stable"].tolist()
     ([0.837, 0.821], [1.0, 1.0])
     """
-    columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
-    failures: list[Failure] = []
+    together: dict[str, FloatArray] = {}  # results of ensembles, by column
     left: dict[int, list[StudyController]] = {}  # what to evaluate one by one, by sample
     for controller in study.controllers:
-        done = np.zeros(len(values), dtype=np.bool_)
-        for rows, found, strehl in _evaluate_groups(study, controller, values):
-            done[rows] = True
-            together = {
-                "strehl": strehl,
-                "residual_nm": found.rms_nm,
-                "turbulence_nm": found.turbulence_nm,
-                "vibration_nm": found.vibration_nm,
-                "noise_nm": found.noise_nm,
-                "stable": found.stable.astype(np.float64),
-            }
-            for name, numbers in together.items():
-                columns[f"{controller.name}.{name}"][rows] = numbers
-            alone = replace(study, controllers=(controller,))
-            _require_agreement(alone, values, start, int(rows[rows.size // 2]), columns)
-        for i in np.flatnonzero(~done).tolist():
+        found = {name: np.full(len(values), np.nan) for name in EXACT_COLUMNS}
+        for rows, residuals, strehl in _evaluate_groups(study, controller, values):
+            found["strehl"][rows] = strehl
+            found["residual_nm"][rows] = residuals.rms_nm
+            for name in ("turbulence_nm", "vibration_nm", "noise_nm", "stable"):
+                found[name][rows] = getattr(residuals, name)
+            i = int(rows[rows.size // 2])
+            numbers = {name: float(column[i]) for name, column in found.items()}
+            _require_agreement(study, controller, values[i], start + i, numbers)
+        for i in np.flatnonzero(np.isnan(found["stable"])).tolist():
             left.setdefault(i, []).append(controller)
-    for i, controllers in sorted(left.items()):
-        some = replace(study, controllers=tuple(controllers))
-        with np.errstate(all="ignore"):  # what overflows fails its checks
-            row, failed = reference.evaluate_row(some, values[i], start + i)
-        failures += failed
-        for name, value in row.items():
-            columns[name][i] = value
-    return BatchResult(start=start, columns=columns, failures=tuple(failures))
+        together |= {f"{controller.name}.{name}": column for name, column in found.items()}
+    batch = reference.evaluate_rows(study, values, start, left=left)
+    for name, column in batch.columns.items():
+        np.copyto(column, together[name], where=~np.isnan(together[name]))
+    return batch
 
 
 def _evaluate_groups(
     study: Study, controller: StudyController, values: FloatArray
 ) -> Iterator[tuple[IntArray, EnsembleResiduals, FloatArray]]:
     """Yield what could be evaluated together: rows, residuals, Strehl ratios."""
-    for_sample = is_kalman_for_sample(controller)
-    if study.settings.evaluation != "exact" or (controller.design is None and not for_sample):
+    design, for_sample = controller.design, is_kalman_for_sample(controller)
+    if study.settings.evaluation != "exact" or (design is None and not for_sample):
         return
-    design = controller.design
     matrices = None if design is None else textbook_matrices([design.controller])
-
-    def together(keys: Keys) -> bool:
-        """Whether samples that differ at a place fit in one ensemble."""
-        if not (changes_numbers_only(study, keys) or changes_assumptions_only(study, keys)):
-            return False
-        return not for_sample or (
-            keys != ASSUMED_DELAY and changes_design_numbers_only(study, keys)
-        )
-
-    for group in _find_groups(study, values, together):
+    reads = read_config(study.config, designs=for_sample)
+    for rows in _find_groups(study, values, reads):
         try:
-            sample = make_sample(study, values[group[0]])
-            if matrices is None and not has_independent_axes(sample.config):
+            sample = make_sample(study, values[rows[0]])
+            if for_sample and not has_independent_axes(sample.config):
                 continue
-            arrays = make_sample_arrays(study, sample, values[group])
-            valid = arrays.valid()
-            arrays, group = arrays.take(np.flatnonzero(valid)), group[valid]
-            if not group.size:
+            samples = _stack_samples(study, sample, values[rows], reads)
+            accepted = accepted_samples(samples)
+            if not accepted.size:
                 continue
+            samples = samples.take(accepted)
             with np.errstate(over="raise", divide="raise", invalid="raise"):
-                own = design_for_samples(arrays) if matrices is None else matrices
-                found = residuals_from_matrices(own, sample.hardware, arrays.ensemble())
+                own = design_for_samples(samples) if matrices is None else matrices
+                found = residuals_from_matrices(own, sample.hardware, build_ensemble(samples))
             strehl = found.strehl(sample.config.imaging)
-        except reference.EXPECTED_ERRORS:
+        except EXPECTED_ERRORS:
             continue  # one of them fails; evaluating them one by one finds which
-        yield group, found, strehl
+        yield rows[accepted], found, strehl
 
 
-def _require_agreement(
-    study: Study, values: FloatArray, start: int, i: int, columns: Mapping[str, FloatArray]
-) -> None:
-    """Refuse a batch in which a sample differs from its evaluation by itself."""
-    alone, failed = reference.evaluate_row(study, values[i], start + i)
-    if failed:
-        raise CertificateError(
-            f"row {start + i} has a result among others, and fails by itself: {failed[0].error} "
-            "This is a fault of the program; please report it with the study file."
-        )
-    for name, expected in alone.items():
-        found = float(columns[name][i])
-        apart = abs(found - expected)
-        if not apart <= _AGREEMENT * max(abs(expected), 1.0):
-            raise CertificateError(
-                f"row {start + i} has {name} {found:.9g} among others, and {expected:.9g} by "
-                "itself: one of the two is wrong. This is a fault of the program; please report "
-                "it with the study file."
-            )
-
-
-def _find_groups(
-    study: Study, values: FloatArray, together: Callable[[Keys], bool]
-) -> Iterator[IntArray]:
-    """Yield the indices of samples that can be evaluated together."""
+def _find_groups(study: Study, values: FloatArray, reads: Reads) -> Iterator[IntArray]:
+    """Yield the indices of samples that differ by numbers that builders take as arrays only."""
     apart = [
         i
         for i, parameter in enumerate(study.parameters)
-        if not all(together(keys) for keys in parameter.places)
+        if not all(map(reads.take_arrays_at, parameter.places))
     ]
     _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
     for group in np.flatnonzero(counts >= min(_FEWEST, len(values))):
         yield np.flatnonzero(which.reshape(-1) == group)
+
+
+def _stack_samples(study: Study, sample: Sample, values: FloatArray, reads: Reads) -> Samples:
+    """Return the samples of a group of rows of ``Study.values``; one of them is given."""
+    by_name = dict(zip(study.parameter_names, values.T, strict=True))
+    return Samples(
+        config=sample.config,
+        values={
+            keys: by_name[parameter.name]
+            for parameter in study.parameters
+            for keys in parameter.places
+            if reads.take_arrays_at(keys)
+        },
+        delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
+        noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
+    )
+
+
+def _require_agreement(
+    study: Study,
+    controller: StudyController,
+    values: FloatArray,
+    row: int,
+    found: Mapping[str, float],
+) -> None:
+    """Refuse a batch in which a sample differs from its evaluation by itself."""
+    alone = replace(study, controllers=(controller,))
+    single, failed = reference.evaluate_row(alone, values, row)
+    fault = "This is a fault of the program; please report it with the study file."
+    if failed:
+        raise CertificateError(
+            f"row {row} has a result among others, and fails by itself: {failed[0].error} {fault}"
+        )
+    for name, expected in single.items():
+        among = found[name.removeprefix(f"{controller.name}.")]
+        if not abs(among - expected) <= _AGREEMENT * max(abs(expected), 1.0):
+            raise CertificateError(
+                f"row {row} has {name} {among:.9g} among others, and {expected:.9g} by itself: one "
+                f"of the two is wrong. {fault}"
+            )

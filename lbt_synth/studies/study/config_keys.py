@@ -7,9 +7,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lbt_synth.config.samples import Keys
 from lbt_synth.errors import ConfigError
 
-Keys = tuple[str | int, ...]
 _PART = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
 
 

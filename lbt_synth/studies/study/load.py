@@ -14,10 +14,11 @@ import numpy as np
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.design_methods import DesignRequest, design_by_method
 from lbt_synth.config.load import read_mapping, validate_sections
+from lbt_synth.config.samples import Keys
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError
 from lbt_synth.files.gain_file.store import load_with_digest
-from lbt_synth.studies.study.config_keys import Keys, is_integer, parse_path, require_number
+from lbt_synth.studies.study.config_keys import is_integer, parse_path, require_number
 from lbt_synth.studies.study.distributions import Distribution, Fixed, Listed, Normal, Uniform
 from lbt_synth.studies.study.reference_evaluation import close_sample_loop
 from lbt_synth.studies.study.sample import Sample, make_sample

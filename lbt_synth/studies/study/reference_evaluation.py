@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lbt_synth.config.design_methods import design_by_method
+from lbt_synth.config.ensemble import EXPECTED_ERRORS
 from lbt_synth.design import Design
-from lbt_synth.errors import LbtSynthError
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, simulate, strehl
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
@@ -17,12 +18,17 @@ from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.study import Study, StudyController
 from lbt_synth.validation import FloatArray
 
-# errors that fail a sample and not the study; LinAlgError is a ValueError
-EXPECTED_ERRORS = (LbtSynthError, ArithmeticError, ValueError)
 
+def evaluate_rows(
+    study: Study,
+    values: FloatArray,
+    start: int,
+    *,
+    left: Mapping[int, Sequence[StudyController]] | None = None,
+) -> BatchResult:
+    """Evaluate consecutive rows of ``Study.values``, (b, parameters), one by one.
 
-def evaluate_rows(study: Study, values: FloatArray, start: int) -> BatchResult:
-    """Evaluate consecutive rows of ``Study.values`` one by one, (b, parameters).
+    ``left`` names the controllers to evaluate on each row, by its place; all of them by default.
 
     Examples
     --------
@@ -33,10 +39,14 @@ def evaluate_rows(study: Study, values: FloatArray, start: int) -> BatchResult:
     >>> batch.columns["kalman.strehl"].round(3).tolist(), batch.columns["kalman.stable"].tolist()
     ([0.837, 0.821], [1.0, 1.0])
     """
+    if left is None:
+        left = dict.fromkeys(range(len(values)), study.controllers)
     columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
     failures: list[Failure] = []
-    for i, row_values in enumerate(values):
-        row, failed = evaluate_row(study, row_values, start + i)
+    for i, controllers in sorted(left.items()):
+        some = replace(study, controllers=tuple(controllers))
+        with np.errstate(all="ignore"):  # what overflows fails its checks
+            row, failed = evaluate_row(some, values[i], start + i)
         failures += failed
         for name, value in row.items():
             columns[name][i] = value

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.config import save_config
+from lbt_synth.config.ensemble import EXPECTED_ERRORS
 from lbt_synth.config.load import validate_sections
-from lbt_synth.config.schema import FileSection
+from lbt_synth.config.plant_and_truth import turbulence_sections
+from lbt_synth.config.schema import Ar2Section, FileSection
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.storage.atomic_files import refuse_replacing
@@ -19,12 +21,10 @@ from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.config_keys import nested_copy
 from lbt_synth.studies.study.output_files import read_row
 from lbt_synth.studies.study.reference_evaluation import (
-    EXPECTED_ERRORS,
     design_for_sample,
     evaluate_row,
 )
 from lbt_synth.studies.study.sample import Sample, make_sample
-from lbt_synth.studies.study.sample_arrays import turbulence_kinds
 from lbt_synth.studies.study.store import (
     list_parts,
     read_manifest,
@@ -172,7 +172,8 @@ def _set_noise(content: dict[str, Any], sample: Sample, comments: dict[str, str]
     content["sensor"]["noise_nm"] = np.asarray(sample.truth.noise_nm).tolist()
     assumed_nm = ", ".join(f"{value:.12g}" for value in np.ravel(config.noise_nm))
     comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
-    if "ar2" in turbulence_kinds(config):  # fitted above the noise that designs assume
+    if any(isinstance(section, Ar2Section) for section in turbulence_sections(config.settings)):
+        # fitted above the noise that designs assume
         sections = [
             {
                 "kind": "ar",

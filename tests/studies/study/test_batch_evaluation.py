@@ -7,10 +7,13 @@ import pytest
 from support.studies import BASE, LBT_TEXT, study_file
 
 import lbt_synth as lbt
+from lbt_synth.config.plant_and_truth import measurement_noise_nm
+from lbt_synth.config.schema import FileSection, Positive, SensorSection
 from lbt_synth.studies.study import batch_evaluation
 from lbt_synth.studies.study import reference_evaluation as reference
 
 COUNT = 8
+GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
 
 
 LBT = LBT_TEXT.replace("kind: ar1", "kind: {kind}")
@@ -245,6 +248,54 @@ def test_a_filter_that_cannot_be_designed(tmp_path):
     found = lbt.studies.evaluate_samples(study, values, 0)
     assert {f.row for f in found.failures} == {3}
     assert np.isfinite(found.columns["own.strehl"]).sum() == COUNT - 1
+
+
+class NewSensor(SensorSection):
+    """A sensor with a key that this package does not know."""
+
+    excess: Positive = 1.0
+
+
+class NewFile(FileSection):
+    """A configuration with that sensor."""
+
+    sensor: NewSensor
+
+
+@pytest.mark.parametrize(
+    ("excess", "singles"),
+    [
+        (lambda sensor: sensor.excess, 2),  # one value at once: a group for each of two
+        (lambda sensor: sensor.per_sample.excess, 1),  # an array: one group
+        (lambda sensor: 1.0, 2),  # which no builder reads
+    ],
+)
+@pytest.mark.parametrize("controllers", ["{kalman: {design: kalman}}", OWN])
+def test_a_new_key_takes_the_way_that_its_builder_declares(
+    tmp_path, monkeypatch, excess, singles, controllers
+):
+    """No line of a study knows the key: how its builder reads it is all that says."""
+
+    def noise(settings):
+        return measurement_noise_nm(settings) * excess(settings.sensor)
+
+    for module in ("config.load", "studies.study.sample"):
+        monkeypatch.setattr(f"lbt_synth.{module}.FileSection", NewFile)
+    for module in ("config.load", "config.ensemble"):
+        monkeypatch.setattr(f"lbt_synth.{module}.measurement_noise_nm", noise)
+    study, found = agree(
+        tmp_path,
+        base=LBT_TEXT.replace("sensor:\n", "sensor:\n  excess: 1.0\n"),
+        controllers=controllers,
+        parameters=f"{{sensor.excess: {{list: [1.5, 3.0]}}, {GAIN}}}",
+    )
+    name = f"{study.controllers[0].name}.noise_nm"
+    groups = [found.columns[name][study.values(0, COUNT)[:, 0] == value] for value in (1.5, 3.0)]
+    if excess(NewSensor(noise_nm=1.0, excess=2.0)) > 1:  # it is read
+        assert np.mean(groups[0]) < 0.7 * np.mean(groups[1])
+    rows = counted(monkeypatch)
+    lbt.studies.evaluate_samples(study, study.values(0, COUNT), 0)
+    assert len(rows) == singles
 
 
 def test_simulations_are_done_one_by_one(tmp_path):
