@@ -1,4 +1,4 @@
-"""Checks of a gain or telemetry file that is read: its bytes, layout version and digest."""
+"""Checks of a gain or telemetry file that is read: its layout version and digest."""
 
 from __future__ import annotations
 
@@ -25,16 +25,6 @@ class FileKind:
     error: type[FileError]
     version_error: type[FileError]
     advice: str = ""  # what to do about a damaged file
-
-    def read_bytes(self, source: Path) -> bytes:
-        """Return the content of a file."""
-        try:
-            return source.read_bytes()
-        except OSError as error:
-            why = error.strerror or error
-            raise self.error(f"cannot read {source}: {why}.", path=source) from error
-        except ValueError as error:
-            raise self.error(f"cannot read {str(source)!r}: {error}.", path=source) from error
 
     def decode(
         self,

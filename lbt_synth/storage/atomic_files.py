@@ -1,4 +1,4 @@
-"""Write files whole or not at all, and never over an input."""
+"""Read whole files, write them whole or not at all, and never over an input."""
 
 from __future__ import annotations
 
@@ -10,6 +10,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lbt_synth.errors import FileError, OutputError
+
+
+def read_bytes(path: str | os.PathLike[str], error: type[FileError]) -> bytes:
+    """Return the content of a file; where it cannot be read, raise an error of a kind."""
+    try:
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as why:  # ValueError: a null character in the name
+        shown = path if isinstance(why, OSError) else repr(str(path))
+        raise error(f"cannot read {shown}: {_reason(why)}.", path=Path(path)) from why
 
 
 def require_ending(
@@ -50,7 +59,7 @@ def require_writable(
         except (OSError, ValueError) as error:
             raise OutputError(
                 f"cannot write {target}: the directory {target.parent} takes no new files "
-                f"({getattr(error, 'strerror', None) or error}).",
+                f"({_reason(error)}).",
                 path=target,
             ) from error
 
@@ -197,7 +206,11 @@ def open_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def _output_error(target: Path, error: Exception) -> OutputError:
-    reason = getattr(error, "strerror", None) or error
     return OutputError(
-        f"cannot write {target}: {reason}. Check the directory and its free space.", path=target
+        f"cannot write {target}: {_reason(error)}. Check the directory and its free space.",
+        path=target,
     )
+
+
+def _reason(error: Exception) -> object:
+    return getattr(error, "strerror", None) or error

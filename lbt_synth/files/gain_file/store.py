@@ -15,7 +15,7 @@ from lbt_synth.files.gain_file.contents import SCHEMA, SCHEMA_VERSION, pack_desi
 from lbt_synth.files.gain_file.fits_layout import write_fits
 from lbt_synth.files.gain_file.json_format import read_json, write_json
 from lbt_synth.storage.array_file import digest, npz_bytes, read_fits, read_npz
-from lbt_synth.storage.atomic_files import require_ending, write_atomically
+from lbt_synth.storage.atomic_files import read_bytes, require_ending, write_atomically
 from lbt_synth.validation import frozen_copy
 
 _READERS = {".fits": read_fits, ".npz": read_npz, ".json": read_json}
@@ -115,7 +115,7 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
 def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
     """Read a gain file as :func:`load_gain` does, and return its digest beside the design."""
     source = require_ending(path, "a gain file", _READERS, GainFileError)
-    content = _KIND.read_bytes(source)
+    content = read_bytes(source, GainFileError)
     arrays, meta = _KIND.decode(content, _READERS[source.suffix.lower()], source)
     for name, array in arrays.items():
         if not np.all(np.isfinite(array)):

@@ -20,7 +20,7 @@ from lbt_synth.files.telemetry.native_layout import (
 )
 from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz
-from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.atomic_files import read_bytes, write_atomically
 from lbt_synth.validation import choice
 
 FORMATS = ("fits", "npz", "aot")
@@ -152,7 +152,7 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     source = Path(path)
     if source.suffix.lower() not in (".fits", ".npz"):
         raise TelemetryError(f"telemetry must end in {_ENDINGS}; got {source.name!r}.", path=source)
-    content = _KIND.read_bytes(source)
+    content = read_bytes(source, TelemetryError)
     is_fits = source.suffix.lower() == ".fits"
     if is_fits and aot.is_aot(content):
         return _KIND.rebuild(lambda: aot.from_bytes(content, source), source)

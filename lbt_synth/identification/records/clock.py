@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,8 +48,7 @@ def build_clock(
         frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
     if times is not None and rows > 1:
         if frame_numbers is None:
-            frame, said = frames_from_times(times, rate)
-            notes += [said] if said else []
+            frame, notes = frames_from_times(times, rate)
         found = fit_rate(times, frame)
         if rate is None:
             rate = found
@@ -69,22 +67,6 @@ def build_clock(
     frames = int(frame[-1]) + 1
     require_few_holes(frames, rows)
     return Clock(frame_rate_hz=rate, frame_of_row=frame, frames=frames, notes=tuple(notes))
-
-
-def first_per_frame(
-    clock: Clock, same: Callable[[IntArray], bool]
-) -> tuple[IntArray, IntArray, int]:
-    """Return the first row of each frame, frames with rows that differ, and rows left out."""
-    frame = clock.frame_of_row
-    first = np.concatenate([[True], np.diff(frame) > 0])
-    keep = np.flatnonzero(first)
-    stops = np.append(keep[1:], len(frame))
-    torn = [
-        int(frame[start])
-        for start, stop in zip(keep, stops, strict=True)
-        if stop - start > 1 and not same(np.arange(start, stop))
-    ]
-    return keep, np.array(torn, dtype=np.int64), int(np.sum(~first))
 
 
 def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:

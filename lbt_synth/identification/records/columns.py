@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from lbt_synth.errors import TelemetryError
-from lbt_synth.identification.records.units import FREQUENCIES, TIMES, density_unit, unit_name
+from lbt_synth.identification.records.units import is_unit, same_unit
 from lbt_synth.validation import FloatArray
 
 # Names by which columns and numbers are recognised, separated by blanks.
@@ -39,12 +39,10 @@ FACTS = {
     "averages": "averages navg n_averages",
     "unit": "unit units bunit",
 }
-_BASES = {name: role for role, names in ROLES.items() for name in names.split()}
-_OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
-_CLOCK_ROWS = 8  # rows of noise all rise with a chance of 1 in 40 000
+OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
 _AXES = {"0": 0, "1": 1, "2": 2, "tip": 0, "tilt": 1, "x": 0, "y": 1}
-_WITH_AXIS = re.compile(r"^(?P<base>.*?)_?(?P<axis>0|1|2|tip|tilt|x|y)$")
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*(?:\([^)]*\))?[^\])]*)[\])]\s*$")
+_CLOCK_ROWS = 8  # rows of noise all rise with a chance of 1 in 40 000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,47 +56,35 @@ class Column:
     unit: str | None = None
 
 
-def parse_column(
-    name: str, values: FloatArray, *, unit: str | None = None, axis: int | None = None
-) -> Column:
+def _list_names() -> dict[str, tuple[str, int | None]]:
+    """List each name of a column with its role and axis: y, y_tip, ytip and tip_y."""
+    names: dict[str, tuple[str, int | None]] = {
+        name: (role, None) for role, words in ROLES.items() for name in words.split()
+    }
+    for name, (role, _) in list(names.items()):
+        for word, axis in _AXES.items() if role in OF_AXES else ():
+            for form in (f"{name}_{word}", f"{name}{word}", f"{word}_{name}"):
+                names.setdefault(form, (role, axis))
+    return names | {word: ("measurements", _AXES[word]) for word in ("tip", "tilt", "x")}
+
+
+_COLUMN_NAMES = _list_names()
+_FACT_NAMES = {name: fact for fact, names in FACTS.items() for name in names.split()}
+
+
+def parse_column(name: str, values: FloatArray, *, unit: str | None = None) -> Column:
     """Make a column; its name tells its role, its axis, and its unit (in brackets or after _)."""
     plain, named_unit = _split_unit(name.strip())
     given = (unit or "").strip()
-    if given and named_unit and _unit_key(given) != _unit_key(named_unit):
+    if given and named_unit and not same_unit(given, named_unit):
         raise TelemetryError(f"{name} has the unit {given!r} in the header: which is right?")
-    role, named_axis = _split_axis(re.sub(r"[\s\-.]+", "_", plain.lower()).strip("_"))
-    return Column(
-        name=name,
-        values=values,
-        role=role,
-        axis=named_axis if axis is None else axis,
-        unit=given or named_unit,
-    )
+    role, axis = _COLUMN_NAMES.get(_normalise(plain), (None, None))
+    return Column(name=name, values=values, role=role, axis=axis, unit=given or named_unit)
 
 
-def array_columns(name: str, values: FloatArray, *, unit: str | None = None) -> list[Column]:
-    """Return the columns of an array (frames, n) of one name."""
-    if values.shape[1] == 1:
-        return [parse_column(name, values[:, 0], unit=unit)]
-    base = parse_column(name, values[:, 0], unit=unit)
-    return [
-        replace(base, name=f"{name}[{i}]", values=values[:, i], axis=i)
-        for i in range(values.shape[1])
-    ]
-
-
-def pair_x_and_y(columns: list[Column]) -> list[Column]:
-    """Take columns x and y for two axes, unless x rises as a clock does."""
-    plain = [_split_unit(each.name.strip())[0].lower() for each in columns]
-    if plain.count("x") != 1 or plain.count("y") != 1:
-        return columns
-    x = columns[plain.index("x")].values
-    if rises(x):
-        return columns
-    return [
-        replace(each, role="measurements", axis=_AXES[name]) if name in ("x", "y") else each
-        for name, each in zip(plain, columns, strict=True)
-    ]
+def recognise_fact(key: str) -> str | None:
+    """Return the fact that a header's keyword or a number's name stands for."""
+    return _FACT_NAMES.get(_normalise(key))
 
 
 def rises(values: FloatArray) -> bool:
@@ -106,37 +92,13 @@ def rises(values: FloatArray) -> bool:
     return len(values) >= _CLOCK_ROWS and bool(np.all(np.diff(values) > 0))
 
 
-def _unit_key(unit: str) -> object:
-    return unit_name(unit) or density_unit(unit) or unit.lower()
+def _normalise(name: str) -> str:
+    return re.sub(r"[\s\-.]+", "_", name.strip().lower()).strip("_")
 
 
 def _split_unit(name: str) -> tuple[str, str | None]:
     if match := _BRACKETS.match(name):
         return match["name"], match["unit"].strip() or None
-    lower = name.lower()
-    for at in [i for i, sign in enumerate(lower) if sign == "_"]:
-        tail = lower[at + 1 :]
-        known = unit_name(tail) or density_unit(tail) or tail in TIMES or tail in FREQUENCIES
-        if known and at > 0:
-            return name[:at], name[at + 1 :]
-    return name, None
-
-
-def _split_axis(name: str) -> tuple[str | None, int | None]:
-    if role := _BASES.get(name):
-        return role, None
-    if name in ("tip", "tilt"):
-        return "measurements", _AXES[name]
-    base, axis = "", ""
-    if match := _WITH_AXIS.match(name):
-        base, axis = match["base"], match["axis"]
-    elif name.startswith(("tip_", "tilt_", "x_", "y_")):  # tip_command
-        axis, _, base = name.partition("_")
-    role = _BASES.get(base)
-    return (role, _AXES[axis]) if role in _OF_AXES else (None, None)
-
-
-def recognise_fact(key: str) -> str | None:
-    """Return the fact that a header's keyword or a number's name stands for."""
-    word = re.sub(r"[\s\-.]+", "_", key.strip().lower())
-    return next((fact for fact, names in FACTS.items() if word in names.split()), None)
+    ends = (match.start() for match in re.finditer("_", name) if match.start() > 0)
+    at = next((at for at in ends if is_unit(name[at + 1 :])), None)
+    return (name, None) if at is None else (name[:at], name[at + 1 :])

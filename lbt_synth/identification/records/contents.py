@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from zipfile import is_zipfile
@@ -14,28 +15,18 @@ from zipfile import is_zipfile
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.errors import TelemetryError
-from lbt_synth.identification.records.columns import (
-    Column,
-    array_columns,
-    pair_x_and_y,
-    parse_column,
-    recognise_fact,
-)
+from lbt_synth.errors import FileError, LbtSynthError, ProblemError, TelemetryError
+from lbt_synth.identification.records.columns import Column, parse_column, recognise_fact
 from lbt_synth.identification.records.csv_file import read_csv
 from lbt_synth.storage.array_file import error_reason
-from lbt_synth.validation import FloatArray
+from lbt_synth.storage.atomic_files import read_bytes, require_ending
 
 FITS = (".fits", ".fit", ".fts")
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
+_SUFFIXES = {"frame_rate_hz": "hz", "delay_frames": "frames?", "diameter_m": "m"}  # of numbers
 _DELAY_CARD = "DELAY"
-_SUFFIXES = {  # what may follow a number in a text
-    "frame_rate_hz": r"\s*hz$",
-    "delay_frames": r"\s*frames?$",
-    "diameter_m": r"\s*m$",
-}
-_IN_FRAMES = re.compile(r"[\[(]\s*frames?\s*[\])]|^[^\[(]*\bin frames\b|^\s*frames\s*$", re.I)
+_IN_FRAMES = ("[frame]", "[frames]")  # the unit of a card, where the FITS standard has it
 
 
 @dataclass(slots=True, eq=False)
@@ -48,168 +39,164 @@ class Contents:
     notes: list[str] = field(default_factory=list)
 
     def add_fact(self, fact: str, value: Any, where: str) -> None:
-        """Add a fact that a place of the file gives."""
+        """Add a unit, or a number that may be written as a text; note what is none."""
+        if fact != "unit":
+            suffix = rf"\s*{_SUFFIXES.get(fact, '')}\s*$"
+            text = re.sub(suffix, "", value, flags=re.I) if isinstance(value, str) else value
+            try:
+                value = float(text)
+            except (TypeError, ValueError):
+                self.notes.append(f"{where} was not taken for {fact}: {value!r} is no number")
+                return
         self.facts.setdefault(fact, {})[where] = value
-
-    def add_number(self, fact: str, value: Any, where: str) -> None:
-        """Add a number that may be written as a text, or note that it is none."""
-        if isinstance(value, str) and fact in _SUFFIXES:
-            value = re.sub(_SUFFIXES[fact], "", value.strip(), flags=re.I)
-        try:
-            self.add_fact(fact, float(value), where)
-        except (TypeError, ValueError):
-            self.notes.append(f"{where} was not taken for {fact}: {value!r} is no number")
 
     def add_array(self, name: str, values: npt.NDArray[Any], unit: str | None = None) -> None:
         """Add the columns of an array; leave out what is no series of numbers."""
+        said = name or "an array"
+        table = np.atleast_1d(np.squeeze(values))
         if values.dtype.kind not in "fiub" or values.size == 0:
-            self.notes.append(f"{name or 'an array'} holds no real numbers and was left out")
-            return
-        table = np.squeeze(values) if values.size > 1 else values.reshape(1)
-        if table.ndim not in (1, 2):
-            self.notes.append(f"{name or 'an array'} has {table.ndim} dimensions; it was left out")
-            return
-        numbers: FloatArray = np.asarray(table, dtype=np.float64)
-        if numbers.ndim == 1:
-            numbers = numbers[:, None]
-        elif numbers.shape[1] > numbers.shape[0]:
-            numbers = numbers.T
-            said = f"{name or 'the array'} {values.shape}: its longer side was taken for the frames"
-            self.notes.append(said)
-        self.columns += array_columns(name, numbers, unit=unit)
+            self.notes.append(f"{said} holds no real numbers and was left out")
+        elif table.ndim > 2:
+            self.notes.append(f"{said} has {table.ndim} dimensions; it was left out")
+        elif table.ndim == 1:
+            self.columns.append(parse_column(name, table.astype(np.float64), unit=unit))
+        else:
+            if table.shape[1] > table.shape[0]:
+                table = table.T
+                said = f"{said} {values.shape}"
+                self.notes.append(f"{said}: its longer side was taken for the frames")
+            base = parse_column(name, np.empty(0), unit=unit)
+            for axis, column in enumerate(table.T.astype(np.float64)):
+                self.columns.append(replace(base, name=f"{name}[{axis}]", values=column, axis=axis))
 
 
-def read_contents(path: Path, content: bytes) -> Contents:
-    """Read a file of a known ending."""
-    ending = path.suffix.lower()
-    reader = {**dict.fromkeys(FITS, _read_fits), ".npy": _read_npy, ".npz": _read_npz}.get(
-        ending, _read_text
-    )
+@contextmanager
+def name_in_errors(path: Path) -> Iterator[None]:
+    """Name a file in the errors that do not name it yet."""
     try:
-        out = reader(content)
-        out.columns = pair_x_and_y(out.columns)
-    except TelemetryError as error:
-        raise TelemetryError(f"{path}: {error}", path=path) from error
-    except Exception as error:  # foreign bytes: the decoders raise whatever they like
-        raise TelemetryError(
-            f"cannot read {path} as {ending}: {error_reason(error)}.", path=path
-        ) from error
+        yield
+    except FileError as error:
+        if error.path is not None:
+            raise
+        raise type(error)(f"{path}: {error}", path=path) from error
+    except ProblemError as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
+def read_record_bytes(path: Path) -> bytes:
+    """Return the content of a file of series."""
+    return read_bytes(require_ending(path, "a record", ENDINGS, TelemetryError), TelemetryError)
+
+
+def read_contents(path: Path) -> Contents:
+    """Return what a file holds."""
+    return parse_contents(path, read_record_bytes(path))
+
+
+def parse_contents(path: Path, content: bytes) -> Contents:
+    """Return what the content of a file holds."""
+    ending, out = path.suffix.lower(), Contents()
+    read = {**dict.fromkeys(FITS, _read_fits), ".npy": _read_npy, ".npz": _read_npz}
+    with name_in_errors(path):
+        try:
+            read.get(ending, _read_text)(out, content)
+        except LbtSynthError:
+            raise
+        except Exception as error:  # foreign bytes: the decoders raise whatever they like
+            raise TelemetryError(
+                f"cannot read {path} as {ending}: {error_reason(error)}.", path=path
+            ) from error
     return out
 
 
-def _read_fits(content: bytes) -> Contents:
+def _read_fits(out: Contents, content: bytes) -> None:
     from astropy.io import fits
 
-    out = Contents()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # foreign headers deviate in many small ways
         for damage in (".*truncated.*", ".*Error validating header.*"):
             warnings.filterwarnings("error", message=damage)
-        with fits.open(io.BytesIO(content), memmap=False) as units:
+        # without uint, gaps of shifted integers become NaN as well
+        with fits.open(io.BytesIO(content), memmap=False, uint=False) as units:
             for place, unit in enumerate(units):
                 name = unit.name if unit.name and unit.name != "PRIMARY" else ""
-                where = name or f"HDU {place}"
                 for card in unit.header.cards:
-                    _add_card(out, card, where)
+                    _add_card(out, card, name or f"HDU {place}")
                 if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
                     _add_table(out, unit)
                 elif unit.is_image and unit.data is not None:
-                    own, blank = unit.header.get("BUNIT"), unit.header.get("BLANK")
-                    zero = float(unit.header.get("BZERO", 0.0))  # reading the data drops it
-                    data = _native_order(unit.data)
-                    if blank is not None and data.dtype.kind in "iu":
-                        data = np.where(data == blank + zero, np.nan, data)
-                    out.add_array(name, data, str(own) if own is not None else None)
-    return out
+                    own = unit.header.get("BUNIT")
+                    out.add_array(name, unit.data, None if own is None else str(own))
 
 
 def _add_card(out: Contents, card: Any, where: str) -> None:
-    keyword = str(card.keyword)
-    fact = recognise_fact(keyword)
-    if keyword == _DELAY_CARD and _IN_FRAMES.search(str(card.comment)):
-        fact = "delay_frames"
-    elif keyword == _DELAY_CARD:
-        out.notes.append("DELAY of the header was not taken: it does not say that it is in frames")
-    if fact is not None and fact != "unit" and not isinstance(card.value, bool):
-        out.add_number(fact, card.value, f"{keyword} of {where}")
+    fact = recognise_fact(str(card.keyword))
+    if card.keyword == _DELAY_CARD:
+        if card.comment.lower().startswith(_IN_FRAMES):
+            fact = "delay_frames"
+        else:
+            out.notes.append(
+                f"{_DELAY_CARD} of the header was not taken: its comment does not say that it is "
+                "in frames, as [frames] does"
+            )
+    if fact not in (None, "unit") and not isinstance(card.value, bool):
+        out.add_fact(fact, card.value, f"{card.keyword} of {where}")
 
 
 def _add_table(out: Contents, unit: Any) -> None:
+    stored = unit.data.view(np.ndarray)  # before scaling, as the null of a column is
     for card in unit.columns:
-        data = _native_order(np.asarray(unit.data[card.name]))
-        if card.null is not None and data.dtype.kind in "iuf":
-            scale, zero = (
-                default if each in (None, "") else float(each)
-                for each, default in ((card.bscale, 1.0), (card.bzero, 0.0))
-            )
-            null = scale * float(card.null) + zero  # the card has it before scaling
-            data = np.where(np.abs(data - null) < 0.25 * abs(scale), np.nan, data)
+        data, raw = np.asarray(unit.data[card.name]), stored[card.name]
+        if raw.dtype.kind == "S":
+            raw = np.char.strip(raw.astype(str))
+        if card.null not in (None, "") and raw.shape == data.shape:
+            data = np.where(raw == card.null, np.nan, data)
         out.add_array(card.name, data, card.unit)
 
 
-def _native_order(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    return data.astype(data.dtype.newbyteorder("="))
-
-
-def _read_npy(content: bytes) -> Contents:
-    out = Contents()
+def _read_npy(out: Contents, content: bytes) -> None:
     if not content.startswith(b"\x93NUMPY"):
         raise ValueError("it does not begin as an NPY file does; it is damaged, or another kind")
     _add_named(out, "", np.asarray(np.load(io.BytesIO(content), allow_pickle=False)))
-    return out
 
 
-def _read_npz(content: bytes) -> Contents:
-    out = Contents()
+def _read_npz(out: Contents, content: bytes) -> None:
     if not is_zipfile(io.BytesIO(content)):
         raise ValueError("it is no ZIP archive; it is damaged, or of another kind")
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         for name in archive.files:
             _add_named(out, name, np.asarray(archive[name]))
-    return out
 
 
 def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
     """Add an array, each field of a structured one, or a number or text as a fact."""
+    fact = recognise_fact(name)
     if array.dtype.names:
         for each in array.dtype.names:
             out.add_array(each, array[each])
-        return
-    fact, text = recognise_fact(name), array.dtype.kind in "US"
-    if array.size == 1 and (array.ndim == 0 or text or fact is not None):
-        value = array.reshape(-1)[0]
-        if fact == "unit":
-            out.add_fact(fact, str(value), name)
-        elif fact is not None:
-            out.add_number(fact, value, name)
-        else:
+    elif array.size == 1 and (array.ndim == 0 or array.dtype.kind in "US" or fact is not None):
+        if fact is None:
             out.notes.append(f"not used: {name}, a single value")
-        return
-    out.add_array(name, array)
+        else:
+            out.add_fact(fact, array.item(), name)
+    else:
+        out.add_array(name, array)
 
 
-def _read_text(content: bytes) -> Contents:
+def _read_text(out: Contents, content: bytes) -> None:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise TelemetryError("it is no text in UTF-8.") from error
     table = read_csv(text)
-    out = Contents(notes=list(table.notes))
+    out.notes += table.notes
     out.columns = [parse_column(n, v) for n, v in zip(table.names, table.values.T, strict=True)]
-    _add_comments(out, table.comments)
-    return out
-
-
-def _add_comments(out: Contents, comments: Iterable[str]) -> None:
-    """Read lines such as ``# frame_rate_hz = 1000``."""
-    for line in comments:
+    for line in table.comments:  # such as frame_rate_hz = 1000
         match = re.match(r"^\s*([A-Za-z][\w .\-]*?)\s*[:=]\s*(\S.*?)\s*$", line)
         if match is None or (fact := recognise_fact(match[1])) is None:
             continue
         where = f"the comment {match[1].strip()}"
         if fact == "unit" and " " in match[2]:
             out.notes.append(f"{where} was not taken for a unit: {match[2]!r}")
-        elif fact == "unit":
-            out.add_fact(fact, match[2], where)
         else:
-            out.add_number(fact, match[2], where)
+            out.add_fact(fact, match[2], where)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from lbt_synth.errors import TelemetryError
 from lbt_synth.validation import FloatArray
 
 _GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
-_DELIMITERS = (";", "\t", ",", "|")
+_DELIMITERS = (";", "\t", ",", "|")  # else blanks
 _LOOKED_AT = 20  # rows, to find decimal commas
 
 
@@ -36,91 +35,68 @@ def read_csv(text: str) -> TextTable:
     >>> table.names, table.values.tolist(), table.comments
     (['time_s', 'y_nm'], [[0.0, 3.5], [0.001, nan]], ['mode: closed'])
     """
-    comments, lines, numbers = list[str](), list[str](), list[int]()
-    last_comment = ""
+    comments, notes = list[str](), list[str]()
+    rows: list[tuple[int, str]] = []  # number of each line, from 1, and its text
+    above = ""  # the last comment before the table
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip("\r\n ")
-        if not line:
-            continue
         if line.lstrip().startswith("#"):
             comments.append(line.lstrip().lstrip("#").strip())
-            last_comment = comments[-1] if not lines else last_comment
-            continue
-        lines.append(line)
-        numbers.append(number)
-    if not lines:
+            above = above if rows else comments[-1]
+        elif line:
+            rows.append((number, line))
+    if not rows:
         raise TelemetryError("it has no rows.")
-    sign = _find_delimiter(lines[0])
-    notes: list[str] = []
-    decimal = (
-        sign in {";", "\t"}
-        and "," in "".join(lines[1:_LOOKED_AT])
-        and all("." not in line for line in lines[1:_LOOKED_AT])
-    )
-    if decimal:
+    sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
+    names = _split_cells(rows[0][1], sign)
+    sample = "".join(line for _, line in rows[1:_LOOKED_AT])
+    if sign in (";", "\t") and "," in sample and "." not in sample:
         notes.append("commas were taken for decimal points")
-        lines = [lines[0], *(line.replace(",", ".") for line in lines[1:])]
-    first = _split_cells(lines[0], sign)
-    heading = any(
-        _parse_number(cell.replace(",", ".") if decimal else cell) is None for cell in first
-    )
-    names = [cell.strip().strip('"') for cell in first] if heading else [""] * len(first)
-    if heading:
-        lines, numbers = lines[1:], numbers[1:]
-    elif decimal:
-        lines[0] = lines[0].replace(",", ".")
-    if not heading and last_comment:
-        above = [cell.strip() for cell in _split_cells(last_comment, sign)]
-        if len(above) == len(first) and all(cell and _parse_number(cell) is None for cell in above):
-            names = above
-    if not lines:
+        rows = [(number, line.replace(",", ".")) for number, line in rows]
+    if None in map(_parse_number, _split_cells(rows[0][1], sign)):
+        rows = rows[1:]
+    else:
+        cells = _split_cells(above, sign)
+        is_heading = len(cells) == len(names) and all(
+            cell and _parse_number(cell) is None for cell in cells
+        )
+        names = cells if is_heading else [""] * len(names)
+    if not rows:
         raise TelemetryError("it has a heading and no rows.")
-    return TextTable(
-        names=names,
-        values=_parse_rows(lines, numbers, sign, len(first)),
-        comments=comments,
-        notes=notes,
-    )
-
-
-def _find_delimiter(line: str) -> str | None:
-    """Return the sign between cells, by the first row; None for blanks or a single column."""
-    return next((sign for sign in _DELIMITERS if sign in line), None)
+    values = _parse_rows(rows, sign, len(names))
+    return TextTable(names=names, values=values, comments=comments, notes=notes)
 
 
 def _split_cells(line: str, sign: str | None) -> list[str]:
-    if sign is None:
-        return line.split()
-    return next(csv.reader(io.StringIO(line), delimiter=sign))
+    cells = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
+    return [cell.strip().strip('"') for cell in cells]
 
 
 def _parse_number(cell: str) -> float | None:
-    word = cell.strip().lower()
-    if word in _GAPS:
-        return float("nan")
+    word = cell.lower()
     try:
-        return float(word)
+        return float("nan" if word in _GAPS else word)
     except ValueError:
         return None
 
 
-def _parse_rows(lines: list[str], numbers: list[int], sign: str | None, width: int) -> FloatArray:
+def _parse_rows(rows: list[tuple[int, str]], sign: str | None, width: int) -> FloatArray:
     try:  # the quick way, which knows no gaps
-        out = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2)
-        if out.shape == (len(lines), width):
-            return np.asarray(out, dtype=np.float64)
+        lines = [line for _, line in rows]
+        out = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
+        if out.shape == (len(rows), width):
+            return out
     except ValueError:
         pass
-    rows = np.empty((len(lines), width))
-    for i, (line, number) in enumerate(zip(lines, numbers, strict=True)):
+    out = np.empty((len(rows), width))
+    for i, (number, line) in enumerate(rows):
         cells = _split_cells(line, sign)
         if len(cells) != width:
             raise TelemetryError(f"line {number} must have {width} cells; got {len(cells)}.")
         for j, cell in enumerate(cells):
-            value = _parse_number(cell)
-            if value is None:
+            if (value := _parse_number(cell)) is None:
                 raise TelemetryError(
-                    f"cell {j + 1} of line {number} must be a number; got {cell.strip()!r}."
+                    f"cell {j + 1} of line {number} must be a number; got {cell!r}."
                 )
-            rows[i, j] = value
-    return rows
+            out[i, j] = value
+    return out

@@ -22,8 +22,8 @@ _BLOCKS = 16  # of rows, whose mean distance from the grid is compared
 _SEARCH = 60
 
 
-def frames_from_times(times: FloatArray, rate: float | None) -> tuple[IntArray, str]:
-    """Return the frame of each row, from 0, and a note that may be empty.
+def frames_from_times(times: FloatArray, rate: float | None) -> tuple[IntArray, list[str]]:
+    """Return the frame of each row, from 0, and notes.
 
     Rounded to a quantum q, the times of frames without a hole stay within ``q rate`` of a
     straight line; a missing frame leaves it by 1. Rows are laid on the grid where only one of
@@ -37,10 +37,10 @@ def frames_from_times(times: FloatArray, rate: float | None) -> tuple[IntArray, 
     require_few_holes(float(times[-1] - times[0]) / period + 1, len(times))
     if rising.size == len(steps) and np.ptp(steps) < 2 * _CLEAR * float(np.median(steps)):
         # no frame is missing, whatever the rate is: that is compared afterwards
-        return np.arange(len(times)), ""
+        return np.arange(len(times)), []
     quantum = _quantum(times, steps)
     if rate is None:
-        return _lay_by_steps(times, steps, period, quantum), ""
+        return _lay_by_steps(times, steps, period, quantum), []
     return _lay_by_rate(times, steps, rate, quantum)
 
 
@@ -114,7 +114,7 @@ def _slack(times: FloatArray, rate: float) -> float:
 
 def _lay_by_rate(
     times: FloatArray, steps: FloatArray, rate: float, quantum: float
-) -> tuple[IntArray, str]:
+) -> tuple[IntArray, list[str]]:
     """Lay rows on the grid of a known rate."""
     rows, slack = len(times), _slack(times, rate)
     step = quantum * rate  # frames
@@ -125,11 +125,10 @@ def _lay_by_rate(
         if not complete and gap < _LEAST_GAP:  # a rate that is stated with few digits
             found, spread = _closest_rate(times)
             complete = abs(found / rate - 1) * rows < 0.5 and spread <= step + slack
-        note = f"times are rounded to {quantum:.6g} s"
         if complete:
             alone = step >= _ABOVE or placed is None or np.array_equal(placed, np.arange(rows))
             if alone and not _may_hide_frame(_grid_distance(times, rate), step, slack):
-                return np.arange(rows), note
+                return np.arange(rows), [f"times are rounded to {quantum:.6g} s"]
             raise ProblemError(
                 f"times_s in steps of {quantum:.6g} s cannot tell rounding from missing or "
                 f"repeated frames at {rate:.9g} Hz in {rows} rows. Give a counter of frames, or "
@@ -143,8 +142,8 @@ def _lay_by_rate(
                 "are missing or repeated. Give a counter of frames, or cut the record there."
             )
     if placed is not None:
-        return placed, ""
-    return _lay_by_steps(times, steps, 1 / rate, 0.0), ""
+        return placed, []
+    return _lay_by_steps(times, steps, 1 / rate, 0.0), []
 
 
 def _is_complete(apart: FloatArray, step: float, slack: float) -> bool:

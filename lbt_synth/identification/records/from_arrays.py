@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError
-from lbt_synth.identification.records.clock import Clock, build_clock, first_per_frame
+from lbt_synth.identification.records.clock import Clock, build_clock
 from lbt_synth.identification.records.faults import (
     equal_runs,
     fill,
@@ -28,7 +28,7 @@ _OPEN_FRAMES = 20  # of zero or equal commands
 _TREND = 2.0  # ratio of scatters
 _LEAST_QUARTER = 64  # pairs of frames that show a trend
 
-Finder = Callable[[FloatArray, BoolArray], BoolArray]
+Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
 
 
 def loop_record(
@@ -111,34 +111,23 @@ def loop_record(
     9.963
     """
     scale = nm_per(unit, diameter_m=diameter_m)
-    y = _series_in_nm(measurements, "measurements", scale)
-    u = None
+    y, u = _series_in_nm(measurements, "measurements", scale), None
     if commands is not None:
-        command_scale = nm_per(
-            unit if command_unit is None else command_unit, diameter_m=diameter_m
-        )
-        u = _series_in_nm(commands, "commands", command_scale)
+        scale = nm_per(unit if command_unit is None else command_unit, diameter_m=diameter_m)
+        u = _series_in_nm(commands, "commands", scale)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
     clock = build_clock(
         len(y), frame_rate_hz=frame_rate_hz, times_s=times_s, frame_numbers=frame_numbers
     )
-    findings, said = list[Finding](), list(clock.notes)
-    keep, there = _choose_rows(clock, y if u is None else np.hstack([y, u]), findings, said)
-    at, frames = clock.frame_of_row[keep], clock.frames
-    y, measured = _judge_series(
-        _lay_on_grid(y[keep], at, frames),
-        there,
-        "measurements",
-        findings,
-        (("saturated", find_saturated), ("stuck", find_stuck), ("outlier", find_outliers)),
-    )
-    commanded = np.ones(frames, dtype=np.bool_)
+    findings, said = list[Finding](), [*notes, *clock.notes]
+    rows = y if u is None else np.hstack([y, u])
+    rows, there = _lay_on_grid(rows, clock, findings, said)
+    axes = y.shape[1]
+    y, measured = _judge_series(rows[:, :axes], there, "measurements", _MEASURED, findings)
+    commanded = np.ones(clock.frames, dtype=np.bool_)
     if u is not None:
-        u = _lay_on_grid(u[keep], at, frames)
-        u, commanded = _judge_series(
-            u, there, "commands", findings, (("saturated", _find_clipped),)
-        )
+        u, commanded = _judge_series(rows[:, axes:], there, "commands", _COMMANDED, findings)
         _report_held(u, commanded, findings)
     said += _note_trends(y, measured)
     record = LoopRecord(
@@ -149,10 +138,10 @@ def loop_record(
         mirror=mirror,
         usable=measured,
         health=RecordHealth(
-            frames=frames,
+            frames=clock.frames,
             usable=int(np.sum(measured)),
             findings=tuple(findings),
-            notes=merge_notes(notes, said),
+            notes=merge_notes(said),
         ),
         diameter_m=diameter_m,
         obstruction=obstruction,
@@ -180,56 +169,38 @@ def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
         return np.where(np.abs(scaled) < _LARGEST_NM, scaled, np.nan)
 
 
-def _choose_rows(
-    clock: Clock, series: FloatArray, findings: list[Finding], said: list[str]
-) -> tuple[IntArray, BoolArray]:
-    """Return the first row of each frame, and the frames with rows that agree."""
-
-    def same(rows: IntArray) -> bool:
-        first = series[rows[:1]]
-        return np.array_equal(series[rows], np.repeat(first, rows.size, axis=0), equal_nan=True)
-
-    keep, torn, again = first_per_frame(clock, same)
-    there = _mark(clock.frame_of_row[keep], clock.frames)
+def _lay_on_grid(
+    rows: FloatArray, clock: Clock, findings: list[Finding], said: list[str]
+) -> tuple[FloatArray, BoolArray]:
+    """Return the first row of each frame, NaN without one, and the frames whose rows agree."""
+    frame = clock.frame_of_row
+    is_first = np.diff(frame, prepend=-1) > 0
+    first = np.flatnonzero(is_first)
+    earlier = rows[first[np.cumsum(is_first) - 1]]
+    differs = ~np.all((rows == earlier) | (np.isnan(rows) & np.isnan(earlier)), axis=1)
+    there, torn = np.zeros((2, clock.frames), dtype=np.bool_)
+    there[frame], torn[frame[differs]] = True, True
     _report(findings, "missing", "frames", None, ~there)
-    if again:
+    _report(findings, "repeated", "frames", None, torn)
+    if again := len(rows) - len(first):
         said.append(f"{again} rows of a time that had been recorded already were left out")
-    contradicted = _mark(torn, clock.frames)
-    _report(findings, "repeated", "frames", None, contradicted)
-    return keep, there & ~contradicted
-
-
-def _mark(frames: IntArray, count: int) -> BoolArray:
-    """Return which of ``count`` frames are among those given."""
-    marks = np.zeros(count, dtype=np.bool_)
-    marks[frames] = True
-    return marks
-
-
-def _lay_on_grid(rows: FloatArray, at: IntArray, frames: int) -> FloatArray:
-    out = np.full((frames, rows.shape[1]), np.nan)
-    out[at] = rows
-    return out
+    out = np.full((clock.frames, rows.shape[1]), np.nan)
+    out[frame[first]] = rows[first]
+    return out, there & ~torn
 
 
 def _judge_series(
-    series: FloatArray,
-    there: BoolArray,
-    name: str,
-    findings: list[Finding],
-    finders: Sequence[tuple[str, Finder]],
+    series: FloatArray, there: BoolArray, name: str, finders: Finders, findings: list[Finding]
 ) -> tuple[FloatArray, BoolArray]:
     """Return the series with faults filled, and the frames that are good on all axes."""
     out, all_good = np.empty(series.shape), np.ones(len(series), dtype=np.bool_)
-    for axis in range(series.shape[1]):
-        column = series[:, axis]
-        finite = np.isfinite(column)
-        _report(findings, "not finite", name, axis, there & ~finite)
-        good = there & finite
+    for axis, column in enumerate(series.T):
+        good = there & np.isfinite(column)
+        _report(findings, "not finite", name, axis, there & ~good)
         for kind, finder in finders:
-            found = finder(np.where(finite, column, 0.0), good)
+            found = finder(np.where(np.isfinite(column), column, 0.0), good)
             _report(findings, kind, name, axis, found)
-            good = good & ~found
+            good &= ~found
         out[:, axis] = fill(column, good)
         all_good &= good
     return out, all_good
@@ -253,31 +224,40 @@ def _find_clipped(series: FloatArray, good: BoolArray) -> BoolArray:
     return find_saturated(series, good & (series != 0))
 
 
+_MEASURED: Finders = (
+    ("saturated", find_saturated),
+    ("stuck", find_stuck),
+    ("outlier", find_outliers),
+)
+_COMMANDED: Finders = (("saturated", _find_clipped),)
+
+
 def _report_held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> None:
     """Report where the loop was open, and where its commands stood still."""
-    zero = np.all(commands == 0, axis=1) & good
-    is_open = np.zeros(len(zero), dtype=np.bool_)
-    for start, stop in runs(zero):
-        is_open[start:stop] = stop - start >= _OPEN_FRAMES
+    is_open = _mark_long(runs(np.all(commands == 0, axis=1) & good), len(commands))
     _report(findings, "loop open", "commands", None, is_open, spoils=False)
-    for axis in range(commands.shape[1]):
-        column, held = commands[:, axis], np.zeros(len(zero), dtype=np.bool_)
-        each = equal_runs(column, good)
-        for start, stop in each[each[:, 1] - each[:, 0] >= _OPEN_FRAMES]:
-            held[start:stop] = True
+    for axis, column in enumerate(commands.T):
+        held = _mark_long(equal_runs(column, good), len(commands))
         _report(findings, "held", "commands", axis, held & ~is_open, spoils=False)
+
+
+def _mark_long(stretches: IntArray, frames: int) -> BoolArray:
+    """Return the frames of the stretches (start, stop) that are long for commands."""
+    out = np.zeros(frames, dtype=np.bool_)
+    for start, stop in stretches[stretches[:, 1] - stretches[:, 0] >= _OPEN_FRAMES]:
+        out[start:stop] = True
+    return out
 
 
 def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
     """Note where the scatter from frame to frame changes between the ends of the record."""
     pairs = np.flatnonzero(good[1:] & good[:-1])
     quarter = pairs.size // 4
-    said = []
-    for axis in range(series.shape[1] if quarter >= _LEAST_QUARTER else 0):
-        steps = np.diff(series[:, axis])[pairs]
-        first, last = (
-            float(np.sqrt(np.mean(part**2))) for part in (steps[:quarter], steps[-quarter:])
-        )
+    if quarter < _LEAST_QUARTER:
+        return []
+    said, squares = [], np.diff(series, axis=0)[pairs] ** 2
+    ends = np.sqrt([squares[:quarter].mean(axis=0), squares[-quarter:].mean(axis=0)])
+    for axis, (first, last) in enumerate(ends.T):
         if max(first, last) > _TREND * min(first, last):
             said.append(
                 f"axis {axis} is not stationary: the rms difference of two frames is {first:.3g} "

@@ -4,41 +4,48 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from lbt_synth.errors import ProblemError, TelemetryError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_telemetry
-from lbt_synth.identification.records.column_selection import Series, select_series
+from lbt_synth.identification.records.column_selection import KINDS, Series, select_series
 from lbt_synth.identification.records.columns import Column
 from lbt_synth.identification.records.commands_file import join_commands
-from lbt_synth.identification.records.contents import ENDINGS, FITS, Contents, read_contents
+from lbt_synth.identification.records.contents import (
+    FITS,
+    Contents,
+    name_in_errors,
+    parse_contents,
+    read_contents,
+    read_record_bytes,
+)
 from lbt_synth.identification.records.from_arrays import loop_record
 from lbt_synth.identification.records.from_telemetry import record_from_telemetry
-from lbt_synth.identification.records.health import merge_notes
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.identification.records.units import (
     density_unit,
     hz_per,
     nm_per,
+    same_unit,
     seconds_per,
-    unit_name,
 )
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.fits import has_card
 from lbt_synth.validation import FloatArray, choice, number
 
-KINDS = ("closed_loop", "open_loop", "spectrum")
-_OURS = "LBTTELEM"  # card of our own telemetry
-_AOT = "AOT-VERS"
-_ARRAYS_OF_OURS = {"META", "COMMANDS", "MEASURE"}
+_TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of our own telemetry, and of the AOT standard
+_TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
 _RATES_HZ = (5.0, 1e5)  # plausible for times without a unit
+_WHICH_UNITS = {
+    "density": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
+    "measurements": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
+}
 
 
 def load_record(
@@ -120,16 +127,16 @@ def load_record(
     source = Path(path)
     if kind is not None:
         choice(kind, "kind", KINDS)
-    content = _read_bytes(source)
+    content = read_record_bytes(source)
     if _is_telemetry(source, content):
-        if kind not in (None, "closed_loop") or columns is not None or commands is not None:
-            raise ProblemError(
-                f"{source} is telemetry with measurements and commands: kind must be closed_loop, "
-                "and neither columns nor commands be given. Choose its modes by axes."
-            )
-        if averages is not None:
-            raise ProblemError(f"{source} is telemetry: averages are of a spectrum.")
-        with _name_in_errors(source):
+        with name_in_errors(source):
+            if kind not in (None, "closed_loop") or columns is not None or commands is not None:
+                raise ProblemError(
+                    "telemetry holds measurements and commands: kind must be closed_loop, and "
+                    "neither columns nor commands be given. Choose its modes by axes."
+                )
+            if averages is not None:
+                raise ProblemError("this is telemetry, and averages are of a spectrum.")
             return record_from_telemetry(
                 load_telemetry(source),
                 modes=None if axes is None else tuple(axes),
@@ -142,27 +149,27 @@ def load_record(
                 obstruction=obstruction,
                 source=str(source),
             )
-    contents = read_contents(source, content)
-    if commands is not None:
-        other = Path(commands)
-        join_commands(contents, read_contents(other, _read_bytes(other)), other)
-    with _name_in_errors(source):
+    contents = parse_contents(source, content)
+    with name_in_errors(source):
+        if commands is not None:
+            other = Path(commands)
+            join_commands(contents, read_contents(other), other)
         series = select_series(contents, kind=kind, axes=axes, columns=columns)
         facts = {
             "frame_rate_hz": _find_fact(contents, "frame_rate_hz", frame_rate_hz, may_differ=False),
             "diameter_m": _find_fact(contents, "diameter_m", diameter_m),
             "source": str(source),
-            "unit": unit,
         }
         if series.kind == "spectrum":
             facts["averages"] = _find_fact(contents, "averages", averages)
-            return _build_spectrum_record(series, contents, **facts)
+            return _build_spectrum_record(series, contents, unit, **facts)
         if averages is not None:
             raise ProblemError(f"averages are of a spectrum; the record is of kind {series.kind}.")
         return _build_loop_record(
             series,
             contents,
-            command_unit=command_unit,
+            unit,
+            command_unit,
             mirror=mirror,
             delay_frames=_find_fact(contents, "delay_frames", delay_frames),
             obstruction=_find_fact(contents, "obstruction", obstruction),
@@ -170,130 +177,64 @@ def load_record(
         )
 
 
-@contextmanager
-def _name_in_errors(source: Path) -> Iterator[None]:
-    """Name the file in errors that do not name it yet."""
-    try:
-        yield
-    except TelemetryError:
-        raise
-    except ProblemError as error:
-        raise type(error)(f"{source}: {error}") from error
-
-
-def _read_bytes(path: Path) -> bytes:
-    if path.suffix.lower() not in ENDINGS:
-        raise TelemetryError(
-            f"a record must end in one of {', '.join(ENDINGS)}; got {path.name!r}.", path=path
-        )
-    try:
-        return path.read_bytes()
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise TelemetryError(f"cannot read {path}: {why}.", path=path) from error
-
-
 def _is_telemetry(path: Path, content: bytes) -> bool:
     if path.suffix.lower() in FITS:
-        return has_card(content, _OURS) or has_card(content, _AOT)
+        return any(has_card(content, card) for card in _TELEMETRY_CARDS)
     if path.suffix.lower() != ".npz":
         return False
     try:
         names = {Path(name).stem for name in ZipFile(io.BytesIO(content)).namelist()}
     except (BadZipFile, OSError, ValueError):
-        return False  # read_contents says so
-    return names >= _ARRAYS_OF_OURS
+        return False  # parse_contents says so
+    return names >= _TELEMETRY_ARRAYS
 
 
 def _find_fact(contents: Contents, name: str, given: Any, *, may_differ: bool = True) -> Any:
     """Return what was given, or what the file has; refuse two values of a file."""
     places = contents.facts.get(name, {})
     own = {where: number(value, f"{where} ({name})") for where, value in places.items()}
-    first = next(iter(own), None)
     if given is None:
         if len(set(own.values())) > 1:
             found = ", ".join(f"{value:.9g} by {where}" for where, value in own.items())
             raise ProblemError(f"the file gives {name} twice: {found}. Choose one in the call.")
-        if first is None:
-            return None
-        contents.notes.append(f"{name} {own[first]:.9g}, by {first}")
-        return int(own[first]) if name == "averages" else own[first]
+        for where, value in own.items():
+            contents.notes.append(f"{name} {value:.9g}, by {where}")
+            return int(value) if name == "averages" else value
+        return None
     wanted = number(given, name)
-    others = {where: value for where, value in own.items() if abs(value - wanted) > 1e-6 * wanted}
-    for where, value in others.items():
-        if not may_differ:
-            raise ProblemError(
-                f"{name} must be that of the file, {value:.9g} by {where}; got {wanted:.9g}."
+    for where, value in own.items():
+        if abs(value - wanted) > 1e-6 * wanted:
+            if not may_differ:
+                raise ProblemError(
+                    f"{name} must be that of the file, {value:.9g} by {where}; got {wanted:.9g}."
+                )
+            contents.notes.append(
+                f"{name} {wanted:.9g} was given; the file has {value:.9g} by {where}"
             )
-        contents.notes.append(f"{name} {wanted:.9g} was given; the file has {value:.9g} by {where}")
     return given
 
 
-def _build_loop_record(
-    series: Series, contents: Contents, *, unit: str | None, command_unit: str | None, **facts: Any
-) -> LoopRecord:
-    y_unit = _find_unit(series.measurements, unit, contents, "unit", "measurements")
-    u_unit = None
-    if series.commands:
-        given = unit if command_unit is None else command_unit
-        fact = "command unit" if "command unit" in contents.facts else "unit"
-        u_unit = _find_unit(series.commands, given, contents, fact, "commands")
-    times = None
-    if series.times is not None:
-        times = seconds_per(series.times.unit) * series.times.values
-        if not series.times.unit:
-            contents.notes.append(f"{series.times.name} was taken for seconds")
-    record = loop_record(
-        _stack_columns(series.measurements),
-        _stack_columns(series.commands) if series.commands else None,
-        unit=y_unit,
-        command_unit=u_unit,
-        times_s=times,
-        frame_numbers=None if series.frame_numbers is None else series.frame_numbers.values,
-        notes=merge_notes(contents.notes, series.notes),
-        **facts,
-    )
-    if series.times is not None and not series.times.unit:
-        low, high = _RATES_HZ
-        if facts["frame_rate_hz"] is None and not low <= record.frame_rate_hz <= high:
-            raise ProblemError(
-                f"the frame rate would be {record.frame_rate_hz:.6g} Hz with "
-                f"{series.times.name or 'the times'} in seconds, and their unit is not given; name "
-                "it, as in time_ms, or give frame_rate_hz."
-            )
-    return record
-
-
 def _find_unit(
-    chosen: Sequence[Column], given: str | None, contents: Contents, fact: str, what: str
+    chosen: Sequence[Column], given: str | None, contents: Contents, what: str, option: str = "unit"
 ) -> str:
     """Return the unit of some columns by their names or headers, the file, or the call."""
-    units = {str(value): where for where, value in contents.facts.get(fact, {}).items()}
-    found = {each.unit or next(iter(units), "") for each in chosen}
-    if len(found) > 1 or len(units) > 1:
+    facts = contents.facts.get(option, contents.facts.get("unit", {}))
+    of_file = list(dict.fromkeys(map(str, facts.values())))
+    found = {each.unit or (of_file[0] if of_file else "") for each in chosen}
+    if len(found) > 1 or len(of_file) > 1:
         raise ProblemError(
-            f"the {what} must all have the same unit; got {', '.join(sorted(found | set(units)))}."
+            f"the {what} must all have the same unit; got "
+            f"{', '.join(sorted(found.union(of_file)))}."
         )
-    own = found.pop()
-    option = "command_unit" if what == "commands" else "unit"
-    if not own:
-        if given is None:
-            choices = (
-                "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude"
-                if what == "density"
-                else "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt"
-            )
-            raise ProblemError(
-                f"the file does not tell the unit of the {what}; give {option} ({choices})."
-            )
-        return given
-    if given is not None and _unit_key(own) != _unit_key(given):
+    (own,) = found
+    if not own and given is None:
+        raise ProblemError(
+            f"the file does not tell the unit of the {what}; give {option} "
+            f"({_WHICH_UNITS.get(what, _WHICH_UNITS['measurements'])})."
+        )
+    if own and given is not None and not same_unit(own, given):
         raise ProblemError(f"{option} must be that of the file, {own!r}; got {given!r}.")
-    return own
-
-
-def _unit_key(text: str) -> Any:
-    return density_unit(text) or unit_name(text) or text
+    return own or str(given)
 
 
 def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
@@ -306,40 +247,73 @@ def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
     return np.column_stack([each.values for each in chosen])
 
 
+def _build_loop_record(
+    series: Series, contents: Contents, unit: str | None, command_unit: str | None, **facts: Any
+) -> LoopRecord:
+    y, u = series.columns[series.role], series.columns.get("commands")
+    (clock,) = series.columns.get("times", [None])
+    (counter,) = series.columns.get("frame_numbers", [None])
+    y_unit, u_unit = _find_unit(y, unit, contents, "measurements"), None
+    if u is not None:
+        u_unit = _find_unit(u, command_unit or unit, contents, "commands", "command_unit")
+    times = None if clock is None else seconds_per(clock.unit) * clock.values
+    if clock is not None and not clock.unit:
+        contents.notes.append(f"{clock.name} was taken for seconds")
+    record = loop_record(
+        _stack_columns(y),
+        None if u is None else _stack_columns(u),
+        unit=y_unit,
+        command_unit=u_unit,
+        times_s=times,
+        frame_numbers=None if counter is None else counter.values,
+        notes=contents.notes,
+        **facts,
+    )
+    low, high = _RATES_HZ
+    plausible = facts["frame_rate_hz"] is not None or low <= record.frame_rate_hz <= high
+    if clock is not None and not clock.unit and not plausible:
+        raise ProblemError(
+            f"the frame rate would be {record.frame_rate_hz:.6g} Hz with "
+            f"{clock.name or 'the times'} in seconds, and their unit is not given; name it, as in "
+            "time_ms, or give frame_rate_hz."
+        )
+    return record
+
+
 def _build_spectrum_record(
-    series: Series, contents: Contents, *, unit: str | None, diameter_m: float | None, **facts: Any
+    series: Series, contents: Contents, unit: str | None, *, diameter_m: float | None, **facts: Any
 ) -> SpectrumRecord:
-    assert series.frequency is not None
-    text = _find_unit(series.measurements, unit, contents, "unit", "density")
+    densities, (frequency,) = series.columns[series.role], series.columns["frequency"]
+    text = _find_unit(densities, unit, contents, "density")
     parted = density_unit(text)
     if parted is None:
         raise ProblemError(
             f"the unit of a density is a square over Hz (nm^2/Hz, mas^2/Hz), or a length or angle "
             f"over sqrt(Hz) (nm/sqrt(Hz)); got {text!r}."
         )
-    if series.amplitude and parted[1] == 2:
+    name, power = parted
+    if series.role == "amplitude" and power == 2:
         raise ProblemError(
-            f"{series.measurements[0].name} is named as an amplitude, but has the unit {text!r} of "
-            "a power; choose by columns={'density': ...}."
+            f"{densities[0].name} is named as an amplitude, but has the unit {text!r} of a power; "
+            "choose by columns={'density': ...}."
         )
-    scale_hz = hz_per(series.frequency.unit)
-    if not series.frequency.unit:
+    if not frequency.unit:
         contents.notes.append("frequencies were taken for Hz")
-    table = _stack_columns([series.frequency, *series.measurements])
+    table = _stack_columns([frequency, *densities])
     complete = np.all(np.isfinite(table), axis=1)
     if not complete.all():
         contents.notes.append(f"{int(np.sum(~complete))} rows with gaps were left out")
     table = table[complete]
-    scaled = nm_per(parted[0], diameter_m=diameter_m) ** parted[1] * table[:, 1:]
-    if parted[1] == 1:
+    scaled = nm_per(name, diameter_m=diameter_m) ** power * table[:, 1:]
+    if power == 1:
         if np.any(scaled < 0):
             raise ProblemError("an amplitude density must be at least 0; got a negative one.")
         contents.notes.append("amplitude densities were squared")
         scaled = scaled**2
     return SpectrumRecord(
-        frequency_hz=scale_hz * table[:, 0],
+        frequency_hz=hz_per(frequency.unit) * table[:, 0],
         density_nm2_hz=scaled,
         diameter_m=diameter_m,
-        notes=merge_notes(contents.notes, series.notes),
+        notes=tuple(dict.fromkeys(contents.notes)),
         **facts,
     )

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, TelemetryError
-from lbt_synth.identification.records.columns import parse_column
-from lbt_synth.identification.records.contents import read_contents
-from lbt_synth.identification.records.csv_file import read_csv
-from lbt_synth.identification.records.units import hz_per
+from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
+from lbt_synth.identification.records.column_selection import CLOCKS
+from lbt_synth.identification.records.columns import Column
+from lbt_synth.identification.records.contents import TEXTS, read_contents
+from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -30,17 +30,10 @@ _AVERAGES = 32  # segments that a record is cut into
 _FINEST_HZ = 0.25
 _SHORTEST_SEGMENT = 64
 _DIP = 0.5  # of a peak, by which the power must fall before another peak counts
-_ERRORS = (
-    "error",
-    "frequency_error",
-    "freq_error",
-    "f_error",
-    "err",
-    "sigma",
-    "std",
-    "uncertainty",
+_ERROR = re.compile(
+    r"((f|freq|frequency)[_ ])?(err|error|sigma|std|uncertainty)(_hz|\s*[\[(]\s*hz.*)?$", re.I
 )
-_ENDINGS = (".csv", ".tsv", ".txt", ".dat")
+_HEADINGS = ("frequency", "error")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,69 +125,48 @@ def _line_prior(one: Any, source: str) -> LinePrior:
 
 
 def _read_lines(path: Path) -> list[LinePrior]:
-    if path.suffix.lower() not in _ENDINGS:
-        raise TelemetryError(
-            f"a list of lines must end in one of {', '.join(_ENDINGS)}; got {path.name!r}.",
-            path=path,
-        )
+    require_ending(path, "a list of lines", TEXTS, TelemetryError)
+    columns = read_contents(path).columns
     try:
-        table = read_csv(path.read_text(encoding="utf-8-sig"))
-        if table.values.shape[1] > 2:
-            raise TelemetryError(
-                f"it must have one or two columns, frequency and error; got "
-                f"{table.values.shape[1]}."
-            )
-        at, error = _find_columns(table.names)
-        gaps = np.flatnonzero(np.isnan(table.values[:, at]))
-        if gaps.size:
-            raise TelemetryError(f"row {gaps[0] + 1} of the numbers has no frequency.")
-        rows = table.values[:, [at] if error is None else [at, error]]
-        return [_line_prior([v for v in row if not np.isnan(v)], str(path)) for row in rows]
-    except OSError as error:
-        why = getattr(error, "strerror", None) or error
-        raise TelemetryError(f"cannot read {path}: {why}.", path=path) from error
-    except UnicodeDecodeError as error:
-        raise TelemetryError(f"{path} is no text in UTF-8.", path=path) from error
-    except LbtSynthError as error:
+        rows = _frequency_rows(columns)
+        return [_line_prior(row[~np.isnan(row)], str(path)) for row in rows]
+    except ProblemError as error:
         raise TelemetryError(f"{path}: {error}", path=path) from error
 
 
-def _find_columns(names: list[str]) -> tuple[int, int | None]:
-    """Return the columns of frequencies and errors; without a heading the first two."""
-    if not any(names):
-        return 0, 1 if len(names) > 1 else None
-    found: dict[str, int] = {}
-    for i, name in enumerate(names):
-        known = parse_column(name, np.zeros(1))
-        plain = re.sub(r"[\s\-.]*[\[(].*$|_hz$", "", name.strip().lower())
-        word = "error" if re.sub(r"[\s\-.]+", "_", plain) in _ERRORS else known.role
-        if word not in ("frequency", "error") or word in found or hz_per(known.unit) != 1:
-            raise TelemetryError(
-                "its columns must be frequency_hz, and frequency_error_hz or error_hz if there is "
-                f"one; got {', '.join(names)}."
-            )
-        found[word] = i
-    if "frequency" not in found:
-        raise TelemetryError(f"it must have a column frequency_hz; got {', '.join(names)}.")
-    return found["frequency"], found.get("error")
+def _frequency_rows(columns: list[Column]) -> FloatArray:
+    """Return frequencies and, if there are any, errors, (lines, 1 or 2), NaN without an error."""
+    if len(columns) > 2:
+        raise ProblemError(
+            f"it must have one or two columns, frequency and error; got {len(columns)}."
+        )
+    found = {
+        "error" if _ERROR.match(each.name.strip()) else each.role: each.values
+        for each in columns
+        if (each.unit or "hz").lower() == "hz"
+    }
+    if not any(each.name for each in columns):
+        found = dict(zip(_HEADINGS, (each.values for each in columns), strict=False))
+    if "frequency" not in found or len(found) < len(columns) or not found.keys() <= {*_HEADINGS}:
+        raise ProblemError(
+            "its columns must be frequency_hz, and frequency_error_hz or error_hz if there is "
+            f"one; got {', '.join(each.name for each in columns)}."
+        )
+    gaps = np.flatnonzero(np.isnan(found["frequency"]))
+    if gaps.size:
+        raise ProblemError(f"row {gaps[0] + 1} of the numbers has no frequency.")
+    return np.column_stack([found[word] for word in _HEADINGS if word in found])
 
 
 def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
     """Read accelerations (frames, sensors) from a file of any format that records have."""
     source = Path(path)
-    try:
-        content = source.read_bytes()
-    except OSError as error:
-        raise TelemetryError(f"cannot read {source}: {error.strerror}.", path=source) from error
-    found = [
-        each.values
-        for each in read_contents(source, content).columns
-        if each.role not in ("times", "frame_numbers")
-    ]
-    if not found or len({values.size for values in found}) > 1:
+    found = [each.values for each in read_contents(source).columns if each.role not in CLOCKS]
+    sizes = sorted({values.size for values in found})
+    if len(sizes) != 1:
         raise TelemetryError(
-            f"{source} must hold columns of one length, a sensor each; got "
-            f"{len(found)} of {sorted({values.size for values in found})} rows.",
+            f"{source} must hold columns of one length, a sensor each; got {len(found)} of "
+            f"{sizes} rows.",
             path=source,
         )
     return frozen_copy(np.stack(found, axis=1))
@@ -261,6 +233,8 @@ def accelerometer_lines(
     >>> [round(line.frequency_hz, 1) for line in found]
     [20.2]
     """
+    from scipy.signal import csd
+
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     a, z = _as_columns(accelerations, "accelerations"), _as_columns(measurement, "measurement")
     if len(a) != len(z):
@@ -276,25 +250,32 @@ def accelerometer_lines(
         length = int(min(longest, max((len(z) - 1) / _AVERAGES, _SHORTEST_SEGMENT)))
     else:
         length = integer(segment_frames, "segment_frames", at_least=_SHORTEST_SEGMENT)
-    fa, fz = _segment_transforms(a, good, length), _segment_transforms(z, good, length)
-    count = len(fz)
+    a, z = (_whole_segments(series, good, length) for series in (a, z))
+    count = len(z) // length
     if count < _FEWEST_AVERAGES:
         raise ProblemError(
             f"coherence needs at least {_FEWEST_AVERAGES} segments of {length} usable frames; got "
             f"{count}. Record more, or shorten segment_frames."
         )
-    power_a, power_z = np.mean(np.abs(fa) ** 2, axis=0), np.mean(np.abs(fz) ** 2, axis=0)
-    cross = np.mean(fa.conj()[:, :, :, None] * fz[:, :, None, :], axis=0)  # (f, sensors, axes)
+    window = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+    welch: dict[str, Any] = {
+        "fs": rate,
+        "window": window,
+        "nperseg": length,
+        "noverlap": 0,
+        "axis": 0,
+    }
+    frequency, cross = csd(a[:, :, None], z[:, None, :], **welch)  # (f, sensors, axes)
+    power_a, power_z = (csd(series, series, **welch)[1].real for series in (a, z))
     both = power_a[:, :, None] * power_z[:, None, :]
     with np.errstate(divide="ignore", invalid="ignore"):
         coherence = np.where(both > 0, np.abs(cross) ** 2 / both, 0.0)
-    frequency = np.arange(len(power_z)) * rate / length
     inside = (frequency >= max(lowest_hz, rate / length)) & (frequency < rate / 2)
     tried = max(int(np.sum(inside)) * coherence.shape[1] * coherence.shape[2], 1)
     threshold = 1 - (chance / tried) ** (1 / (count - 1))
     significant = inside & np.any(coherence > threshold, axis=(1, 2))
     # power of the phase (not of its difference) that goes with a sensor
-    steps = 4 * np.sin(np.pi * np.minimum(frequency, rate / 2) / rate) ** 2
+    steps = 4 * np.sin(np.pi * frequency / rate) ** 2
     shared = np.max(coherence * power_z[:, None, :], axis=(1, 2)) / np.where(inside, steps, 1.0)
     source = f"accelerometers: coherence over {count} segments, false alarm {chance:g}"
     return _find_lines(frequency, np.where(inside, shared, 0.0), significant, source)
@@ -308,14 +289,12 @@ def _as_columns(value: Any, name: str) -> FloatArray:
     return out
 
 
-def _segment_transforms(series: FloatArray, good: BoolArray, length: int) -> Any:
-    """Return the transforms of the segments without a spoilt frame, (segments, f, columns)."""
+def _whole_segments(series: FloatArray, good: BoolArray, length: int) -> FloatArray:
+    """Return the steps of the segments without a spoilt frame, one after another."""
     steps, fine = np.diff(series, axis=0), good[1:] & good[:-1]
     count = len(steps) // length
-    whole = fine[: count * length].reshape(count, length).all(axis=1)
-    parts = steps[: count * length].reshape(count, length, -1)[whole]
-    window = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
-    return np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window[:, None], axis=1)
+    whole = np.repeat(fine[: count * length].reshape(count, length).all(axis=1), length)
+    return np.asarray(steps[: count * length][whole])
 
 
 def _find_lines(

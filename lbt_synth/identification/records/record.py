@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.records.faults import runs
-from lbt_synth.identification.records.health import Finding, RecordHealth, finding_in, merge_notes
+from lbt_synth.identification.records.health import RecordHealth, finding_in, merge_notes
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import (
@@ -25,7 +25,7 @@ from lbt_synth.validation import (
 _MOST_AXES = 2
 _BRIDGED_FRAMES = 3
 _BRIDGED_FRACTION = 0.01
-NOT_KNOWN = "correction not known"
+_NOT_KNOWN = "correction not known"
 _LIMITS: dict[str, dict[str, Any]] = {
     "delay_frames": {"at_least": 1, "at_most": 100},
     "diameter_m": {"above": 0},
@@ -245,12 +245,15 @@ class LoopRecord:
             frame_rate_hz=self.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
         )
         measured = self.usable if self.measured is None else self.measured
-        commanded = np.ones(self.frames, np.bool_) if self.commanded is None else self.commanded
-        findings = tuple(found for found in self.health.findings if found.kind != NOT_KNOWN)
+        findings = tuple(found for found in self.health.findings if found.kind != _NOT_KNOWN)
         usable = measured
         if self.commands is not None:
-            usable, unknown = known_frames(path.mirror_taps, measured, commanded)
-            findings = (*findings, unknown)
+            spoilt = [False] * self.frames if self.commanded is None else ~self.commanded
+            unknown = np.convolve(spoilt, [0, *(path.mirror_taps != 0)])[: self.frames] > 0
+            unknown[: len(path.mirror_taps)] = True  # commands before the record
+            usable = measured & ~unknown
+            found = finding_in(unknown, _NOT_KNOWN, "frames", None, spoils=True)
+            findings = (*findings, found)
         health = replace(self.health, usable=int(np.sum(usable)), findings=findings, bridged=0)
         return replace(
             self,
@@ -258,7 +261,6 @@ class LoopRecord:
             mirror=mirror,
             usable=usable,
             measured=measured,
-            commanded=commanded,
             health=health,
         )
 
@@ -331,35 +333,14 @@ class LoopRecord:
         )
 
 
-def known_frames(
-    taps: FloatArray, measured: BoolArray, commanded: BoolArray
-) -> tuple[BoolArray, Finding]:
-    """Return the frames with a good measurement and a known correction, and a finding of others.
-
-    The correction of a frame is known if all commands that enter it are good.
-    """
-    frames = len(measured)
-    unknown = np.zeros(frames, dtype=np.bool_)
-    unknown[: len(taps)] = True
-    bad = np.flatnonzero(~commanded)
-    for i in np.flatnonzero(taps):
-        hit = bad + 1 + i
-        unknown[hit[hit < frames]] = True
-    return measured & ~unknown, finding_in(unknown, NOT_KNOWN, "frames", None, spoils=True)
-
-
 def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
     """Interpolate a hole by the polynomial through two frames on either side, or one."""
-    known = np.array([start - 1, stop])
-    wide = np.array([start - 2, start - 1, stop, stop + 1])
-    if wide[0] >= 0 and wide[-1] < len(series) and usable[wide].all():
-        known = wide
-    inside = np.arange(start, stop)
-    weights = np.ones((inside.size, known.size))  # Lagrange
-    for i, at in enumerate(known):
-        for other in np.delete(known, i):
-            weights[:, i] *= (inside - other) / (at - other)
-    return np.asarray(weights @ series[known])
+    known = np.array([start - 2, start - 1, stop, stop + 1])
+    if known[0] < 0 or known[-1] >= len(series) or not usable[known].all():
+        known = known[1:3]
+    powers = np.vander(known - start, increasing=True)
+    inside = np.vander(np.arange(stop - start), known.size, increasing=True)
+    return np.asarray(inside @ np.linalg.solve(powers, series[known]))
 
 
 def _check_flags(value: Any, name: str, frames: int) -> BoolArray:

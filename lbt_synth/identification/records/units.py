@@ -17,18 +17,18 @@ _MAS = {
     "rad": math.degrees(1.0) * 3600e3,
 }
 UNITS = (*_NM, *_MAS)
-_OTHER_NAMES = {
-    "nm": ["nanometer", "nanometre"],
-    "um": ["micron", "micrometer", "micrometre", "µm", "μm"],
-    "m": ["meter", "metre"],
-    "urad": ["µrad", "μrad", "microrad"],
-    "rad": ["radian"],
-    "arcsec": ["arcsecond", "asec", '"'],
-    "mas": ["milliarcsec", "milliarcsecond"],
+_ALIASES = {
+    **dict.fromkeys(("nanometer", "nanometre"), "nm"),
+    **dict.fromkeys(("micron", "micrometer", "micrometre", "µm", "μm"), "um"),
+    **dict.fromkeys(("meter", "metre"), "m"),
+    **dict.fromkeys(("µrad", "μrad", "microrad"), "urad"),
+    "radian": "rad",
+    **dict.fromkeys(("arcsecond", "asec", '"'), "arcsec"),
+    **dict.fromkeys(("milliarcsec", "milliarcsecond"), "mas"),
 }
-_ALIASES = {other: unit for unit, names in _OTHER_NAMES.items() for other in names}
-TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": None}  # mHz or MHz, which only capitals tell
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_HERTZ = {"hz": 1.0, "khz": 1e3, "mHz": 1e-3, "MHz": 1e6}  # capitals matter where both exist
+_CLOCK_UNITS = {*_SECONDS, *(word.lower() for word in _HERTZ)}
 _SQUARED = re.compile(r"^(?P<unit>.+?)(?:\^2|\*\*2|²|2)\s*(?:/|_|\s|per)\s*hz$", re.IGNORECASE)
 _ROOT = re.compile(
     r"^(?P<unit>.+?)\s*(?:/|_|per)\s*(?:sqrt\(?hz\)?|rthz|√hz|hz\^?(?:0\.5|\(1/2\)))$",
@@ -38,18 +38,33 @@ _ROOT = re.compile(
 
 def unit_name(text: str) -> str | None:
     """Return the name that this package has for a unit, None for an unknown one."""
-    word = text.strip()
-    lower = word.lower()
+    lower = text.strip().lower()
     found = _ALIASES.get(lower) or _ALIASES.get(lower.removesuffix("s")) or lower
     return found if found in UNITS else None
 
 
+def density_unit(text: str) -> tuple[str, int] | None:
+    """Split the unit of a spectrum into a unit and its power, 1 or 2; None for others."""
+    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
+        if match := pattern.match(text.strip()):
+            unit = unit_name(match["unit"])
+            return None if unit is None else (unit, power)
+    return None
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is a unit of a series, a spectrum, times or frequencies."""
+    return bool(unit_name(text) or density_unit(text)) or text.lower() in _CLOCK_UNITS
+
+
+def same_unit(one: str, other: str) -> bool:
+    """Whether two texts are the same unit."""
+    return len({unit_name(u) or density_unit(u) or u.lower() for u in map(str, (one, other))}) == 1
+
+
 def nm_per(unit: str, *, diameter_m: float | None = None) -> float:
     """Return the nanometres of wavefront, rms over the pupil, of one unit."""
-    word = unit_name(unit) if isinstance(unit, str) else None
-    if word is None:
-        choice(unit, "unit", UNITS)
-        raise AssertionError  # choice refuses
+    word = choice((unit_name(unit) if isinstance(unit, str) else None) or unit, "unit", UNITS)
     if word in _NM:
         return _NM[word]
     if diameter_m is None:
@@ -62,27 +77,16 @@ def nm_per(unit: str, *, diameter_m: float | None = None) -> float:
 
 def seconds_per(unit: str | None) -> float:
     """Return the seconds of a unit of time, 1 if no unit is given."""
-    factor = TIMES.get((unit or "s").strip().lower())
+    factor = _SECONDS.get((unit or "s").strip().lower())
     if factor is None:
-        raise ProblemError(f"times must be in one of {', '.join(TIMES)}; got {unit!r}.")
+        raise ProblemError(f"times must be in one of {', '.join(_SECONDS)}; got {unit!r}.")
     return factor
 
 
 def hz_per(unit: str | None) -> float:
     """Return the hertz of a unit of frequency, 1 if no unit is given."""
     word = (unit or "Hz").strip()
-    if word in ("mHz", "MHz"):
-        return 1e-3 if word == "mHz" else 1e6
-    factor = FREQUENCIES.get(word.lower())
+    factor = _HERTZ.get(word) or _HERTZ.get(word.lower())
     if factor is None:
         raise ProblemError(f"frequencies must be in one of Hz, kHz, mHz, MHz; got {unit!r}.")
     return factor
-
-
-def density_unit(text: str) -> tuple[str, int] | None:
-    """Split the unit of a spectrum into a unit and its power, 1 or 2; None for others."""
-    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
-        if match := pattern.match(text.strip()):
-            unit = unit_name(match["unit"])
-            return None if unit is None else (unit, power)
-    return None

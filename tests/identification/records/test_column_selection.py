@@ -69,7 +69,7 @@ def test_open_loop_and_commands(tmp_path, series):
     assert "commands were left out: the record is of an open loop" in seen.health.notes
     both = write_csv(tmp_path / "b.csv", ["y_nm", "u_nm", "pol_nm"], [*y.T, u[:, 0]])
     with pytest.raises(
-        lbt.errors.ProblemError, match="more than one record; say kind: open_loop or clos"
+        lbt.errors.ProblemError, match="more than one record; say kind: closed_loop or open_"
     ):
         lbt.load_record(both, frame_rate_hz=RATE)
     assert lbt.load_record(both, kind="open_loop", frame_rate_hz=RATE).measurements[
@@ -129,19 +129,25 @@ def test_measurements_and_commands_are_of_the_same_axes(tmp_path, series):
     assert np.array_equal(seen.commands[:, 0], u)
 
 
-def test_x_and_y_are_two_axes(tmp_path, series):
+def test_x_and_y_may_be_a_clock_and_its_series(tmp_path, series):
     y, u = series
     path = csv(tmp_path / "a.csv", x_nm=y[:, 0], y_nm=y[:, 1])
-    seen = lbt.load_record(path, kind="open_loop", frame_rate_hz=RATE)
+    clock = csv(tmp_path / "c.csv", x=np.arange(FRAMES), y_nm=y[:, 1])
+    for each, names in ((path, "x_nm, y_nm"), (clock, "x, y_nm")):
+        with pytest.raises(
+            lbt.errors.ProblemError,
+            match=rf"{names} are all named as .*columns=.* \(--columns \w+=\.\.\.\)",
+        ):
+            lbt.load_record(each, kind="open_loop", frame_rate_hz=RATE)
+    chosen = {"open_loop": ("x_nm", "y_nm")}
+    seen = lbt.load_record(path, columns=chosen, frame_rate_hz=RATE)
     assert np.array_equal(seen.measurements, y)
-    both = csv(tmp_path / "b.csv", y_nm=y[:, 1], x_nm=y[:, 0], ux_nm=u[:, 0], uy_nm=u[:, 1])
+    seen = lbt.load_record(clock, columns={"open_loop": "y_nm"}, frame_rate_hz=RATE)
+    assert np.array_equal(seen.measurements, y[:, 1:])
+    both = csv(tmp_path / "b.csv", yy_nm=y[:, 1], yx_nm=y[:, 0], ux_nm=u[:, 0], uy_nm=u[:, 1])
     seen = lbt.load_record(both, frame_rate_hz=RATE)
     assert np.array_equal(seen.measurements, y)
     assert np.array_equal(seen.commands, u)
-    # x is no axis where it is a clock
-    clock = csv(tmp_path / "c.csv", x=np.arange(FRAMES), y_nm=y[:, 1])
-    seen = lbt.load_record(clock, kind="open_loop", frame_rate_hz=RATE)
-    assert np.array_equal(seen.measurements, y[:, 1:])
 
 
 def test_a_clock_without_a_name_is_no_axis(tmp_path, series):

@@ -15,7 +15,7 @@ RATE = 500.0
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.xls", b"", "must end in one of .fits"),
+        ("a.xls", b"", r"a record must end in \.fits, .*got 'a\.xls'"),
         ("a.csv", b"", "has no rows"),
         ("a.csv", b"y_nm,u_nm\n", "a heading and no rows"),
         ("a.csv", b"y_nm,u_nm\n1,2\n3\n", "line 3 must have 2 cells; got 1"),
@@ -122,8 +122,9 @@ def test_a_name_and_a_header_of_two_units(tmp_path, series):
         ("[s] in frames of 2 ms", None),
         ("after the end of the frame", None),
         ("[frames] of the loop", 2.5),
-        ("total, in frames", 2.5),
-        ("(frames)", 2.5),
+        ("[frame]", 2.5),
+        ("total, in frames", None),
+        ("(frames)", None),
     ],
 )
 def test_delays_that_are_in_frames(tmp_path, series, comment, delay):
@@ -135,7 +136,10 @@ def test_delays_that_are_in_frames(tmp_path, series, comment, delay):
         FPS=RATE,
         DELAY=(2.5, comment),
     )
-    assert lbt.load_record(path).delay_frames == delay
+    seen = lbt.load_record(path)
+    assert seen.delay_frames == delay
+    said = "DELAY of the header was not taken: its comment does not say that it is in frames"
+    assert any(note.startswith(said) for note in seen.health.notes) is (delay is None)
 
 
 def test_facts_in_arrays_and_texts(tmp_path, series):

@@ -289,7 +289,7 @@ def gapped(folder):
             "a column was chosen twice",
         ),
         (["y_nm", "u_nm", "a", "b"], {"kind": "video"}, "kind must be one of closed_loop"),
-        (["y_nm", "u_nm", "a", "b"], {"kind": "spectrum"}, "needs columns of frequencies and dens"),
+        (["y_nm", "u_nm", "a", "b"], {"kind": "spectrum"}, "needs density and frequency; got y_nm"),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": 0}, "delay_frames must be at least 1; got 0"),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": "two"}, "delay_frames must be a number"),
         (["y_nm", "u_nm", "a", "b"], {"frame_rate_hz": None}, "frame rate is not known; give fra"),
@@ -329,7 +329,7 @@ FRAMES = 60
         ("frequency_hz,rms_nm\n20,300\n", "must be frequency_hz, and frequency_error_hz.*rms_nm"),
         ("frequency_khz\n0.02\n", "must be frequency_hz"),
         ("f_hz,frequency_hz\n20,20\n", "must be frequency_hz"),
-        ("error_hz\n20\n", "must have a column frequency_hz"),
+        ("error_hz\n20\n", "must be frequency_hz.*got error_hz"),
     ],
 )
 def test_lists_of_lines_that_are_refused(tmp_path, text, words):

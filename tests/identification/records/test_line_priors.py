@@ -71,7 +71,7 @@ def test_files(tmp_path):
         ([(20, 1, 2)], lbt.errors.ProblemError, "a pair of frequency and error"),
         (["20 Hz"], lbt.errors.ProblemError, "must be a number"),
         (20.0, lbt.errors.ProblemError, "a file or a list of frequencies; got float"),
-        ("lines.xml", lbt.errors.TelemetryError, "must end in one of .csv"),
+        ("lines.xml", lbt.errors.TelemetryError, "a list of lines must end in .csv"),
         ("nowhere.csv", lbt.errors.TelemetryError, "cannot read nowhere.csv: No such file"),
     ],
 )
