@@ -10,8 +10,7 @@ from scipy.linalg import solve_discrete_are
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.linear.lmi.balanced_coordinates import balance
-from lbt_synth.linear.lmi.hinf import hinf_lmi, least_gamma_lmi
-from lbt_synth.linear.lmi.kalman import kalman_sdp
+from lbt_synth.linear.lmi.filters import hinf_lmi, kalman_sdp, least_gamma_lmi
 from lbt_synth.linear.lmi.solver import solve
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.linear.riccati.gamma import gamma_riccati

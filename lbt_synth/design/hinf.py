@@ -184,14 +184,14 @@ class _LmiRoute:
         self.scale = _kalman_bracket(problem, start)[1]
 
     def least_gamma(self) -> tuple[SolvedGains, Witness]:
-        from lbt_synth.linear.lmi.hinf import least_gamma_lmi
+        from lbt_synth.linear.lmi.filters import least_gamma_lmi
 
         solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
         assert solution.witness is not None  # the least gamma has a dual solution
         return solution, solution.witness
 
     def central(self, gamma: float) -> SolvedGains:
-        from lbt_synth.linear.lmi.hinf import hinf_lmi
+        from lbt_synth.linear.lmi.filters import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 

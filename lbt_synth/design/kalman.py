@@ -53,7 +53,7 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     solution = kalman_riccati(problem)
     gains: SolvedGains = solution
     if route == "sdp":
-        from lbt_synth.linear.lmi.kalman import kalman_sdp
+        from lbt_synth.linear.lmi.filters import kalman_sdp
 
         scale = error_scale(problem, solution.P)
         gains = kalman_sdp(problem, coordinates=solution.P, scale=scale)

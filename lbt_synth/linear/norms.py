@@ -108,12 +108,13 @@ def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
 
 def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
     """Largest singular value of a balanced system between two angles, by level sets."""
-    seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
-    peak, angle = _climb(
-        seeds=_fold(seeds, low, high),
-        largest=lambda angles: _largest(G, angles),
-        propose=lambda level: _fold(_level_angles(G, level), low, high),
-    )
+
+    def pencil(level: float) -> FloatArray:
+        # one scaling of states serves both x and p; levels are scaled to one
+        B, C, D = G.B / np.sqrt(level), G.C / np.sqrt(level), G.D / level
+        return _pencil_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
+
+    peak, angle = _climb(G, low, high, lambda angles: _largest(G, angles), pencil)
     return HinfNorm(
         value=peak,
         lower=peak,
@@ -145,33 +146,33 @@ def largest_real_part(system: StateSpace) -> float:
         best = int(np.argmax(values))
         return float(values[best]), float(angles[best])
 
-    peak, _ = _climb(
-        seeds=_fold(np.concatenate([np.angle(G.poles), np.linspace(0, np.pi, 33)]), 0.0, np.pi),
-        largest=largest,
-        propose=lambda level: _fold(_real_part_angles(moved, level), 0.0, np.pi),
-    )
+    def pencil(level: float) -> FloatArray:
+        return _pencil_angles(G.A, G.B, np.zeros_like(G.A), G.C, 2 * (moved.D - level))
+
+    peak, _ = _climb(G, 0.0, np.pi, largest, pencil)
     return peak * (1 + 2 * _TOLERANCE) - 2 * size
 
 
 def _climb(
-    *,
-    seeds: FloatArray,
+    G: StateSpace,
+    low: float,
+    high: float,
     largest: Callable[[FloatArray], tuple[float, float]],
-    propose: Callable[[float], FloatArray],
+    level_angles: Callable[[float], FloatArray],
 ) -> tuple[float, float]:
-    """Find the peak over angles, and its angle, by raising a level until nothing lies above it.
+    """Find the peak between two angles by raising a level until nothing lies above it.
 
-    ``largest`` returns the largest value at some angles, at least 0, and its angle. ``propose``
-    returns the angles between which values may lie above a level.
+    ``largest`` returns the largest value at some angles, at least 0, and its angle.
+    ``level_angles`` returns the angles between which values may lie above a level.
     """
-    peak, angle = largest(seeds)
+    seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
+    peak, angle = largest(_fold(seeds, low, high))
     if peak == 0:
         return peak, angle
     for _ in range(100):
         level = peak * (1 + _TOLERANCE)
-        candidates = propose(level)
-        tests = np.concatenate([candidates, (candidates[1:] + candidates[:-1]) / 2])
-        new_peak, new_angle = largest(tests)
+        angles = _fold(level_angles(level), low, high)
+        new_peak, new_angle = largest(np.concatenate([angles, (angles[1:] + angles[:-1]) / 2]))
         if new_peak > peak:
             peak, angle = new_peak, new_angle
         if new_peak <= level:
@@ -251,55 +252,18 @@ def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
     return float(careful[best]), float(angles[high[best]])
 
 
-def _level_angles(G: StateSpace, level: float) -> FloatArray:
-    """Angles of the generalised eigenvalues at which ``level`` may be a singular value.
+def _pencil_angles(
+    A: FloatArray, B: FloatArray, Q: FloatArray, S: FloatArray, R: FloatArray
+) -> FloatArray:
+    """Angles of the generalised eigenvalues of a symplectic pencil; no matrix is inverted.
 
-    With e = C x + D w, w = (B'p + D'e) / level^2 and the adjoint state p,
-    ``z [x; A'p + C'e; 0] = [A x + B w; p; B'p + D'e - level^2 w]``; no matrix is inverted.
+    ``z [x; A'p + Q x + S'w; 0] = [A x + B w; p; S x + B'p + R w]`` with the adjoint state p. For
+    a singular value sigma, ``Q = C'C``, ``S = D'C`` and ``R = D'D - sigma^2 I``; for a level of
+    the real part of a scalar response, ``Q = 0``, ``S = C`` and ``R = 2 (D - level)``.
     """
-    n, m = G.B.shape
-    # one scaling of states serves both x and p; levels are scaled to one
-    C, D = G.C / np.sqrt(level), G.D / level
-    B = G.B / np.sqrt(level)
-    zero = np.zeros
-    E = np.block(
-        [
-            [np.eye(n), zero((n, n)), zero((n, m))],
-            [C.T @ C, G.A.T, C.T @ D],
-            [zero((m, 2 * n + m))],
-        ]
-    )
-    F = np.block(
-        [
-            [G.A, zero((n, n)), B],
-            [zero((n, n)), np.eye(n), zero((n, m))],
-            [D.T @ C, B.T, D.T @ D - np.eye(m)],
-        ]
-    )
-    return _pencil_angles(F, E)
-
-
-def _real_part_angles(G: StateSpace, level: float) -> FloatArray:
-    """Angles of the generalised eigenvalues at which ``Re G`` of a scalar system may be a level.
-
-    ``z [x; A'p + C'u; 0] = [A x + B u; p; C x + B'p + 2 (D - level) u]``.
-    """
-    n = G.n_states
-    zero = np.zeros
-    E = np.block(
-        [[np.eye(n), zero((n, n + 1))], [zero((n, n)), G.A.T, G.C.T], [zero((1, 2 * n + 1))]]
-    )
-    F = np.block(
-        [
-            [G.A, zero((n, n)), G.B],
-            [zero((n, n)), np.eye(n), zero((n, 1))],
-            [G.C, G.B.T, 2 * (G.D - level)],
-        ]
-    )
-    return _pencil_angles(F, E)
-
-
-def _pencil_angles(F: FloatArray, E: FloatArray) -> FloatArray:
+    (n, m), zero = B.shape, np.zeros
+    E = np.block([[np.eye(n), zero((n, n + m))], [Q, A.T, S.T], [zero((m, 2 * n + m))]])
+    F = np.block([[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, B.T, R]])
     with np.errstate(all="ignore"):
         values = eigvals(F, E)
     return np.asarray(np.angle(values[np.isfinite(values) & (values != 0)]))

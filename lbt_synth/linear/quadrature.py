@@ -33,6 +33,16 @@ def panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArra
     return middle + half * x, half * w
 
 
+def _panel_integrals(
+    integrand: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray, order: int
+) -> FloatArray:
+    """Integral over each panel, (panels, ...)."""
+    nodes, weights = panel_rule(low, high, order)
+    values = integrand(nodes.ravel())
+    values = values.reshape(low.size, order, *values.shape[1:])
+    return np.asarray(np.einsum("po,po...->p...", weights, values))
+
+
 def _stack(left: FloatArray, right: FloatArray, rows: BoolArray) -> FloatArray:
     """Chosen rows of two arrays, one below the other."""
     return np.concatenate([left[rows], right[rows]])
@@ -55,19 +65,13 @@ def adaptive_integral(
     >>> round(float(adaptive_integral(peak, np.array([0.0, 1.0]))[0, 0]), 5)  # close to pi
     3.14112
     """
-
-    def panels(low: FloatArray, high: FloatArray) -> FloatArray:
-        nodes, weights = panel_rule(low, high, order)
-        values = integrand(nodes.ravel())
-        values = values.reshape(low.size, order, *values.shape[1:])
-        return np.asarray(np.einsum("po,po...->p...", weights, values))
-
     low, high = edges[:-1], edges[1:]
-    coarse = panels(low, high)
+    coarse = _panel_integrals(integrand, low, high, order)
     done = np.zeros(coarse.shape[1:])
     for _ in range(40):
         middle = (low + high) / 2
-        left, right = panels(low, middle), panels(middle, high)
+        left = _panel_integrals(integrand, low, middle, order)
+        right = _panel_integrals(integrand, middle, high, order)
         fine = left + right
         total = np.trace(done + fine.sum(axis=0), axis1=-2, axis2=-1)
         change = np.abs(np.trace(fine - coarse, axis1=-2, axis2=-1))
@@ -113,32 +117,30 @@ def refine_panels(
     -1.0
     """
 
-    def panels(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-        nodes, weights = panel_rule(low, high, order)
-        values = integrand(nodes.ravel()).reshape(low.size, order, -1)
-        size = np.sum(weights * np.abs(values[..., 0]), axis=1)
-        return np.einsum("po,pok->pk", weights, values), size
+    def with_size(x: FloatArray) -> FloatArray:
+        values = integrand(x)
+        return np.concatenate([values, np.abs(values[:, :1])], axis=1)
 
     low, high = edges[:-1], edges[1:]
-    coarse, _ = panels(low, high)
+    coarse = _panel_integrals(with_size, low, high, order)
     done: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     done_size = moved = 0.0
     for _ in range(45):
         middle = (low + high) / 2
-        left, left_size = panels(low, middle)
-        right, right_size = panels(middle, high)
-        fine, size = left + right, left_size + right_size
-        scale = min(1.0, done_size + float(size.sum()))
-        change = np.max(np.abs(fine - coarse), axis=1)
+        left = _panel_integrals(with_size, low, middle, order)
+        right = _panel_integrals(with_size, middle, high, order)
+        fine = left + right
+        scale = min(1.0, done_size + float(fine[:, -1].sum()))
+        change = np.max(np.abs(fine - coarse)[:, :-1], axis=1)
         open_ = change > np.maximum(tolerance * scale, floor * (high - low))
-        done.append((low[~open_], high[~open_], fine[~open_]))
-        done_size += float(size[~open_].sum())
+        done.append((low[~open_], high[~open_], fine[~open_, :-1]))
+        done_size += float(fine[~open_, -1].sum())
         moved += float(change[~open_].sum())
         if not open_.any():
-            ends = [np.concatenate(parts) for parts in zip(*done, strict=True)]
-            rank = np.argsort(ends[0])
+            begin, end, integrals = (np.concatenate(parts) for parts in zip(*done, strict=True))
+            rank = np.argsort(begin)
             return RefinedPanels(
-                low=ends[0][rank], high=ends[1][rank], integrals=ends[2][rank], change=moved
+                low=begin[rank], high=end[rank], integrals=integrals[rank], change=moved
             )
         low, high = _stack(low, middle, open_), _stack(middle, high, open_)
         coarse = _stack(left, right, open_)

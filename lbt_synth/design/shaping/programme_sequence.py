@@ -131,11 +131,12 @@ class _Programme:
             )
         self.solved += 1
         constraints = _merged(self.groups)
-        found = minimize(function, constraints, size=self.size, scale=self.scale, start=start)
-        self.status = found.status
-        if found.coefficients is None:
+        c, self.status = minimize(
+            function, constraints, size=self.size, scale=self.scale, start=start
+        )
+        if c is None:
             raise _infeasibility_error(self.specification, self.groups, self.size, self.status)
-        return found.coefficients
+        return c
 
     def is_stable(self, c: FloatArray) -> bool:
         """Whether the half-planes of the sensor gains hold at all frequencies, without the room."""

@@ -13,6 +13,19 @@ from lbt_synth.validation import FloatArray, frozen_copy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LmiSolution:
+    """A solved semidefinite programme, back in the problem's own coordinates."""
+
+    gamma: float  # level of the programme (infinite for the Kalman filter)
+    P: FloatArray  # (n, n): covariance, or ``gamma^2`` times the inverse of the storage matrix
+    gain_predictor: FloatArray  # (n, q), in closed form from P
+    gain_filter: FloatArray  # (n, q), in closed form from P
+    status: str  # as reported by the solver; the design is certified without it
+    iterations: int
+    witness: Witness | None = None  # the dual solution of the least gamma
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BalancedProblem:
     """A problem in coordinates where a given error covariance is the identity."""
 
@@ -22,12 +35,26 @@ class BalancedProblem:
     output_scale: float  # ``zbar = z / output_scale``
     injection: FloatArray  # (n, q): part of the gain that the decorrelation adds
 
-    def gains(self, information: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Predictor and filter gain of an information matrix, in the original coordinates."""
+    def solution(
+        self,
+        P: FloatArray,
+        information: FloatArray,
+        run: tuple[str, int],
+        *,
+        gamma: float = np.inf,
+        witness: Witness | None = None,
+    ) -> LmiSolution:
+        """Bring a covariance, and the gains of an information matrix, to the original states."""
         predictor, filtering = filter_gains(self.problem, information)
         back = self.basis @ predictor @ self.measurement_scale
-        return frozen_copy(back + self.injection), frozen_copy(
-            self.basis @ filtering @ self.measurement_scale
+        return LmiSolution(
+            gamma=gamma,
+            P=frozen_copy(self.basis @ P @ self.basis.T),
+            gain_predictor=frozen_copy(back + self.injection),
+            gain_filter=frozen_copy(self.basis @ filtering @ self.measurement_scale),
+            status=run[0],
+            iterations=run[1],
+            witness=witness,
         )
 
     def witness(self, moments: FloatArray, basis: FloatArray) -> Witness:
@@ -38,10 +65,6 @@ class BalancedProblem:
         return Witness(
             states=frozen_copy(self.basis @ pairs[:n]), disturbances=frozen_copy(pairs[n:])
         )
-
-    def covariance(self, balanced: FloatArray) -> FloatArray:
-        """Covariance in the original coordinates."""
-        return frozen_copy(self.basis @ balanced @ self.basis.T)
 
 
 def balance(

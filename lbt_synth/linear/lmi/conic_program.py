@@ -14,12 +14,9 @@ doi:10.1162/08997660360581958).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cvxpy as cp
 import numpy as np
 
-from lbt_synth.errors import NumericalError
 from lbt_synth.linear.convex_functions import (
     CombinedFunction,
     Constraint,
@@ -29,16 +26,8 @@ from lbt_synth.linear.convex_functions import (
     FunctionBound,
     HalfPlanes,
 )
-from lbt_synth.linear.lmi.solver import USABLE, solve
+from lbt_synth.linear.lmi.solver import USABLE, require_optimum, solve
 from lbt_synth.validation import ComplexArray, FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ConicSolution:
-    """Answer of a programme."""
-
-    coefficients: FloatArray | None  # (n,); None if the constraints cannot hold together
-    status: str  # as reported by the solver
 
 
 def minimize(
@@ -48,17 +37,18 @@ def minimize(
     size: int,
     scale: float,
     start: FloatArray | None = None,
-) -> ConicSolution:
-    """Minimise a function; one with denominators by its convex majorant at ``start``, (size,)."""
+) -> tuple[FloatArray | None, str]:
+    """Minimise a function; one with denominators by its convex majorant at ``start``, (size,).
+
+    Return the coefficients, None if the constraints cannot hold together, and the solver's status.
+    """
     c = cp.Variable(size)
     held: list[cp.Constraint] = []
     objective = _expression(function, c, held, scale, start)
     for constraint in constraints:
         held += _as_constraints(constraint, c, 0.0)
     status, _ = solve(cp.Minimize(objective), held)
-    if status not in USABLE or c.value is None:
-        return ConicSolution(coefficients=None, status=status)
-    return ConicSolution(coefficients=np.asarray(c.value, dtype=np.float64), status=status)
+    return (np.asarray(c.value, dtype=np.float64) if status in USABLE else None), status
 
 
 def minimize_relaxation(
@@ -73,15 +63,15 @@ def minimize_relaxation(
     for i, group in enumerate(groups):
         for constraint in group:
             held += _as_constraints(constraint, c, 0.0 if rigid[i] else slack[i])
-    status, _ = solve(cp.Minimize(cp.sum(slack)), held)
-    if "infeasible" in status:
+    run = solve(cp.Minimize(cp.sum(slack)), held)
+    if "infeasible" in run[0]:
         return np.full(len(groups), np.inf)
-    if status not in USABLE or slack.value is None:
-        raise NumericalError(
-            f"the search for constraints that clash ended as {status!r}. They may be close to what "
-            "can be met, or very far from it; relax them, or try another number of functions.",
-            status=status,
-        )
+    require_optimum(
+        run,
+        "the search for constraints that clash",
+        "They may be close to what can be met, or very far from it; relax them, or try another "
+        "number of functions.",
+    )
     return np.asarray(np.where(rigid, 0.0, slack.value), dtype=np.float64)
 
 

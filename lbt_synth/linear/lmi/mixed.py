@@ -15,9 +15,8 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from lbt_synth.errors import NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.lmi.solver import USABLE, solve
+from lbt_synth.linear.lmi.solver import require_optimum, solve
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import FloatArray
@@ -105,15 +104,14 @@ class InnovationProgramme:
     def _solve(
         self, taps: cp.Variable, objective: cp.Minimize, constraints: list[cp.Constraint]
     ) -> tuple[FloatArray, str]:
-        status, _ = solve(objective, constraints)
-        if status not in USABLE or taps.value is None:
-            raise NumericalError(
-                f"the programme of the mixed filter ended as {status!r}; expected an optimum. "
-                "Try a larger bound, or another number of taps.",
-                status=status,
-            )
+        run = solve(objective, constraints)
+        require_optimum(
+            run,
+            "the programme of the mixed filter",
+            "Try a larger bound, or another number of taps.",
+        )
         unscaled = taps.value * self.scale @ np.kron(np.eye(self.taps), self.whitening)
-        return np.asarray(unscaled, dtype=np.float64), status
+        return np.asarray(unscaled, dtype=np.float64), run[0]
 
     def _bounds(
         self, taps: cp.Variable, level: float | cp.Variable, frequency_hz: FloatArray

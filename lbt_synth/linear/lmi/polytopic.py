@@ -29,7 +29,7 @@ import numpy as np
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.infeasibility_proof import whitening_coordinates
-from lbt_synth.linear.lmi.solver import USABLE, solve, symmetrise
+from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.validation import FloatArray, frozen_copy
 
@@ -66,18 +66,13 @@ def segment_filter(
     constraints = [
         inequality >> 0 for k in range(3) for inequality in programme.inequalities(k, norm, level)
     ]
-    status, iterations = solve(cp.Minimize(level), constraints)
-    if status not in USABLE or programme.K.value is None or level.value is None:
-        raise NumericalError(
-            f"the semidefinite programme of the interval ended as {status!r}; expected an optimum. "
-            "Try a narrower interval.",
-            status=status,
-        )
+    run = solve(cp.Minimize(level), constraints)
+    require_optimum(run, "the semidefinite programme of the interval", "Try a narrower interval.")
     try:
         inverse = np.linalg.inv(programme.K.value)
     except np.linalg.LinAlgError as error:
         raise NumericalError(
-            "the slack matrix of the filter is singular. Try a narrower interval.", status=status
+            "the slack matrix of the filter is singular. Try a narrower interval.", status=run[0]
         ) from error
     back = segment.basis @ inverse
     return SegmentFilter(
@@ -85,8 +80,8 @@ def segment_filter(
         B=frozen_copy(-back @ programme.KB.value @ segment.measurement_scale),
         C=frozen_copy(programme.output.value @ segment.inverse * scale),
         bound=float(np.sqrt(level.value)) * scale,
-        status=status,
-        iterations=iterations,
+        status=run[0],
+        iterations=run[1],
     )
 
 

@@ -1,16 +1,13 @@
-"""Call the conic solver, and keep its answer as plain arrays."""
+"""Call the conic solver, and refuse what it did not solve."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from typing import Any
 
 import cvxpy as cp
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.validation import FloatArray
 
 # Tighter tolerances end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 _SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
@@ -22,19 +19,6 @@ _ATTEMPTS: tuple[dict[str, Any], ...] = (
     {"static_regularization_constant": 1e-9},
 )
 USABLE = ("optimal", "optimal_inaccurate")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LmiSolution:
-    """A solved semidefinite programme, back in the problem's own coordinates."""
-
-    gamma: float  # level of the programme (infinite for the Kalman filter)
-    P: FloatArray  # (n, n): covariance, or ``gamma^2`` times the inverse of the storage matrix
-    gain_predictor: FloatArray  # (n, q), in closed form from P
-    gain_filter: FloatArray  # (n, q), in closed form from P
-    status: str  # as reported by the solver; the design is certified without it
-    iterations: int
-    witness: Witness | None = None  # the dual solution of the least gamma
 
 
 def symmetrise(expression: Any) -> Any:
@@ -72,3 +56,11 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
             raise _solver_error("the solver gave up on numbers out of its range.") from error
     iterations = programme.solver_stats.num_iters if programme.solver_stats else 0
     return str(programme.status), int(iterations or 0)
+
+
+def require_optimum(run: tuple[str, int], programme: str, advice: str) -> None:
+    """Refuse a programme whose status is not that of an optimum."""
+    if run[0] not in USABLE:
+        raise NumericalError(
+            f"{programme} ended as {run[0]!r}; expected an optimum. {advice}", status=run[0]
+        )

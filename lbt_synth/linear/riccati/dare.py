@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
-from lbt_synth.linear.riccati.equations import Equations
+from lbt_synth.linear.riccati.equations import Equations, Solutions
 from lbt_synth.linear.riccati.routes import ROUTES
 from lbt_synth.linear.riccati.solvability import require_stabilising
 from lbt_synth.validation import (
@@ -170,7 +170,7 @@ def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     factors = equations.normalising_factors()
     units = equations.balancing_units()
     balanced = equations.divide_weights(factors).change_units(units)
-    best = _try_routes(balanced)
+    best, attempts = _try_routes(balanced)
     radius = np.abs(best.poles).max(axis=-1)
 
     solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
@@ -183,7 +183,7 @@ def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
         except ValueError:  # numbers out of range (LinAlgError): refused without a reason
             continue
     if not solved.all():
-        _refuse(int(np.flatnonzero(~solved)[0]), lead, best)
+        _refuse(int(np.flatnonzero(~solved)[0]), lead, best, attempts)
     X = best.X
     weights = balanced.weights(X)
     negative = np.sum(np.linalg.eigvalsh(weights) < 0, axis=-1)
@@ -199,7 +199,7 @@ def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
         errors=frozen_copy(best.errors.reshape(lead)),
         negative=read_only(negative.reshape(lead)),
         iterations=int(np.max(best.steps, initial=0)),
-        attempts=tuple(best.attempts),
+        attempts=attempts,
     )
 
 
@@ -213,9 +213,9 @@ def _stack_arguments(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations,
         raise DimensionError(f"B must have at least one column; got {B.shape}.")
     Q = symmetric(Q, "Q", size=(n, why), stacked=True)
     R = symmetric(R, "R", size=(m, also), stacked=True)
-    if S is None:
-        S = np.zeros((n, m))
-    S = matrix(S, "S", rows=(n, why), cols=(m, also), stacked=True)
+    S = matrix(
+        np.zeros((n, m)) if S is None else S, "S", rows=(n, why), cols=(m, also), stacked=True
+    )
     parts = {"A": A, "B": B, "Q": Q, "R": R, "S": S}
     try:
         lead = np.broadcast_shapes(*(part.shape[:-2] for part in parts.values()))
@@ -231,42 +231,26 @@ def _stack_arguments(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations,
     return Equations(**stacks), lead
 
 
-class _Best:
-    """The best answer to each equation so far, and the routes that were tried."""
-
-    def __init__(self, equations: Equations) -> None:
-        count, n, m = equations.B.shape
-        self.X = np.full((count, n, n), np.nan)
-        self.gains = np.full((count, m, n), np.nan)
-        self.poles: ComplexArray = np.full((count, n), np.inf, dtype=np.complex128)
-        self.residuals, self.errors = np.full(count, np.inf), np.full(count, np.inf)
-        self.steps: IntArray = np.zeros(count, dtype=np.int64)
-        self.attempts: list[Attempt] = []
-
-
-def _try_routes(equations: Equations) -> _Best:
-    """Try the routes in order, each on the equations that are still unsolved."""
-    best = _Best(equations)
-    pending = np.arange(len(best.X))
+def _try_routes(equations: Equations) -> tuple[Solutions, tuple[Attempt, ...]]:
+    """Try the routes in order, each on the equations that are still unsolved; keep the best."""
+    best: Solutions | None = None
+    attempts = []
+    pending = np.arange(len(equations.A))
     for route, solve in ROUTES:
-        if pending.size == 0:
+        if best is not None and pending.size == 0:
             break
         part = equations.take(pending)
-        found, steps = solve(part)
-        refined = part.refine(found)
-        poles = part.poles(refined.gains)
-        size = np.where(np.abs(poles).max(axis=-1) < 1, refined.residuals, np.inf)
-        better = size < best.residuals[pending]
-        chosen = pending[better]
-        best.X[chosen], best.gains[chosen] = refined.X[better], refined.gains[better]
-        best.residuals[chosen], best.errors[chosen] = size[better], refined.errors[better]
-        best.poles[chosen], best.steps[chosen] = poles[better], steps[better]
-        satisfied = (size <= RESIDUAL_LIMIT) & (refined.errors <= _SATISFIED)
-        best.attempts.append(
-            Attempt(route=route, tried=int(pending.size), solved=int(satisfied.sum()))
-        )
+        found = part.refine(*solve(part))
+        stable = np.abs(found.poles).max(axis=-1) < 1
+        found = replace(found, residuals=np.where(stable, found.residuals, np.inf))
+        best = best or found
+        better = found.residuals < best.residuals[pending]
+        best.replace_rows(pending[better], found, better)
+        satisfied = (found.residuals <= RESIDUAL_LIMIT) & (found.errors <= _SATISFIED)
+        attempts.append(Attempt(route=route, tried=pending.size, solved=int(satisfied.sum())))
         pending = pending[~satisfied]
-    return best
+    assert best is not None  # there are routes
+    return best, tuple(attempts)
 
 
 def _prefix(index: int, lead: tuple[int, ...]) -> str:
@@ -277,19 +261,21 @@ def _prefix(index: int, lead: tuple[int, ...]) -> str:
     return f"equation {where[0] if len(where) == 1 else where}: "
 
 
-def _refuse(index: int, lead: tuple[int, ...], best: _Best) -> None:
+def _refuse(
+    index: int, lead: tuple[int, ...], best: Solutions, attempts: tuple[Attempt, ...]
+) -> None:
     residual, error = float(best.residuals[index]), float(best.errors[index])
     stable = bool(np.isfinite(residual))
-    gap = 1 - float(np.abs(best.poles[index]).max())
-    found = (
-        f"a relative residual of {residual:.3g}, an estimated error of {error:.3g} and a pole "
-        f"{gap:.3g} inside the unit circle"
-        if stable
-        else "no stable closed loop"
-    )
+    found = "no stable closed loop"
+    if stable:
+        gap = 1 - float(np.abs(best.poles[index]).max())
+        found = (
+            f"a relative residual of {residual:.3g}, an estimated error of {error:.3g} and a pole "
+            f"{gap:.3g} inside the unit circle"
+        )
     raise NumericalError(
         f"{_prefix(index, lead)}the Riccati equation was not solved: "
-        f"{', '.join(attempt.route for attempt in best.attempts)} gave {found}; expected a stable "
+        f"{', '.join(attempt.route for attempt in attempts)} gave {found}; expected a stable "
         f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
         f"{ERROR_LIMIT:g} (of a pole near the unit circle, below {_CLEAR:g} of its distance). "
         "There may be no stabilising solution; look for modes near the unit circle that are barely "
@@ -308,14 +294,18 @@ def _require_saddle(
     for i in np.flatnonzero(expected > 0):
         spectrum = np.linalg.eigvalsh(X[i])
         if negative[i] != expected[i]:
-            raise InfeasibleError(
-                f"{_prefix(int(i), lead)}R + B'XB must have as many negative eigenvalues as R, "
-                f"{expected[i]}; got {negative[i]}. The level that R holds cannot be met: "
-                "try a larger one."
+            wrong = (
+                f"R + B'XB must have as many negative eigenvalues as R, {expected[i]}; got "
+                f"{negative[i]}."
             )
-        if spectrum[0] < -1e-9 * max(abs(spectrum[-1]), abs(spectrum[0])):
-            raise InfeasibleError(
-                f"{_prefix(int(i), lead)}X must be positive semidefinite, as R is indefinite; got "
-                f"an eigenvalue of {spectrum[0]:.3g}. The level that R holds cannot be met: "
-                "try a larger one."
+        elif spectrum[0] < -1e-9 * max(abs(spectrum[-1]), abs(spectrum[0])):
+            wrong = (
+                "X must be positive semidefinite, as R is indefinite; got an eigenvalue of "
+                f"{spectrum[0]:.3g}."
             )
+        else:
+            continue
+        raise InfeasibleError(
+            f"{_prefix(int(i), lead)}{wrong} The level that R holds cannot be met: try a larger "
+            "one."
+        )

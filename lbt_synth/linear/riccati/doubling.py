@@ -7,52 +7,34 @@ the Riccati recursion; the convergence is quadratic. G need not be semidefinite.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lbt_synth.linear.batched import frobenius_norms, solve_stack, symmetrise, transpose
-from lbt_synth.validation import BoolArray, FloatArray, IntArray
+from lbt_synth.validation import FloatArray, IntArray
 
-MAX_DOUBLINGS = 60
+_MOST_STEPS = 60
 _ROUNDING = 4 * np.finfo(float).eps
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DoublingResult:
-    """The last iterates of a stack of N equations."""
+def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Iterate to the stabilising X, until a step changes it by no more than rounding.
 
-    X: FloatArray  # (N, n, n): not finite where the recursion diverged
-    steps: IntArray  # (N,): doublings
-    converged: BoolArray  # (N,): whether the last step changed X by no more than rounding
-
-
-def doubling(
-    A: FloatArray, G: FloatArray, H: FloatArray, *, max_steps: int = MAX_DOUBLINGS
-) -> DoublingResult:
-    """Iterate to the stabilising X of ``X = A' X (I + G X)^-1 A + H``; all are (N, n, n).
-
-    An equation leaves the stack as soon as it has converged or diverged.
+    All arrays are (N, n, n). Return X, nan where the iteration did not converge, and the steps
+    made (N,). An equation leaves the stack as soon as it has converged or diverged.
 
     Examples
     --------
     >>> import numpy as np
     >>> from lbt_synth.linear.riccati.doubling import doubling
     >>> one = np.ones((1, 1, 1))
-    >>> done = doubling(one, one, one)
-    >>> round(float(done.X[0, 0, 0]), 12), bool(done.converged[0])  # the golden ratio
-    (1.61803398875, True)
+    >>> round(float(doubling(one, one, one)[0][0, 0, 0]), 12)  # the golden ratio
+    1.61803398875
     """
-    count, n = A.shape[0], A.shape[-1]
-    identity = np.eye(n)
-    X_out = np.array(H)
-    steps = np.zeros(count, dtype=np.int64)
-    converged = np.zeros(count, dtype=bool)
-    going = np.arange(count)
-    X = X_out
+    X, going, n = H, np.arange(len(A)), A.shape[-1]
+    found, steps = np.full_like(H, np.nan), np.zeros(len(A), dtype=np.int64)
     with np.errstate(all="ignore"):
-        for step in range(1, max_steps + 1):
-            solved = solve_stack(identity + G @ X, np.concatenate([A, G], axis=-1))
+        for step in range(1, _MOST_STEPS + 1):
+            solved = solve_stack(np.eye(n) + G @ X, np.concatenate([A, G], axis=-1))
             WA, WG = solved[..., :n], solved[..., n:]
             increment = symmetrise(transpose(A) @ X @ WA)
             G = symmetrise(G + A @ WG @ transpose(A))
@@ -60,13 +42,12 @@ def doubling(
             A = A @ WA
             size = frobenius_norms(X)
             still = frobenius_norms(increment) <= _ROUNDING * size
-            left = still | ~np.isfinite(size)
-            if left.any() or step == max_steps:
-                steps[going], X_out[going] = step, X
-                converged[going] = still & np.isfinite(size)
-                keep = ~left
-                going = going[keep]
+            keep = ~still & np.isfinite(size)
+            steps[going] = step
+            if not keep.all():
+                converged = still & np.isfinite(size)
+                found[going[converged]] = X[converged]
+                going, A, G, X = going[keep], A[keep], G[keep], X[keep]
                 if going.size == 0:
                     break
-                A, G, X = A[keep], G[keep], X[keep]
-    return DoublingResult(X=X_out, steps=steps, converged=converged)
+    return found, steps

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from lbt_synth.linear.batched import frobenius_norms, solve_stack, symmetrise, transpose
 from lbt_synth.linear.lyapunov import smith_sum
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Where the platform has it, the residual is formed with 64 bits of mantissa instead of 53:
 # the limit of accuracy is then the rounding of X itself, not that of the products.
@@ -19,13 +19,20 @@ _BALANCING_STEPS = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RefinedSolutions:
-    """Solutions after Newton steps: X and gains, relative residuals, estimated errors of X."""
+class Solutions:
+    """Answers to N equations, found by some route and refined."""
 
     X: FloatArray
     gains: FloatArray
-    residuals: FloatArray
-    errors: FloatArray
+    poles: ComplexArray
+    residuals: FloatArray  # relative
+    errors: FloatArray  # of X, estimated
+    steps: IntArray  # doublings
+
+    def replace_rows(self, rows: IntArray, other: Solutions, chosen: BoolArray) -> None:
+        """Put the chosen answers of others in these rows."""
+        for field in fields(self):
+            getattr(self, field.name)[rows] = getattr(other, field.name)[chosen]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,7 +71,8 @@ class Equations:
         """Powers of two that make rows and columns of A, bordered by B and Q, alike, (N, n)."""
         off = np.abs(self.A) * (1 - np.eye(self.A.shape[-1]))
         scale = np.maximum(np.abs(self.A).max(axis=(-2, -1)), 1e-300)[:, None]
-        entry, weight = np.linalg.norm(self.B, axis=-1), np.sqrt(np.abs(_diagonal(self.Q)))
+        entry = np.linalg.norm(self.B, axis=-1)
+        weight = np.sqrt(np.abs(np.diagonal(self.Q, axis1=-2, axis2=-1)))
         entry = entry * scale / np.maximum(entry.max(axis=-1, keepdims=True), 1e-300)
         weight = weight * scale / np.maximum(weight.max(axis=-1, keepdims=True), 1e-300)
         exponent = np.zeros(entry.shape)
@@ -119,7 +127,7 @@ class Equations:
         scale = size + frobenius_norms(AXA.astype(np.float64)) + frobenius_norms(self.Q)
         return gains, residual, frobenius_norms(residual) / np.maximum(scale, 1e-300)
 
-    def refine(self, X: FloatArray) -> RefinedSolutions:
+    def refine(self, X: FloatArray, steps: IntArray) -> Solutions:
         """Take Newton steps while they lower the residual.
 
         An equation whose closed loop is not stable is left alone. The next Newton step,
@@ -144,8 +152,5 @@ class Equations:
                 X[done], gains[done] = trial[better], new_gains[better]
                 residual[done], size[done] = new_residual[better], new_size[better]
                 active = active[better & (change > _SETTLED)]
-        return RefinedSolutions(X=X, gains=gains, residuals=size, errors=error)
-
-
-def _diagonal(stack: FloatArray) -> FloatArray:
-    return np.asarray(np.diagonal(stack, axis1=-2, axis2=-1))
+            poles = self.poles(gains)
+        return Solutions(X=X, gains=gains, poles=poles, residuals=size, errors=error, steps=steps)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
 from lbt_synth.errors import InfeasibleError, NumericalError
@@ -79,36 +80,33 @@ class GammaEquation:
         widened = (self.identity + seen.T @ spread) @ self.keep
         A1, G1 = self.A @ widened, W @ widened
         H1 = self.A @ (seen.T @ spread @ self.filtered) @ self.A.T
-        done = doubling(A1.T[None], (G1 + G1.T)[None] / 2, (H1 + H1.T)[None] / 2)
-        if not done.converged[0]:
+        found, steps = doubling(A1.T[None], (G1 + G1.T)[None] / 2, (H1 + H1.T)[None] / 2)
+        X = found[0]
+        if not np.all(np.isfinite(X)):
             return LevelTrial(slack=-1.0)
-        X = done.X[0]
         P = P0 + X
         spectrum = np.linalg.eigvalsh(X)
         slack = 1 - float(np.linalg.eigvalsh(L @ P @ L.T)[-1]) / gamma**2
         transition = np.linalg.solve((self.identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
         if spectrum[0] < -1e-9 * abs(spectrum[-1]) or not _stable(transition):
             return LevelTrial(slack=-1.0)
-        return LevelTrial(slack=slack, P=P if slack > 0 else None, iterations=int(done.steps[0]))
+        return LevelTrial(slack=slack, P=P if slack > 0 else None, iterations=int(steps[0]))
 
     def solution(self, gamma: float, trial: LevelTrial) -> FilterRiccati | None:
         """Refine a trial by Newton steps and form its gains; None if it is no filter."""
         if trial.P is None:
             return None
-        problem = self.problem
+        problem, n, q = self.problem, len(self.A), len(self.problem.C)
         outputs = np.vstack([problem.C, problem.L / gamma])
-        weight = np.zeros((len(outputs), len(outputs)))
-        q = problem.C.shape[0]
-        weight[:q, :q] = problem.R
-        weight[q:, q:] = -np.eye(len(outputs) - q)
+        weight = block_diag(problem.R, -np.eye(len(problem.L)))
         equation = Equations(
             A=self.A.T[None],
             B=outputs.T[None],
             Q=(self.B @ self.B.T)[None],
             R=weight[None],
-            S=np.zeros((1, *outputs.T.shape)),
+            S=np.zeros((1, n, len(outputs))),
         )
-        refined = equation.refine(trial.P[None])
+        refined = equation.refine(trial.P[None], np.array([trial.iterations]))
         P, residual = refined.X[0], float(refined.residuals[0])
         if residual > _RESIDUAL_LIMIT:
             raise NumericalError(

@@ -98,11 +98,10 @@ def _double_from(
     Q = symmetrise(part.Q + transpose(A) @ PA - P)
     feedback = solve_stack(R, np.concatenate([transpose(S), transpose(B)], axis=-1))
     n = A.shape[-1]
-    done = doubling(
+    Y, steps[which] = doubling(
         A - B @ feedback[..., :n],
         symmetrise(B @ feedback[..., n:]),
         symmetrise(Q - S @ feedback[..., :n]),
     )
-    X[which] = np.where(done.converged[:, None, None], P + done.X, np.nan)
-    steps[which] = done.steps
+    X[which] = P + Y
     return X, steps

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
@@ -316,8 +315,9 @@ def assemble(parts: PlantParts) -> TipTiltPlant:
     total = np.zeros((n, size))
     total[:, :p] = np.array([line.direction for line in parts.vibrations]).reshape(p, n).T
     total[:, tur : tur + n] = np.eye(n)
-    A = block_diag(_companion(lines), _companion(air), np.eye(size - tot, k=-n))
-    A[tot : tot + n] = total
+    A = np.zeros((size, size))
+    A[:tur, :tur], A[tur:tot, tur:tot] = _companion(lines), _companion(air)
+    A[tot : tot + n], A[tot + n :, tot : size - n] = total, np.eye(size - tot - n)
 
     q = hardware.n_measurements
     B = np.zeros((size, p + n + q))

@@ -1,7 +1,7 @@
-"""Solve for the H-infinity predictor by a linear matrix inequality.
+"""Solve for the Kalman and the H-infinity predictor by semidefinite programmes.
 
-The gain is eliminated: with N a basis of the null space of ``[C D]``, a filter
-with error norm below gamma exists if and only if some P satisfies::
+For the H-infinity predictor the gain is eliminated: with N a basis of the null space of
+``[C D]``, a filter with error norm below gamma exists if and only if some P satisfies::
 
     Nx'P Nx + gamma^2 Nw'Nw - (A Nx + B Nw)' P (A Nx + B Nw) - (L Nx)'(L Nx) > 0
     P - L'L > 0
@@ -20,12 +20,31 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import null_space
 
-from lbt_synth.errors import InfeasibleError, NumericalError
+from lbt_synth.errors import InfeasibleError
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lmi.balanced_coordinates import BalancedProblem, balance
-from lbt_synth.linear.lmi.solver import USABLE, LmiSolution, solve, symmetrise
+from lbt_synth.linear.lmi.balanced_coordinates import BalancedProblem, LmiSolution, balance
+from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
 from lbt_synth.validation import FloatArray
+
+_ADVICE = 'Try route="riccati".'
+
+
+def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: float) -> LmiSolution:
+    """Maximise tr P subject to ``[[APA' + Q - P, APC'], [CPA', R + CPC']] >= 0``.
+
+    The stabilising solution of the filter Riccati equation is the greatest P that satisfies the
+    inequality (S. Boyd et al., "Linear Matrix Inequalities in System and Control Theory", SIAM
+    (1994), doi:10.1137/1.9781611970777).
+    """
+    scaled = balance(problem, coordinates, scale)
+    A, B, C = scaled.problem.A, scaled.problem.B, scaled.problem.C
+    P = cp.Variable(A.shape, symmetric=True)
+    block = cp.bmat(
+        [[A @ P @ A.T + B @ B.T - P, A @ P @ C.T], [C @ P @ A.T, np.eye(len(C)) + C @ P @ C.T]]
+    )
+    run = solve(cp.Maximize(cp.trace(P)), [symmetrise(block) >> 0, P >> 0])
+    require_optimum(run, "the semidefinite programme of the Kalman filter", _ADVICE)
+    return scaled.solution(P.value, np.linalg.inv((P.value + P.value.T) / 2), run)
 
 
 def least_gamma_lmi(
@@ -37,16 +56,11 @@ def least_gamma_lmi(
     gamma_squared = cp.Variable(nonneg=True)
     basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
     inequalities = _inequalities(scaled.problem, basis, P, gamma_squared, 1.0)
-    status, iterations = solve(cp.Minimize(gamma_squared), inequalities)
-    if status not in USABLE or P.value is None or gamma_squared.value is None:
-        raise NumericalError(
-            f"the least gamma's semidefinite programme ended as {status!r}; expected an optimum. "
-            'Try route="riccati".',
-            status=status,
-        )
+    run = solve(cp.Minimize(gamma_squared), inequalities)
+    require_optimum(run, "the least gamma's semidefinite programme", _ADVICE)
     level = float(gamma_squared.value)
     witness = scaled.witness(inequalities[0].dual_value, basis)
-    return _unpack(scaled, P.value / level, level, status, iterations, witness)
+    return _unpack(scaled, P.value / level, level, run, witness=witness)
 
 
 def hinf_lmi(
@@ -58,20 +72,15 @@ def hinf_lmi(
     P = cp.Variable(scaled.problem.A.shape, symmetric=True)
     basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
     inequalities = _inequalities(scaled.problem, basis, P, 1.0, 1 / level)
-    status, iterations = solve(cp.Maximize(cp.trace(P)), inequalities)
-    if "infeasible" in status:
+    run = solve(cp.Maximize(cp.trace(P)), inequalities)
+    if "infeasible" in run[0]:
         raise InfeasibleError(
             f"no H-infinity filter reaches gamma = {gamma:.9g}: the LMI is infeasible. "
             "Try a larger gamma.",
             gamma=gamma,
         )
-    if status not in USABLE or P.value is None:
-        raise NumericalError(
-            f"the semidefinite programme of the H-infinity filter ended as {status!r}; expected "
-            'an optimum. Try route="riccati".',
-            status=status,
-        )
-    return _unpack(scaled, P.value, level, status, iterations)
+    require_optimum(run, "the semidefinite programme of the H-infinity filter", _ADVICE)
+    return _unpack(scaled, P.value, level, run)
 
 
 def _inequalities(
@@ -79,8 +88,7 @@ def _inequalities(
 ) -> list[Any]:
     """Return the two inequalities; dividing them by gamma^2 suits a large, given level."""
     A, B, L = problem.A, problem.B, problem.L
-    n = A.shape[0]
-    Nx, Nw = basis[:n], basis[n:]
+    Nx, Nw = basis[: len(A)], basis[len(A) :]
     step, seen = A @ Nx + B @ Nw, L @ Nx
     dissipation = (
         Nx.T @ P @ Nx
@@ -92,23 +100,11 @@ def _inequalities(
 
 
 def _unpack(
-    scaled: BalancedProblem,
-    P: FloatArray,
-    gamma_squared: float,
-    status: str,
-    iterations: int,
-    witness: Witness | None = None,
+    scaled: BalancedProblem, P: FloatArray, level: float, run: tuple[str, int], **more: Any
 ) -> LmiSolution:
-    """Turn ``P / gamma^2`` into gains and a covariance in the problem's coordinates."""
+    """Turn ``P / gamma^2`` into a filter in the problem's coordinates; the level is gamma^2."""
     storage = (P + P.T) / 2
-    information = storage - scaled.problem.L.T @ scaled.problem.L / gamma_squared
-    predictor, filtering = scaled.gains(information)
-    return LmiSolution(
-        gamma=float(np.sqrt(gamma_squared) * scaled.output_scale),
-        P=scaled.covariance(np.asarray(np.linalg.inv(storage), dtype=np.float64)),
-        gain_predictor=predictor,
-        gain_filter=filtering,
-        status=status,
-        iterations=iterations,
-        witness=witness,
-    )
+    information = storage - scaled.problem.L.T @ scaled.problem.L / level
+    gamma = float(np.sqrt(level) * scaled.output_scale)
+    P = np.asarray(np.linalg.inv(storage), dtype=np.float64)
+    return scaled.solution(P, information, run, gamma=gamma, **more)
