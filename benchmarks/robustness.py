@@ -14,7 +14,6 @@ from rich.table import Table
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.config.robust import design_robust
 from lbt_synth.report.figures.style import house_style
 from lbt_synth.studies.paper import parameters as paper
 from lbt_synth.studies.paper.tables import paper_filters
@@ -86,7 +85,7 @@ def designs() -> dict[str, lbt.Design]:
         "Kalman, AR2, five lines, tuned": tuned(
             multi_mode, [0.02, 400.0], "Kalman, AR2 turbulence, five lines"
         ),
-        "shaped": design_robust(lbt.load_config("examples/lbt_robust.yaml")),
+        "shaped": lbt.load_config("examples/lbt_robust.yaml").design("robust"),
     }
 
 

@@ -21,7 +21,9 @@ DONE, FAILED, WRONG = 0, 1, 2
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    arguments = build_parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    named = next((word for word in words if not word.startswith("-")), "")
+    arguments = build_parser(named).parse_args(words)
     given = os.environ.get("SOURCE_DATE_EPOCH")
     if given is not None:  # checked here, as libraries read it when they are loaded
         try:

@@ -72,8 +72,8 @@ COMMANDS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
 }
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Build the parser of all commands; it imports nothing heavy."""
+def build_parser(named: str = "") -> argparse.ArgumentParser:
+    """Build the parser of all commands, with the arguments of the command that is named."""
     parser = argparse.ArgumentParser(
         prog="lbt-synth",
         description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
@@ -84,5 +84,6 @@ def build_parser() -> argparse.ArgumentParser:
     for name, (text, add_arguments) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=f"{text}.")
         command.add_argument("--json", action="store_true", help="print one JSON object instead")
-        add_arguments(command)
+        if name == named:
+            add_arguments(command)
     return parser

@@ -18,13 +18,16 @@ from lbt_synth.config.plant_and_truth import (
     build_truth,
     measurement_noise_nm,
     reference_gain,
+    vibration_rms_nm,
 )
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.telescope_and_atmosphere import build_atmosphere, require_atmosphere
+from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, ProblemError, name_file
 from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
+from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.validation import FloatArray
 
@@ -69,6 +72,53 @@ class Config:
     def hardware(self) -> LoopHardware:
         """The loop."""
         return self.plant.hardware
+
+    @property
+    def design_defaults(self) -> dict[str, Any]:
+        """Options of methods of synthesis that the file gives, or their defaults."""
+        return dict(self.settings.design)
+
+    def method_section(self, name: str) -> Any:
+        """Return the section ``design.<name>`` of a method, None if there is none."""
+        return getattr(self.settings.design, name, None)
+
+    def size_nm(self, entry: Any, key: str) -> float:
+        """Return the size of an entry with ``rms_nm`` or ``rms_mas`` [nm rms wavefront]."""
+        return vibration_rms_nm(entry, self.settings, key)
+
+    def design(self, method: str | DesignRequest, **options: Any) -> Design:
+        """Design a controller for the configuration.
+
+        Parameters
+        ----------
+        method : str
+            Method of synthesis, as ``lbt-synth design --method`` names it.
+        **options
+            Its options, as those of ``lbt-synth design``; the configuration gives others.
+
+        Returns
+        -------
+        Design
+            Certified design.
+
+        Raises
+        ------
+        ProblemError
+            If there is no such method, or it does not take an option.
+        ConfigError
+            If the configuration lacks what the method needs.
+        SynthesisError
+            If the design fails, or does not pass its checks.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> lbt.load_config("examples/lbt.yaml").design("integrator", gain=0.4).gain
+        0.4
+        """
+        request = design_request(method, options) if isinstance(method, str) else method
+        with name_file(self.source):
+            return request.build(self)
 
     def require_atmosphere(self, reason: str) -> Atmosphere:
         """Return the atmosphere; raise ConfigError with the reason if the file has none."""

@@ -17,10 +17,8 @@ from lbt_synth.config.schema import (
     Ar1Section,
     Ar2Section,
     ArSection,
-    BandSection,
     FileSection,
     LocalLoopSection,
-    TrueVibrationSection,
     VibrationSection,
 )
 from lbt_synth.config.telescope_and_atmosphere import (
@@ -314,13 +312,10 @@ def relative_gain(settings: FileSection, reference: float) -> Any:
     return float(ratios[0])
 
 
-def vibration_rms_nm(
-    section: VibrationSection | TrueVibrationSection | BandSection, settings: FileSection, key: str
-) -> float:
+def vibration_rms_nm(section: Any, settings: FileSection, key: str) -> float:
     """Return the size of a vibration [nm rms wavefront], which the file gives in nm or mas."""
     if section.rms_nm is not None:
-        return section.rms_nm
-    assert section.rms_mas is not None  # the schema wants exactly one of the two
+        return float(section.rms_nm)
     return convert_mas_to_nm(settings, section.rms_mas, f"{key}.rms_mas")
 
 

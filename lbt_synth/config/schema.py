@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Fraction = Annotated[float, Field(gt=0, le=1)]
-Damping = Annotated[float, Field(gt=0, lt=1)]
-Count = Annotated[int, Field(ge=1)]
+from lbt_synth.methods import section
+from lbt_synth.methods.registry import all_methods
+from lbt_synth.methods.section import Count, Damping, Fraction, NonNegative, Positive
+
 ONE, EACH = "one", "each"  # one value for all axes, or a list with one per axis
 
 
@@ -24,10 +23,8 @@ PositiveOrEach = Annotated[
 ]
 
 
-class Section(BaseModel):
-    """What all sections share: strict types, no unknown keys, read-only."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+class Section(section.Section):
+    """A section of a configuration, whose builders declare which numbers may vary."""
 
     @property
     def per_sample(self) -> Self:
@@ -230,64 +227,22 @@ class ImagingSection(Section):
     other_modes_strehl: Fraction = 1.0
 
 
-class BandSection(Section):
-    """A band in which a vibration may be anywhere."""
-
-    low_hz: NonNegative
-    high_hz: Positive
-    rms_nm: Positive | None = None
-    rms_mas: Positive | None = None
-
-    @model_validator(mode="after")
-    def _require_one_size(self) -> BandSection:
-        if (self.rms_nm is None) == (self.rms_mas is None):
-            raise ValueError("expected exactly one of rms_nm, rms_mas")
-        return self
+def _design_section() -> type[Section]:
+    """Return the defaults of the synthesis: options of the methods, and their own sections."""
+    fields: dict[str, Any] = {}
+    for method in all_methods().values():
+        for name in sorted(method.configurable):
+            option = method.options.model_fields[name]
+            fields[name] = (option.annotation, option)
+        if method.section is not None:
+            fields[method.name] = (method.section | None, None)
+    return create_model("DesignSection", __base__=Section, **fields)
 
 
-class AttenuationSection(Section):
-    """One step of a mask on the rejection."""
-
-    low_hz: NonNegative
-    high_hz: Positive
-    at_most: Positive
-    sensor_gain: Positive | None = None
-
-
-class MirrorUncertaintySection(Section):
-    """Relative uncertainty of the mirror in a band."""
-
-    relative: Positive
-    low_hz: NonNegative
-    high_hz: Positive
-
-
-class RobustSection(Section):
-    """The robust design: bands of vibrations, sensor gains, demands."""
-
-    bands: Annotated[list[BandSection], Field(min_length=1)]
-    turbulence: Literal["frozen_flow", "model"] | None = None
-    sensor_gain: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
-    scenarios: Annotated[list[Positive], Field(min_length=1)] | None = None
-    modulus_margin: Annotated[float, Field(gt=0, lt=1)] = 0.45
-    noise_peak: Positive | None = None
-    delay_error_frames: Annotated[float, Field(gt=0, le=1)] | None = None
-    command_stroke_nm: Positive | None = None
-    command_step_nm: Positive | None = None
-    attenuation: list[AttenuationSection] = []
-    mirror_uncertainty: list[MirrorUncertaintySection] = []
-    functions: Count = 60
-    pole: Annotated[float, Field(ge=0, lt=1)] = 0.7
-    states: Annotated[int, Field(ge=2)] | None = 20
-    loss: NonNegative = 0.1
-
-
-class DesignSection(Section):
-    """Defaults of the synthesis."""
-
-    gamma_ratio: Annotated[float, Field(ge=1)] = 1.2
-    command_weight: NonNegative = 0.0
-    robust: RobustSection | None = None
+if TYPE_CHECKING:
+    DesignSection: TypeAlias = Any
+else:
+    DesignSection = _design_section()
 
 
 class SimulationSection(Section):

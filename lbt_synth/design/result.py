@@ -49,8 +49,7 @@ class Design:
     Attributes
     ----------
     method : str
-        "kalman", "hinf", "mixed", "lqg", "polytopic-hinf", "polytopic-h2", "shaped" or
-        "integrator".
+        Name that the method of synthesis gives its designs.
     controller : Controller
         From y(k) to u(k), the known input included (new-state form).
     certificate : Certificate
@@ -193,6 +192,11 @@ class FilterDesign(EstimatorDesign):
         return (problem or self.problem).error_system(self.gain_predictor)
 
     @property
+    def is_bounded(self) -> bool:
+        """Whether the design was given a bound; without one its variance is the least."""
+        return self.gamma_requested is not None or self.rms_requested is not None
+
+    @property
     def estimator(self) -> Controller:
         """Estimator of z whatever the commands are, from [y(k), u(k-1)] for a plant."""
         return self.problem.estimator(self.gain_predictor)
@@ -287,7 +291,7 @@ def certify_design(design: FilterDesign) -> Certificate:
         problem,
         design.gain_predictor,
         gamma=design.gamma_requested,
-        least_variance=design.method == "kalman",
+        least_variance=not design.is_bounded,
     )
     checks = list(certificate.checks)
     if design.rms_requested is not None:

@@ -191,7 +191,10 @@ def test_the_command_line(tmp_path, capsys):
     assert main(["simulate", config, target, "--frames", "400", "--cases", "1"]) == 0
     capsys.readouterr()
     for wrong, text in (
-        (design, "needs the half width of the interval of frequencies; try --half-width-hz 1"),
+        (
+            design,
+            "needs --half-width-hz, the half width of the interval of vibration frequencies [Hz]; try --half-width-hz 1",
+        ),
         (
             [*design, "--half-width-hz", "1", "--gamma", "200"],
             "--gamma goes with --method hinf or mixed; got --method polytopic",
@@ -199,7 +202,7 @@ def test_the_command_line(tmp_path, capsys):
         ([*design, "--half-width-hz", "1", "--taps", "3"], "--taps goes with --method mixed"),
         (
             [*design, "--half-width-hz", "1", "--route", "lmi"],
-            "--method polytopic takes no --route",
+            "--route goes with --method hinf or kalman; got --method polytopic",
         ),
         ([*design, "--half-width-hz", "25"], "must have a frequency above that"),
         (

@@ -52,9 +52,12 @@ def test_wrong_commands(tmp_path, capsys):
     assert status == 2
     assert "tolerance" in err
     for extra, text in (
-        (("--horizon", "2"), "takes no horizon"),
+        (
+            ("--horizon", "2"),
+            "--horizon goes with --method hinf or kalman or mixed or polytopic; got --method lqg. Set loop.delay_frames",
+        ),
         (("--gain", "1"), "--gain goes"),
-        (("--route", "sdp"), "takes no --route"),
+        (("--route", "sdp"), "--route goes with --method hinf or kalman; got --method lqg"),
     ):
         status, _, err = run(capsys, "design", SLOW_YAML, "--method", "lqg", *extra, "-o", gain)
         assert status == 2

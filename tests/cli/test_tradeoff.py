@@ -58,7 +58,7 @@ def test_two_axes_on_the_command_line(tmp_path, capsys):
                 "-o",
                 str(tmp_path / "k.fits"),
             ],
-            "no horizon",
+            "--horizon goes with --method hinf or kalman or mixed or polytopic; got --method integrator",
         ),
         (
             [

@@ -5,7 +5,6 @@ from support.configs import AR, OTHER, minimal_config, write_config
 from support.robust_config import SMALL, robust_writer
 
 import lbt_synth as lbt
-from lbt_synth.config.robust import design_robust
 
 
 @pytest.fixture
@@ -14,10 +13,10 @@ def small(tmp_path):
 
 
 def test_sensor_gains_of_the_file_are_real_ones(small):
-    plain = design_robust(lbt.load_config(small()))
+    plain = lbt.load_config(small()).design("robust")
     believed = {"a": ("    kind: ar2", "    kind: ar2\n  sensor_gain: 0.5")}
     section = SMALL + "    sensor_gain: [0.3, 0.8]\n    scenarios: [0.5]\n"
-    design = design_robust(lbt.load_config(small(section, **believed)))
+    design = lbt.load_config(small(section, **believed)).design("robust")
     assert plain.specifications[0].objective.terms[0].sensor_gain == 1
     labels = [d.label for d in design.specifications[0].demands]
     assert "stability for sensor gains 0.6 to 1.6" in labels
@@ -38,7 +37,7 @@ def test_every_demand_of_the_file_reaches_the_specification(small):
       - {relative: 0.2, low_hz: 200.0, high_hz: 400.0}
 """
     )
-    design = design_robust(lbt.load_config(small(section)))
+    design = lbt.load_config(small(section)).design("robust")
     kinds = [type(d).__name__ for d in design.specifications[0].demands]
     assert kinds == [
         "ModulusMargin",
@@ -56,7 +55,7 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     robust = {"bands": [band], "functions": 8, "states": None, "modulus_margin": 0.3}
     content = minimal_config(design={"robust": robust})
     config = lbt.load_config(write_config(tmp_path, content))
-    design_robust(config)  # with the model's turbulence, as there is no atmosphere
+    config.design("robust")  # with the model's turbulence, as there is no atmosphere
     for change, text in (
         ({"turbulence": "frozen_flow"}, "atmosphere is missing: design.robust.turbulence"),
         (
@@ -66,8 +65,8 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     ):
         content["design"] = {"robust": {**robust, **change}}
         with pytest.raises(lbt.errors.ConfigError, match=text):
-            design_robust(lbt.load_config(write_config(tmp_path, content)))
+            lbt.load_config(write_config(tmp_path, content)).design("robust")
     content["design"] = {"robust": {**robust, "command_step_nm": 500.0}}
     content["model"]["turbulence"] = [AR, OTHER]
     with pytest.raises(lbt.errors.ConfigError, match="hold under one turbulence for all axes"):
-        design_robust(lbt.load_config(write_config(tmp_path, content)))
+        lbt.load_config(write_config(tmp_path, content)).design("robust")

@@ -7,12 +7,11 @@ import pytest
 from support.robust_config import EXAMPLE
 
 import lbt_synth as lbt
-from lbt_synth.config.robust import design_robust
 
 
 @pytest.fixture(scope="module")
 def example():
-    return design_robust(lbt.load_config(EXAMPLE))
+    return lbt.load_config(EXAMPLE).design("robust")
 
 
 def test_the_example_holds_at_every_row_and_sensor_gain(example):

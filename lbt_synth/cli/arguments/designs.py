@@ -16,67 +16,11 @@ from lbt_synth.cli.arguments.shared import (
 
 def add_design(parser: ArgumentParser) -> None:
     """Add the arguments of design."""
+    from lbt_synth.cli.arguments.method_options import add_method_options
+
     add_config(parser)
-    parser.add_argument(
-        "--method",
-        choices=("kalman", "hinf", "mixed", "lqg", "robust", "polytopic", "integrator"),
-        required=True,
-    )
-    parser.add_argument(
-        "--route",
-        choices=("riccati", "sdp", "lmi"),
-        help="kalman: riccati (default) or sdp; hinf: lmi (default up to 20 states) or riccati",
-    )
-    _add_bound(parser)
-    parser.add_argument(
-        "--taps",
-        type=int,
-        help="mixed: past innovations that the filter weighs, 1 to 64 (default 16)",
-    )
-    parser.add_argument(
-        "--norm",
-        choices=("hinf", "h2"),
-        help="polytopic: what is minimised over the interval, the H-infinity norm (default) or "
-        "the rms",
-    )
-    parser.add_argument(
-        "--half-width-hz",
-        type=float,
-        help="polytopic: half width of the interval of vibration frequencies [Hz]",
-    )
-    parser.add_argument(
-        "--command-weight",
-        type=float,
-        help="lqg: weight of the squared command beside the squared residual (default: the "
-        "configuration's, else 0)",
-    )
-    parser.add_argument(
-        "--horizon",
-        type=int,
-        default=1,
-        help="frames from the newest measurement to the estimate (default 1): the filter is for a "
-        "loop with a delay of loop.delay_frames + horizon - 1, at least 1 frame",
-    )
-    parser.add_argument(
-        "--gain", type=float, help="integrator: its gain (default: the best for the truth)"
-    )
+    add_method_options(parser)
     add_output(parser, GAIN_FILE)
-
-
-def _add_bound(parser: ArgumentParser) -> None:
-    bound = parser.add_mutually_exclusive_group()
-    bound.add_argument("--gamma", type=float, help="hinf, mixed: bound of the H-infinity norm [nm]")
-    bound.add_argument(
-        "--gamma-ratio",
-        type=float,
-        help="the same as a multiple of the least norm (default: the configuration's, else 1.2)",
-    )
-    bound.add_argument(
-        "--rms",
-        type=float,
-        help="mixed: bound of the estimation error [nm rms] instead, under which the norm is "
-        "minimised",
-    )
 
 
 def add_show(parser: ArgumentParser) -> None:

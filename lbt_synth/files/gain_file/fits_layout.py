@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from lbt_synth.design import Design, EstimatorDesign
-from lbt_synth.files.gain_file.contents import SCHEMA_VERSION, Meta
+from lbt_synth.design.record import Meta
+from lbt_synth.files.gain_file.contents import SCHEMA_VERSION
 from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.validation import FloatArray
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.design import Design
+from lbt_synth.design.record import DesignRecord
 from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files.file_checks import FileKind
 from lbt_synth.files.gain_file.contents import SCHEMA, SCHEMA_VERSION, pack_design, unpack_design
@@ -69,8 +70,9 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     target = require_gain_name(path)
     if not isinstance(design, Design):
         raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
-    arrays, meta = pack_design(design)
-    meta = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **meta}
+    record = pack_design(design)
+    arrays = record.arrays
+    meta = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **record.meta}
     meta["digest"] = digest(arrays, meta)
     text, ending = json.dumps(meta, allow_nan=False), target.suffix.lower()
     if ending == ".fits":
@@ -122,5 +124,5 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
             raise GainFileError(
                 f"{source} is damaged: {name} holds values that are not finite.", path=source
             )
-    fixed = {name: frozen_copy(array) for name, array in arrays.items()}
-    return _KIND.rebuild(lambda: unpack_design(fixed, meta), source), str(meta["digest"])
+    record = DesignRecord({name: frozen_copy(array) for name, array in arrays.items()}, meta)
+    return _KIND.rebuild(lambda: unpack_design(record), source), str(meta["digest"])

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.config import Config, load_config
-from lbt_synth.config.design_methods import DesignRequest, design_by_method
 from lbt_synth.config.load import read_mapping, validate_sections
 from lbt_synth.config.samples import Keys
 from lbt_synth.design import Design
-from lbt_synth.errors import ConfigError, LbtSynthError
+from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key
 from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.methods import method_named
+from lbt_synth.methods.request import DesignRequest, Wording, design_request
 from lbt_synth.studies.study.config_keys import is_integer, parse_path, require_number
 from lbt_synth.studies.study.distributions import Distribution, Fixed, Listed, Normal, Uniform
 from lbt_synth.studies.study.reference_evaluation import close_sample_loop
@@ -28,6 +29,12 @@ from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyControl
 
 # The oldest version whose results this one repeats to rounding: studies that it began are read
 # and resumed. Raise it with any change that moves a result.
+# the digest names these options of a controller also where they are not given
+_OPTIONS_IN_DIGEST = {
+    *("route", "horizon", "gamma", "gamma_ratio", "rms", "taps"),
+    *("norm", "half_width_hz", "command_weight", "gain"),
+}
+_WORDING = Wording(method="design: {}")
 _SAME_RESULTS_SINCE = "0.1.0"
 _MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
 
@@ -108,7 +115,10 @@ def load_study(
             )
         else:
             assert section.design is not None  # the schema requires a file or a design
-            request = DesignRequest(method=section.design, options=section.options)
+            with name_file(source), name_key(f"controllers.{name}.design"):
+                method_named(section.design)
+            with name_file(source), name_key(f"controllers.{name}"):
+                request = design_request(section.design, section.options, _WORDING)
             own = section.for_ == "sample"
             design = (
                 None if own else stored.get(name) or _make_design(name, request, config, source)
@@ -143,7 +153,7 @@ def _read_designs(study: Study, directory: str | os.PathLike[str] | None) -> dic
 
 def _make_design(name: str, request: DesignRequest, config: Config, source: Path) -> Design:
     try:
-        return design_by_method(config, request)
+        return config.design(request)
     except LbtSynthError as error:
         error.args = (f"{source}: controllers.{name}: {error}",)
         raise
@@ -154,6 +164,7 @@ def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> st
     study = settings.model_dump(by_alias=True, exclude={"config", "results"})
     for section in study["controllers"].values():
         del section["file"]
+        section |= dict.fromkeys(_OPTIONS_IN_DIGEST - section.keys())
     content = {
         "version": _SAME_RESULTS_SINCE,
         "study": study,

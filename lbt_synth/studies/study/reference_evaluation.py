@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from lbt_synth.config.design_methods import design_by_method
 from lbt_synth.config.ensemble import EXPECTED_ERRORS
 from lbt_synth.design import Design
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, simulate, strehl
@@ -98,7 +97,7 @@ def design_for_sample(controller: StudyController, sample: Sample) -> Design:
     if controller.design is not None:
         return controller.design
     assert controller.request is not None  # only a gain file has none
-    return design_by_method(sample.config, controller.request)
+    return sample.config.design(controller.request)
 
 
 def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:

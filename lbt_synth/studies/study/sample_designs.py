@@ -18,8 +18,8 @@ def is_kalman_for_sample(controller: StudyController) -> bool:
     return (
         request is not None
         and controller.design is None
-        and request.method == "kalman"
-        and not request.options
+        and request.method.batched
+        and not request.given
     )
 
 

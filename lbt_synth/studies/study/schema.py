@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from lbt_synth.config.design_methods import METHOD_ROUTES, METHODS_WITHOUT_HORIZON, OPTION_METHODS
-from lbt_synth.config.schema import Positive, Section
+from lbt_synth.methods.section import Positive, Section
 
 KINDS = ("fixed", "uniform", "normal", "list")
 _CONTROLLER_NAME = r"^[A-Za-z][A-Za-z0-9_-]*$"
@@ -61,27 +60,16 @@ class ParameterSection(Section):
 class ControllerSection(Section):
     """A controller: a gain file, or a design with the options of ``lbt-synth design``."""
 
+    model_config = ConfigDict(extra="allow")
+
     file: str | None = None
-    design: (
-        Literal["kalman", "hinf", "mixed", "lqg", "robust", "polytopic", "integrator"] | None
-    ) = None
+    design: str | None = None
     for_: Literal["configuration", "sample"] | None = Field(default=None, alias="for")
-    route: str | None = None
-    gamma: Positive | None = None
-    gamma_ratio: Annotated[float, Field(ge=1)] | None = None
-    rms: Positive | None = None
-    taps: Annotated[int, Field(ge=1, le=64)] | None = None
-    norm: Literal["hinf", "h2"] | None = None
-    half_width_hz: Positive | None = None
-    command_weight: Annotated[float, Field(ge=0)] | None = None
-    gain: Positive | None = None
-    horizon: Annotated[int, Field(ge=0)] | None = None
 
     @property
     def options(self) -> dict[str, Any]:
         """The options of the design that are given."""
-        named = {name: getattr(self, name) for name in ("route", "horizon", *OPTION_METHODS)}
-        return {name: value for name, value in named.items() if value is not None}
+        return dict(self.model_extra or {})
 
     @model_validator(mode="after")
     def _one_kind(self) -> ControllerSection:
@@ -91,20 +79,6 @@ class ControllerSection(Section):
             foreign = [*(["for"] if self.for_ is not None else []), *self.options]
             if foreign:
                 raise ValueError(f"{foreign[0]} goes with design, not with file")
-            return self
-        for name in self.options:
-            owners = OPTION_METHODS.get(name)
-            if owners is not None and self.design not in owners:
-                raise ValueError(f"{name} goes with design: {' or '.join(owners)}")
-        if self.route is not None and self.route not in METHOD_ROUTES[self.design]:
-            known = " or ".join(METHOD_ROUTES[self.design]) or "no route"
-            raise ValueError(f"design: {self.design} takes {known}; got route {self.route!r}")
-        if self.design == "polytopic" and self.half_width_hz is None:
-            raise ValueError("design: polytopic needs half_width_hz")
-        if self.horizon is not None and self.design in METHODS_WITHOUT_HORIZON:
-            raise ValueError(f"design: {self.design} takes no horizon")
-        if sum(v is not None for v in (self.gamma, self.gamma_ratio, self.rms)) > 1:
-            raise ValueError("expected at most one of gamma, gamma_ratio, rms")
         return self
 
 

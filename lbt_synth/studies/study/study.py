@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.config.design_methods import DesignRequest
 from lbt_synth.config.samples import Keys
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
+from lbt_synth.methods.request import DesignRequest
 from lbt_synth.studies.study.distributions import Distribution
 from lbt_synth.studies.study.sampling import unit_points
 from lbt_synth.studies.study.schema import StudySection

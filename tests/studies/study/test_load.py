@@ -24,7 +24,7 @@ def test_controllers(tmp_path):
     a, b, c, d = study.controllers
     assert a.design.gain == 0.4
     assert b.design.certificate.passed
-    assert (c.design, c.for_sample, c.request.options) == (None, True, {"gamma_ratio": 1.5})
+    assert (c.design, c.for_sample, c.request.given) == (None, True, {"gamma_ratio": 1.5})
     assert (
         d.design.gain
         == lbt.design.optimal_integrator(study.config.hardware, study.config.truth).gain
@@ -212,7 +212,7 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
         ({"controllers": "{a: {}}"}, "expected exactly one of design, file", "controllers.a"),
         (
             {"controllers": "{a: {design: kalmn}}"},
-            r"controllers\.a\.design: input should be 'kalman'",
+            r"controllers\.a\.design: method must be one of .*Did you mean kalman\?",
             "controllers.a.design",
         ),
         (
@@ -229,12 +229,20 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
         ),
         (
             {"controllers": "{a: {design: kalman, route: lmi}}"},
-            "takes riccati or sdp; got route 'lmi'",
+            "design: kalman takes route riccati or sdp; got route lmi",
             None,
         ),
-        ({"controllers": "{a: {design: mixed, route: lmi}}"}, "takes no route", None),
+        (
+            {"controllers": "{a: {design: mixed, route: lmi}}"},
+            "route goes with design: hinf or kalman; got design: mixed",
+            None,
+        ),
         ({"controllers": "{a: {design: polytopic}}"}, "needs half_width_hz", None),
-        ({"controllers": "{a: {design: lqg, horizon: 2}}"}, "takes no horizon", None),
+        (
+            {"controllers": "{a: {design: lqg, horizon: 2}}"},
+            "horizon goes with design: hinf or kalman or mixed or polytopic; got design: lqg",
+            None,
+        ),
         (
             {"controllers": "{a: {design: hinf, gamma: 5, gamma_ratio: 2}}"},
             "at most one of gamma",

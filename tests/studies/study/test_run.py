@@ -169,9 +169,7 @@ def test_other_studies_and_damage_are_refused(tmp_path):
 def test_designs_are_read_where_a_study_was_begun(tmp_path, monkeypatch):
     study, folder = load_small_study(tmp_path, controllers=TWO), make_folder(tmp_path)
     lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    monkeypatch.setattr(
-        "lbt_synth.studies.study.load.design_by_method", None
-    )  # nothing is designed
+    monkeypatch.setattr(lbt.config.Config, "design", None)  # nothing is designed
     again = lbt.studies.load_study(study.source, directory=folder)
     for one, other in zip(study.controllers, again.controllers, strict=True):
         np.testing.assert_array_equal(one.design.controller.A, other.design.controller.A)

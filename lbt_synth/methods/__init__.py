@@ -1,0 +1,9 @@
+"""The methods of synthesis, one module each; nothing else knows their names.
+
+A module of this folder with a ``METHOD`` is a method. A package of its own adds one under the
+entry point ``lbt_synth.methods``, and a script by :func:`~lbt_synth.methods.register`.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,121 @@
+"""What the methods of filters share: their options, their record and their description."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
+
+from lbt_synth.methods.method import Description
+from lbt_synth.methods.section import Section
+from lbt_synth.storage.rows import column, table_row
+
+if TYPE_CHECKING:
+    from lbt_synth.design.record import DesignRecord
+    from lbt_synth.design.result import EstimatorDesign, FilterDesign
+
+_CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
+
+Horizon = Annotated[
+    int,
+    Field(
+        ge=0,
+        description="frames from the newest measurement to the estimate: the filter is for a loop "
+        "with a delay of loop.delay_frames + horizon - 1, at least 1 frame",
+        json_schema_extra={"instead": "Set loop.delay_frames in the configuration instead."},
+    ),
+]
+BOUNDS = frozenset({"gamma", "gamma_ratio", "rms"})  # at most one is given
+
+
+class BoundOptions(Section):
+    """A bound on the H-infinity norm, and the horizon."""
+
+    gamma: float | None = Field(default=None, gt=0, description="bound of the H-infinity norm [nm]")
+    gamma_ratio: float = Field(
+        default=1.2, ge=1, description="bound of the norm as a multiple of the least norm"
+    )
+    horizon: Horizon = 1
+
+    def bound(self) -> dict[str, Any]:
+        """Return the bound as an argument: an absolute one, else the multiple of the least."""
+        return {"gamma_ratio": self.gamma_ratio} if self.gamma is None else {"gamma": self.gamma}
+
+
+@table_row
+class FilterFacts:
+    """What a filter achieves, beside what it was asked for and what is possible."""
+
+    rms: float = column("estimation error, rms", unit="nm")
+    gamma: float = column("estimation error, H-infinity norm", unit="nm")
+    limit_nm: float | None = column("least residual of any linear controller", unit="nm")
+    above_limit_percent: float | None = column("estimation error above it", unit="%")
+    rms_requested: float | None = column("rms asked for", unit="nm")
+    gamma_requested: float | None = column("bound asked for", unit="nm")
+    gamma_least: float | None = column(
+        "least norm of any filter, upper bound", unit="nm", format=".9g"
+    )
+    gamma_infeasible: float | None = column(
+        "least norm of any filter, lower bound", unit="nm", format=".9g"
+    )
+
+
+def limit_facts(design: EstimatorDesign) -> dict[str, Any]:
+    """Return the limit of a design's own model, and how far the design is above it."""
+    from lbt_synth.design.model_limits import model_limit
+
+    if design.hardware is None:
+        return {"limit_nm": None, "above_limit_percent": None}
+    limit_nm, above = model_limit(design)
+    return {"limit_nm": limit_nm, "above_limit_percent": round(above, 6) + 0.0}
+
+
+def describe_filter(design: FilterDesign) -> Description:
+    """Describe a filter."""
+    return Description(
+        facts=FilterFacts(
+            rms=design.rms,
+            gamma=design.gamma,
+            **limit_facts(design),
+            **{name: getattr(design, name) for name in _CLAIMS},
+        ),
+        matrices={"gain_predictor": design.gain_predictor, "gain_filter": design.gain_filter},
+    )
+
+
+def pack_filter(design: FilterDesign) -> DesignRecord:
+    """Record the gains and claims of a filter, with its problem."""
+    from lbt_synth.design.record import DesignRecord, record_problem
+
+    arrays = {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
+    if design.witness is not None:
+        arrays |= {"WITNESS_X": design.witness.states, "WITNESS_W": design.witness.disturbances}
+    meta = {name: getattr(design, name) for name in _CLAIMS}
+    return DesignRecord(arrays, meta) | record_problem(design.problem)
+
+
+def unpack_filter(record: DesignRecord) -> FilterDesign:
+    """Rebuild a filter."""
+    from lbt_synth.design import FilterDesign
+    from lbt_synth.linear import Witness
+
+    problem, arrays = record.problem(), record.arrays
+    rows_cols = (problem.A.shape[0], problem.C.shape[0])
+    for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
+        if arrays[name].shape != rows_cols:
+            raise ValueError(f"{name} must be {rows_cols} to match the plant")
+    return FilterDesign(
+        **record.common(),
+        problem=problem,
+        gain_predictor=arrays["GAIN_PREDICTOR"],
+        gain_filter=arrays["GAIN_FILTER"],
+        gamma_requested=record.meta["gamma_requested"],
+        gamma_least=record.meta["gamma_least"],
+        rms_requested=record.meta.get("rms_requested"),
+        gamma_infeasible=record.meta.get(
+            "gamma_infeasible"
+        ),  # files of 0.1 have none, nor a witness
+        witness=Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
+        if "WITNESS_X" in arrays
+        else None,
+    )

@@ -1,0 +1,48 @@
+"""The method of the H-infinity filter."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from lbt_synth.methods.filters import (
+    BOUNDS,
+    BoundOptions,
+    describe_filter,
+    pack_filter,
+    unpack_filter,
+)
+from lbt_synth.methods.method import DesignInputs, Method
+
+if TYPE_CHECKING:
+    from lbt_synth.design.result import FilterDesign
+
+
+class HinfOptions(BoundOptions):
+    """Options of the H-infinity filter."""
+
+    route: Literal["lmi", "riccati"] | None = Field(
+        default=None, description="solver (default lmi up to 20 states, riccati beyond)"
+    )
+
+
+def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign:
+    from lbt_synth.design.hinf import hinf
+
+    return hinf(inputs.plant, **options.bound(), horizon=options.horizon, route=options.route)
+
+
+METHOD = Method(
+    name="hinf",
+    title="H-infinity filter",
+    label=r"H$_\infty$",
+    options=HinfOptions,
+    build=_build,
+    pack=pack_filter,
+    unpack=unpack_filter,
+    describe=describe_filter,
+    exclusive=BOUNDS,
+    configurable=frozenset({"gamma_ratio"}),
+    reference=(2, {"route": "riccati"}),
+)

@@ -1,0 +1,54 @@
+"""The method of the mixed filter."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from lbt_synth.methods.filters import (
+    BOUNDS,
+    BoundOptions,
+    describe_filter,
+    pack_filter,
+    unpack_filter,
+)
+from lbt_synth.methods.method import DesignInputs, Method
+
+if TYPE_CHECKING:
+    from lbt_synth.design.result import FilterDesign
+
+
+class MixedOptions(BoundOptions):
+    """Options of the mixed filter."""
+
+    rms: float | None = Field(
+        default=None,
+        gt=0,
+        description="bound of the estimation error [nm rms] instead, under which the norm is "
+        "minimised",
+    )
+    taps: int = Field(
+        default=16, ge=1, le=64, description="past innovations that the filter weighs"
+    )
+
+
+def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign:
+    from lbt_synth.design.mixed import mixed
+
+    bound = options.bound() if options.rms is None else {"rms": options.rms}
+    return mixed(inputs.plant, **bound, taps=options.taps, horizon=options.horizon)
+
+
+METHOD = Method(
+    name="mixed",
+    title="mixed filter",
+    label="mixed",
+    options=MixedOptions,
+    build=_build,
+    pack=pack_filter,
+    unpack=unpack_filter,
+    describe=describe_filter,
+    exclusive=BOUNDS,
+    configurable=frozenset({"gamma_ratio"}),
+)

@@ -1,0 +1,118 @@
+"""The method of the filter for an interval of vibration frequencies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from lbt_synth.methods.filters import Horizon, limit_facts
+from lbt_synth.methods.method import Description, DesignInputs, Method
+from lbt_synth.methods.section import Section
+from lbt_synth.storage.rows import column, table_row
+from lbt_synth.validation import choice, number
+
+if TYPE_CHECKING:
+    from lbt_synth.design.polytopic import PolytopicDesign
+    from lbt_synth.design.record import DesignRecord
+
+_NORMS = ("hinf", "h2")
+_SIZES = ("bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme")
+
+
+class PolytopicOptions(Section):
+    """Options of the filter for an interval."""
+
+    half_width_hz: float = Field(
+        gt=0, description="half width of the interval of vibration frequencies [Hz]", examples=[1]
+    )
+    norm: Literal["hinf", "h2"] = Field(
+        default="hinf",
+        description="what is minimised over the interval, the H-infinity norm or the rms",
+    )
+    horizon: Horizon = 1
+
+
+@table_row
+class PolytopicFacts:
+    """What a filter guarantees over its interval, beside the worst that was found."""
+
+    rms: float = column("estimation error at the centre, rms", unit="nm")
+    gamma: float = column("estimation error at the centre, H-infinity norm", unit="nm")
+    limit_nm: float | None = column("least residual of any linear controller", unit="nm")
+    above_limit_percent: float | None = column("estimation error above it", unit="%")
+    half_width_hz: float = column("half width of the interval of frequencies", unit="Hz")
+    low_hz: float = column("interval of frequencies, from", unit="Hz")
+    high_hz: float = column("interval of frequencies, to", unit="Hz")
+    norm: str = column("norm that is bounded on the interval")
+    bound_guaranteed: float = column("norm on the interval, guaranteed", unit="nm", format=".9g")
+    worst_achieved: float = column("norm on the interval, worst found", unit="nm", format=".9g")
+    guaranteed_over_found: float = column("  guaranteed over found", format=".6f")
+    worst_frequency_hz: float = column("  found at", unit="Hz")
+    bound_programme: float = column("  bound of the programme", unit="nm", format=".9g")
+
+
+def _build(inputs: DesignInputs, options: PolytopicOptions) -> PolytopicDesign:
+    from lbt_synth.design.polytopic import polytopic
+
+    return polytopic(inputs.plant, **options.model_dump())
+
+
+def _pack(design: PolytopicDesign) -> DesignRecord:
+    from lbt_synth.design.record import DesignRecord, record_problem
+
+    arrays = {f"PREDICTOR_{name}": getattr(design.predictor, name) for name in "ABC"}
+    interval = {name: getattr(design, name) for name in ("half_width_hz", "norm", *_SIZES)}
+    return DesignRecord(arrays, {"interval": interval}) | record_problem(design.problem)
+
+
+def _unpack(record: DesignRecord) -> PolytopicDesign:
+    from lbt_synth.design.polytopic import PolytopicDesign
+
+    problem = record.plant("an interval of frequencies")
+    common, interval = record.common(), record.meta["interval"]
+    if common["method"] != f"{METHOD.name}-{interval['norm']}":
+        raise ValueError(f"the method {common['method']} is not of the norm {interval['norm']}")
+    sizes: dict[str, Any] = {name: number(interval[name], name, above=0) for name in _SIZES}
+    design = PolytopicDesign(
+        **common,
+        **sizes,
+        problem=problem,
+        predictor=record.controller("PREDICTOR_", D=np.zeros((len(problem.L), len(problem.C)))),
+        norm=choice(interval["norm"], "norm", _NORMS),
+        half_width_hz=number(interval["half_width_hz"], "half_width_hz", at_least=0),
+    )
+    # an interval that does not fit the plant is refused here, not when it is verified
+    design.interval.coefficient(design.worst_frequency_hz)
+    return design
+
+
+def _describe(design: PolytopicDesign) -> Description:
+    return Description(
+        facts=PolytopicFacts(
+            rms=design.rms,
+            gamma=design.gamma,
+            **limit_facts(design),
+            half_width_hz=design.half_width_hz,
+            low_hz=design.interval.low_hz,
+            high_hz=design.interval.high_hz,
+            norm=design.norm,
+            **{name: getattr(design, name) for name in _SIZES},
+            guaranteed_over_found=design.bound_guaranteed / design.worst_achieved,
+        ),
+        matrices={f"predictor_{name}": getattr(design.predictor, name) for name in "ABC"},
+    )
+
+
+METHOD = Method(
+    name="polytopic",
+    title="filter for an interval",
+    label="polytopic",
+    options=PolytopicOptions,
+    build=_build,
+    pack=_pack,
+    unpack=_unpack,
+    describe=_describe,
+    design_names=tuple(f"polytopic-{norm}" for norm in _NORMS),
+)

@@ -1,0 +1,91 @@
+"""The registry of the methods of synthesis: all of them, and each by name."""
+
+from __future__ import annotations
+
+import difflib
+import pkgutil
+from functools import cache
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING
+
+from lbt_synth import methods as folder
+from lbt_synth.errors import ProblemError
+from lbt_synth.methods.method import Method
+
+if TYPE_CHECKING:
+    from lbt_synth.design.result import Design
+
+
+@cache
+def _registered() -> dict[str, Method]:
+    found = {}
+    for module in pkgutil.iter_modules(folder.__path__):
+        method = getattr(import_module(f"{folder.__name__}.{module.name}"), "METHOD", None)
+        if method is not None:
+            found[method.name] = method
+    for entry in metadata.entry_points(group="lbt_synth.methods"):
+        method = entry.load()
+        found[method.name] = method
+    return found
+
+
+def all_methods() -> dict[str, Method]:
+    """Return the methods of synthesis by name, in the order of their names."""
+    return dict(sorted(_registered().items()))
+
+
+def register(method: Method) -> None:
+    """Add a method of synthesis, or replace the one of its name."""
+    _registered()[method.name] = method
+
+
+def unregister(name: str) -> None:
+    """Remove a method of synthesis."""
+    del _registered()[name]
+
+
+def method_named(name: str) -> Method:
+    """Return a method by its name; ProblemError if there is none.
+
+    Examples
+    --------
+    >>> from lbt_synth.methods.registry import method_named
+    >>> method_named("kalman").title
+    'Kalman filter'
+    """
+    methods = all_methods()
+    if name not in methods:
+        close = difflib.get_close_matches(name, methods, n=1)
+        hint = f" Did you mean {close[0]}?" if close else ""
+        raise ProblemError(f"method must be one of {', '.join(methods)}; got {name!r}.{hint}")
+    return methods[name]
+
+
+def method_of_design(name: str) -> Method:
+    """Return the method whose designs carry a name in ``Design.method``."""
+    for method in all_methods().values():
+        if name in (method.design_names or (method.name,)):
+            return method
+    raise ProblemError(f"no method of synthesis makes designs of the name {name!r}.")
+
+
+def option_names() -> list[str]:
+    """Return the names of the options of all methods."""
+    return sorted({name for m in all_methods().values() for name in m.options.model_fields})
+
+
+def design_label(design: Design) -> str:
+    """Return what figures call a design: the label of its method, else its method's name."""
+    try:
+        return method_of_design(design.method).label
+    except ProblemError:
+        return design.method
+
+
+def reference_methods(*, estimators_only: bool = False) -> list[Method]:
+    """Return the methods that studies compare designs with, in their order."""
+    found = [m for m in all_methods().values() if m.reference is not None]
+    return sorted(
+        (m for m in found if m.estimator or not estimators_only),
+        key=lambda method: method.reference[0] if method.reference else 0,
+    )

@@ -1,0 +1,122 @@
+"""A method of synthesis with its options, as a command or a study asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.methods.method import DesignInputs, Method
+from lbt_synth.methods.registry import all_methods, method_named
+from lbt_synth.methods.section import Section
+
+if TYPE_CHECKING:
+    from lbt_synth.design.result import Design
+
+
+_SHORT_WORDS = {
+    "greater than or equal to": "at least",
+    "less than or equal to": "at most",
+    "greater than": "above",
+    "less than": "below",
+    "a finite number": "finite",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wording:
+    """How a surface writes a method and an option."""
+
+    method: str = "method {}"
+    option: str = "{}"
+
+    def name(self, option: str) -> str:
+        """Return the name of an option as people write it."""
+        dashed = option.replace("_", "-") if self.option.startswith("--") else option
+        return self.option.format(dashed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DesignRequest:
+    """A method of synthesis and its options; the inputs of a design give the others."""
+
+    method: Method
+    given: Mapping[str, Any]  # the options that were given
+    options: Section  # all of them
+
+    @property
+    def text(self) -> str:
+        """Method and options as people read them."""
+        given = ", ".join(f"{name} {value}" for name, value in self.given.items())
+        return f"{self.method.name} ({given})" if given else self.method.name
+
+    def build(self, inputs: DesignInputs) -> Design:
+        """Design a controller; the inputs give defaults of options that are not given.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> from lbt_synth.methods.request import design_request
+        >>> config = lbt.load_config("examples/lbt.yaml")
+        >>> design_request("integrator", {"gain": 0.4}).build(config).gain
+        0.4
+        """
+        defaults = inputs.design_defaults
+        missing = (self.method.configurable & defaults.keys()) - self.given.keys()
+        options = self.options.model_copy(update={name: defaults[name] for name in missing})
+        return self.method.build(inputs, options)
+
+
+def design_request(
+    name: str, given: Mapping[str, Any], wording: Wording | None = None
+) -> DesignRequest:
+    """Check the options of a method; ProblemError in the words of the surface they came from."""
+    method, words = method_named(name), wording or Wording()
+    called = words.method.format(name)
+    for option in given:
+        if option not in method.options.model_fields:
+            owners = option_owners(option)
+            if not owners:
+                raise ProblemError(f"{called} has no option {words.name(option)}.")
+            extra = method_named(owners[0]).options.model_fields[option].json_schema_extra
+            raise ProblemError(
+                f"{words.name(option)} goes with {words.method.format(' or '.join(owners))}; got "
+                f"{called}." + (f" {extra['instead']}" if isinstance(extra, dict) else "")
+            )
+    both = [option for option in given if option in method.exclusive]
+    if len(both) > 1:
+        names = ", ".join(
+            map(words.name, sorted(method.exclusive & method.options.model_fields.keys()))
+        )
+        raise ProblemError(
+            f"{called} takes at most one of {names}; got {' and '.join(map(words.name, both))}."
+        )
+    try:
+        options = method.options.model_validate(dict(given))
+    except ValidationError as error:
+        raise ProblemError(_describe_error(error, method, called, words)) from None
+    return DesignRequest(method=method, given=dict(given), options=options)
+
+
+def option_owners(option: str) -> list[str]:
+    """Return the names of the methods that take an option."""
+    return [m.name for m in all_methods().values() if option in m.options.model_fields]
+
+
+def _describe_error(error: ValidationError, method: Method, called: str, words: Wording) -> str:
+    first = error.errors()[0]
+    option = str(first["loc"][0])
+    name, field = words.name(option), method.options.model_fields[option]
+    if first["type"] == "missing":
+        example = f"; try {name} {field.examples[0]}" if field.examples else ""
+        return f"{called} needs {name}, the {field.description}{example}."
+    if first["type"] == "literal_error":
+        expected = first["ctx"]["expected"].replace("'", "")
+        return f"{called} takes {name} {expected}; got {name} {first['input']}."
+    text = first["msg"].removeprefix("Input should be ")
+    for long, short in _SHORT_WORDS.items():
+        text = text.replace(long, short)
+    return f"{name} must be {text}; got {first['input']!r}."

@@ -1,0 +1,325 @@
+"""The method of the robust controller, which the section ``design.robust`` describes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from lbt_synth.errors import ConfigError, name_key
+from lbt_synth.methods.method import Description, DesignInputs, Method, RowTable
+from lbt_synth.methods.section import Count, NonNegative, Positive, Section
+from lbt_synth.storage.rows import column, table_row
+from lbt_synth.validation import number
+
+if TYPE_CHECKING:
+    from lbt_synth.design.record import DesignRecord
+    from lbt_synth.design.shaped_design import ShapedDesign
+    from lbt_synth.design.shaping.specification import Demand
+    from lbt_synth.models import Spectrum
+
+T = TypeVar("T")
+_KEY = "design.robust"
+
+
+class BandSection(Section):
+    """A band in which a vibration may be anywhere."""
+
+    low_hz: NonNegative
+    high_hz: Positive
+    rms_nm: Positive | None = None
+    rms_mas: Positive | None = None
+
+    @model_validator(mode="after")
+    def _require_one_size(self) -> BandSection:
+        if (self.rms_nm is None) == (self.rms_mas is None):
+            raise ValueError("expected exactly one of rms_nm, rms_mas")
+        return self
+
+
+class AttenuationSection(Section):
+    """One step of a mask on the rejection."""
+
+    low_hz: NonNegative
+    high_hz: Positive
+    at_most: Positive
+    sensor_gain: Positive | None = None
+
+
+class MirrorUncertaintySection(Section):
+    """Relative uncertainty of the mirror in a band."""
+
+    relative: Positive
+    low_hz: NonNegative
+    high_hz: Positive
+
+
+class RobustSection(Section):
+    """The robust design: bands of vibrations, sensor gains, demands."""
+
+    bands: Annotated[list[BandSection], Field(min_length=1)]
+    turbulence: Literal["frozen_flow", "model"] | None = None
+    sensor_gain: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
+    scenarios: Annotated[list[Positive], Field(min_length=1)] | None = None
+    modulus_margin: Annotated[float, Field(gt=0, lt=1)] = 0.45
+    noise_peak: Positive | None = None
+    delay_error_frames: Annotated[float, Field(gt=0, le=1)] | None = None
+    command_stroke_nm: Positive | None = None
+    command_step_nm: Positive | None = None
+    attenuation: list[AttenuationSection] = []
+    mirror_uncertainty: list[MirrorUncertaintySection] = []
+    functions: Count = 60
+    pole: Annotated[float, Field(ge=0, lt=1)] = 0.7
+    states: Annotated[int, Field(ge=2)] | None = 20
+    loss: NonNegative = 0.1
+
+
+@table_row
+class RobustFacts:
+    """What a robust controller is, beside the limits over its bands."""
+
+    states_per_mode: int = column("states of one mode, past commands included")
+    loss: float = column("objective above the long parameter's", unit="%", scale=100)
+    limit_nm: float = column("least worst residual over its bands, all modes", unit="nm")
+    above_limit_percent: float = column("residual at unit sensor gain above it", unit="%")
+    objective_nm: tuple[float, ...] = column(unit="nm")
+    long_objective_nm: tuple[float, ...] = column(unit="nm")
+
+
+@table_row
+class DemandRow:
+    """One demand on one mode."""
+
+    demand: str = column("demand")
+    mode: int = column("mode")
+
+
+@table_row
+class TermRow:
+    """The residual of one term of the objective."""
+
+    term: str = column("term")
+    mode: int = column("mode")
+    rms_nm: float = column("residual", unit="nm rms")
+
+
+def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
+    """Design the controller; the section's sensor gains are real, the design's are relative."""
+    from lbt_synth.design.robust import robust
+
+    section: RobustSection | None = inputs.method_section(METHOD.name)
+    if section is None:
+        raise ConfigError(
+            f"the key {_KEY} is missing: the robust design needs its bands at least. Try "
+            "examples/lbt_robust.yaml.",
+            path=_KEY,
+        )
+    assumed = inputs.sensor_gain
+    arguments: dict[str, Any] = {
+        name: getattr(section, name)
+        for name in ("modulus_margin", "functions", "pole", "states", "loss")
+    }
+    if section.sensor_gain is not None:
+        low, high = section.sensor_gain
+        if not low <= assumed <= high:
+            key = f"{_KEY}.sensor_gain"
+            raise ConfigError(
+                f"{key}: must hold model.sensor_gain, {assumed:g}; got {low:g} to {high:g}.",
+                path=key,
+            )
+        arguments["sensor_gain"] = (low / assumed, high / assumed)
+    if section.scenarios is not None:
+        arguments["scenarios"] = tuple(gain / assumed for gain in section.scenarios)
+    with name_key(_KEY):
+        spectrum = _choose_spectrum(inputs, section)
+        bands = _build_bands(inputs, section)
+        demands = _list_demands(inputs, section, spectrum)
+        return robust(inputs.plant, bands=bands, turbulence=spectrum, demands=demands, **arguments)
+
+
+def _choose_spectrum(inputs: DesignInputs, section: RobustSection) -> Spectrum | None:
+    """Return the spectrum of the turbulence, None for that of the model."""
+    if section.turbulence == "model" or (section.turbulence is None and inputs.atmosphere is None):
+        return None
+    if inputs.atmosphere is None:
+        raise ConfigError(
+            f"the key atmosphere is missing: {_KEY}.turbulence: frozen_flow is its spectrum. Give "
+            f"it, or {_KEY}.turbulence: model.",
+            path="atmosphere",
+        )
+    return inputs.atmosphere
+
+
+def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[Any]:
+    from lbt_synth.design.shaping import VibrationBand
+
+    out = []
+    for i, band in enumerate(section.bands):
+        rms_nm = inputs.size_nm(band, f"{_KEY}.bands[{i}]")
+        entry = {"low_hz": band.low_hz, "high_hz": band.high_hz, "rms_nm": rms_nm}
+        out.append(_build_entry(inputs, f"bands[{i}]", VibrationBand, entry))
+    return out
+
+
+def _build_entry(
+    inputs: DesignInputs, name: str, kind: Callable[..., T], values: Mapping[str, Any]
+) -> T:
+    """Build one entry of a list; an error names its key."""
+    key = f"{_KEY}.{name}"
+    nyquist_hz = inputs.hardware.frame_rate_hz / 2
+    if values["high_hz"] > nyquist_hz:
+        raise ConfigError(
+            f"{key}: must lie below the Nyquist frequency {nyquist_hz:.6g} Hz; got up to "
+            f"{values['high_hz']:g} Hz.",
+            path=key,
+        )
+    with name_key(key):
+        return kind(**values)
+
+
+def _list_demands(
+    inputs: DesignInputs, section: RobustSection, spectrum: Spectrum | None
+) -> list[Demand]:
+    from lbt_synth.design.shaping import (
+        Attenuation,
+        DelayError,
+        MirrorUncertainty,
+        NoisePeak,
+    )
+
+    out: list[Demand] = []
+    if section.noise_peak is not None:
+        out.append(NoisePeak(at_most=section.noise_peak))
+    if section.delay_error_frames is not None:
+        out.append(DelayError(frames=section.delay_error_frames))
+    for i, step in enumerate(section.attenuation):
+        gain = 1.0 if step.sensor_gain is None else step.sensor_gain / inputs.sensor_gain
+        entry = step.model_dump() | {"sensor_gain": gain}
+        out.append(_build_entry(inputs, f"attenuation[{i}]", Attenuation, entry))
+    for i, part in enumerate(section.mirror_uncertainty):
+        name = f"mirror_uncertainty[{i}]"
+        out.append(_build_entry(inputs, name, MirrorUncertainty, part.model_dump()))
+    return out + _list_command_bounds(inputs, section, spectrum)
+
+
+def _list_command_bounds(
+    inputs: DesignInputs, section: RobustSection, spectrum: Spectrum | None
+) -> list[Demand]:
+    from lbt_synth.design.shaped_design import noise_per_mode
+    from lbt_synth.design.shaping import CommandRms
+    from lbt_synth.models.spectra import spectrum_key
+
+    given = ((section.command_stroke_nm, False), (section.command_step_nm, True))
+    bounds = [(bound, rate) for bound, rate in given if bound is not None]
+    models = inputs.plant.turbulence
+    if bounds and spectrum is None and len({spectrum_key(model) for model in models}) > 1:
+        raise ConfigError(
+            f"{_KEY}: bounds on the commands hold under one turbulence for all axes, but "
+            "model.turbulence has one per axis. Leave command_stroke_nm and command_step_nm "
+            "out, or give one model.",
+            path=_KEY,
+        )
+    bound_commands = partial(
+        CommandRms,
+        turbulence=models[0] if spectrum is None else spectrum,
+        noise_nm=float(max(noise_per_mode(inputs.hardware, inputs.plant.R))),
+    )
+    return [bound_commands(at_most_nm=bound, rate=rate) for bound, rate in bounds]
+
+
+def _pack(design: ShapedDesign) -> DesignRecord:
+    from lbt_synth.design.record import DesignRecord
+    from lbt_synth.design.shaping.metadata import to_metadata
+
+    arrays = {
+        f"YOULA{mode + 1}_{name}": getattr(parameter, name)
+        for mode, parameter in enumerate(design.parameters)
+        for name in "ABC"
+    }
+    shaped = {
+        "specifications": [to_metadata(spec) for spec in design.specifications],
+        "objective_nm": list(design.objective_nm),
+        "long_objective_nm": list(design.long_objective_nm),
+        "long_functions": design.long_functions,
+    }
+    return DesignRecord(arrays, {"shaped": shaped})
+
+
+def _unpack(record: DesignRecord) -> ShapedDesign:
+    from lbt_synth.design.shaped_design import ShapedDesign
+    from lbt_synth.design.shaping import Specification
+    from lbt_synth.design.shaping.metadata import from_metadata
+
+    hardware, shaped = record.hardware(), record.meta["shaped"]
+    parameters = tuple(
+        record.controller(f"YOULA{mode + 1}_", D=np.zeros((1, 1))) for mode in range(hardware.modes)
+    )
+    specifications = tuple(from_metadata(spec) for spec in shaped["specifications"])
+    if not all(isinstance(spec, Specification) for spec in specifications):
+        raise ValueError("what it holds as specifications are none")
+    for spec in specifications:
+        spec.require_fitting(hardware.frame_rate_hz)
+    objective, long = (
+        tuple(number(v, name, above=0) for v in shaped[name])
+        for name in ("objective_nm", "long_objective_nm")
+    )
+    if {len(specifications), len(objective), len(long)} != {hardware.modes}:
+        raise ValueError(
+            f"it must have {hardware.modes} specifications and claims, one for each mode"
+        )
+    return ShapedDesign(
+        **record.common(),
+        loop_hardware=hardware,
+        specifications=specifications,
+        parameters=parameters,
+        objective_nm=objective,
+        long_objective_nm=long,
+        long_functions=int(shaped["long_functions"]),
+    )
+
+
+def _describe(design: ShapedDesign) -> Description:
+    from lbt_synth.design.model_limits import shaped_limit
+
+    limit_nm, above = shaped_limit(design)
+    notes = []
+    if design.is_reduced and design.loss < 0:
+        notes.append(
+            f"note: the long parameter is not long enough: one of {design.states_per_mode} states "
+            "is better. Try more functions, or another pole."
+        )
+    demands = [DemandRow(demand=label, mode=m + 1) for m, label in design.demand_labels()]
+    terms = [TermRow(term=text, mode=m + 1, rms_nm=rms) for m, text, rms in design.terms_nm()]
+    return Description(
+        facts=RobustFacts(
+            states_per_mode=design.states_per_mode,
+            loss=design.loss,
+            limit_nm=limit_nm,
+            above_limit_percent=above,
+            objective_nm=design.objective_nm,
+            long_objective_nm=design.long_objective_nm,
+        ),
+        tables=(
+            RowTable(key="demands", title="Demands", rows=demands),
+            RowTable(key="terms", title="Residual of each term", rows=terms),
+        ),
+        notes=notes,
+    )
+
+
+METHOD = Method(
+    name="robust",
+    title="robust controller",
+    label="robust",
+    options=Section,
+    build=_build,
+    pack=_pack,
+    unpack=_unpack,
+    describe=_describe,
+    section=RobustSection,
+    design_names=("robust", "shaped"),
+    estimator=False,
+)

@@ -1,0 +1,148 @@
+"""All that the package knows of a method of synthesis stands in its module."""
+
+from __future__ import annotations
+
+import ast
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import leaky_method
+from support.commands import run
+from support.plants import LBT_YAML, ROOT
+
+import lbt_synth as lbt
+from lbt_synth.methods import all_methods, method_named, register, unregister
+from lbt_synth.methods.registry import design_label, method_of_design, reference_methods
+
+CONFIG = str(LBT_YAML)
+BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "polytopic", "robust")
+
+
+@pytest.fixture
+def leaky():
+    register(leaky_method.METHOD)
+    yield leaky_method.METHOD
+    unregister("leaky")
+
+
+def test_methods_by_name(leaky):
+    assert tuple(name for name in all_methods() if name != "leaky") == BUILT_IN
+    assert method_named("leaky") is leaky
+    assert method_of_design("polytopic-h2") is method_named("polytopic")
+    assert method_of_design("shaped") is method_named("robust")
+    assert [m.name for m in reference_methods()] == ["integrator", "kalman", "hinf"]
+    assert [m.name for m in reference_methods(estimators_only=True)] == ["kalman", "hinf"]
+    assert leaky.needs_options
+    assert not method_named("mixed").needs_options
+    with pytest.raises(lbt.errors.ProblemError, match=r"got 'kalmann'. Did you mean kalman\?"):
+        method_named("kalmann")
+    with pytest.raises(lbt.errors.ProblemError, match="no method of synthesis makes designs"):
+        method_of_design("magic")
+
+
+def test_labels(leaky, config):
+    assert design_label(config.design("leaky", leak_per_s=1.0)) == "leaky"
+    assert design_label(config.design("kalman")) == "Kalman"
+
+
+@pytest.fixture(scope="module")
+def config():
+    return lbt.load_config(CONFIG)
+
+
+def test_every_command_takes_a_method_that_is_registered(leaky, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    gain = "leaky.fits"
+    status, text, _ = run(capsys, "design", "--help")
+    assert status == 0
+    help_text = " ".join(text.split())
+    assert "leaky: leaky integrator" in help_text
+    assert "--leak-per-s LEAK_PER_S leaky: part of the command lost [1/s]" in help_text
+    assert "leaky: its gain (default: the configuration's, else 0.3)" in help_text
+    design = ("design", CONFIG, "--method", "leaky", "-o", gain)
+    status, _, error = run(capsys, *design)
+    assert (status, "--leak-per-s, the part of the command lost" in error) == (2, True)
+    assert "try --leak-per-s 5" in error
+    status, _, error = run(capsys, *design, "--leak-per-s", "-1")
+    assert (status, error) == (2, "lbt-synth: error: --leak-per-s must be above 0; got -1.0.\n")
+    status, out, error = run(capsys, *design, "--leak-per-s", "5")
+    assert (status, error) == (0, "")
+    assert "What is left" in out
+    assert "note: this integrator forgets." in out
+
+    status, out, _ = run(capsys, "show", gain, "--json", "--matrices")
+    shown = json.loads(out)
+    assert (status, shown["leak_per_s"], shown["gain"]) == (0, 5.0, 0.3)
+    assert shown["leak"][1] == {"after_s": 0.1, "left": pytest.approx(np.exp(-0.5))}
+    assert shown["matrices"]["forgets"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))
+    assert run(capsys, "verify", gain)[0] == 0
+    assert run(capsys, "sigma", gain, "-o", "sigma.png")[0] == 0
+    status, out, _ = run(capsys, "simulate", CONFIG, gain, "--frames", "400", "--cases", "1")
+    assert (status, "Strehl ratio" in out) == (0, True)
+    assert run(capsys, "report", CONFIG, gain, "-o", "report.html")[0] == 0
+    assert "leaky" in Path("report.html").read_text()
+
+
+STUDY = """\
+version: 1
+config: {config}
+samples: 4
+controllers:
+  forgetful: {{design: leaky, leak_per_s: 5.0}}
+  own: {{design: leaky, leak_per_s: {leak}, for: sample}}
+parameters:
+  truth.vibrations[0].frequency_hz: {{uniform: [18.0, 22.0]}}
+"""
+
+
+def test_a_study_takes_a_method_that_is_registered(leaky, tmp_path, capsys):
+    study = tmp_path / "study.yaml"
+    study.write_text(STUDY.format(config=CONFIG, leak=5.0))
+    status, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
+    assert (status, error) == (0, "")
+    rows = np.genfromtxt(tmp_path / "out" / "results.csv", delimiter=",", names=True)
+    assert np.all(rows["forgetfulstable"] == 1)
+    np.testing.assert_allclose(rows["forgetfulstrehl"], rows["ownstrehl"], rtol=1e-9)
+    study.write_text(STUDY.format(config=CONFIG, leak=-1.0))
+    status, _, error = run(capsys, "study", study, "-o", tmp_path / "out2")
+    assert status == 2
+    assert "controllers.own: leak_per_s must be above 0; got -1.0" in error
+
+
+def test_a_package_adds_a_method_by_its_entry_point(tmp_path):
+    shutil.copy(leaky_method.__file__, tmp_path / "leaky_method.py")
+    facts = tmp_path / "leaky-1.0.dist-info"
+    facts.mkdir()
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: leaky\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text("[lbt_synth.methods]\nleaky = leaky_method:METHOD\n")
+    code = (
+        f"import sys; sys.path[:0] = [{str(tmp_path)!r}]; "
+        "from lbt_synth.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", code, "design", CONFIG, "--method", "leaky"]
+    options = ["--leak-per-s", "5", "-o", str(tmp_path / "k.npz"), "--json"]
+    done = subprocess.run([*command, *options], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["method"] == "leaky"
+
+
+def test_no_other_file_names_a_method():
+    """A method's name stands in its module, and in the design that it makes."""
+    known = {"design", "methods"}
+    named = {
+        str(path.relative_to(ROOT)): sorted(found)
+        for path in (ROOT / "lbt_synth").rglob("*.py")
+        if path.relative_to(ROOT).parts[1] not in known and (found := method_names_in(path))
+    }
+    assert named == {}
+
+
+def method_names_in(path):
+    """Names of methods among the strings of a file that are no docstrings."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
+    return strings & {*BUILT_IN, "polytopic-hinf", "polytopic-h2", "shaped"}
