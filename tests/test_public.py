@@ -26,6 +26,7 @@ ROOMS = (
     "interop",
     "linear",
     "loop",
+    "methods",
     "models",
     "report",
     "report.figures",

@@ -2,7 +2,6 @@ from .method import Description as Description
 from .method import DesignInputs as DesignInputs
 from .method import Method as Method
 from .method import RowTable as RowTable
-from .registry import all_methods as all_methods
 from .registry import method_named as method_named
 from .registry import register as register
 from .registry import unregister as unregister

@@ -19,7 +19,6 @@ _CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested"
 Horizon = Annotated[
     int,
     Field(
-        ge=0,
         description="frames from the newest measurement to the estimate: the filter is for a loop "
         "with a delay of loop.delay_frames + horizon - 1, at least 1 frame",
         json_schema_extra={"instead": "Set loop.delay_frames in the configuration instead."},

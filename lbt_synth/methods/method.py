@@ -16,7 +16,15 @@ if TYPE_CHECKING:
 
 
 class DesignInputs(Protocol):
-    """What a method designs for: a configuration, or the system identified from a record."""
+    """What a method designs for: a configuration, or a plant alone.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> config.design_defaults["gamma_ratio"], config.method_section("robust")
+    (1.2, None)
+    """
 
     @property
     def plant(self) -> TipTiltPlant:
@@ -51,18 +59,54 @@ class DesignInputs(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowTable:
-    """A table that ``show`` prints: rows are dataclasses of columns."""
+    """A table that ``show`` prints.
 
-    key: str  # in JSON
+    Attributes
+    ----------
+    key : str
+        Name in JSON.
+    title : str
+        Line above the table.
+    rows : sequence
+        Rows made with :func:`lbt_synth.storage.rows.table_row`, all of one type.
+
+    Examples
+    --------
+    >>> from lbt_synth.methods import RowTable
+    >>> RowTable(key="terms", title="Residual of each term", rows=()).key
+    'terms'
+    """
+
+    key: str
     title: str
     rows: Sequence[Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Description:
-    """What ``show`` says of a design beyond what it says of every design."""
+    """What ``show`` says of a design beyond what it says of every design.
 
-    facts: Any  # a dataclass of columns; what is None is not printed
+    Attributes
+    ----------
+    facts : object
+        A row made with :func:`lbt_synth.storage.rows.table_row`; None is not printed.
+    tables : sequence of RowTable
+        Tables below the facts.
+    notes : sequence of str
+        Warnings below the tables.
+    matrices : mapping of str to ndarray
+        What ``--matrices`` adds to the controller's.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.methods import method_named
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
+    >>> method_named("integrator").describe(slow).facts.gain
+    0.3
+    """
+
+    facts: Any
     tables: Sequence[RowTable] = ()
     notes: Sequence[str] = ()
     matrices: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -70,23 +114,58 @@ class Description:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A method of synthesis, whole: all that the package knows of it stands here."""
+    """A method of synthesis, whole: all that the package knows of it stands here.
 
-    name: str  # of ``--method``, and of ``design:`` in a study
-    title: str  # in a sentence: "Kalman filter"
-    label: str  # in a figure: "Kalman"
-    options: type[Section]  # each field with its help, unit, limits and default
+    Attributes
+    ----------
+    name : str
+        As ``lbt-synth design --method`` and ``design:`` in a study call it.
+    title, label : str
+        In a sentence ("Kalman filter"), and in the legend of a figure ("Kalman").
+    options : type
+        A :class:`Section`: each option with its description, limits and default.
+    build : callable
+        From :class:`DesignInputs` and the options to a certified design.
+    pack, unpack : callable
+        What a gain file holds beyond the controller; and the design of a whole record.
+    describe : callable
+        From a design to its :class:`Description`.
+    design_names : tuple of str
+        ``Design.method`` of its designs, where it is not the name.
+    section : type or None
+        Section ``design.<name>`` of a configuration, a :class:`Section`.
+    exclusive : frozenset of str
+        Options of which at most one is given.
+    configurable : frozenset of str
+        Options whose default ``design`` in a configuration can give.
+    estimator : bool
+        Whether the design depends on the vibrations of the plant.
+    batched : bool
+        Whether a study designs it for many samples at once.
+    reference : tuple or None
+        Rank among the methods that studies compare designs with, and the options it has there.
+
+    Examples
+    --------
+    >>> from lbt_synth.methods import method_named
+    >>> sorted(method_named("mixed").exclusive)
+    ['gamma', 'gamma_ratio', 'rms']
+    """
+
+    name: str
+    title: str
+    label: str
+    options: type[Section]
     build: Callable[[DesignInputs, Any], Design]
-    pack: Callable[[Any], DesignRecord]  # what a gain file holds beyond the controller
+    pack: Callable[[Any], DesignRecord]
     unpack: Callable[[DesignRecord], Design]
     describe: Callable[[Any], Description]
-    design_names: tuple[str, ...] = ()  # ``Design.method`` of its designs, where not ``name``
-    section: type[Section] | None = None  # of the configuration, as ``design.<name>``
-    exclusive: frozenset[str] = frozenset()  # at most one of these options is given
-    configurable: frozenset[str] = frozenset()  # options that ``design`` gives a default
-    estimator: bool = True  # designed for the model of the plant, vibrations included
-    batched: bool = False  # of single axes: designed for many samples at once
-    # rank among the references that studies compare designs with, and their options
+    design_names: tuple[str, ...] = ()
+    section: type[Section] | None = None
+    exclusive: frozenset[str] = frozenset()
+    configurable: frozenset[str] = frozenset()
+    estimator: bool = True
+    batched: bool = False
     reference: tuple[int, Mapping[str, Any]] | None = None
 
     @property

@@ -30,26 +30,94 @@ def _registered() -> dict[str, Method]:
 
 
 def all_methods() -> dict[str, Method]:
-    """Return the methods of synthesis by name, in the order of their names."""
-    return dict(sorted(_registered().items()))
+    """Return the methods of synthesis.
 
-
-def register(method: Method) -> None:
-    """Add a method of synthesis, or replace the one of its name."""
-    _registered()[method.name] = method
-
-
-def unregister(name: str) -> None:
-    """Remove a method of synthesis."""
-    del _registered()[name]
-
-
-def method_named(name: str) -> Method:
-    """Return a method by its name; ProblemError if there is none.
+    Returns
+    -------
+    dict of str to Method
+        In the order of their names.
 
     Examples
     --------
-    >>> from lbt_synth.methods.registry import method_named
+    >>> from lbt_synth.methods.registry import all_methods
+    >>> ", ".join(all_methods())
+    'hinf, integrator, kalman, lqg, mixed, polytopic, robust'
+    """
+    return dict(sorted(_registered().items()))
+
+
+def register(method: Method) -> Method:
+    """Add a method of synthesis, or replace the one of its name.
+
+    Parameters
+    ----------
+    method : Method
+        The method; command line, studies and gain files know it from now on.
+
+    Returns
+    -------
+    Method
+        The same.
+
+    Examples
+    --------
+    >>> from lbt_synth.methods import method_named, register
+    >>> register(method_named("kalman")).label  # replaces itself
+    'Kalman'
+    """
+    _registered()[method.name] = method
+    return method
+
+
+def unregister(name: str) -> Method:
+    """Remove a method of synthesis.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+
+    Returns
+    -------
+    Method
+        The method that was removed.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such method.
+
+    Examples
+    --------
+    >>> from lbt_synth.methods import register, unregister
+    >>> register(unregister("mixed")).label
+    'mixed'
+    """
+    method_named(name)
+    return _registered().pop(name)
+
+
+def method_named(name: str) -> Method:
+    """Return a method by its name.
+
+    Parameters
+    ----------
+    name : str
+        The name.
+
+    Returns
+    -------
+    Method
+        The method.
+
+    Raises
+    ------
+    ProblemError
+        If there is none of this name.
+
+    Examples
+    --------
+    >>> from lbt_synth.methods import method_named
     >>> method_named("kalman").title
     'Kalman filter'
     """
@@ -80,6 +148,11 @@ def design_label(design: Design) -> str:
         return method_of_design(design.method).label
     except ProblemError:
         return design.method
+
+
+def record_methods() -> list[str]:
+    """Return the names of the methods that need no more than a plant identified from a record."""
+    return [n for n, m in all_methods().items() if m.estimator and not m.needs_options]
 
 
 def reference_methods(*, estimators_only: bool = False) -> list[Method]:

@@ -14,6 +14,16 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Section(BaseModel):
-    """What all sections share: strict types, no unknown keys, read-only."""
+    """Options or a section of a file: strict types, no unknown keys, read-only.
+
+    Examples
+    --------
+    >>> from pydantic import Field
+    >>> from lbt_synth.methods import Section
+    >>> class Leak(Section):
+    ...     leak_per_s: float = Field(gt=0, description="part of the command lost [1/s]")
+    >>> Leak(leak_per_s=5).leak_per_s
+    5.0
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
