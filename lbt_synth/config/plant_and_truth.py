@@ -315,7 +315,7 @@ def relative_gain(settings: FileSection, reference: float) -> Any:
 def vibration_rms_nm(section: Any, settings: FileSection, key: str) -> float:
     """Return the size of a vibration [nm rms wavefront], which the file gives in nm or mas."""
     if section.rms_nm is not None:
-        return float(section.rms_nm)
+        return section.rms_nm  # type: ignore[no-any-return]  # a section with a size
     return convert_mas_to_nm(settings, section.rms_mas, f"{key}.rms_mas")
 
 
