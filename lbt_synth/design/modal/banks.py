@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from lbt_synth.errors import DimensionError
 from lbt_synth.validation import FloatArray, float_array
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Bank:
     """Controllers in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``."""
 
@@ -29,7 +29,7 @@ class Bank:
 
     def for_modes(self, modes: np.ndarray) -> Bank:
         """Return the same controllers for other modes: i becomes ``modes[i]``."""
-        return Bank(modes=modes[self.modes], A=self.A, B=self.B, C=self.C, D=self.D)
+        return replace(self, modes=modes[self.modes])
 
 
 @dataclass(slots=True, eq=False)
@@ -43,7 +43,7 @@ class RunningBanks:
     >>> import numpy as np
     >>> from lbt_synth.design.modal.banks import Bank, RunningBanks
     >>> one = np.ones((2, 1, 1))
-    >>> bank = Bank(modes=np.array([[1], [0]]), A=one, B=one, C=one, D=0 * one)
+    >>> bank = Bank(np.array([[1], [0]]), one, one, one, 0 * one)
     >>> run = RunningBanks((bank,), 2)
     >>> [run.step([1.0, 2.0]).tolist() for _ in range(2)]
     [[1.0, 2.0], [2.0, 4.0]]

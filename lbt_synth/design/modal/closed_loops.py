@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.validation import FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class LoopBlock:
     """Closed loops of one bank, from ``[phi_tot, noise]`` to ``[phi_res, u]``."""
 
@@ -42,7 +43,7 @@ def close_bank(bank: Bank, sensor_gain: FloatArray, mirror: Response) -> LoopBlo
     A0, A1, B, C0, C1, D = loop_matrices(*textbook, mirror=mirror, sensor=sensor, influence=unit)
     part = slice(2 * w)  # the measurement is left out
     C = C0[:, part] + factor * C1[:, part]
-    return LoopBlock(modes=bank.modes, A=A0 + factor * A1, B=B, C=C, D=D[:, part])
+    return LoopBlock(bank.modes, A0 + factor * A1, B, C, D[:, part])
 
 
 def spectral_radii(A: FloatArray) -> FloatArray:
@@ -50,14 +51,20 @@ def spectral_radii(A: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.linalg.eigvals(A)).max(axis=-1))
 
 
+class LoopVariances(NamedTuple):
+    """What the loops of a block leave, with what tells how far it can be trusted."""
+
+    variances: FloatArray  # (N, w), of each mode's residual
+    residuals: FloatArray  # (N,), relative, of the Lyapunov equations
+    rounding: FloatArray  # (N,), what it may have done to the variances, relative
+
+
 def block_variances(
     block: LoopBlock, turbulence: ModalTurbulence, lines: Lines, noise_nm: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Exact variance of the residual of each mode, (N, w), under models and white noise.
+) -> LoopVariances:
+    """Exact variances under models and white noise: Lyapunov equations of loops and models.
 
-    The models are joined to the loops, and the Lyapunov equations solved; the second array,
-    (N,), is their relative residuals. The third, (N,), is what rounding may have done to the
-    variances, relative: they are small differences where a process is nearly a random walk.
+    The variances are small differences where a process is nearly a random walk.
     """
     count, w = block.modes.shape
     n = block.A.shape[-1]
@@ -83,4 +90,4 @@ def block_variances(
     sizes = np.diagonal(sizes, axis1=-2, axis2=-1) + np.sum(D**2, axis=-1)
     small = np.finfo(float).tiny  # no disturbance: 0, and nothing is lost
     rounding = np.finfo(float).eps * np.max(sizes / np.maximum(variances, small), axis=-1)
-    return variances, residuals, np.asarray(rounding)
+    return LoopVariances(variances, residuals, np.asarray(rounding))

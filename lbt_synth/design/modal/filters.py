@@ -10,8 +10,8 @@ import numpy as np
 
 from lbt_synth.design.certificate import Certificate
 from lbt_synth.design.modal.banks import Bank, RunningBanks
-from lbt_synth.design.modal.certificate import ModalChecks
-from lbt_synth.design.modal.closed_loops import block_variances, close_bank, spectral_radii
+from lbt_synth.design.modal.certificate import batch_errors, modal_certificate
+from lbt_synth.design.modal.closed_loops import block_variances, close_bank
 from lbt_synth.design.modal.plants import (
     Lines,
     PlantBatch,
@@ -25,7 +25,7 @@ from lbt_synth.errors import DetectabilityError, NumericalError, ProblemError
 from lbt_synth.linear import Controller, DareSolution, solve_dare
 from lbt_synth.linear.batched import transpose
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray, frozen_copy, integer
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray, frozen_copy, integer, read_only
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,13 +119,8 @@ class ModalFilters:
         if i >= self.n_modes:
             raise ProblemError(f"mode must be from 0 to {self.n_modes - 1}; got {i}.")
         s = int(self.controller_states[i])
-        return Controller(
-            A=self.A[i, :s, :s],
-            B=self.B[i, :s],
-            C=self.C[i, :, :s],
-            D=self.D[i],
-            dt_s=self.dt_s,
-        )
+        A, B, C = self.A[i, :s, :s], self.B[i, :s], self.C[i, :, :s]
+        return Controller(A=A, B=B, C=C, D=self.D[i], dt_s=self.dt_s)
 
     def banks(self) -> tuple[Bank, ...]:
         """Return the controllers, those of the same size together."""
@@ -133,7 +128,7 @@ class ModalFilters:
         for s in np.unique(self.controller_states):
             modes = np.flatnonzero(self.controller_states == s)
             A, B, C = self.A[modes, :s, :s], self.B[modes, :s], self.C[modes, :, :s]
-            out.append(Bank(modes=modes[:, None], A=A, B=B, C=C, D=self.D[modes]))
+            out.append(Bank(modes[:, None], A, B, C, self.D[modes]))
         return tuple(out)
 
     def start(self) -> RunningBanks:
@@ -208,57 +203,55 @@ def modal_filters(
         frame_rate_hz=air.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
     )
     lines = lines_per_mode(vibrations, n)
-    response = hardware.mirror_system.whole
-    batches = plant_batches(
-        air, lines, noise_nm=noise, delay_frames=hardware.delay_frames, sensor_gain=gain
-    )
-    s = max(batch.A.shape[-1] for batch in batches)
-    c = s + response.n_states
-    parts = {
-        "gain_predictor": np.zeros((n, s)),
-        "A": np.zeros((n, c, c)),
-        "B": np.zeros((n, c, 1)),
-        "C": np.zeros((n, 1, c)),
-        "D": np.zeros((n, 1, 1)),
-    }
-    poles = np.zeros((n, s), dtype=np.complex128)
+    delay, response = hardware.delay_frames, hardware.mirror_system.whole
+    applied = mirror is None and delay >= 2 and delay == int(delay)
+    batches = plant_batches(air, lines, noise_nm=noise, delay_frames=delay, sensor_gain=gain)
     states = np.zeros(n, dtype=np.int64)
-    checks = ModalChecks(n)
+    errors, residual_nm2, estimation_nm2 = np.zeros((8, n)), np.zeros(n), np.zeros(n)
+    parts = []
     for batch in batches:
-        modes, size = batch.modes, batch.A.shape[-1]
-        solution = _solve_filters(batch)
+        modes, solution = batch.modes, _solve_filters(batch)
         gains = np.array(transpose(solution.gain_feedback))
-        A, B, C, D = batch.controllers(gains, response)
-        used = A.shape[-1]
-        states[modes], poles[modes, :size] = size, solution.poles
-        parts["gain_predictor"][modes, :size] = gains[..., 0]
-        parts["A"][modes, :used, :used], parts["B"][modes, :used] = A, B
-        parts["C"][modes, :, :used], parts["D"][modes] = C, D
-        bank = Bank(modes=modes[:, None], A=A, B=B, C=C, D=D)
-        block = close_bank(bank, gain, response)
-        checks.add_filters(batch, gains, solution)
-        checks.add_loops(modes, spectral_radii(block.A), *block_variances(block, air, lines, noise))
-    whole = hardware.delay_frames >= 2 and hardware.delay_frames == int(hardware.delay_frames)
-    certificate = checks.certificate(applied=whole and mirror is None).require(
+        matrices = batch.controllers(gains, response)
+        block = close_bank(Bank(modes[:, None], *matrices), gain, response)
+        left = block_variances(block, air, lines, noise)
+        found = batch_errors(batch, gains, solution, (block, left), applied=applied)
+        errors[:, modes], estimation_nm2[modes] = found
+        states[modes], residual_nm2[modes] = batch.A.shape[-1], left.variances[:, 0]
+        parts.append((gains[..., 0], *matrices, solution.poles))
+    certificate = modal_certificate(errors, estimation_nm2, applied=applied).require(
         "Scale the noise or the turbulence of these modes to sizes that occur."
     )
-    controller_states = states + response.n_states
-    for array in (poles, states, controller_states):
-        array.setflags(write=False)
+    joined = [_join_batches(batches, each) for each in zip(*parts, strict=True)]
+    gain_predictor, A, B, C, D, poles = joined
     return ModalFilters(
         turbulence=air,
         vibrations=lines,
         noise_nm=noise,
         sensor_gain=gain,
-        delay_frames=hardware.delay_frames,
+        delay_frames=delay,
         mirror=mirror,
-        states=states,
-        controller_states=controller_states,
+        states=read_only(states),
+        controller_states=read_only(states + response.n_states),
+        gain_predictor=gain_predictor,
+        A=A,
+        B=B,
+        C=C,
+        D=D,
         poles=poles,
-        rms_nm=frozen_copy(np.sqrt(checks.residual)),
+        rms_nm=frozen_copy(np.sqrt(residual_nm2)),
         certificate=certificate,
-        **{name: frozen_copy(part) for name, part in parts.items()},
     )
+
+
+def _join_batches(batches: list[PlantBatch], arrays: tuple[Any, ...]) -> Any:
+    """Join arrays of batches, (N, ...), as one of all modes, with zeros behind the smaller ones."""
+    shape = np.max([array.shape[1:] for array in arrays], axis=0)
+    out = np.zeros((sum(len(array) for array in arrays), *shape), dtype=arrays[0].dtype)
+    for batch, array in zip(batches, arrays, strict=True):
+        own: tuple[Any, ...] = (batch.modes, *(slice(size) for size in array.shape[1:]))
+        out[own] = array
+    return read_only(out)
 
 
 def _solve_filters(batch: PlantBatch) -> DareSolution:

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import comb
 
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
-from lbt_synth.design.modal.plants import Lines, lines_per_mode, number_per_mode
+from lbt_synth.design.modal.plants import lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import distinct_edges, pole_edges
@@ -28,7 +29,7 @@ from lbt_synth.models import (
     Vibration,
 )
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, number
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, number, read_only
 
 Density = Callable[[FloatArray], FloatArray]
 
@@ -137,20 +138,19 @@ def modal_gains(
         frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
     )
     rate = path.frame_rate_hz
-    densities, count = _densities(spectra, rate)
+    densities, count, edges = _spectra_per_mode(spectra, rate)
     lines = lines_per_mode(vibrations, count)
-    edges = _own_edges(spectra, lines, rate)
+    models = [(mode, line.ar_model(rate)) for mode, own in enumerate(lines) for line in own]
 
     def density(frequency: FloatArray) -> FloatArray:
         out = densities(frequency)
-        for mode, own in enumerate(lines):
-            for line in own:
-                out[mode] += line.ar_model(rate).psd(frequency)
+        for mode, model in models:
+            out[mode] += model.psd(frequency)
         return out
 
     return find_gains(
         density,
-        edges,
+        np.concatenate([*edges, *(_model_edges(model) for _, model in models)]),
         path,
         noise=number_per_mode(noise_nm, "noise_nm", count, zero=True),
         gain=number_per_mode(sensor_gain, "sensor_gain", count),
@@ -158,28 +158,39 @@ def modal_gains(
     )
 
 
-def _densities(spectra: ModalTurbulence | Sequence[Spectrum], rate: float) -> tuple[Density, int]:
-    """Return the function from frequencies (f,) to all spectra (n, f), and n."""
+def _spectra_per_mode(
+    spectra: ModalTurbulence | Sequence[Spectrum], rate: float
+) -> tuple[Density, int, list[FloatArray]]:
+    """Return the function from frequencies (f,) to all spectra (n, f), n, and edges of panels.
+
+    The edges are where spectra have peaks or kinks, over the Nyquist frequency.
+    """
     if isinstance(spectra, ModalTurbulence):
         _require_rate(spectra.frame_rate_hz, rate)
-        return spectra.psd, spectra.n_modes
+        poles = _distinct_poles(np.linalg.eigvals(spectra.companions).ravel())
+        return spectra.psd, spectra.n_modes, [pole_edges(poles)]
     each = tuple(spectra) if isinstance(spectra, Sequence) else ()
     if not each or not all(isinstance(spectrum, Spectrum) for spectrum in each):
         raise ProblemError(
             "spectra must be ModalTurbulence, or a list with one spectrum per mode (objects with "
             f"psd(frequency_hz)); got {type(spectra).__name__}."
         )
-    for spectrum in each:
+    distinct = {id(spectrum): spectrum for spectrum in each}
+    edges = [breakpoints_below(spectrum, rate / 2) * 2 / rate for spectrum in distinct.values()]
+    for spectrum in distinct.values():
         if isinstance(spectrum, ARModel):
             _require_rate(spectrum.frame_rate_hz, rate)
-
-    distinct = {id(spectrum): spectrum for spectrum in each}
+            edges.append(_model_edges(spectrum))
 
     def evaluate(frequency: FloatArray) -> FloatArray:
         known = {i: np.asarray(one.psd(frequency), np.float64) for i, one in distinct.items()}
         return np.stack([known[id(one)] for one in each])
 
-    return evaluate, len(each)
+    return evaluate, len(each), edges
+
+
+def _model_edges(model: ARModel) -> FloatArray:
+    return pole_edges(np.linalg.eigvals(model.companion).astype(np.complex128))
 
 
 def _require_rate(own: float, rate: float) -> None:
@@ -187,22 +198,6 @@ def _require_rate(own: float, rate: float) -> None:
         raise ProblemError(
             f"a model must be sampled at the frame rate {rate:.6g} Hz; got {own:.6g} Hz."
         )
-
-
-def _own_edges(
-    spectra: ModalTurbulence | Sequence[Spectrum], lines: Lines, rate: float
-) -> FloatArray:
-    """Return panel edges where spectra have peaks or kinks, over the Nyquist frequency."""
-    models = [line.ar_model(rate) for own in lines for line in own]
-    if isinstance(spectra, ModalTurbulence):
-        edges = [pole_edges(_distinct_poles(np.linalg.eigvals(spectra.companions).ravel()))]
-    else:
-        distinct = {id(spectrum): spectrum for spectrum in spectra}.values()
-        models += [spectrum for spectrum in distinct if isinstance(spectrum, ARModel)]
-        edges = [breakpoints_below(spectrum, rate / 2) * 2 / rate for spectrum in distinct]
-    for model in models:
-        edges.append(pole_edges(np.linalg.eigvals(model.companion).astype(np.complex128)))
-    return np.concatenate(edges)
 
 
 def _distinct_poles(poles: Any) -> ComplexArray:
@@ -249,48 +244,52 @@ def find_gains(
     last: tuple[FloatArray, FloatArray] | None = None
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
-        spectra = density(nodes)
-        sound = np.isfinite(spectra) & ((spectra >= 0) | differenced)
-        wrong = np.flatnonzero(~sound.all(axis=1))
-        if wrong.size:
-            raise ProblemError(
-                f"every spectrum must be finite and at least 0; that of mode {wrong[0]} is not."
-            )
         rejection, propagation = _transfers(nodes / rate, taps, loop_gains, differenced)
-        variances = (spectra * weights) @ rejection.T
         propagated = propagation @ weights * 2 / rate
+        variances = (_checked(density(nodes), differenced) * weights) @ rejection.T
         variances += np.outer((noise / gain) ** 2, propagated)
         if np.any(variances[:, 0] == 0):
             raise ProblemError(
                 "every mode must have turbulence, vibration or noise; got none in mode "
                 f"{int(np.argmin(variances[:, 0]))}."
             )
-        found = _minimise(loop_gains, variances, limit, highest)
+        best, variance = _minimise(loop_gains, variances, limit, highest)
         if differenced:
-            floor = (noise / gain) ** 2 * np.interp(found[0], loop_gains, propagated)
-            found = found[0], np.maximum(found[1], floor)
-        if last is not None and _is_settled(found, last):
-            allowed = highest / gain
-            gains = np.minimum(found[0] / gain, allowed)
-            limited = gains > allowed * (1 - 1e-6)
-            limited.setflags(write=False)
-            return ModalGains(
-                gains=frozen_copy(gains),
-                rms_nm=frozen_copy(np.sqrt(found[1])),
-                limit=frozen_copy(allowed),
-                limited=limited,
-                noise_nm=noise,
-                delay_frames=path.delay_frames,
-                mirror=path.mirror,
-            )
-        last = found
+            floor = (noise / gain) ** 2 * np.interp(best, loop_gains, propagated)
+            variance = np.maximum(variance, floor)
+        if last is not None and _is_settled((best, variance), last):
+            break
+        last = best, variance
         edges = np.union1d(edges, (edges[1:] + edges[:-1]) / 2)
-    raise NumericalError(
-        "the integral over a spectrum did not settle: residuals change still after "
-        f"{_HALVINGS} halvings of all panels. Check that no spectrum is a set of lines; give a "
-        "table its own frequencies.",
-        status="quadrature",
+    else:
+        raise NumericalError(
+            "the integral over a spectrum did not settle: residuals change still after "
+            f"{_HALVINGS} halvings of all panels. Check that no spectrum is a set of lines; give a "
+            "table its own frequencies.",
+            status="quadrature",
+        )
+    allowed = highest / gain
+    gains = np.minimum(best / gain, allowed)
+    return ModalGains(
+        gains=frozen_copy(gains),
+        rms_nm=frozen_copy(np.sqrt(variance)),
+        limit=frozen_copy(allowed),
+        limited=read_only(gains > allowed * (1 - 1e-6)),
+        noise_nm=noise,
+        delay_frames=path.delay_frames,
+        mirror=path.mirror,
     )
+
+
+def _checked(spectra: FloatArray, differenced: bool) -> FloatArray:
+    """Return the spectra (n, f); refuse what is not finite, or negative unless differenced."""
+    sound = np.isfinite(spectra) & ((spectra >= 0) | differenced)
+    wrong = np.flatnonzero(~sound.all(axis=1))
+    if wrong.size:
+        raise ProblemError(
+            f"every spectrum must be finite and at least 0; that of mode {wrong[0]} is not."
+        )
+    return spectra
 
 
 def _is_settled(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> bool:
@@ -326,17 +325,14 @@ def _minimise(
     loop_gains: FloatArray, variances: FloatArray, limit: float, highest: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the loop gain of least variance of each mode, up to the highest, and that variance."""
-    count = len(variances)
     step = np.log(loop_gains[1] / loop_gains[0])
     top = np.log(highest / loop_gains[0]) / step  # place on the grid, a fraction
     allowed = np.arange(loop_gains.size) <= top[:, None] + 1e-9
     best = np.argmin(np.where(allowed, variances, np.inf), axis=1)
     first = np.clip(best - _WINDOW // 2, 0, loop_gains.size - _WINDOW)
-    rows = np.arange(count)[:, None]
-    smooth = (variances * (1 - loop_gains / limit))[rows, first[:, None] + np.arange(_WINDOW)]
-    factors = np.array([1.0])
-    for i in range(1, _WINDOW):  # binomial coefficients with alternating signs
-        factors = np.append(factors, -factors[-1] * (_WINDOW - i) / i)
+    window = first[:, None] + np.arange(_WINDOW)
+    smooth = np.take_along_axis(variances * (1 - loop_gains / limit), window, axis=1)
+    factors = (-1.0) ** np.arange(_WINDOW) * comb(_WINDOW - 1, np.arange(_WINDOW))
 
     def variance(place: FloatArray) -> FloatArray:
         apart = (place - first)[:, None] - np.arange(_WINDOW)
@@ -346,13 +342,10 @@ def _minimise(
         return np.asarray(value / (1 - loop_gains[0] * np.exp(step * place) / limit))
 
     low, high = np.maximum(best - 1.0, 0.0), np.minimum(best + 1.0, top)
-    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    at_left, at_right = variance(left), variance(right)
     for _ in range(_STEPS):
-        lower = at_left < at_right
-        low, high = np.where(lower, low, left), np.where(lower, right, high)
         left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        at_left, at_right = variance(left), variance(right)
+        lower = variance(left) < variance(right)
+        low, high = np.where(lower, low, left), np.where(lower, right, high)
     place = (low + high) / 2
     end = variance(top) <= variance(place)
     place = np.where(end & (top <= best + 1.0), top, place)

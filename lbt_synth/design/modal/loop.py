@@ -22,7 +22,7 @@ from lbt_synth.design.modal.filters import ModalFilters
 from lbt_synth.design.modal.mixed_controller import MixedController
 from lbt_synth.design.modal.plants import as_modal_turbulence, lines_per_mode, number_per_mode
 from lbt_synth.design.modal.reconstructor import name_modes
-from lbt_synth.design.modal.series import filter_phase, residual_system
+from lbt_synth.design.modal.series import filter_phase, phase_system
 from lbt_synth.errors import (
     DimensionError,
     NonFiniteError,
@@ -33,7 +33,15 @@ from lbt_synth.errors import (
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.simulation.block_filtering import BatchedSystems
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
-from lbt_synth.validation import FloatArray, float_array, frozen_copy, integer, number, real_array
+from lbt_synth.validation import (
+    FloatArray,
+    float_array,
+    frozen_copy,
+    integer,
+    number,
+    read_only,
+    real_array,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,10 +167,11 @@ class ModalLoop:
         lines = lines_per_mode(vibrations, self.n_modes)
         out = np.zeros(self.n_modes)
         for block in self.blocks:
-            variances, residuals, rounding = block_variances(block, air, lines, noise)
+            left = block_variances(block, air, lines, noise)
+            equation = "the relative residual of the Lyapunov equation"
             for what, error, limit in (
-                ("the relative residual of the Lyapunov equation", residuals, RESIDUAL_TOLERANCE),
-                ("rounding of the variance, relative,", rounding, VARIANCE_TOLERANCE),
+                (equation, left.residuals, RESIDUAL_TOLERANCE),
+                ("rounding of the variance, relative,", left.rounding, VARIANCE_TOLERANCE),
             ):
                 bad = np.flatnonzero(~(error < limit))
                 if bad.size:
@@ -173,7 +182,7 @@ class ModalLoop:
                         status="lyapunov",
                         residual=float(np.max(error)),
                     )
-            out[block.modes] = np.sqrt(np.maximum(variances, 0))
+            out[block.modes] = np.sqrt(np.maximum(left.variances, 0))
         return frozen_copy(out)
 
     def run(
@@ -241,13 +250,14 @@ class ModalLoop:
         if not np.isfinite(residual[:, -1]).all() or not np.isfinite(rms).all():
             real_array(total, "total_nm"), real_array(noise, "noise_nm")
             raise NonFiniteError("the residual must be finite; its numbers ran out of range.")
-        for series in (residual, commands, measurements):
-            if series is not None:
-                series.setflags(write=False)
+        series: list[Any] = [
+            None if each is None else read_only(each)[:, settle:]
+            for each in (residual, commands, measurements)
+        ]
         return ModalRun(
-            residual_nm=residual[:, settle:],
-            commands=None if commands is None else commands[:, settle:],
-            measurements=None if measurements is None else measurements[:, settle:],
+            residual_nm=series[0],
+            commands=series[1],
+            measurements=series[2],
             rms_nm=frozen_copy(rms),
         )
 
@@ -315,8 +325,8 @@ def modal_loop(
     hardware, rate = _path(controller, delay_frames, mirror, frame_rate_hz)
     n = controller.n_modes
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
-    mirror_response = hardware.mirror_system.whole
-    blocks = tuple(close_bank(bank, gain, mirror_response) for bank in controller.banks())
+    response = hardware.mirror_system.whole
+    blocks = tuple(close_bank(bank, gain, response) for bank in controller.banks())
     radii = np.zeros(n)
     for block in blocks:
         radii[block.modes] = spectral_radii(block.A)[:, None]
@@ -327,7 +337,7 @@ def modal_loop(
         sensor_gain=gain,
         spectral_radii=frozen_copy(radii),
         blocks=blocks,
-        systems=tuple(residual_system(block) for block in blocks),
+        systems=tuple(phase_system(block, block.modes.shape[1]) for block in blocks),
     )
 
 
@@ -338,8 +348,8 @@ def _path(
     frame_rate_hz: float | None,
 ) -> tuple[LoopHardware, float | None]:
     """Return the hardware of one mode, from what is given or else designed for, and its rate."""
-    period, designed = controller.dt_s, controller.hardware
-    rate = None if period is None else 1 / period
+    designed = controller.hardware
+    rate = None if controller.dt_s is None else 1 / controller.dt_s
     if frame_rate_hz is not None:
         given = number(frame_rate_hz, "frame_rate_hz", above=0)
         if rate is not None and not np.isclose(given, rate, rtol=1e-9):
@@ -347,15 +357,12 @@ def _path(
                 f"frame_rate_hz must be that of the filters, {rate:.6g} Hz; got {given:.6g} Hz."
             )
         rate = given
-    if designed is not None:
-        delay_frames = designed.delay_frames if delay_frames is None else delay_frames
-        mirror = designed.mirror if mirror is None else mirror
+    if mirror is None and designed is not None:
+        mirror = designed.mirror
+    if delay_frames is None:
+        delay_frames = 2.0 if designed is None else designed.delay_frames
     if mirror is not None and rate is None:
         raise ProblemError("a mirror with dynamics needs frame_rate_hz; got none.")
-    path = LoopHardware(
-        frame_rate_hz=1.0 if rate is None else rate,
-        delay_frames=2.0 if delay_frames is None else delay_frames,
-        modes=1,
-        mirror=mirror,
-    )
+    sampling = 1.0 if rate is None else rate
+    path = LoopHardware(frame_rate_hz=sampling, delay_frames=delay_frames, modes=1, mirror=mirror)
     return path, rate

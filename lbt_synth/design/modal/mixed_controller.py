@@ -15,13 +15,14 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design.modal.banks import Bank, RunningBanks
 from lbt_synth.design.modal.filters import ModalFilters
+from lbt_synth.design.modal.plants import number_per_mode
 from lbt_synth.design.modal.reconstructor import Reconstructor, mode_indices
 from lbt_synth.design.result import Design
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller, RunningController
 from lbt_synth.loop.simulation.run import SteppedController
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, float_array, frozen_copy, real_array, require_instance
+from lbt_synth.validation import FloatArray, float_array, real_array, require_instance
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -85,17 +86,8 @@ class MixedController:
                 f"gains must be a list, one number per mode; got shape {gains.shape}."
             )
         n = gains.size
-        leak = real_array(self.leak, "leak")
-        if leak.shape not in ((), (n,)):
-            raise DimensionError(
-                f"leak must be one number, or one per mode ({n}); got {leak.shape}."
-            )
-        if np.any(gains < 0):
-            raise ProblemError(f"gains must be at least 0; got {gains.min():.6g}.")
-        if np.any(leak < 0) or np.any(leak > 1):
-            raise ProblemError(
-                f"leak must be from 0 to 1; got {leak.min():.6g} to {leak.max():.6g}."
-            )
+        self.gains = number_per_mode(gains, "gains", n, zero=True)
+        self.leak = number_per_mode(self.leak, "leak", n, zero=True, at_most=1)
         if self.reconstructor is not None:
             require_instance(self.reconstructor, Reconstructor)
             if self.reconstructor.n_modes != n:
@@ -103,7 +95,6 @@ class MixedController:
                     "gains must be one per mode of the reconstructor, "
                     f"{self.reconstructor.n_modes}; got {n}."
                 )
-        self.gains, self.leak = gains, frozen_copy(np.broadcast_to(leak, (n,)))
         self._gain, self._leak = np.array(self.gains), np.array(self.leak)
         self._modes, self._running = np.zeros(0, dtype=np.intp), None
         if self.filter is not None:
@@ -241,15 +232,12 @@ class MixedController:
         kept = np.setdiff1d(np.arange(self.n_modes), self._modes)
         one = np.ones((kept.size, 1, 1))
         leak, gain = self._leak[kept, None, None], self._gain[kept, None, None]
-        own = Bank(modes=kept[:, None], A=leak, B=gain, C=one, D=np.zeros_like(one))
-        out = [own] if kept.size else []
+        out = [Bank(kept[:, None], leak, gain, one, np.zeros_like(one))] if kept.size else []
         if isinstance(self._running, RunningBanks):
             out += [bank.for_modes(self._modes) for bank in self._running.banks]
         elif isinstance(self._running, RunningController):
             k = self._running.controller
-            out.append(
-                Bank(modes=self._modes[None], A=k.A[None], B=k.B[None], C=k.C[None], D=k.D[None])
-            )
+            out.append(Bank(self._modes[None], k.A[None], k.B[None], k.C[None], k.D[None]))
         elif self._running is not None:
             raise ProblemError(
                 "only a filter with matrices (a design or a Controller) makes a linear "
@@ -291,25 +279,20 @@ class MixedController:
                 f"dt_s must be that of the filter, {own:.9g} s; got {period:.9g} s. Design the "
                 "filter for this frame rate."
             )
-        A: list[FloatArray] = []
-        inputs: list[FloatArray] = []
-        outputs: list[FloatArray] = []
-        direct = np.zeros((n, n))
-        for bank in banks:
-            for modes, *parts in zip(bank.modes, bank.A, bank.B, bank.C, bank.D, strict=True):
-                chosen = np.eye(n)[modes]
-                A.append(parts[0])
-                inputs.append(parts[1] @ chosen)
-                outputs.append(chosen.T @ parts[2])
-                direct += chosen.T @ parts[3] @ chosen
-        B = np.vstack(inputs)
+        each = [
+            (np.eye(n)[modes], *matrices)
+            for bank in banks
+            for modes, *matrices in zip(bank.modes, bank.A, bank.B, bank.C, bank.D, strict=True)
+        ]
+        B = np.vstack([B @ chosen for chosen, _, B, _, _ in each])
+        D = sum((chosen.T @ D @ chosen for chosen, *_, D in each), np.zeros((n, n)))
         if self.reconstructor is not None:
-            B, direct = B @ self.reconstructor.matrix, direct @ self.reconstructor.matrix
+            B, D = B @ self.reconstructor.matrix, D @ self.reconstructor.matrix
         return Controller(
-            A=block_diag(*A),
+            A=block_diag(*(A for _, A, *_ in each)),
             B=B,
-            C=np.hstack(outputs),
-            D=direct,
+            C=np.hstack([chosen.T @ C for chosen, _, _, C, _ in each]),
+            D=D,
             dt_s=1.0 if period is None else period,
         )
 

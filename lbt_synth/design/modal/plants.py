@@ -27,11 +27,12 @@ def number_per_mode(
         raise DimensionError(
             f"{name} must be one number, or one per mode ({modes}); got shape {given.shape}."
         )
-    low = float(np.min(given, initial=np.inf))
-    if low < 0 or (low == 0 and not zero):
-        raise ProblemError(f"{name} must be {'at least' if zero else 'above'} 0; got {low:.6g}.")
-    if np.any(given > at_most):
-        raise ProblemError(f"{name} must be at most {at_most:g}; got {given.max():.6g}.")
+    low, high = float(np.min(given, initial=np.inf)), float(np.max(given, initial=-np.inf))
+    if low < 0 or (low == 0 and not zero) or high > at_most:
+        bounds = f"{'at least' if zero else 'above'} 0"
+        if at_most < np.inf:
+            bounds += f" and at most {at_most:g}"
+        raise ProblemError(f"{name} must be {bounds}; got {low:.6g} to {high:.6g}.")
     return frozen_copy(np.broadcast_to(given, (modes,)))
 
 
@@ -50,8 +51,7 @@ def lines_per_mode(
 ) -> Lines:
     """Return the vibrations of each mode, from a mapping of some modes."""
     lines: list[tuple[Vibration, ...]] = [()] * modes
-    if vibrations is None:
-        return tuple(lines)
+    vibrations = {} if vibrations is None else vibrations
     if not isinstance(vibrations, Mapping):
         raise ProblemError(
             "vibrations must be a mapping from mode numbers to vibrations, such as {0: [line]}; "

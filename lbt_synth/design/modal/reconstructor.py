@@ -126,12 +126,9 @@ def reconstructor(
         )
     left, values, right = np.linalg.svd(D, full_matrices=False)
     rank = int(np.sum(values > max(D.shape) * np.finfo(float).eps * values[0]))
+    count = n if kept is None else integer(kept, "kept", at_least=1)
     if condition is not None:
         count = int(np.sum(values >= values[0] / number(condition, "condition", at_least=1)))
-    elif kept is not None:
-        count = integer(kept, "kept", at_least=1)
-    else:
-        count = n
     if count > rank:
         raise ProblemError(
             f"the {min(q, n)} singular values that are inverted must not vanish; got {rank} that "
@@ -257,6 +254,6 @@ def name_modes(indices: Any) -> str:
     numbers = [str(int(i)) for i in indices]
     if len(numbers) == 1:
         return f"mode {numbers[0]}"
-    if len(numbers) <= _NAMED:
-        return f"modes {', '.join(numbers[:-1])} and {numbers[-1]}"
-    return f"modes {', '.join(numbers[:_NAMED])} and {len(numbers) - _NAMED} more"
+    if len(numbers) > _NAMED:
+        numbers = [*numbers[:_NAMED], f"{len(numbers) - _NAMED} more"]
+    return f"modes {', '.join(numbers[:-1])} and {numbers[-1]}"

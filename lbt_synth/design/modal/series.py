@@ -16,10 +16,10 @@ from lbt_synth.loop.simulation.block_filtering import BatchedSystems
 from lbt_synth.validation import FloatArray
 
 
-def residual_system(block: LoopBlock) -> BatchedSystems:
-    """Return the systems of a block from the phase to the residual."""
+def phase_system(block: LoopBlock, outputs: int) -> BatchedSystems:
+    """Return the systems of a block from the phase to its first outputs, the residual first."""
     w = block.modes.shape[1]
-    return BatchedSystems(block.A, block.B[..., :w], block.C[:, :w], block.D[:, :w, :w])
+    return BatchedSystems(block.A, block.B[..., :w], block.C[:, :outputs], block.D[:, :outputs, :w])
 
 
 def filter_phase(
@@ -42,20 +42,18 @@ def filter_phase(
             only = systems[0].filter(joined, in_place=True)[:, 1:, 0]
             only[:, :-1] -= scaled[:, 1:]
             return only, None
-    residual = np.empty(total.shape)
-    commands = np.empty(total.shape) if with_commands else None
+    series = [np.empty(total.shape) for _ in range(2 if with_commands else 1)]
     for block, system in zip(blocks, systems, strict=True):
         w = block.modes.shape[1]
         if with_commands:
-            system = BatchedSystems(block.A, block.B[..., :w], block.C, block.D[..., :w])
+            system = phase_system(block, 2 * w)
         out = system.filter(_effective_phase(block, total, scaled))[:, 1:]
         for i in range(w):
             which = _index(block.modes[:, i])
-            residual[which] = out[..., i]
-            residual[which, :-1] -= scaled[which, 1:]
-            if commands is not None:
-                commands[which] = out[..., w + i]
-    return residual, commands
+            for k, target in enumerate(series):
+                target[which] = out[..., k * w + i]
+            series[0][which, :-1] -= scaled[which, 1:]
+    return series[0], series[1] if with_commands else None
 
 
 def _effective_phase(block: LoopBlock, total: FloatArray, scaled: FloatArray) -> FloatArray:

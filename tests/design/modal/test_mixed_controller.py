@@ -142,7 +142,7 @@ def test_bad_mixed_controllers_are_refused():
         (
             {"filter": None, "gains": gains, "leak": 1.1},
             lbt.errors.ProblemError,
-            "leak must be from 0 to 1",
+            "leak must be at least 0 and at most 1; got 1.1 to 1.1",
         ),
         (
             {"filter": None, "gains": gains, "leak": [1, 1]},
