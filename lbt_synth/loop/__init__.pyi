@@ -3,10 +3,10 @@ from .budget import model_budget as model_budget
 from .budget import residual_budget as residual_budget
 from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
+from .ensemble.evaluation import EnsembleResiduals as EnsembleResiduals
 from .ensemble.evaluation import ensemble_residuals as ensemble_residuals
 from .ensemble.loop_ensemble import EnsembleVibration as EnsembleVibration
 from .ensemble.loop_ensemble import LoopEnsemble as LoopEnsemble
-from .ensemble.residuals import EnsembleResiduals as EnsembleResiduals
 from .least_residuals.band_limit import BandLimit as BandLimit
 from .least_residuals.band_limit import least_worst_residual as least_worst_residual
 from .least_residuals.residual_limit import ResidualLimit as ResidualLimit

@@ -1,45 +1,62 @@
-"""Many closed loops by subloop and by whole delay, with their poles and their stability."""
+"""Closed loops at many sensor gains and delays, by subloop, as arrays of state matrices.
+
+Between two whole delays a settled mirror shows the commands of two frames within an exposure,
+so that every matrix of the loop is affine in the fraction, as it is in the sensor gain.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.loop.ensemble.batched_loops import (
-    BatchedLoops,
-    DelayGroup,
-    close_subloop,
-    group_by_delay,
-)
-from lbt_synth.loop.ensemble.subloops import Subloop
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
+from lbt_synth.loop.ensemble.subloops import Subloop, split_into_subloops
 from lbt_synth.models import LoopHardware
+from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _AT_ONCE = 256  # loops that share frequencies
+_PER_LOOP = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopGroup:
-    """The loops of one subloop that have the same whole delay."""
+    """k loops of one subloop, from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``.
 
-    mirrors: DelayGroup
-    loops: BatchedLoops
+    Their mirrors are ``(1 - fraction) first + fraction second``.
+    """
+
+    subloop: Subloop
+    first: Response  # the two mirrors have the same states
+    second: Response
+    rows: IntArray  # which loops, (k,)
+    fraction: FloatArray  # (k,)
+    sensor_gains: FloatArray  # (k,)
+    A: FloatArray  # (k, s, s)
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
     poles: ComplexArray  # (k, s)
+
+    def take(self, which: IntArray) -> LoopGroup:
+        """Return some of the loops."""
+        return replace(self, **{name: getattr(self, name)[which] for name in _PER_LOOP})
 
     def batches(self, stable: BoolArray) -> Iterator[LoopGroup]:
         """Yield batches of the stable loops, sorted by their distance from instability."""
-        found = np.flatnonzero(stable[self.mirrors.rows])
+        found = np.flatnonzero(stable[self.rows])
         order = found[np.argsort(_radius(self.poles[found]), kind="stable")]
         for start in range(0, order.size, _AT_ONCE):
-            which = order[start : start + _AT_ONCE]
-            yield LoopGroup(
-                mirrors=self.mirrors.take(which),
-                loops=self.loops.take(which),
-                poles=self.poles[which],
-            )
+            yield self.take(order[start : start + _AT_ONCE])
+
+    def rejections(self, turn: FloatArray) -> ComplexArray:
+        """Rejection (k, n, n) of each loop at its own frequency [radians per frame]."""
+        n = self.C.shape[1]
+        pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
+        states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
+        return np.asarray(self.C @ states + self.D[..., :n])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,42 +64,85 @@ class ClosedLoops:
     """Loops with the same sensor and mirror, at p sensor gains and delays."""
 
     hardware: LoopHardware
-    sensor_gains: FloatArray  # (p,)
-    subloops: list[tuple[Subloop, list[LoopGroup]]]  # each with its groups, the same rows in all
     stable: BoolArray  # (p,)
+    subloops: list[list[LoopGroup]]  # the groups of each subloop, with the same rows in all
 
     @classmethod
     def of(
         cls,
-        subloops: list[Subloop],
-        rest: list[FloatArray],
+        matrices: tuple[FloatArray, ...],
         hardware: LoopHardware,
         sensor_gains: FloatArray,
         delay_frames: FloatArray,
     ) -> ClosedLoops:
-        """Close the loops, equal subloops only once; ``rest`` are the states without modes."""
+        """Close the loops of controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
         stable = np.ones(sensor_gains.size, dtype=np.bool_)
+        subloops, rest = split_into_subloops(matrices, hardware)
         for A in rest:
             if A.shape[-1]:
                 stable &= _radius(np.linalg.eigvals(A).astype(np.complex128)) < 1 - STABILITY_MARGIN
-        closed: list[tuple[Subloop, list[LoopGroup]]] = []
-        for subloop in subloops:
-            groups = next((known for other, known in closed if other.equals(subloop)), None)
-            if groups is None:
-                groups = []
-                for mirrors in group_by_delay(hardware, delay_frames):
-                    loops = close_subloop(subloop, mirrors, sensor_gains[mirrors.rows])
-                    poles = np.linalg.eigvals(loops.A).astype(np.complex128)
-                    stable[mirrors.rows] &= _radius(poles) < 1 - STABILITY_MARGIN
-                    groups.append(LoopGroup(mirrors=mirrors, loops=loops, poles=poles))
-            closed.append((subloop, groups))
-        return cls(hardware=hardware, sensor_gains=sensor_gains, subloops=closed, stable=stable)
+        closed: list[list[LoopGroup]] = []
+        for subloop in subloops:  # equal ones are closed only once
+            known = next((groups for groups in closed if groups[0].subloop.equals(subloop)), None)
+            if known is None:
+                groups = list(_close_subloop(subloop, hardware, sensor_gains, delay_frames))
+                for group in groups:
+                    stable[group.rows] &= _radius(group.poles) < 1 - STABILITY_MARGIN
+            else:
+                groups = [replace(group, subloop=subloop) for group in known]
+            closed.append(groups)
+        return cls(hardware=hardware, stable=stable, subloops=closed)
 
-    def by_delay(self) -> Iterator[tuple[IntArray, list[tuple[IntArray, BatchedLoops]]]]:
-        """Yield the rows of each whole delay, with the modes and loops of each subloop."""
-        for i, group in enumerate(self.subloops[0][1]):
-            loops = [(subloop.modes, groups[i].loops) for subloop, groups in self.subloops]
-            yield group.mirrors.rows, loops
+
+def _close_subloop(
+    subloop: Subloop, hardware: LoopHardware, sensor_gains: FloatArray, delay_frames: FloatArray
+) -> Iterator[LoopGroup]:
+    """Close a subloop at all sensor gains and delays, by whole delay."""
+    for rows, fraction, mirrors in _mirrors_by_delay(hardware, delay_frames):
+        sensor, influence = subloop.sensor, subloop.influence
+        ends = [
+            loop_matrices(*subloop.controllers(rows), mirror=m, sensor=sensor, influence=influence)
+            for m in mirrors
+        ]
+        share, gain = fraction[:, None, None], sensor_gains[rows][:, None, None]
+        A0, A1, B, C0, C1, D = (
+            one if one is two or not fraction.any() else one + share * (two - one)
+            for one, two in zip(*ends, strict=True)
+        )
+        n, A = subloop.modes.size, A0 + gain * A1
+        B, D = (np.broadcast_to(m, (rows.size, *m.shape[1:])) for m in (B, D[:, :n]))
+        yield LoopGroup(
+            subloop=subloop,
+            first=mirrors[0],
+            second=mirrors[1],
+            rows=rows,
+            fraction=fraction,
+            sensor_gains=sensor_gains[rows],
+            A=A,
+            B=B,
+            C=(C0 + gain * C1)[:, :n],
+            D=D,
+            poles=np.linalg.eigvals(A).astype(np.complex128),
+        )
+
+
+def _mirrors_by_delay(
+    hardware: LoopHardware, delay_frames: FloatArray
+) -> Iterator[tuple[IntArray, FloatArray, tuple[Response, Response]]]:
+    """Yield rows, fractions and mirrors by whole delay, or by delay if the mirror has dynamics."""
+    if hardware.mirror is not None:
+        for delay in np.unique(delay_frames):
+            mirror = replace(hardware, delay_frames=float(delay)).mirror_system.whole
+            rows = np.flatnonzero(delay_frames == delay)
+            yield rows, np.zeros(rows.size), (mirror, mirror)
+        return
+    lead = np.floor(delay_frames - 1).astype(np.int64)
+    fraction = delay_frames - 1 - lead
+    for whole in np.unique(lead):
+        rows = np.flatnonzero(lead == whole)
+        taps = np.zeros((2, whole + (2 if np.any(fraction[rows] > 0) else 1)))
+        taps[0, whole] = taps[1, -1] = 1.0
+        yield rows, fraction[rows], (tapped_mirror(taps[0]), tapped_mirror(taps[1]))
 
 
 def _radius(poles: ComplexArray) -> FloatArray:

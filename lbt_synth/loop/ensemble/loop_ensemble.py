@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
+from lbt_synth.models import FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
 from lbt_synth.models.spectra import spectrum_key
 from lbt_synth.validation import (
     FloatArray,
@@ -18,6 +18,7 @@ from lbt_synth.validation import (
     real_array,
     require_instance,
     sequence,
+    set_fields,
 )
 
 Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
@@ -66,15 +67,15 @@ class EnsembleVibration:
                 raise ProblemError(
                     f"{name} must be {allowed}; got {value.min():.6g} to {value.max():.6g}."
                 )
-            object.__setattr__(self, name, value)
+            set_fields(self, **{name: value})
         direction = real_array(self.direction, "direction")
-        size = np.linalg.norm(direction, axis=-1, keepdims=True)
+        size = np.linalg.norm(np.atleast_1d(direction), axis=-1, keepdims=True)
         if direction.ndim not in (1, 2) or not np.all(size > 0):
             raise ProblemError(
                 "direction must be a vector over the modes, or one per loop, and not zero; got "
                 f"shape {direction.shape}."
             )
-        object.__setattr__(self, "direction", frozen_copy(direction / size))
+        set_fields(self, direction=frozen_copy(direction / size))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,19 +121,17 @@ class LoopEnsemble:
     loops: int = 0
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        set_(self, "vibrations", sequence(self.vibrations, "vibrations"))
+        set_fields(self, vibrations=sequence(self.vibrations, "vibrations"))
         for line in self.vibrations:
             require_instance(line, EnsembleVibration)
-        given = {"sensor_gain": self.sensor_gain, "noise_nm": self.noise_nm}
-        given |= {} if self.delay_frames is None else {"delay_frames": self.delay_frames}
         for name, bound in (("sensor_gain", 0.0), ("noise_nm", 0.0), ("delay_frames", 1.0)):
-            if name in given:
-                value = real_array(given[name], name)
-                if np.any(value < bound) or (name == "sensor_gain" and np.any(value == 0)):
-                    word = "above" if name == "sensor_gain" else "at least"
-                    raise ProblemError(f"{name} must be {word} {bound:g}; got {value.min():.6g}.")
-                set_(self, name, value)
+            if name == "delay_frames" and self.delay_frames is None:
+                continue
+            value = real_array(getattr(self, name), name)
+            if np.any(value < bound) or (name == "sensor_gain" and np.any(value == 0)):
+                word = "above" if name == "sensor_gain" else "at least"
+                raise ProblemError(f"{name} must be {word} {bound:g}; got {value.min():.6g}.")
+            set_fields(self, **{name: value})
         lengths = {name: len(values) for name, values in self._arrays().items()}
         lengths |= {} if self.loops == 0 else {"loops": self.loops}
         if len(set(lengths.values()) - {1}) > 1:
@@ -140,21 +139,18 @@ class LoopEnsemble:
             raise DimensionError(f"all must have one entry per loop; got {text}.")
         if 0 in lengths.values():
             raise DimensionError("an ensemble needs at least one loop; got none.")
-        set_(self, "loops", max(lengths.values(), default=1))
+        set_fields(self, loops=max(lengths.values(), default=1))
 
     def _arrays(self) -> dict[str, Any]:
         """Return what has one entry per loop, by name."""
-        out: dict[str, Any] = {}
-        for name in ("sensor_gain", "noise_nm", "delay_frames"):
-            if np.ndim(getattr(self, name)):
-                out[name] = getattr(self, name)
+        names = ("sensor_gain", "noise_nm", "delay_frames")
+        out = {name: getattr(self, name) for name in names if np.ndim(getattr(self, name))}
         for i, line in enumerate(self.vibrations):
             for name in ("frequency_hz", "rms_nm", "damping", "direction"):
                 value = getattr(line, name)
                 if value is not None and np.ndim(value) > (name == "direction"):
                     out[f"{name} of vibration {i}"] = value
-        each = self.turbulence if isinstance(self.turbulence, Sequence) else (self.turbulence,)
-        for part in each:
+        for part in self._each_turbulence(1):
             if isinstance(part, FrozenFlows):
                 out["turbulence"] = part
             elif isinstance(part, ModalTurbulence):
@@ -165,6 +161,11 @@ class LoopEnsemble:
                     f"sequence of these; got {type(part).__name__}."
                 )
         return out
+
+    def _each_turbulence(self, modes: int) -> tuple[Any, ...]:
+        """Return the turbulence as it was given per mode, or for each of some modes."""
+        given = self.turbulence
+        return tuple(given) if isinstance(given, Sequence) else (given,) * modes
 
     def delays(self, hardware: LoopHardware) -> FloatArray:
         """Return the total delay of each loop [frames], (p,)."""
@@ -187,17 +188,14 @@ class LoopEnsemble:
 
     def groups(self, hardware: LoopHardware) -> list[tuple[Turbulence, tuple[int, ...]]]:
         """Return the turbulence with the modes that have it."""
-        n, given = hardware.modes, self.turbulence
-        each = tuple(given) if isinstance(given, Sequence) else (given,) * n
+        n, each = hardware.modes, self._each_turbulence(hardware.modes)
         if len(each) != n:
             raise DimensionError(f"turbulence must have one entry per mode ({n}); got {len(each)}.")
         found: dict[object, tuple[Turbulence, tuple[int, ...]]] = {}
         for mode, part in enumerate(each):
-            if part is None:
-                continue
-            key = spectrum_key(part) if isinstance(part, ARModel) else id(part)
-            first, modes = found.get(key, (part, ()))
-            found[key] = (first, (*modes, mode))
+            if part is not None:
+                first, modes = found.get(spectrum_key(part), (part, ()))
+                found[spectrum_key(part)] = (first, (*modes, mode))
         return list(found.values())
 
     def distinct(self, hardware: LoopHardware, *, apart: bool) -> tuple[IntArray, IntArray]:
@@ -206,6 +204,8 @@ class LoopEnsemble:
         With ``apart`` all rows differ, as each has its own controller.
         """
         rows = np.arange(self.loops)
+        if apart:
+            return rows, rows
         columns = [self.gains(), self.delays(hardware), *self.noise(hardware).T]
         for part, _ in self.groups(hardware):
             if isinstance(part, FrozenFlows) and len(part) > 1:
@@ -213,8 +213,6 @@ class LoopEnsemble:
                 columns += [] if part.outer_scale_m is None else [part.outer_scale_m]
             elif isinstance(part, ModalTurbulence) and part.n_modes > 1:
                 columns += [*part.coefficients.T, part.driving_rms_nm]
-        if apart:
-            return rows, rows
         varying = [column for column in columns if np.ptp(column) > 0]
         if not varying:
             return rows[:1], np.zeros(self.loops, dtype=np.int64)
@@ -237,11 +235,8 @@ class LoopEnsemble:
                     f"a vibration must lie below the Nyquist frequency {nyquist:.6g} Hz; got "
                     f"{np.max(line.frequency_hz):.6g} Hz."
                 )
-            filled = {
-                name: None if value is None else np.broadcast_to(value, (p,))
-                for name in ("frequency_hz", "rms_nm", "damping")
-                for value in (getattr(line, name),)
-            }
+            given = {name: getattr(line, name) for name in ("frequency_hz", "rms_nm", "damping")}
+            filled = {k: np.broadcast_to(v, (p,)) for k, v in given.items() if v is not None}
             direction = np.broadcast_to(line.direction, (p, hardware.modes))
             out.append(replace(line, **filled, direction=direction))
         return out
@@ -252,9 +247,6 @@ def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
     if isinstance(turbulence, FrozenFlows) and len(turbulence) > 1:
         return turbulence.take(rows)
     if isinstance(turbulence, ModalTurbulence) and turbulence.n_modes > 1:
-        return ModalTurbulence(
-            coefficients=turbulence.coefficients[rows],
-            driving_rms_nm=turbulence.driving_rms_nm[rows],
-            frame_rate_hz=turbulence.frame_rate_hz,
-        )
+        a, driving = turbulence.coefficients[rows], turbulence.driving_rms_nm[rows]
+        return replace(turbulence, coefficients=a, driving_rms_nm=driving)
     return turbulence

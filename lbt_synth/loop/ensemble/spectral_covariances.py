@@ -12,12 +12,9 @@ import numpy as np
 
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import gauss_panels, panel_rule
-from lbt_synth.linear.state_space import schur_response
-from lbt_synth.loop.ensemble.batched_loops import DelayGroup
-from lbt_synth.loop.ensemble.frequency_responses import batched_response
+from lbt_synth.linear.state_space import pointwise_response, schur_response
+from lbt_synth.loop.ensemble.closed_loops import LoopGroup
 from lbt_synth.loop.ensemble.loop_ensemble import Turbulence
-from lbt_synth.loop.ensemble.panels import graded_edges
-from lbt_synth.loop.ensemble.subloops import Subloop
 from lbt_synth.models import ARModel, Atmosphere, FrozenFlows, SumSpectrum, TabulatedSpectrum
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.turbulence.atmosphere import LOWEST
@@ -29,48 +26,90 @@ _ALIKE, _STEP = 3.5, 0.08  # winds of a larger ratio share panels that widen wit
 _FLAT = 0.02  # a spectrum is flat below this fraction of the frequency V / L0
 _SETTLED, _HALVINGS = 1e-8, 20  # of the panels of a spectrum of unknown shape
 _COVERED = 1e-6  # fraction of Nyquist above which there are geometric panels in any case
+_NARROWEST = 1e-10  # pole width that panels are still refined to, as a fraction of Nyquist
+_PANEL = 2.0  # length of a panel over its distance from a pole, or over the pole's width
+_PROBES = 5  # frequencies at which partial fractions are checked by solving linear systems
+_AGREEMENT = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _SampledResponses:
-    """Responses of a subloop's elements at the f frequencies of a quadrature."""
+class _Samples:
+    """A subloop's elements and the spectra at the f frequencies of a quadrature."""
 
-    frequency_hz: FloatArray
-    weight_hz: FloatArray
     delay: ComplexArray  # ``z^-1``
     first: ComplexArray  # of the group's two mirrors
     second: ComplexArray
     controller: ComplexArray  # (f, m, q), or (k, f, m, q) with one per loop
+    white: FloatArray  # weighted spectrum of unit noise per frame, (f,)
+    densities: list[tuple[FloatArray, list[int]]]  # weighted, (f,) or (k, f), with their modes
 
 
-def _sample_responses(
-    subloop: Subloop,
-    group: DelayGroup,
-    poles: ComplexArray,
-    spectra: list[Turbulence],
+def spectral_covariances(
+    group: LoopGroup,
+    turbulence: list[tuple[Turbulence, list[int]]],
+    noise_nm: FloatArray,
     frame_rate_hz: float,
-) -> _SampledResponses:
-    """Choose frequencies for the poles of a batch of loops, and evaluate a subloop there."""
-    nyquist = frame_rate_hz / 2
-    edges = [graded_edges(poles.ravel()) * nyquist]
-    edges += [_breakpoints(spectrum, nyquist) for spectrum in spectra]
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (k, n, n) of the residual from turbulence, and from noise (k, q).
+
+    ``turbulence`` pairs each spectrum with its modes of the subloop.
+    """
+    samples = _sample(group, turbulence, frame_rate_hz)
+    is_scalar = group.subloop.sensor.shape == group.subloop.influence.shape == (1, 1)
+    evaluate = _scalar_covariances if is_scalar else _matrix_covariances
+    return evaluate(group, samples, noise_nm)
+
+
+def _sample(
+    group: LoopGroup, turbulence: list[tuple[Turbulence, list[int]]], frame_rate_hz: float
+) -> _Samples:
+    """Choose frequencies for the poles of a batch of loops, and evaluate its subloop there."""
+    nyquist, subloop = frame_rate_hz / 2, group.subloop
+    edges = [graded_edges(group.poles.ravel()) * nyquist]
+    edges += [_breakpoints(spectrum, nyquist) for spectrum, _ in turbulence]
     frequency, weight = gauss_panels(np.unique(np.concatenate(edges)), ORDER)
     z = np.exp(1j * np.pi * frequency / nyquist)
     ends = (group.first,) if group.first is group.second else (group.first, group.second)
     mirrors = [_response(m.A, m.B[:, None], m.C[None], np.array([[m.D]]), z) for m in ends]
     A, B, C, D = subloop.controllers(group.rows)
-    if subloop.is_shared:
-        controller = _response(A[0], B[0], C[0], D[0], z)
-    else:
-        controller = batched_response(A, B, C, D, z)
-    return _SampledResponses(
-        frequency_hz=frequency,
-        weight_hz=weight,
+    shared = subloop.is_shared
+    densities = []
+    for spectrum, modes in turbulence:
+        density = spectrum.psd(frequency)
+        density = np.asarray(density[0] if len(density) == 1 else density) * weight
+        densities.append((density, modes))
+    return _Samples(
         delay=1 / z,
         first=mirrors[0][:, 0, 0],
         second=mirrors[-1][:, 0, 0],
-        controller=controller,
+        controller=_response(A[0], B[0], C[0], D[0], z)
+        if shared
+        else batched_response(A, B, C, D, z),
+        white=2 / frame_rate_hz * weight,
+        densities=densities,
     )
+
+
+def graded_edges(poles: ComplexArray) -> FloatArray:
+    """Panels of (0, 1), as fractions of Nyquist, that are short where a pole is near.
+
+    A panel is halved while it is longer than twice its distance from a pole, or than twice
+    the width of a pole that it holds.
+    """
+    upper = poles[poles.imag >= 0]
+    centre = np.abs(np.angle(upper)) / np.pi
+    width = np.maximum(1 - np.abs(upper), np.pi * _NARROWEST) / np.pi
+    grid = np.concatenate([[0.0], np.geomspace(1e-6, 1, 24)])
+    low, high = grid[:-1], grid[1:]
+    done = [np.ones(1)]
+    while low.size:
+        outside = np.maximum(low[:, None] - centre, centre - high[:, None])
+        nearest = np.min(np.maximum(outside, width), axis=1, initial=1.0)
+        long = high - low > _PANEL * nearest
+        done.append(low[~long])
+        middle = (low[long] + high[long]) / 2
+        low, high = np.concatenate([low[long], middle]), np.concatenate([middle, high[long]])
+    return np.sort(np.concatenate(done))
 
 
 def _response(
@@ -141,44 +180,11 @@ def _panel_integrals(spectrum: Turbulence, low: FloatArray, high: FloatArray) ->
     return np.asarray(np.sum(weights * spectrum.psd(nodes.ravel()).reshape(nodes.shape), axis=1))
 
 
-def spectral_covariances(
-    subloop: Subloop,
-    group: DelayGroup,
-    poles: ComplexArray,
-    sensor_gains: FloatArray,
-    turbulence: list[tuple[Turbulence, list[int]]],
-    noise_nm: FloatArray,
-    frame_rate_hz: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Covariances (k, n, n) of the residual from turbulence, and from noise (k, q).
-
-    ``turbulence`` pairs each spectrum with its modes of the subloop.
-    """
-    is_scalar = subloop.sensor.shape == subloop.influence.shape == (1, 1)
-    evaluate = _scalar_covariances if is_scalar else _matrix_covariances
-    spectra = [spectrum for spectrum, _ in turbulence]
-    samples = _sample_responses(subloop, group, poles, spectra, frame_rate_hz)
-    densities = [(_weighted_density(spectrum, samples), modes) for spectrum, modes in turbulence]
-    white = 2 / frame_rate_hz * samples.weight_hz
-    return evaluate(subloop, group, sensor_gains, samples, densities, noise_nm, white)
-
-
-def _weighted_density(spectrum: Turbulence, samples: _SampledResponses) -> FloatArray:
-    """Spectrum times the weights, (f,) or (k, f)."""
-    density = spectrum.psd(samples.frequency_hz)
-    return np.asarray(density[0] if len(density) == 1 else density) * samples.weight_hz
-
-
 def _scalar_covariances(
-    subloop: Subloop,
-    group: DelayGroup,
-    gains: FloatArray,
-    samples: _SampledResponses,
-    densities: list[tuple[FloatArray, list[int]]],
-    noise_nm: FloatArray,
-    white: FloatArray,
+    group: LoopGroup, samples: _Samples, noise_nm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """One mode, in real numbers: ``|S|^2 = 1 / |1 + g L|^2`` with the loop L at unit gain."""
+    subloop, g = group.subloop, group.sensor_gains[:, None]
     size = subloop.influence[0, 0] * subloop.sensor[0, 0]
     unit = size * samples.controller[..., 0, 0] * samples.delay
     first, second = unit * samples.first, unit * samples.second
@@ -187,14 +193,13 @@ def _scalar_covariances(
         share = group.fraction[:, None]
         real = real + share * (second.real - real)
         imaginary = imaginary + share * (second.imag - imaginary)
-    g = gains[:, None]
     # not 1 + 2 g Re L + g^2 |L|^2, which cancels next to instability
     rejection = 1 / ((1 + g * real) ** 2 + (g * imaginary) ** 2)
     square = (real**2 + imaginary**2) / subloop.sensor[0, 0] ** 2
-    turbulence = np.zeros(len(gains))
-    for density, _ in densities:  # each is of the one mode
+    turbulence = np.zeros(len(g))
+    for density, _ in samples.densities:  # each is of the one mode
         turbulence += _integrate(rejection, density)
-    noise = noise_nm[:, 0] ** 2 * _integrate(rejection * square, white)
+    noise = noise_nm[:, 0] ** 2 * _integrate(rejection * square, samples.white)
     return turbulence[:, None, None], noise[:, None, None]
 
 
@@ -206,18 +211,12 @@ def _integrate(values: FloatArray, density: FloatArray) -> FloatArray:
 
 
 def _matrix_covariances(
-    subloop: Subloop,
-    group: DelayGroup,
-    gains: FloatArray,
-    samples: _SampledResponses,
-    densities: list[tuple[FloatArray, list[int]]],
-    noise_nm: FloatArray,
-    white: FloatArray,
+    group: LoopGroup, samples: _Samples, noise_nm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Several modes, one loop at a time."""
-    n = subloop.modes.size
-    turbulence, noise = np.zeros((2, len(gains), n, n))
-    for k, gain in enumerate(gains):
+    subloop, n = group.subloop, group.subloop.modes.size
+    turbulence, noise = np.zeros((2, len(group.rows), n, n))
+    for k, gain in enumerate(group.sensor_gains):
         share = group.fraction[k]
         mirror = (1 - share) * samples.first + share * samples.second
         controller = samples.controller if subloop.is_shared else samples.controller[k]
@@ -225,8 +224,8 @@ def _matrix_covariances(
         loop = path @ (gain * subloop.sensor) * samples.delay[:, None, None]
         S = _inverses(np.eye(n) + loop)
         N = S @ (path * noise_nm[k])
-        noise[k] = _gram(N, white)
-        for density, modes in densities:
+        noise[k] = _gram(N, samples.white)
+        for density, modes in samples.densities:
             turbulence[k] += _gram(S[..., modes], density if density.ndim == 1 else density[k])
     return turbulence, noise
 
@@ -248,3 +247,64 @@ def _inverses(matrices: ComplexArray) -> ComplexArray:
     out[..., 0, 0], out[..., 1, 1] = scale * d, scale * a
     out[..., 0, 1], out[..., 1, 0] = -scale * b, -scale * c
     return out
+
+
+def batched_response(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, z: ComplexArray
+) -> ComplexArray:
+    """Transfer matrices (k, f, m, q) of k systems at f points z, by partial fractions.
+
+    A system whose eigenvectors are nearly dependent fails at some probes; its points are then
+    solved one by one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.loop.ensemble.spectral_covariances import batched_response
+    >>> halves = np.array([[[0.5]], [[-0.5]]])
+    >>> one = np.ones((2, 1, 1))
+    >>> batched_response(halves, one, one, 0 * one, np.array([1.0 + 0j])).real.ravel().round(6)
+    array([2.      , 0.666667])
+    """
+    out = np.empty((len(A), z.size, C.shape[1], B.shape[2]), dtype=np.complex128)
+    if A.shape[1] == 0:
+        out[:] = D[:, None]
+        return out
+    poles, vectors = np.linalg.eig(A)
+    with np.errstate(all="ignore"):  # what is not finite fails the probes
+        try:
+            entries = np.linalg.solve(vectors, B.astype(np.complex128))
+        except np.linalg.LinAlgError:  # one of them has no basis of eigenvectors
+            entries = np.full(B.shape, np.nan, dtype=np.complex128)
+        leaving = C @ vectors
+        for i in range(out.shape[2]):
+            for j in range(out.shape[3]):
+                residues = leaving[:, i] * entries[..., j]
+                out[..., i, j] = _partial_fractions(poles, residues, z) + D[:, i, j, None]
+    probes = np.linspace(0, z.size - 1, _PROBES).astype(np.int64)
+    pencils = z[probes, None, None] * np.eye(A.shape[1]) - A[:, None]
+    states = np.linalg.solve(pencils, B[:, None].astype(np.complex128))
+    direct = C[:, None] @ states + D[:, None]
+    apart = np.max(np.abs(out[:, probes] - direct), axis=(1, 2, 3))
+    agree = apart <= _AGREEMENT * np.max(np.abs(direct), axis=(1, 2, 3))
+    for k in np.flatnonzero(~agree):
+        out[k] = pointwise_response(StateSpace(A=A[k], B=B[k], C=C[k], D=D[k]), z)
+    return out
+
+
+def _partial_fractions(
+    poles: ComplexArray, residues: ComplexArray, z: ComplexArray
+) -> ComplexArray:
+    """Sum ``residue / (z - pole)`` over the poles (k, s), at all points, (k, f).
+
+    In real numbers, which is several times faster than a division of complex ones.
+    """
+    real, imaginary = np.zeros((2, len(poles), z.size))
+    for pole, residue in zip(poles.T[..., None], residues.T[..., None], strict=True):
+        x, y = z.real - pole.real, z.imag - pole.imag
+        scale = 1 / (x * x + y * y)
+        x *= scale
+        y *= scale
+        real += residue.real * x + residue.imag * y
+        imaginary += residue.imag * x - residue.real * y
+    return np.asarray(real + 1j * imaginary)

@@ -73,14 +73,8 @@ def split_into_subloops(
     s, q, m, n = A.shape[-1], B.shape[-1], C.shape[-2], hardware.modes
     x, y, u, r = np.split(np.arange(s + q + m + n), np.cumsum([s, q, m]))
     links = np.zeros((s + q + m + n, s + q + m + n), dtype=np.bool_)
-    for rows, columns, entries in (
-        (x, x, A),
-        (x, y, B),
-        (u, x, C),
-        (u, y, D),
-        (y, r, sensor[None]),
-        (r, u, influence[None]),
-    ):
+    controller = (x, x, A), (x, y, B), (u, x, C), (u, y, D)
+    for rows, columns, entries in (*controller, (y, r, sensor[None]), (r, u, influence[None])):
         links[np.ix_(rows, columns)] = _nonzero_entries(entries)
     _, label = connected_components(csr_matrix(links), directed=False)
     subloops, rest = [], []

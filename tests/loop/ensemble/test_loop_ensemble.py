@@ -58,6 +58,7 @@ def test_what_loops_cannot_meet(kalman, given, kind, message):
         ({"rms_nm": [1.0, -1.0]}, "rms_nm must be above 0"),
         ({"damping": 1.0}, "damping must be between 0 and 1"),
         ({"direction": [0.0, 0.0]}, "direction must be a vector"),
+        ({"direction": 1.0}, "direction must be a vector"),
     ],
 )
 def test_what_is_no_vibration(given, message):
