@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 
 from lbt_synth.config.schema import FileSection
@@ -16,6 +18,7 @@ from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import require_instance
 
 _COLUMN = 40  # where comments begin
+_LONGEST_LINE = 10**9  # a list stays on its line
 
 
 def config_text(settings: FileSection, comments: Mapping[str, str] | None = None) -> str:
@@ -24,20 +27,16 @@ def config_text(settings: FileSection, comments: Mapping[str, str] | None = None
     content = settings.model_dump(exclude_unset=True)
     left = dict(comments or {})
     head = left.pop("", "")
-    out = [f"# {line}".rstrip() for line in head.splitlines()]
-    for key, text in left.items():
-        if text.splitlines() not in ([text], []):
-            raise ProblemError(f"the comment on {key} must be one line; got {text!r}.")
-    for number, (key, value) in enumerate(content.items()):
-        if number > 0:
-            out.append("")
-        out += _write_key(key, value, key, 0, left)
+    for key, comment in left.items():
+        if comment.splitlines() not in ([comment], []):
+            raise ProblemError(f"the comment on {key} must be one line; got {comment!r}.")
+    document = _commented(content, "", left)
     if left:
         raise ProblemError(
             f"comments must be on keys that are written; got one on {next(iter(left))}, which is "
             "not. Keys are paths such as model.vibrations[0].rms_nm."
         )
-    text = "\n".join(out) + "\n"
+    text = _dump(document, head)
     try:
         again = FileSection.model_validate(YAML(typ="safe", pure=True).load(text))
     except (YAMLError, ValueError) as error:
@@ -101,46 +100,38 @@ def save_config(
     return write_atomically(path, config_text(settings, comments).encode())
 
 
-def _write_key(
-    key: str, value: Any, path: str, depth: int, comments: dict[str, str]
-) -> Iterator[str]:
-    """Yield the lines of a key; the comments used are removed from the mapping."""
-    start = f"{'  ' * depth}{key}:"
-    listed = isinstance(value, list) and bool(value) and isinstance(value[0], dict)
-    if isinstance(value, dict) and value:
-        yield _append_comment(start, comments.pop(path, ""))
-        for name, inner in value.items():
-            yield from _write_key(name, inner, f"{path}.{name}", depth + 1, comments)
-    elif listed:
-        yield _append_comment(start, comments.pop(path, ""))
-        for index, item in enumerate(value):
-            own = f"{path}[{index}]"
-            note = comments.pop(own, "")
-            if note:
-                yield f"{'  ' * (depth + 1)}# {note}"
-            rows = [
-                row
-                for name, inner in item.items()
-                for row in _write_key(name, inner, f"{own}.{name}", depth + 2, comments)
-            ]
-            rows[0] = f"{'  ' * (depth + 1)}- {rows[0].lstrip()}"
-            yield from rows
-    else:
-        yield _append_comment(f"{start} {_inline_value(value)}", comments.pop(path, ""))
-
-
-def _append_comment(line: str, comment: str) -> str:
-    return f"{line:<{_COLUMN - 2}}  # {comment}" if comment else line
-
-
-def _inline_value(value: Any) -> str:
-    """Return a value on one line."""
-    if isinstance(value, list):
-        return f"[{', '.join(_inline_value(item) for item in value)}]"
+def _commented(value: Any, path: str, comments: dict[str, str]) -> Any:
+    """Return a value with its comments for ruamel; the comments used leave the mapping."""
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{k}: {_inline_value(v)}' for k, v in value.items())}}}"
-    if value is None:
-        return "null"
-    if isinstance(value, float):
-        return repr(value)  # the shortest text that is read as this number
-    return str(value)
+        section = CommentedMap()
+        for key, inner in value.items():
+            own = f"{path}.{key}" if path else key
+            section[key] = _commented(inner, own, comments)
+            if comment := comments.pop(own, ""):
+                section.yaml_add_eol_comment(comment, key, column=_COLUMN)
+        return section
+    if not isinstance(value, list):
+        return value
+    entries = CommentedSeq()
+    for i, inner in enumerate(value):
+        own = f"{path}[{i}]"
+        entries.append(_commented(inner, own, comments))
+        if comment := comments.pop(own, ""):
+            depth = path.count(".") + 1
+            entries.yaml_set_comment_before_after_key(i, before=comment, indent=2 * depth)
+    if not (value and isinstance(value[0], dict)):
+        entries.fa.set_flow_style()
+    return entries
+
+
+def _dump(document: CommentedMap, head: str) -> str:
+    """Return the YAML of a document, its sections apart, below the lines of a heading."""
+    for key in list(document)[1:]:
+        document.yaml_set_comment_before_after_key(key, before="\n")
+    if head:
+        document.yaml_set_start_comment(head)
+    yaml, text = YAML(), io.StringIO()
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    yaml.width = _LONGEST_LINE
+    yaml.dump(document, text)
+    return text.getvalue()
