@@ -19,7 +19,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum
-from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
+from lbt_synth.loop.least_residuals.prediction import Prediction
 from lbt_synth.loop.least_residuals.residual_limit import mode_limit, truth_modes
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration.in_a_loop import checked_direction
@@ -120,21 +120,18 @@ def least_worst_residual(
         frequency_hz=high, rms_nm=rms_nm, direction=tuple(np.ravel(direction))
     )
     along = checked_direction(line, hardware)
-    decoupled = truth_modes(hardware, truth, (along,))
-    own = int(np.argmax(np.abs(decoupled.directions @ along)))
-    inner = InnerFactor.of(hardware)
-    saddle = _find_saddle(
-        inner, decoupled.modes[own], (low / nyquist, high / nyquist), line.rms_nm**2
-    )
-    modes = enumerate(decoupled.modes)
-    variance = np.array([saddle.lower if i == own else mode_limit(inner, m)[0] for i, m in modes])
+    directions, modes = truth_modes(hardware, truth, (along,))
+    own = int(np.argmax(np.abs(directions @ along)))
+    ends = low / nyquist, high / nyquist
+    lower, gap, x, weight = _find_saddle(modes[own], ends, line.rms_nm**2)
+    variance = np.array([lower if m is modes[own] else mode_limit(m)[0] for m in modes])
     return BandLimit(
         rms_nm=float(np.sqrt(variance.sum())),
-        achieved_nm=float(np.sqrt(variance.sum() + saddle.gap)),
+        achieved_nm=float(np.sqrt(variance.sum() + gap)),
         variance_nm2=frozen_copy(variance),
-        directions=frozen_copy(decoupled.directions),
-        frequency_hz=frozen_copy(saddle.x * nyquist),
-        weight=frozen_copy(saddle.weight),
+        directions=frozen_copy(directions),
+        frequency_hz=frozen_copy(x * nyquist),
+        weight=frozen_copy(weight),
     )
 
 
@@ -156,20 +153,9 @@ def _checked_band(band_hz: tuple[float, float], nyquist_hz: float) -> tuple[floa
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Saddle:
-    """Lower bound and gap [nm^2] for one mode, and the density at nodes x."""
-
-    lower: float
-    gap: float
-    x: FloatArray
-    weight: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Band:
     """One mode with a band, prepared for many densities of the sinusoid."""
 
-    inner: InnerFactor
     mode: ModeSpectrum
     reference: float  # unit of the logarithm [nm^2]
     outside: FloatArray  # integrals of the logarithm outside the band
@@ -191,12 +177,10 @@ class _Band:
     def predict(self, added: FloatArray) -> Prediction:
         """Return the best prediction with some spectrum added within the band."""
         noise = self.mode.noise_nm2
-        if noise > 0:
-            values = np.log1p((self.base - noise + added) / self.reference)
-        else:
-            values = np.log((self.base + added) / self.reference)
-        inside = (self.quadrature * values) @ self.inner.weights(self.x)
-        return Prediction.of(self.inner, self.outside + inside)
+        logarithm = np.log1p if noise > 0 else np.log
+        values = logarithm((self.base - noise + added) / self.reference)
+        inside = (self.quadrature * values) @ self.mode.inner.weights(self.x)
+        return Prediction.of(self.mode.inner, self.outside + inside)
 
     def bounds(
         self, prediction: Prediction, added: FloatArray, worst: float
@@ -214,41 +198,40 @@ class _Band:
 
 
 def _find_saddle(
-    inner: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
-) -> _Saddle:
-    band = _prepare_band(inner, mode, ends, total)
+    mode: ModeSpectrum, ends: tuple[float, float], total: float
+) -> tuple[float, float, FloatArray, FloatArray]:
+    """Return lower bound and gap [nm^2], and the worst density: its nodes and their weights."""
+    band = _prepare_band(mode, ends, total)
     if band is None:  # the spectrum vanishes outside the band: the line is known from its past
         x, q = gauss_panels(np.linspace(*ends, _PANELS + 1), _ORDER)
-        return _Saddle(lower=0.0, gap=0.0, x=x, weight=q / q.sum())
+        return 0.0, 0.0, x, q / q.sum()
     # the worst case is sought between the nodes, too
     fine = np.unique(np.concatenate([np.linspace(*ends, 8 * _PANELS + 1), band.x]))
     base = mode.power(fine) + mode.noise_nm2
     shape, fine_shape = np.ones(band.x.size), np.ones(fine.size)
-    best: _Saddle | None = None
+    best_lower, best_gap, weight = 0.0, np.inf, band.quadrature
     for rounds in range(_ROUNDS):
         level, added = band.fill(shape, total)
         prediction = band.predict(added)
         fine_power = prediction.error_power(fine)
         worst = float(np.max(fine_power / np.maximum(base, level * fine_shape)))
         lower, gap = band.bounds(prediction, added, worst)
-        if best is None or gap < best.gap:
-            weight = band.quadrature * added / total
-            best = _Saddle(lower=lower, gap=gap, x=band.x, weight=weight)
+        if gap < best_gap:
+            best_lower, best_gap, weight = lower, gap, band.quadrature * added / total
         if gap <= _SETTLED * lower:
             break
         # half a step where whole ones oscillate
         share = 1.0 if rounds < _WHOLE_STEPS else 0.5
         shape = _step_towards(shape, prediction.error_power(band.x), share)
         fine_shape = _step_towards(fine_shape, fine_power, share)
-    assert best is not None  # set in the first round
-    if not best.gap <= _LARGEST_GAP * best.lower:
+    if not best_gap <= _LARGEST_GAP * best_lower:
         raise NumericalError(
             f"the worst density of a sinusoid did not settle in {_ROUNDS} rounds: a gap of "
-            f"{best.gap / best.lower:.3g} of the variance is left. Try a narrower band.",
+            f"{best_gap / best_lower:.3g} of the variance is left. Try a narrower band.",
             status="rounds",
-            residual=best.gap / best.lower,
+            residual=best_gap / best_lower,
         )
-    return best
+    return best_lower, best_gap, band.x, weight
 
 
 def _step_towards(shape: FloatArray, target: FloatArray, share: float) -> FloatArray:
@@ -257,16 +240,13 @@ def _step_towards(shape: FloatArray, target: FloatArray, share: float) -> FloatA
     return np.asarray(np.maximum(mixed, 1e-14 * np.max(mixed)))
 
 
-def _prepare_band(
-    inner: InnerFactor, mode: ModeSpectrum, ends: tuple[float, float], total: float
-) -> _Band | None:
-    noise = mode.noise_nm2
-    width = ends[1] - ends[0]
-    reference = mode.reference()
+def _prepare_band(mode: ModeSpectrum, ends: tuple[float, float], total: float) -> _Band | None:
+    """Prepare a mode with a band; None where its spectrum vanishes outside of it."""
+    noise, reference, width = mode.noise_nm2, mode.reference(), ends[1] - ends[0]
     if noise == 0:
         reference = max(reference, total / width)
     # without noise the line fills the band, and the spectrum may vanish only outside of it
-    panels = mode.log_moments(inner, reference, ends=ends, skip=noise == 0)
+    panels = mode.log_moments(reference, ends=ends, skip=noise == 0)
     if panels is None:
         return None
     middle = (panels.low + panels.high) / 2
@@ -276,7 +256,6 @@ def _prepare_band(
     edges = edges[np.concatenate([[True], np.diff(edges) > 1e-4 * width / _PANELS])]
     x, q = gauss_panels(edges, _ORDER)
     return _Band(
-        inner=inner,
         mode=mode,
         reference=reference,
         outside=panels.integrals[~inside].sum(axis=0),

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.least_residuals.prediction import InnerFactor
-from lbt_synth.models import ARModel, LoopHardware, Spectrum, Vibration
+from lbt_synth.models import ARModel, FullStatePlant, LoopHardware, Spectrum, Vibration
 from lbt_synth.models.spectra import breakpoints_below, spectrum_key
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, real_array
 
 _COUPLING = 1e-9  # relative size above which an off-diagonal entry counts as coupling
+_SAMPLES = 24  # frequencies at which the modes of a plant have to decouple
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModeSpectrum:
     """One decoupled mode: its disturbance and the white noise on its measurement."""
 
+    inner: InnerFactor  # of the path to the residual
     rate_hz: float
     parts: tuple[Spectrum, ...]  # independent parts of the disturbance
     noise_nm2: float  # variance of the noise per frame, as a phase [nm^2]
@@ -62,12 +66,7 @@ class ModeSpectrum:
         return float(np.max(self.power((edges[1:] + edges[:-1]) / 2), initial=0.0))
 
     def log_moments(
-        self,
-        inner: InnerFactor,
-        reference: float,
-        *,
-        ends: Sequence[float] = (),
-        skip: bool = False,
+        self, reference: float, *, ends: Sequence[float] = (), skip: bool = False
     ) -> RefinedPanels | None:
         """Integrals of ``log(Phi / reference)`` times the weights; None where Phi vanishes.
 
@@ -88,7 +87,7 @@ class ModeSpectrum:
             if noiseless and np.any(ratio == 0):
                 raise _VanishingError
             values = np.log(ratio) if noiseless else np.log1p(ratio)
-            return np.asarray(values[:, None] * inner.weights(x))
+            return np.asarray(values[:, None] * self.inner.weights(x))
 
         try:
             return refine_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
@@ -100,12 +99,28 @@ class _VanishingError(Exception):
     """A spectrum without noise is zero over an interval: the process can be predicted exactly."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DecoupledModes:
-    """Directions over the modes (rows) and the spectrum along each."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ResponseSpectrum:
+    """One-sided spectrum of one direction of a system driven by white noise."""
 
-    directions: FloatArray
-    modes: tuple[ModeSpectrum, ...]
+    system: StateSpace  # from unit white noise to the modes
+    axis: FloatArray  # (n,)
+
+    @property
+    def breakpoints_hz(self) -> FloatArray:
+        """Frequencies around the poles [Hz]."""
+        poles = self.system.poles
+        centre = np.abs(np.angle(poles)) / np.pi
+        width = np.maximum(1 - np.abs(poles), 1e-9) / np.pi
+        spread = centre[:, None] + width[:, None] * np.array([-16, -4, -1, 0, 1, 4, 16])
+        return np.asarray(spread.ravel() / (2 * self.system.dt_s))
+
+    def psd(self, frequency_hz: Any) -> FloatArray:
+        """Return the spectrum [nm^2/Hz]."""
+        frequency = real_array(frequency_hz, "frequency_hz")
+        response = (self.axis[None] @ self.system.frequency_response(frequency.ravel()))[:, 0]
+        power = np.sum(np.abs(response) ** 2, axis=-1)
+        return np.asarray(2 * self.system.dt_s * power.reshape(frequency.shape))
 
 
 def decoupled_modes(
@@ -115,13 +130,14 @@ def decoupled_modes(
     turbulence: Sequence[Spectrum | None],
     vibrations: Sequence[tuple[FloatArray, Vibration]] = (),
     directions: Sequence[FloatArray] = (),
-) -> DecoupledModes:
+) -> tuple[FloatArray, list[ModeSpectrum]]:
     """Rotate the modes until disturbance and noise (q, q) are diagonal.
 
-    Vibrations come with their directions (n,); further ``directions`` must be axes, too.
+    Return the directions over the modes (rows) and the spectrum along each. Vibrations come with
+    their directions (n,); further ``directions`` must be axes, too.
     """
     n, rate = hardware.modes, hardware.frame_rate_hz
-    noise = noise_on_modes(hardware, noise_nm2)
+    noise = _noise_on_modes(hardware, noise_nm2)
     if np.linalg.matrix_rank(hardware.influence) < n:
         raise ProblemError(
             "the mirror must reach every mode: an influence matrix with full row rank; got rank "
@@ -142,18 +158,28 @@ def decoupled_modes(
         for along, line in vibrations
     ]
     matrices += [("the given direction", np.outer(along, along)) for along in directions]
-    axes = common_axes(matrices)
-    modes = []
+    axes = _common_axes(matrices)
+    parts = []
     for axis in axes:
         own = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
         lines = [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
-        parts = tuple(part for part in (kinds[own], *lines) if part is not None)
-        own_noise = max(float(axis @ noise @ axis), 0.0)
-        modes.append(ModeSpectrum(rate_hz=rate, parts=parts, noise_nm2=own_noise))
-    return DecoupledModes(directions=axes, modes=tuple(modes))
+        parts.append(tuple(part for part in (kinds[own], *lines) if part is not None))
+    return axes, _spectra_along(axes, parts, noise, hardware)
 
 
-def noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
+def _spectra_along(
+    axes: FloatArray, parts: list[tuple[Spectrum, ...]], noise: FloatArray, hardware: LoopHardware
+) -> list[ModeSpectrum]:
+    inner, rate = InnerFactor.of(hardware), hardware.frame_rate_hz
+    return [
+        ModeSpectrum(
+            inner=inner, rate_hz=rate, parts=own, noise_nm2=max(float(axis @ noise @ axis), 0.0)
+        )
+        for axis, own in zip(axes, parts, strict=True)
+    ]
+
+
+def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
     """Covariance (n, n) of the best unbiased estimate of the modes from one measurement."""
     sensor, n = hardware.sensor, hardware.modes
     if np.linalg.matrix_rank(sensor) < n:
@@ -176,7 +202,7 @@ def noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
     return np.asarray(size * np.linalg.inv(white.T @ white))
 
 
-def common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
+def _common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
     """Orthonormal rows that make all symmetric matrices diagonal."""
     n = len(matrices[0][1])
     unit = [(name, m / max(float(np.linalg.norm(m, 2)), 1e-300)) for name, m in matrices]
@@ -206,3 +232,35 @@ def common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
             "each mode by itself."
         )
     return np.asarray(axes)
+
+
+def plant_modes(plant: FullStatePlant) -> tuple[FloatArray, list[ModeSpectrum]]:
+    """Decouple the modes of a plant that is given by its matrices, as :func:`decoupled_modes`."""
+    hardware = plant.hardware
+    noise = _noise_on_modes(hardware, plant.R)
+    if np.any(plant.S):
+        raise ProblemError(
+            "a limit needs measurement noise that is independent of the disturbance; got a plant "
+            "with B D' different from zero."
+        )
+    # the commands are left out: this is the response to the disturbance alone
+    C = np.linalg.pinv(hardware.sensor) @ plant.C
+    D = np.zeros((len(C), plant.B.shape[1]))
+    system = StateSpace(A=plant.A, B=plant.B, C=C, D=D, dt_s=plant.dt_s)
+    nyquist = hardware.frame_rate_hz / 2
+    poles = ResponseSpectrum(system, np.ones(hardware.modes)).breakpoints_hz
+    at = np.concatenate([np.geomspace(1e-5, 0.999, _SAMPLES) * nyquist, poles])
+    response = system.frequency_response(at[(at > 0) & (at < nyquist)])
+    spectra = response @ response.conj().transpose(0, 2, 1)
+    matrices = [("the noise of the sensor", noise)]
+    matrices += [("the disturbance", np.real(one)) for one in spectra]
+    axes = _common_axes(matrices)
+    turned = axes @ spectra @ axes.T
+    crossed = np.abs(turned * (1 - np.eye(hardware.modes)))
+    if np.any(crossed.max(axis=(1, 2)) > 1e-6 * np.abs(turned).max(axis=(1, 2))):
+        raise ProblemError(
+            "a limit needs modes that decouple; got disturbances of two modes that follow each "
+            "other with a delay. Treat each mode by itself."
+        )
+    parts: list[tuple[Spectrum, ...]] = [(ResponseSpectrum(system, axis),) for axis in axes]
+    return axes, _spectra_along(axes, parts, noise, hardware)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
@@ -53,15 +54,8 @@ class InnerFactor:
             )
         # for small zeros, the quotient (F - f_0 - ...) / zero^whole is summed as a series
         small = [abs(a) for a in zeros if abs(a) ** whole <= _FEW_DIGITS]
-        if not small:
-            return InnerFactor(whole=whole, zeros=zeros, terms=whole)
-        more = int(np.ceil(np.log(1e-17) / np.log(max(*small, 1e-300))))
-        return InnerFactor(whole=whole, zeros=zeros, terms=whole + 1 + more)
-
-    @property
-    def by_series(self) -> bool:
-        """Whether the value at a zero is summed from its series."""
-        return self.terms > self.whole
+        more = 1 + int(np.ceil(np.log(1e-17) / np.log(max(*small, 1e-300)))) if small else 0
+        return InnerFactor(whole=whole, zeros=zeros, terms=whole + more)
 
     @property
     def by_weight(self) -> tuple[float, ...]:
@@ -95,18 +89,16 @@ class Prediction:
     @staticmethod
     def of(inner: InnerFactor, moments: FloatArray) -> Prediction:
         """Predict from the integrals of the logarithm times the weights of an inner factor."""
-        polynomial = np.polynomial.polynomial.polyval
         f = _exponential(moments[: inner.terms])
         whole, tails = inner.whole, np.zeros(len(inner.zeros))
         for i, a in enumerate(inner.zeros):
             if a in inner.by_weight:
                 value = float(np.exp(moments[inner.terms + inner.by_weight.index(a)]))
-                tails[i] = (value - float(polynomial(a, f[:whole]))) / a**whole
+                tails[i] = (value - float(polyval(a, f[:whole]))) / a**whole
             else:
-                tails[i] = float(polynomial(a, f[whole:]))
-        return Prediction(
-            inner=inner, mean_log=float(moments[0]), coefficients=f[:whole], tails=tails
-        )
+                tails[i] = float(polyval(a, f[whole:]))
+        mean_log = float(moments[0])
+        return Prediction(inner=inner, mean_log=mean_log, coefficients=f[:whole], tails=tails)
 
     @property
     def _kernels(self) -> FloatArray:
@@ -131,9 +123,7 @@ class Prediction:
     def error_power(self, x: FloatArray) -> FloatArray:
         """``|P|^2 / sigma^2`` at frequencies x: the rejection is ``|P / F|^2``."""
         shift = np.exp(-1j * np.pi * x)
-        part: ComplexArray = np.asarray(
-            np.polynomial.polynomial.polyval(shift, self.coefficients), dtype=np.complex128
-        )
+        part: ComplexArray = polyval(shift, self.coefficients)
         for a, weight in zip(self.inner.zeros, self._kernels, strict=True):
             part = part + weight * shift**self.inner.whole / (1 - a * shift)
         return np.asarray(np.abs(part) ** 2)

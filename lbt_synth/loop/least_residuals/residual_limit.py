@@ -8,12 +8,11 @@ from typing import assert_never
 import numpy as np
 
 from lbt_synth.loop.least_residuals.mode_spectra import (
-    DecoupledModes,
     ModeSpectrum,
     decoupled_modes,
+    plant_modes,
 )
-from lbt_synth.loop.least_residuals.plant_modes import plant_modes
-from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
+from lbt_synth.loop.least_residuals.prediction import Prediction
 from lbt_synth.models import (
     FullStatePlant,
     LoopHardware,
@@ -91,24 +90,25 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     >>> round(float(limit.variance_nm2[0]), 8)  # 2^2 (1 + 0.5^2)
     5.0
     """
-    return _residual_limit(hardware, truth_modes(hardware, truth))
+    return _residual_limit(*truth_modes(hardware, truth))
 
 
 def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth."""
     if isinstance(plant, FullStatePlant):
-        return _residual_limit(plant.hardware, plant_modes(plant))
+        return _residual_limit(*plant_modes(plant))
     lines = [(checked_direction(line, plant.hardware), line) for line in plant.vibrations]
-    modes = decoupled_modes(
-        plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
+    return _residual_limit(
+        *decoupled_modes(
+            plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
+        )
     )
-    return _residual_limit(plant.hardware, modes)
 
 
 def truth_modes(
     hardware: LoopHardware, truth: Truth, directions: tuple[FloatArray, ...] = ()
-) -> DecoupledModes:
-    """Decouple the modes of a truth, its sinusoids left out."""
+) -> tuple[FloatArray, list[ModeSpectrum]]:
+    """Decouple the modes of a truth without its sinusoids, as :func:`decoupled_modes`."""
     require_instance(hardware, LoopHardware)
     require_instance(truth, Truth)
     lines = []
@@ -128,30 +128,29 @@ def truth_modes(
     )
 
 
-def _residual_limit(hardware: LoopHardware, decoupled: DecoupledModes) -> ResidualLimit:
-    inner = InnerFactor.of(hardware)
+def _residual_limit(directions: FloatArray, modes: list[ModeSpectrum]) -> ResidualLimit:
     known: dict[tuple[object, ...], tuple[float, float]] = {}
     found = []
-    for mode in decoupled.modes:
+    for mode in modes:
         key = (tuple(id(part) for part in mode.parts), mode.noise_nm2)
         if key not in known:
-            known[key] = mode_limit(inner, mode)
+            known[key] = mode_limit(mode)
         found.append(known[key])
     variance, change = np.array(found).T
     return ResidualLimit(
         variance_nm2=frozen_copy(variance),
-        directions=frozen_copy(decoupled.directions),
+        directions=frozen_copy(directions),
         change=float(np.max(change)),
     )
 
 
-def mode_limit(inner: InnerFactor, mode: ModeSpectrum) -> tuple[float, float]:
+def mode_limit(mode: ModeSpectrum) -> tuple[float, float]:
     """Least variance of one mode, and its relative change at the last refinement."""
     reference = mode.reference()
-    panels = mode.log_moments(inner, reference) if mode.parts and reference > 0 else None
+    panels = mode.log_moments(reference) if mode.parts and reference > 0 else None
     if panels is None:  # nothing to correct, or all of it can be predicted
         return 0.0, 0.0
     moments = panels.integrals.sum(axis=0)
-    variance = Prediction.of(inner, moments).variance(reference, mode.noise_nm2)
+    variance = Prediction.of(mode.inner, moments).variance(reference, mode.noise_nm2)
     scale = min(1.0, float(moments[0])) if mode.noise_nm2 > 0 else 1.0
     return variance, panels.change / scale if scale > 0 else 0.0
