@@ -12,7 +12,7 @@ from lbt_synth.cli.identification_files import (
     require_places,
 )
 from lbt_synth.cli.identification_tables import add_model, add_record, marked_note
-from lbt_synth.cli.output import Report, format_fixed, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.cli.record_arguments import identification_options, read_record
 from lbt_synth.errors import ProblemError
@@ -29,6 +29,7 @@ from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.rows import column, fill_row, table_row
 
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
 
@@ -77,34 +78,28 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
+@table_row
+class HeldOutRow:
+    """One controller on frames that nothing was fitted to, beside what the model promises."""
+
+    name: str = column("controller")
+    replayed_nm: float = column("data", unit="nm", format=".2f", key="data_nm")
+    replayed_error_nm: float = column("+-", format=".2f", key="data_error_nm")
+    model_nm: float = column("model", unit="nm", format=".2f")
+    ratio: float = column("data/model", format=".3f")
+    strehl: float = column("Strehl, data", format=".3f")
+    model_strehl: float = column("Strehl, model", format=".3f")
+
+
 def _add_comparison(report: Report, found: RecordedDesign, record: LoopRecord) -> None:
     """Add what the second half of the data says of a design from the first."""
     table = found.held_out
-    report.tables.append(
-        tabulate(
-            "Residual on the second half of the record, by models of the first",
-            table.entries,
-            ("controller", lambda entry: entry.name),
-            ("data [nm]", lambda entry: format_fixed(entry.replayed_nm, 2)),
-            ("+-", lambda entry: format_fixed(entry.replayed_error_nm, 2)),
-            ("model [nm]", lambda entry: format_fixed(entry.model_nm, 2)),
-            ("data/model", lambda entry: format_fixed(entry.ratio, 3)),
-            ("Strehl, data", lambda entry: format_fixed(entry.strehl, 3)),
-            ("Strehl, model", lambda entry: format_fixed(entry.model_strehl, 3)),
-        )
+    report.add_rows(
+        "held_out",
+        "Residual on the second half of the record, by models of the first",
+        [fill_row(HeldOutRow, entry) for entry in table.entries],
     )
     report.notes += [f"note: {note}" for note in table.notes]
-    report.data["held_out"] = [
-        {
-            "name": entry.name,
-            "data_nm": entry.replayed_nm,
-            "data_error_nm": entry.replayed_error_nm,
-            "model_nm": entry.model_nm,
-            "strehl": entry.strehl,
-            "model_strehl": entry.model_strehl,
-        }
-        for entry in table.entries
-    ]
     best = table[found.name]
     report.data["gain_over_what_ran"] = None
     if record.commands is not None:

@@ -5,23 +5,50 @@ from __future__ import annotations
 import hashlib
 import json
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from lbt_synth.cli.end_to_end_setup import calibrate_setup, load_setup
-from lbt_synth.cli.output import Report, TableText, format_fixed, json_value
+from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
+from lbt_synth.config import load_config
 from lbt_synth.design import Design
 from lbt_synth.files import Telemetry, load_gain, save_telemetry
-from lbt_synth.interop import Calibration, EndToEndRun
+from lbt_synth.interop import Calibration, EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.json_cases import summarise_run
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.report.figures import end_to_end_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
+from lbt_synth.storage.rows import column, fill_row, table_row
 
 _FILES = ("run.png", "telemetry.fits", "summary.json")
+
+
+@table_row
+class EndToEndFacts:
+    """The main numbers of a run."""
+
+    gain: str = column()
+    method: str = column()
+    specula: str = column()
+    pixels: int = column()
+    frames: int = column()
+    settle_frames: int = column()
+    seed: int = column()
+    strehl: float = column("Strehl ratio", unit="%", scale=100, format=".2f")
+    strehl_error: float | None = column("  standard error", unit="points", scale=100, format=".2f")
+    other_modes_strehl: float = column("  without tip and tilt", unit="%", scale=100, format=".2f")
+    tip_rms_nm: float = column("tip", unit="nm rms", format=".1f")
+    tilt_rms_nm: float = column("tilt", unit="nm rms", format=".1f")
+    other_modes_rms_nm: float = column("all other modes", unit="nm rms", format=".1f")
+    tip_tilt_gain: float = column("optical gain of tip and tilt", format=".3f")
+    tip_tilt_gain_error: float = column("  standard error", format=".3f")
+    tip_tilt_noise_nm: float = column(
+        "what it leaves of their measurements", unit="nm rms", format=".1f"
+    )
+    condition_number: float = column("condition of the reconstructor", format=".1f")
+    milliseconds_a_frame: float = column("time per frame", unit="ms", format=".1f")
 
 
 def run(arguments: Namespace) -> Report:
@@ -38,67 +65,49 @@ def run(arguments: Namespace) -> Report:
     total = setup.frames + setup.settle_frames
     with count_progress(total=total, what="frames", quiet=arguments.json) as count:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
-    figures = summarise_run(loop_run)
-    inverse = calibration.reconstructor
-    data: dict[str, Any] = {
-        "gain": str(arguments.gain),
-        "method": design.method,
-        "specula": version,
-        "pixels": setup.system.pixels,
-        "frames": loop_run.frames,
-        "settle_frames": loop_run.settle_frames,
-        "seed": loop_run.seed,
-        **figures,
-        "condition_number": inverse.condition_number,
-        "milliseconds_a_frame": 1e3 * loop_run.seconds / total,
-    }
-    files = [
-        save_figure(end_to_end_figure(loop_run), figure_file),
-        save_telemetry(
-            telemetry_file,
-            _telemetry(loop_run, design, calibration, arguments),
-            precision="float32",
-        ),
-        write_atomically(summary_file, json.dumps(json_value(data), indent=1).encode() + b"\n"),
-    ]
-    data["files"] = [str(path) for path in files]
-    return Report(
-        data=data,
-        tables=[
-            TableText(
-                title=f"End to end: {loop_run.system.modes} modes, {loop_run.frames} frames after "
-                f"{loop_run.settle_frames}, seed {loop_run.seed}",
-                headings=("figure", "value", "unit"),
-                rows=[
-                    *_figure_rows(loop_run, figures),
-                    ("condition of the reconstructor", f"{inverse.condition_number:.1f}", ""),
-                    ("time per frame", f"{data['milliseconds_a_frame']:.1f}", "ms"),
-                ],
-            )
-        ],
-        notes=[f"written: {path}" for path in files],
+    system = loop_run.system
+    facts = fill_row(
+        EndToEndFacts,
+        *(loop_run, system, calibration.reconstructor),
+        gain=str(arguments.gain),
+        method=design.method,
+        specula=version,
+        milliseconds_a_frame=1e3 * loop_run.seconds / total,
+        **summarise_run(loop_run),
     )
+    report = Report()
+    report.add_facts(
+        f"End to end, Strehl ratio at {system.imaging_wavelength_um:g} um: {system.modes} modes, "
+        f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
+        facts,
+    )
+    summary = json.dumps(json_value(report.data), indent=1).encode() + b"\n"
+    recorded = _telemetry(loop_run, design, calibration, arguments)
+    report.note_files(
+        [
+            save_figure(end_to_end_figure(loop_run), figure_file),
+            save_telemetry(telemetry_file, recorded, precision="float32"),
+            write_atomically(summary_file, summary),
+        ]
+    )
+    return report
 
 
-def _figure_rows(loop_run: EndToEndRun, figures: dict[str, Any]) -> list[tuple[str, str, str]]:
-    wavelength = loop_run.system.imaging_wavelength_um
-    return [
-        (
-            f"Strehl ratio at {wavelength:g} um",
-            f"{100 * loop_run.strehl:.2f} +- {format_fixed(100 * loop_run.strehl_error, 2)}",
-            "%",
-        ),
-        ("the same without tip and tilt", f"{100 * loop_run.other_modes_strehl:.2f}", "%"),
-        ("tip", f"{figures['tip_rms_nm']:.1f}", "nm rms"),
-        ("tilt", f"{figures['tilt_rms_nm']:.1f}", "nm rms"),
-        ("all other modes", f"{figures['other_modes_rms_nm']:.1f}", "nm rms"),
-        (
-            "optical gain of tip and tilt",
-            f"{loop_run.tip_tilt_gain:.3f} +- {loop_run.tip_tilt_gain_error:.3f}",
-            "",
-        ),
-        ("what it leaves of their measurements", f"{loop_run.tip_tilt_noise_nm:.1f}", "nm rms"),
-    ]
+def load_setup(arguments: Namespace) -> EndToEndSetup:
+    """Load the end-to-end setup of a configuration, with the changes of the command line."""
+    setup = load_config(arguments.config).end_to_end
+    if arguments.pixels is not None:
+        setup = replace(setup, system=replace(setup.system, pixels=arguments.pixels))
+    given = {name: getattr(arguments, name) for name in ("frames", "settle_frames", "seed")}
+    return replace(setup, **{name: value for name, value in given.items() if value is not None})
+
+
+def calibrate_setup(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
+    """Calibrate a system, or take its calibration from the cache, behind a progress bar."""
+    with count_progress(
+        total=setup.system.modes, what="calibration", quiet=arguments.json
+    ) as count:
+        return calibrate(setup.system, cache=arguments.cache, progress=count)
 
 
 def _telemetry(

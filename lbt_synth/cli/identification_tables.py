@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.identification import (
     IdentifiedAxis,
-    IdentifiedLine,
     IdentifiedModel,
     LoopRecord,
     SpectrumRecord,
 )
 from lbt_synth.identification.records.health import HEADINGS
+from lbt_synth.storage.rows import cell_text, column, fill_row, row_table, table_row
 
 
 def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
@@ -27,15 +27,13 @@ def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
 def _add_spectra(report: Report, record: SpectrumRecord) -> None:
     f = record.frequency_hz
     report.data["record"] = {"kind": "spectrum", "frequencies": f.size, "notes": record.notes}
-    report.tables.append(
-        TableText(
-            title=f"Spectra of {_axes_text(record.axes)}",
-            headings=("axis", "from [Hz]", "to [Hz]", "rms [nm]"),
-            rows=[
-                (name, float(f[0]), float(f[-1]), format_fixed(float(rms), 1))
-                for name, rms in zip(_axis_names(record.axes), record.rms_nm, strict=True)
-            ],
-        )
+    report.add_table(
+        f"Spectra of {_axes_text(record.axes)}",
+        ("axis", "from [Hz]", "to [Hz]", "rms [nm]"),
+        [
+            (name, f[0], f[-1], f"{rms:.1f}")
+            for name, rms in zip(_axis_names(record.axes), record.rms_nm, strict=True)
+        ],
     )
     report.notes += [f"note: {note}" for note in record.notes]
 
@@ -58,8 +56,7 @@ def _add_series(report: Report, record: LoopRecord) -> None:
         for fault, series, axis, *rest in health.rows()
     ]
     if rows:
-        title = f"Record: {text}: {health.summary()}"
-        report.tables.append(TableText(title=title, headings=HEADINGS, rows=rows))
+        report.add_table(f"Record: {text}: {health.summary()}", HEADINGS, rows)
     else:
         report.notes.append(f"record: {text}; {health.summary()}")
     report.notes += [f"note: {note}" for note in health.notes]
@@ -73,34 +70,49 @@ def _axis_names(count: int) -> list[str]:
     return ["tip", "tilt"] if count == 2 else ["-"] * count
 
 
+@table_row
+class VibrationRow:
+    """A vibration found on one axis."""
+
+    axis: str = column("axis")
+    frequency_hz: float = column("f", unit="Hz", format=".3f")
+    frequency_error_hz: float = column("+-", format=".2g")
+    damping: str = column("damping")  # one that is not resolved has a bound, and no error
+    damping_error: float | None = column("+-", format=".2g")
+    rms_nm: float = column("rms", unit="nm", format=".2f")
+    rms_error_nm: float = column("+-", format=".2g")
+    prominence: float = column("over the rest", format=".3g")
+    origin: str = column("origin")
+
+
 def add_model(report: Report, model: IdentifiedModel) -> None:
     """Add the tables of an identified model, its notes, and its numbers."""
     names = _axis_names(len(model.axes))
     named_axes = list(zip(names, model.axes, strict=True))
-    report.tables.append(
-        TableText(
-            title="Turbulence, noise and sensor",
-            headings=("quantity", "axis", "value", "error", "unit"),
-            rows=[row for name, axis in named_axes for row in _background_rows(name, axis)],
-        )
+    report.add_table(
+        "Turbulence, noise and sensor",
+        ("quantity", "axis", "value", "error", "unit"),
+        [
+            (quantity, name, cell_text(value, digits), cell_text(error, ".2g"), unit)
+            for name, axis in named_axes
+            for quantity, value, digits, error, unit in _background(axis)
+            if value is not None
+        ],
     )
-    lines = [(name, line) for name, axis in named_axes for line in axis.parts]
-    if lines:
-        report.tables.append(
-            tabulate(
-                "Vibrations",
-                lines,
-                ("axis", lambda item: item[0]),
-                ("f [Hz]", lambda item: format_fixed(item[1].frequency_hz, 3)),
-                ("+-", lambda item: f"{item[1].frequency_error_hz:.2g}"),
-                ("damping", lambda item: _damping_texts(item[1])[0]),
-                ("+-", lambda item: _damping_texts(item[1])[1]),
-                ("rms [nm]", lambda item: format_fixed(item[1].rms_nm, 2)),
-                ("+-", lambda item: f"{item[1].rms_error_nm:.2g}"),
-                ("over the rest", lambda item: f"{item[1].prominence:.3g}"),
-                ("origin", lambda item: item[1].kind + ", announced" * item[1].announced),
-            )
+    lines = [
+        fill_row(
+            VibrationRow,
+            line,
+            axis=name,
+            damping=f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
+            damping_error=line.damping_error if line.resolved else None,
+            origin=line.kind + ", announced" * line.announced,
         )
+        for name, axis in named_axes
+        for line in axis.parts
+    ]
+    if lines:
+        report.tables.append(row_table("Vibrations", lines))
     else:
         report.notes.append("no vibration stands out of the turbulence and the noise.")
     report.notes += [marked_note(note) for note in model.notes]
@@ -112,57 +124,24 @@ def add_model(report: Report, model: IdentifiedModel) -> None:
     report.data["model_notes"] = model.notes
 
 
-def _damping_texts(line: IdentifiedLine) -> tuple[str, str | None]:
-    if line.resolved:
-        return f"{line.damping:.3g}", f"{line.damping_error:.2g}"
-    return f"< {line.damping:.2g}", None
+def _background(
+    axis: IdentifiedAxis,
+) -> tuple[tuple[str, float | None, str, float | None, str], ...]:
+    """Return each quantity, its value, how it is written, its standard error and its unit."""
+    slow = axis.turbulence_fit
+    return (
+        ("turbulence, rms", slow.rms_nm, ".1f", slow.rms_error_nm, "nm"),
+        ("turbulence, frequency", slow.frequency_hz, ".4g", slow.frequency_error_hz, "Hz"),
+        ("turbulence, damping", slow.damping, ".3g", slow.damping_error, ""),
+        ("turbulence, roll-off", slow.corner_hz, ".3g", slow.corner_error_hz, "Hz"),
+        ("noise per frame", axis.noise_nm, ".3f", axis.noise_error_nm, "nm"),
+        ("sensor gain", axis.sensor_gain, ".4f", axis.sensor_gain_error, ""),
+    )
 
 
 def marked_note(note: str) -> str:
     """Mark a note as such, unless it is a warning."""
     return note if note.startswith("warning") else f"note: {note}"
-
-
-def _background_rows(name: str, axis: IdentifiedAxis) -> list[tuple[Any, ...]]:
-    slow, error = axis.turbulence_fit, axis.sensor_gain_error
-    rows: list[tuple[Any, ...]] = [
-        ("turbulence, rms", name, format_fixed(slow.rms_nm, 1), f"{slow.rms_error_nm:.2g}", "nm"),
-        (
-            "turbulence, frequency",
-            name,
-            f"{slow.frequency_hz:.4g}",
-            f"{slow.frequency_error_hz:.2g}",
-            "Hz",
-        ),
-        ("turbulence, damping", name, f"{slow.damping:.3g}", f"{slow.damping_error:.2g}", ""),
-    ]
-    if slow.corner_hz is not None and slow.corner_error_hz is not None:
-        rows.append(
-            (
-                "turbulence, roll-off",
-                name,
-                f"{slow.corner_hz:.3g}",
-                f"{slow.corner_error_hz:.2g}",
-                "Hz",
-            )
-        )
-    rows += [
-        (
-            "noise per frame",
-            name,
-            format_fixed(axis.noise_nm, 3),
-            f"{axis.noise_error_nm:.2g}",
-            "nm",
-        ),
-        (
-            "sensor gain",
-            name,
-            format_fixed(axis.sensor_gain, 4),
-            None if error is None else f"{error:.2g}",
-            "",
-        ),
-    ]
-    return rows
 
 
 def _whiteness_note(axis: IdentifiedAxis) -> str:
@@ -177,22 +156,13 @@ def _whiteness_note(axis: IdentifiedAxis) -> str:
 
 
 def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
+    turbulence, whiteness = axis.turbulence, axis.whiteness
+    tests = ("deviation", "p_value", "correlation_p_value", "white")
+    own = ("noise_nm", "noise_error_nm", "sensor_gain", "sensor_gain_error", "sensor_gain_note")
     return {
         "turbulence": asdict(axis.turbulence_fit)
-        | {
-            "coefficients": axis.turbulence.coefficients,
-            "driving_rms_nm": axis.turbulence.driving_rms_nm,
-        },
+        | {"coefficients": turbulence.coefficients, "driving_rms_nm": turbulence.driving_rms_nm},
         "vibrations": [asdict(line) for line in axis.parts],
-        "noise_nm": axis.noise_nm,
-        "noise_error_nm": axis.noise_error_nm,
-        "sensor_gain": axis.sensor_gain,
-        "sensor_gain_error": axis.sensor_gain_error,
-        "sensor_gain_note": axis.sensor_gain_note,
-        "whiteness": {
-            "deviation": axis.whiteness.deviation,
-            "p_value": axis.whiteness.p_value,
-            "correlation_p_value": axis.whiteness.correlation_p_value,
-            "white": axis.whiteness.white,
-        },
+        **{name: getattr(axis, name) for name in own},
+        "whiteness": {name: getattr(whiteness, name) for name in tests},
     }

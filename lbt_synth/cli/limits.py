@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable
-from dataclasses import asdict
-from typing import Any
 
 from lbt_synth import studies
 from lbt_synth.cli.loop_inputs import load_designs, loop_difference_notes
-from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
@@ -32,16 +29,30 @@ def run(arguments: Namespace) -> Report:
             config.imaging,
             errors_hz=config.settings.robustness.errors_hz,
         )
-    records = [asdict(row) for row in study.rows]
-    if study.band is None:
-        for record in records:
-            del record["above_band_limit_percent"]
-    report = Report(
-        data=_data(study, records),
-        tables=[_limit_table(study)],
-        notes=[*_limit_notes(study), *_design_notes(config, designs, study)],
+    no_band = () if study.band is not None else ("above_band_limit_percent",)
+    report = Report()
+    report.add_rows(
+        "rows",
+        "Distance to the limits of any linear controller",
+        study.rows,
+        without=no_band,
+        hidden=() if study.shift_hz.size else ("worst_nm",),
     )
-    write_outputs(report, arguments.output, records=records, figure=lambda: limits_figure(study))
+    report.data["limit_nm"] = None if study.limit is None else study.limit.rms_nm
+    if study.band is not None:
+        report.data |= {
+            "band_hz": study.band_hz,
+            "band_limit_nm": study.band.rms_nm,
+            "band_achieved_nm": study.band.achieved_nm,
+        }
+    report.notes += [*_limit_notes(study), *_design_notes(config, designs, study)]
+    write_outputs(
+        report,
+        arguments.output,
+        study.rows,
+        figure=lambda: limits_figure(study),
+        without=no_band,
+    )
     return report
 
 
@@ -51,39 +62,6 @@ def _config_designs(config: Config) -> dict[str, Design]:
         "kalman": kalman(config.plant),
         "hinf": hinf(config.plant, gamma_ratio=config.settings.design.gamma_ratio, route="riccati"),
     }
-
-
-def _limit_table(study: studies.LimitStudy) -> TableText:
-    columns: list[tuple[str, Callable[[studies.LimitRow], str]]] = [
-        ("design", lambda row: row.design),
-        (
-            "residual [nm]",
-            lambda row: format_fixed(row.residual_nm, 2) if row.stable else "unstable",
-        ),
-        ("Strehl [%]", lambda row: format_fixed(100 * row.strehl, 2)),
-        ("above the limit [%]", lambda row: format_fixed(row.above_limit_percent, 2)),
-    ]
-    if study.shift_hz.size:
-        columns.append(("worst residual [nm]", lambda row: format_fixed(row.worst_nm, 2)))
-    if study.band is not None:
-        columns.append(
-            ("above the band limit [%]", lambda row: format_fixed(row.above_band_limit_percent, 2))
-        )
-    return tabulate("Distance to the limits of any linear controller", study.rows, *columns)
-
-
-def _data(study: studies.LimitStudy, records: list[dict[str, Any]]) -> dict[str, Any]:
-    data: dict[str, Any] = {
-        "rows": records,
-        "limit_nm": None if study.limit is None else study.limit.rms_nm,
-    }
-    if study.band is not None:
-        data |= {
-            "band_hz": study.band_hz,
-            "band_limit_nm": study.band.rms_nm,
-            "band_achieved_nm": study.band.achieved_nm,
-        }
-    return data
 
 
 def _limit_notes(study: studies.LimitStudy) -> list[str]:

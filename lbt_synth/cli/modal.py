@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
@@ -22,9 +22,24 @@ from lbt_synth.models import (
     pyramid_modal_noise_nm,
 )
 from lbt_synth.report.figures import modal_figure
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import FloatArray, integer
 
 _MOST_MODES = 20_000
+
+
+@table_row
+class OrderRow:
+    """One radial order: root sums of squares over its modes."""
+
+    radial_order: int = column("radial order")
+    modes: int = column("modes")
+    turbulence_nm: float = column("turbulence", unit="nm", format=".1f")
+    noise_nm: float = column("noise per mode", unit="nm", format=".2f")
+    gain: float = column("mean gain", format=".3f")
+    uniform_nm: float = column("one gain", unit="nm", format=".1f")
+    optimised_nm: float = column("optimised gains", unit="nm", format=".1f")
+    kalman_nm: float = column("Kalman", unit="nm", format=".1f")
 
 
 def run(arguments: Namespace) -> Report:
@@ -39,40 +54,35 @@ def run(arguments: Namespace) -> Report:
     with show_spinner("designing", quiet=arguments.json):
         air = modal_turbulence(atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz)
         uniform, gains, residuals = _design_controllers(config, air, noise)
-    records = _order_records(count, air.rms_nm, noise, gains, list(residuals.values()))
+    rows = _order_rows(air.rms_nm, noise, gains, *residuals.values())
     whole = {name: _total_rms(rms) for name, rms in residuals.items()}
     alone = _total_rms(air.rms_nm)
     report = Report(
         data={
             "modes": count,
             "uniform_gain": uniform,
-            "rows": records,
             "residual_nm": whole,
             "turbulence_nm": alone,
-        },
-        tables=[
-            TableText(
-                title="All modes",
-                headings=("controller", "residual [nm]"),
-                rows=[
-                    (name, format_fixed(rms, 1))
-                    for name, rms in {"none, turbulence alone": alone, **whole}.items()
-                ],
-            ),
-            _order_table(records),
-        ],
-        notes=[
-            "turbulence: AR1 models, von Karman variances, poles by radial order.",
-            "vibrations: those of the model, on tip and tilt.",
-            assumed,
-            *_mirror_notes(config),
-            "the modes are those of Zernike, independent; nothing leaks from one to another.",
-        ],
+        }
     )
+    report.add_table(
+        "All modes",
+        ("controller", "residual [nm]"),
+        [("none, turbulence alone", f"{alone:.1f}")]
+        + [(name, f"{rms:.1f}") for name, rms in whole.items()],
+    )
+    report.add_rows("rows", "By radial order, residuals over its modes", rows)
+    report.notes += [
+        "turbulence: AR1 models, von Karman variances, poles by radial order.",
+        "vibrations: those of the model, on tip and tilt.",
+        assumed,
+        *_mirror_notes(config),
+        "the modes are those of Zernike, independent; nothing leaks from one to another.",
+    ]
     write_outputs(
         report,
         arguments.output,
-        records=records,
+        rows,
         figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
     )
     return report
@@ -129,11 +139,13 @@ def _mode_count(given: int | None, config: Config) -> int:
 def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
     """Return the noise of each mode [nm], and what it assumes in words."""
     settings = config.settings
-    for section, key in ((settings.sensor, "noise_nm"), (settings.model, "sensor_gain")):
-        if isinstance(getattr(section, key), list):
-            path = f"{'sensor' if section is settings.sensor else 'model'}.{key}"
+    for path, value in (
+        ("sensor.noise_nm", settings.sensor.noise_nm),
+        ("model.sensor_gain", settings.model.sensor_gain),
+    ):
+        if isinstance(value, list):
             raise ConfigError(
-                f"{config.source}: {path} must be one number for hundreds of modes; got one an "
+                f"{config.source}: {path} must be one number for hundreds of modes; got one per "
                 "axis.",
                 path=path,
             )
@@ -180,44 +192,24 @@ def _total_rms(rms: FloatArray) -> float:
     return float(np.sqrt(np.sum(rms**2)))
 
 
-def _order_records(
-    count: int,
-    turbulence: FloatArray,
-    noise: FloatArray,
-    gains: FloatArray,
-    residuals: list[FloatArray],
-) -> list[dict[str, Any]]:
-    """Return one record per radial order: its mean gain, and sums over its modes."""
-    radial, _ = noll_orders(count)
+def _order_rows(
+    turbulence: FloatArray, noise: FloatArray, gains: FloatArray, *residuals: FloatArray
+) -> list[OrderRow]:
+    radial, _ = noll_orders(noise.size)
     rows = []
-    for order in range(1, int(radial[-1]) + 1):
+    for order in np.unique(radial):
         which = radial == order
         uniform, optimised, filtered = (_total_rms(rms[which]) for rms in residuals)
         rows.append(
-            {
-                "radial_order": order,
-                "modes": int(which.sum()),
-                "turbulence_nm": _total_rms(turbulence[which]),
-                "noise_nm": float(noise[which][0]),
-                "gain": float(gains[which].mean()),
-                "uniform_nm": uniform,
-                "optimised_nm": optimised,
-                "kalman_nm": filtered,
-            }
+            OrderRow(
+                radial_order=int(order),
+                modes=int(which.sum()),
+                turbulence_nm=_total_rms(turbulence[which]),
+                noise_nm=float(noise[which][0]),
+                gain=float(gains[which].mean()),
+                uniform_nm=uniform,
+                optimised_nm=optimised,
+                kalman_nm=filtered,
+            )
         )
     return rows
-
-
-def _order_table(records: list[dict[str, Any]]) -> TableText:
-    return tabulate(
-        "By radial order, residuals over its modes",
-        records,
-        ("radial order", lambda record: record["radial_order"]),
-        ("modes", lambda record: record["modes"]),
-        ("turbulence [nm]", lambda record: format_fixed(record["turbulence_nm"], 1)),
-        ("noise per mode [nm]", lambda record: format_fixed(record["noise_nm"], 2)),
-        ("mean gain", lambda record: format_fixed(record["gain"], 3)),
-        ("one gain [nm]", lambda record: format_fixed(record["uniform_nm"], 1)),
-        ("optimised gains [nm]", lambda record: format_fixed(record["optimised_nm"], 1)),
-        ("Kalman [nm]", lambda record: format_fixed(record["kalman_nm"], 1)),
-    )

@@ -6,15 +6,19 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
+from rich import table as rich_table
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
+
+from lbt_synth.storage import rows
+from lbt_synth.storage.rows import cell_text, json_record, json_units
+from lbt_synth.storage.tables import Table
 
 _WIDTH = 200  # where the output is no terminal
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
@@ -22,44 +26,82 @@ _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flu
 Facts: TypeAlias = list[tuple[str, Any, str]]  # quantity, value, unit
 
 
-@dataclass(kw_only=True)
-class TableText:
-    """A table: a title, headings with units, and rows of cells."""
-
-    title: str
-    headings: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-
-def fact_table(title: str, facts: Facts) -> TableText:
-    """Make a table of facts: a quantity, its value, and its unit."""
-    return TableText(title=title, headings=("quantity", "value", "unit"), rows=facts)
-
-
-def tabulate(
-    title: str, items: Iterable[Any], *columns: tuple[str, Callable[[Any], Any]]
-) -> TableText:
-    """Make a table of items from columns: a heading, and the cell of an item below it."""
-    return TableText(
-        title=title,
-        headings=[heading for heading, _ in columns],
-        rows=[[cell(item) for _, cell in columns] for item in items],
+def text_table(caption: str, headings: Sequence[str], cells: Iterable[Sequence[Any]]) -> Table:
+    """Return a table of values of any kind."""
+    return Table(
+        caption=caption,
+        headings=tuple(headings),
+        rows=tuple(tuple(map(cell_text, row)) for row in cells),
+        words=tuple(i for i, heading in enumerate(headings) if i and heading in _WORDS),
     )
+
+
+class TableText(Table):
+    """A table of values of any kind."""
+
+    def __init__(
+        self, *, title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]
+    ) -> None:
+        table = text_table(title, headings, rows)
+        super().__init__(caption=title, headings=table.headings, rows=table.rows, words=table.words)
+
+
+def fact_table(title: str, facts: Facts) -> Table:
+    """Make a table of facts: a quantity, its value, and its unit."""
+    return text_table(title, ("quantity", "value", "unit"), facts)
 
 
 @dataclass(kw_only=True)
 class Report:
     """What a command reports, for programs and for people."""
 
-    data: dict[str, Any]  # what ``--json`` prints; nan and inf become null
-    tables: list[TableText] = field(default_factory=list)  # what people see
+    data: dict[str, Any] = field(default_factory=dict)  # for ``--json``; nan and inf become null
+    tables: list[Table] = field(default_factory=list)  # what people see
     notes: list[str] = field(default_factory=list)  # lines below the tables
     passed: bool = True  # False makes the exit status 1
+
+    def add_table(
+        self, caption: str, headings: Sequence[str], cells: Iterable[Sequence[Any]]
+    ) -> None:
+        """Add a table of values of any kind, for people only."""
+        self.tables.append(text_table(caption, headings, cells))
+
+    def add_rows(
+        self,
+        key: str,
+        caption: str,
+        found: Sequence[Any],
+        *,
+        without: Collection[str] = (),
+        hidden: Collection[str] = (),
+    ) -> None:
+        """Add rows of one type under a key of the data, with their units, and as a table.
+
+        Fields of ``without`` are left out of both, and those of ``hidden`` out of the table.
+        """
+        self.data[key] = [json_record(row, without=without) for row in found]
+        self._add_units(found[0])
+        self.tables.append(rows.row_table(caption, found, without=(*without, *hidden)))
+
+    def add_facts(self, caption: str, *facts: Any) -> None:
+        """Add the values of rows to the data, with their units, and as a table, one a line."""
+        for row in facts:
+            self.data |= json_record(row)
+            self._add_units(row)
+        self.tables.append(rows.fact_table(caption, *facts))
+
+    def _add_units(self, row: Any) -> None:
+        self.data["units"] = self.data.get("units", {}) | json_units(row)
 
     def note_written(self, path: str | os.PathLike[str], key: str = "file") -> None:
         """Add a file that was written to the data, and a line about it to the notes."""
         self.data[key] = str(path)
         self.notes.append(f"written: {path}")
+
+    def note_files(self, paths: Iterable[str | os.PathLike[str]]) -> None:
+        """Add files that were written to the data, and a line about each to the notes."""
+        self.data["files"] = [str(path) for path in paths]
+        self.notes += [f"written: {path}" for path in self.data["files"]]
 
     def print(self, *, as_json: bool) -> None:
         """Print to standard output."""
@@ -67,36 +109,21 @@ class Report:
             print(json.dumps(json_value(self.data), allow_nan=False))
             return
         console = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
-        for text in self.tables:
-            console.print(_rich_table(text))
+        for table in self.tables:
+            console.print(_printable(table))
         for note in self.notes:
             console.print(note, markup=False, soft_wrap=True)
 
 
-def _rich_table(text: TableText) -> Table:
-    table = Table(title=Text(text.title, style="bold"), title_justify="left", box=SIMPLE_HEAD)
-    for i, heading in enumerate(text.headings):
-        words = heading in _WORDS
-        table.add_column(Text(heading), justify="left" if i == 0 or words else "right")
-    for row in text.rows:
-        table.add_row(*(Text(cell_text(value)) for value in row))
-    return table
-
-
-def cell_text(value: Any) -> str:
-    """Return the text of a cell, with at most six significant digits."""
-    if value is None:
-        return "-"
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    if isinstance(value, float | np.floating):
-        return "-" if math.isnan(value) else f"{float(value):.6g}"
-    return str(value)
-
-
-def format_fixed(value: float, digits: int) -> str:
-    """Format a number with a fixed count of decimals, and nan as a dash."""
-    return "-" if np.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"
+def _printable(table: Table) -> rich_table.Table:
+    out = rich_table.Table(
+        title=Text(table.caption, style="bold"), title_justify="left", box=SIMPLE_HEAD
+    )
+    for i, heading in enumerate(table.headings):
+        out.add_column(Text(heading), justify="left" if i in (0, *table.words) else "right")
+    for row in table.cells():
+        out.add_row(*(Text(cell.text) for cell in row))
+    return out
 
 
 def json_value(value: Any) -> Any:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from lbt_synth.files.telemetry.aot import lost_fields
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.report.figures.style import FIGURE_ENDINGS, require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_writable, write_atomically
-from lbt_synth.storage.tables import csv_bytes
+from lbt_synth.storage.rows import csv_rows
 
 
 def make_directory(path: str | Path) -> Path:
@@ -47,28 +46,18 @@ def require_outputs(outputs: Sequence[str], *, inputs: Sequence[str]) -> None:
 def write_outputs(
     report: Report,
     outputs: Sequence[str],
+    rows: Sequence[Any],
     *,
-    records: Sequence[Mapping[str, Any]],
     figure: Callable[[], Any],
+    without: Collection[str] = (),
 ) -> None:
-    """Write each output as its ending says, and note it in the report."""
-    report.data["files"] = []
-    for output in outputs:
-        if Path(output).suffix.lower() == ".csv":
-            path = write_atomically(output, records_csv(records))
-        else:
-            path = save_figure(figure(), output)
-        report.data["files"].append(str(path))
-        report.notes.append(f"written: {path}")
-
-
-def records_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return records with the same keys as a CSV table, with empty cells for nan."""
-    cells = [
-        ["" if isinstance(v, float) and math.isnan(v) else v for v in record.values()]
-        for record in records
-    ]
-    return csv_bytes(list(records[0]), cells)
+    """Write each output as its ending says, rows or the figure, and note it in the report."""
+    report.note_files(
+        write_atomically(output, csv_rows(rows, without=without))
+        if Path(output).suffix.lower() == ".csv"
+        else save_figure(figure(), output)
+        for output in outputs
+    )
 
 
 def write_telemetry(

@@ -8,7 +8,7 @@ from typing import Any
 
 from lbt_synth.cli.certificate_table import check_records
 from lbt_synth.cli.loop_inputs import load_designs
-from lbt_synth.cli.output import Report, format_fixed, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.errors import ProblemError
@@ -17,6 +17,14 @@ from lbt_synth.report.designs.report import count_steps
 from lbt_synth.report.designs.verdict import good_range, verdict
 from lbt_synth.report.page.page_files import require_page_names
 from lbt_synth.report.provenance import require_letters, time_text
+from lbt_synth.storage.rows import (
+    column,
+    fill_row,
+    json_record,
+    json_units,
+    row_table,
+    table_row,
+)
 from lbt_synth.studies import LimitRow
 
 
@@ -35,73 +43,75 @@ def run(arguments: Namespace) -> Report:
         found = design_report(config, designs, gain_files=files, advance=count)
         written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
         count(1)
-    return Report(
+    rows = [_assessment_row(found, one, limits) for one, limits in found.rows]
+    report = Report(
         data={
-            "designs": {one.name: _design_record(found, one, row) for one, row in found.rows},
+            "designs": {
+                row.design: json_record(row, without=["design", "modulus"]) | _design_record(one)
+                for row, one in zip(rows, found.assessments, strict=True)
+            },
+            "units": json_units(AssessmentRow),
             "verdict": verdict(found),
             "limit_nm": None if found.limits.limit is None else found.limits.limit.rms_nm,
             "sensor_gain": found.real_gain,
             "sha256": {file.name: file.sha256 for file in found.files},
             "made": time_text(found.made),
-            "files": [str(path) for path in written],
         },
-        tables=[
-            tabulate(
-                f"Designs in the loop of {config.source.name}",
-                found.assessments,
-                ("design", lambda one: one.name),
-                ("method", lambda one: one.design.method),
-                ("stable", lambda one: one.stable),
-                ("certified", lambda one: one.certified),
-                ("residual [nm]", lambda one: format_fixed(one.residual_nm, 2)),
-                ("Strehl [%]", lambda one: format_fixed(100 * one.strehl, 2)),
-                ("worst Strehl [%]", lambda one: format_fixed(100 * _worst_strehl(one), 2)),
-                (
-                    "modulus margin",
-                    lambda one: (
-                        None if one.margins is None else format_fixed(one.margins.modulus, 3)
-                    ),
-                ),
-            )
-        ],
+        tables=[row_table(f"Designs in the loop of {config.source.name}", rows)],
         notes=[
             verdict(found).replace("\u00a0", " "),
             *(f"note: {one.name}: {note}" for one in found.assessments for note in one.notes),
-            *(f"written: {path}" for path in written),
         ],
+    )
+    report.note_files(written)
+    return report
+
+
+@table_row
+class AssessmentRow:
+    """One design in the loop of the configuration."""
+
+    design: str = column("design")
+    method: str = column("method")
+    route: str = column()
+    n_states: int = column()
+    gamma: float = column(unit="nm")
+    estimation_rms: float = column(unit="nm")
+    stable: bool = column("stable")
+    spectral_radius: float = column()
+    certified: bool = column("certified")
+    residual_nm: float = column("residual", unit="nm", format=".2f")
+    turbulence_nm: float | None = column(unit="nm", default=None)
+    vibration_nm: float | None = column(unit="nm", default=None)
+    noise_nm: float | None = column(unit="nm", default=None)
+    strehl: float = column("Strehl", unit="%", scale=100, format=".2f")
+    strehl_simulated: float | None = column()
+    worst_strehl: float = column("worst Strehl", unit="%", scale=100, format=".2f")
+    above_limit_percent: float = column(unit="%")
+    worst_nm: float = column(unit="nm")
+    above_band_limit_percent: float = column(unit="%")
+    modulus: float | None = column("modulus margin", format=".3f", default=None)
+    multiplications: int = column()
+
+
+def _assessment_row(found: DesignReport, one: DesignAssessment, limits: LimitRow) -> AssessmentRow:
+    design, simulation = one.design, found.simulations.get(one.name)
+    return fill_row(
+        AssessmentRow,
+        *(one, one.budget, one.margins, one.cost, limits, design.solver),
+        design=one.name,
+        n_states=design.controller.n_states,
+        strehl_simulated=None if simulation is None else simulation.strehl,
+        worst_strehl=float(one.curve.strehl.min()) if one.stable else float("nan"),
     )
 
 
-def _design_record(found: DesignReport, one: DesignAssessment, row: LimitRow) -> dict[str, Any]:
-    """Return the summary of one design for JSON."""
-    budget, good = one.budget, good_range(one)
-    simulation = found.simulations.get(one.name)
+def _design_record(one: DesignAssessment) -> dict[str, Any]:
+    """Return what JSON says of a design beside its row."""
+    good = good_range(one)
     return {
-        "method": one.design.method,
-        "route": one.design.solver.route,
-        "n_states": one.design.controller.n_states,
-        "gamma": one.gamma,
-        "estimation_rms": one.estimation_rms,
-        "stable": one.stable,
-        "spectral_radius": one.spectral_radius,
-        "certified": one.certified,
         "checks": check_records(one.checks),
-        "residual_nm": one.residual_nm,
-        "turbulence_nm": None if budget is None else budget.turbulence_nm,
-        "vibration_nm": None if budget is None else budget.vibration_nm,
-        "noise_nm": None if budget is None else budget.noise_nm,
-        "strehl": one.strehl,
-        "strehl_simulated": None if simulation is None else simulation.strehl,
-        "worst_strehl": _worst_strehl(one),
         "good_errors_hz": None if good is None else [good.low_hz, good.high_hz],
-        "above_limit_percent": row.above_limit_percent,
-        "worst_nm": row.worst_nm,
-        "above_band_limit_percent": row.above_band_limit_percent,
         "margins": None if one.margins is None else asdict(one.margins),
         "stable_sensor_gains": one.sensor_gains,
-        "multiplications": one.cost.multiplications,
     }
-
-
-def _worst_strehl(one: DesignAssessment) -> float:
-    return float(one.curve.strehl.min()) if one.stable else float("nan")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 
 from lbt_synth import studies
 from lbt_synth.cli.loop_inputs import load_designs, truth_at_sensor_gain
-from lbt_synth.cli.output import Report, TableText, format_fixed, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import count_progress, track_progress
 from lbt_synth.config import Config, load_config
@@ -19,6 +18,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import stable_sensor_gains
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
+from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.studies.robustness import METHODS
 from lbt_synth.validation import FloatArray, frozen_copy, number
@@ -43,12 +43,12 @@ def _refuse_unused_options(arguments: Namespace) -> None:
         "--sensor-gains": arguments.sensor_gains,
         "--delay-errors": arguments.delay_errors,
     }
+    unused, reason = maps, "goes with gain files, whose designs stay as they are; name some"
     if arguments.gains:
         unused = redesign
-        reason = "is for redesigning, without gain files; the options of these are "
-        reason += ", ".join(maps)
-    else:
-        unused, reason = maps, "goes with gain files, whose designs stay as they are; name some"
+        reason = (
+            f"is for redesigning, without gain files; the options of these are {', '.join(maps)}"
+        )
     for option, value in unused.items():
         if value is not None:
             raise ProblemError(f"{option} {reason}.")
@@ -73,25 +73,9 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
             quiet=arguments.json,
         )
     )
-    records = [asdict(row) for row in rows]
-    report = Report(
-        data={"rows": records},
-        tables=[
-            tabulate(
-                "Robustness to the vibration frequency",
-                rows,
-                ("error [Hz]", lambda row: f"{row.error_hz:+.2f}"),
-                ("method", lambda row: row.method),
-                ("Strehl [%]", lambda row: format_fixed(100 * row.strehl, 2)),
-                ("residual [nm]", lambda row: format_fixed(row.residual_nm, 1)),
-                ("vibration [nm]", lambda row: format_fixed(row.vibration_nm, 1)),
-                ("turbulence [nm]", lambda row: format_fixed(row.turbulence_nm, 1)),
-                ("noise [nm]", lambda row: format_fixed(row.noise_nm, 1)),
-                ("stable", lambda row: row.stable),
-            )
-        ],
-    )
-    write_outputs(report, arguments.output, records=records, figure=lambda: robustness_figure(rows))
+    report = Report()
+    report.add_rows("rows", "Robustness to the vibration frequency", rows)
+    write_outputs(report, arguments.output, rows, figure=lambda: robustness_figure(rows))
     return report
 
 
@@ -119,21 +103,16 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
                 advance=count,
             )
             maps[name] = replace(found, sensor_gains=frozen_copy(gains))  # the real ones again
-    intervals = {name: _stable_gains(designs[name], maps[name], assumed[name]) for name in designs}
-    report = Report(
-        data={
-            "maps": {
-                name: asdict(found) | {"stable_sensor_gains": intervals[name]}
-                for name, found in maps.items()
-            }
-        },
-        tables=[_map_table(name, found) for name, found in maps.items()],
-        notes=_map_notes(config, designs, maps, intervals),
-    )
+    report = Report(data={"maps": {}})
+    for name, found in maps.items():
+        intervals = _stable_gains(designs[name], found, assumed[name])
+        report.data["maps"][name] = asdict(found) | {"stable_sensor_gains": intervals}
+        report.tables.append(row_table(_map_title(name, found), _map_lines(found)))
+        report.notes += _map_notes(name, designs[name], config, found, intervals)
     write_outputs(
         report,
         arguments.output,
-        records=[record for name, found in maps.items() for record in _map_records(name, found)],
+        [point for name, found in maps.items() for point in _map_points(name, found)],
         figure=lambda: robustness_map_figure(maps),
     )
     return report
@@ -211,84 +190,96 @@ def _stable_gains(
     return intervals
 
 
-def _map_table(name: str, found: RobustnessMap) -> TableText:
+@table_row
+class MapLine:
+    """One sensor gain and delay error of a map, at the centre and at its worst frequency error."""
+
+    sensor_gain: float = column("sensor gain", format=".3f")
+    delay_error_frames: float = column("delay error", unit="frames", format="+g")
+    stable: bool = column("stable")
+    centre: float = column("Strehl at 0 Hz", unit="%", scale=100, format=".2f")
+    worst: float = column("worst Strehl", unit="%", scale=100, format=".2f")
+    worst_hz: float = column("at", unit="Hz", format="+.2f")
+
+
+def _map_title(name: str, found: RobustnessMap) -> str:
+    low, high = np.min(found.errors_hz), np.max(found.errors_hz)
+    return f"{name}: Strehl ratio over frequency errors of {low:+g} to {high:+g} Hz"
+
+
+def _map_lines(found: RobustnessMap) -> list[MapLine]:
     gains = found.sensor_gains
-    if gains.size <= _LISTED_GAINS:
-        shown = np.arange(gains.size)
-    else:  # some from end to end, and the one that is nearest to 1
+    shown = np.arange(gains.size)
+    if gains.size > _LISTED_GAINS:  # some from end to end, and the one that is nearest to 1
         some = np.linspace(0, gains.size - 1, _LISTED_GAINS - 1).round().astype(int)
         shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
-    centre = np.nonzero(found.errors_hz == 0)[0]
-    rows = []
+    centre = np.append(np.nonzero(found.errors_hz == 0)[0], -1)[0]
+    lines = []
     for i, delay in enumerate(found.delay_errors_frames):
         for j in shown:
-            strehls = 100 * found.strehl[i, j]
-            stable = bool(found.stable[i, j])
+            stable, strehls = bool(found.stable[i, j]), found.strehl[i, j]
             worst = int(np.argmin(strehls)) if stable else 0
-            rows.append(
-                (
-                    f"{gains[j]:.3f}",
-                    f"{delay:+g}",
-                    stable,
-                    format_fixed(strehls[centre[0]], 2) if centre.size else None,
-                    format_fixed(strehls[worst], 2),
-                    f"{found.errors_hz[worst]:+.2f}" if stable else None,
+            lines.append(
+                MapLine(
+                    sensor_gain=gains[j],
+                    delay_error_frames=delay,
+                    stable=stable,
+                    centre=strehls[centre] if centre >= 0 else np.nan,
+                    worst=strehls[worst],
+                    worst_hz=found.errors_hz[worst] if stable else np.nan,
                 )
             )
-    return TableText(
-        title=f"{name}: Strehl ratio over frequency errors of {np.min(found.errors_hz):+g} to "
-        f"{np.max(found.errors_hz):+g} Hz",
-        headings=(
-            "sensor gain",
-            "delay error",
-            "stable",
-            "Strehl at 0 Hz [%]",
-            "worst Strehl [%]",
-            "at [Hz]",
-        ),
-        rows=rows,
-    )
+    return lines
 
 
 def _map_notes(
+    name: str,
+    design: Design,
     config: Config,
-    designs: dict[str, Design],
-    maps: dict[str, RobustnessMap],
-    intervals: dict[str, list[tuple[float, float]]],
+    found: RobustnessMap,
+    intervals: list[tuple[float, float]],
 ) -> list[str]:
     notes = []
-    for name, found in maps.items():
-        for delay, (low, high) in zip(found.delay_errors_frames, intervals[name], strict=True):
-            late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
-            ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
-            notes.append(f"{name}: stable sensor gains{late}: {ends}")
-        own = designs[name].hardware
-        assert own is not None
-        if own.delay_frames != config.hardware.delay_frames:
-            notes.append(
-                f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
-                f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
-            )
-        if own.mirror != config.hardware.mirror:
-            notes.append(
-                f"note: {name} was designed for another mirror than the configuration's, and its "
-                "map is that of its own."
-            )
+    for delay, (low, high) in zip(found.delay_errors_frames, intervals, strict=True):
+        late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
+        ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
+        notes.append(f"{name}: stable sensor gains{late}: {ends}")
+    own = design.hardware
+    assert own is not None  # _assumed_gain has refused the others
+    if own.delay_frames != config.hardware.delay_frames:
+        notes.append(
+            f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
+            f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
+        )
+    if own.mirror != config.hardware.mirror:
+        notes.append(
+            f"note: {name} was designed for another mirror than the configuration's, and its map "
+            "is that of its own."
+        )
     return notes
 
 
-def _map_records(name: str, found: RobustnessMap) -> list[dict[str, Any]]:
-    return [
-        {
-            "file": name,
-            "delay_error_frames": float(delay),
-            "sensor_gain": float(gain),
-            "error_hz": float(error),
-            "strehl": float(found.strehl[i, j, k]),
-            "residual_nm": float(found.residual_nm[i, j, k]),
-            "stable": bool(found.stable[i, j]),
-        }
-        for i, delay in enumerate(found.delay_errors_frames)
-        for j, gain in enumerate(found.sensor_gains)
-        for k, error in enumerate(found.errors_hz)
-    ]
+@table_row
+class MapPoint:
+    """One point of the map of a gain file."""
+
+    file: str = column()
+    delay_error_frames: float = column()
+    sensor_gain: float = column()
+    error_hz: float = column()
+    strehl: float = column()
+    residual_nm: float = column()
+    stable: bool = column()
+
+
+def _map_points(name: str, found: RobustnessMap) -> Iterator[MapPoint]:
+    for (i, j, k), strehl in np.ndenumerate(found.strehl):
+        yield MapPoint(
+            file=name,
+            delay_error_frames=float(found.delay_errors_frames[i]),
+            sensor_gain=float(found.sensor_gains[j]),
+            error_hz=float(found.errors_hz[k]),
+            strehl=float(strehl),
+            residual_nm=float(found.residual_nm[i, j, k]),
+            stable=bool(found.stable[i, j]),
+        )

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from argparse import Namespace
 from dataclasses import asdict
+from typing import Any
 
 from lbt_synth.cli.loop_inputs import load_designs
-from lbt_synth.cli.output import Report, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.design import EstimatorDesign
+from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.report.figures import sigma_figure
 from lbt_synth.report.figures.style import save_figure
+
+_HEADINGS = {
+    "stable": "stable",
+    "modulus": "modulus",
+    "gain_low": "gain from",
+    "gain_high": "gain to",
+    "phase_deg": "phase [deg]",
+    "delay_frames": "delay [frames]",
+}
 
 
 def run(arguments: Namespace) -> Report:
@@ -21,35 +31,29 @@ def run(arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     with show_spinner("drawing", quiet=arguments.json):
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
-    data = {}
-    for name, design in designs.items():
-        entry: dict[str, object] = {"method": design.method}
-        if isinstance(design, EstimatorDesign):
-            entry |= {"gamma": design.gamma, "rms": design.rms}
-        if design.hardware is not None:
-            loop = close_loop(design.hardware, design.controller, sensor_gain=arguments.sensor_gain)
-            entry["stable"] = loop.is_stable
-            if loop.is_stable:
-                entry |= asdict(loop_margins(loop))
-        data[name] = entry
-    path = save_figure(figure, arguments.output)
+    margins = {name: _margins(design, arguments.sensor_gain) for name, design in designs.items()}
     physical = all(design.hardware is not None for design in designs.values())
-    norm = "norm [nm]" if physical else "norm"
-    return Report(
-        data={"designs": data, "sensor_gain": arguments.sensor_gain, "file": str(path)},
-        tables=[
-            tabulate(
-                f"Margins at sensor gain {arguments.sensor_gain:g}",
-                data,
-                ("design", lambda name: name),
-                (norm, lambda name: data[name].get("gamma")),
-                ("stable", lambda name: data[name].get("stable")),
-                ("modulus", lambda name: data[name].get("modulus")),
-                ("gain from", lambda name: data[name].get("gain_low")),
-                ("gain to", lambda name: data[name].get("gain_high")),
-                ("phase [deg]", lambda name: data[name].get("phase_deg")),
-                ("delay [frames]", lambda name: data[name].get("delay_frames")),
-            )
+    report = Report(data={"designs": margins, "sensor_gain": arguments.sensor_gain})
+    report.add_table(
+        f"Margins at sensor gain {arguments.sensor_gain:g}",
+        ("design", "norm [nm]" if physical else "norm", *_HEADINGS.values()),
+        [
+            (name, *(margin.get(key) for key in ("gamma", *_HEADINGS)))
+            for name, margin in margins.items()
         ],
-        notes=[f"written: {path}"],
     )
+    report.note_written(save_figure(figure, arguments.output))
+    return report
+
+
+def _margins(design: Design, sensor_gain: float) -> dict[str, Any]:
+    """Return what is known of a design: its norm in its model, and the margins of its loop."""
+    known: dict[str, Any] = {"method": design.method}
+    if isinstance(design, EstimatorDesign):
+        known |= {"gamma": design.gamma, "rms": design.rms}
+    if design.hardware is not None:
+        loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
+        known["stable"] = loop.is_stable
+        if loop.is_stable:
+            known |= asdict(loop_margins(loop))
+    return known

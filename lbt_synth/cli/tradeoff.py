@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import fields
 
-from lbt_synth.cli.output import Report, tabulate
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import track_progress
 from lbt_synth.config import load_config
@@ -29,32 +28,13 @@ def run(arguments: Namespace) -> Report:
             quiet=arguments.json,
         )
     )
-    names = [field.name for field in fields(points[0]) if field.name != "design"]
-    records = [{name: getattr(point, name) for name in names} for point in points]
     least = points[0].design
-    report = Report(
-        data={
-            "points": records,
-            "gamma_least": least.gamma_least,
-            "gamma_infeasible": least.gamma_infeasible,
-        },
-        tables=[
-            tabulate(
-                "Trade-off of variance, norm and sensor gain",
-                points,
-                ("filter", lambda point: point.family),
-                ("norm [nm]", lambda point: f"{point.gamma:.2f}"),
-                ("norm / least", lambda point: f"{point.gamma_ratio:.4f}"),
-                ("rms [nm]", lambda point: f"{point.rms:.2f}"),
-                ("gain from", lambda point: f"{point.gain_low:.3f}"),
-                ("gain to", lambda point: f"{point.gain_high:.3f}"),
-                ("modulus", lambda point: f"{point.modulus:.3f}"),
-            )
-        ],
-        notes=[
-            f"the least norm of any filter lies between {least.gamma_infeasible:.9g} and "
-            f"{least.gamma_least:.9g} nm"
-        ],
+    report = Report()
+    report.add_rows("points", "Trade-off of variance, norm and sensor gain", points)
+    report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
+    report.notes.append(
+        f"the least norm of any filter lies between {least.gamma_infeasible:.9g} and "
+        f"{least.gamma_least:.9g} nm"
     )
-    write_outputs(report, arguments.output, records=records, figure=lambda: tradeoff_figure(points))
+    write_outputs(report, arguments.output, points, figure=lambda: tradeoff_figure(points))
     return report

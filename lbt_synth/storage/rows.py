@@ -103,6 +103,15 @@ def columns(kind: Any) -> tuple[Column, ...]:
     )
 
 
+def fill_row(kind: type[Row], *sources: Any, **given: Any) -> Row:
+    """Return a row of given values, the others attributes of the first source that has them."""
+    for each in dataclasses.fields(kind):  # type: ignore[arg-type]
+        for source in sources:
+            if each.init and each.name not in given and hasattr(source, each.name):
+                given[each.name] = getattr(source, each.name)
+    return kind(**given)
+
+
 def json_record(row: Any, *, without: Collection[str] = ()) -> dict[str, Any]:
     """Return the values of a row by their keys, but for the fields left out."""
     kept = [each for each in columns(row) if each.name not in without]

@@ -23,43 +23,47 @@ from lbt_synth.loop import (
 )
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _GRID = 65  # shifts over the range of errors, at least
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class LimitRow:
-    """One design beside the limits.
+    """One design beside the limits; what an unstable loop does not have is nan."""
 
-    Attributes
-    ----------
-    design : str
-        Its name.
-    method : str
-        How it was made.
-    residual_nm : float
-        Residual under the truth [nm rms]; nan if the loop is unstable, as all that follows.
-    strehl : float
-        Strehl ratio in [0, 1].
-    above_limit_percent : float
-        Residual over the limit, less 1 [%]; nan where there is no limit, or it is 0.
-    worst_nm : float
-        Largest residual with all true vibrations moved within the range of errors [nm rms].
-    above_band_limit_percent : float
-        The same over the limit for the band, less 1 [%]; nan where there is none.
-    stable : bool
-        Whether the loop is stable with the real sensor gain.
-    """
-
-    design: str
-    method: str
-    residual_nm: float
-    strehl: float
-    above_limit_percent: float
-    worst_nm: float
-    above_band_limit_percent: float
-    stable: bool
+    design: str = column("design", help="Its name")
+    method: str = column(help="How it was made")
+    residual_nm: float = column(
+        "residual",
+        unit="nm",
+        format=".2f",
+        missing="unstable",
+        help="Residual under the truth, rms",
+    )
+    strehl: float = column(
+        "Strehl", unit="%", scale=100, format=".2f", help="Strehl ratio in [0, 1]"
+    )
+    above_limit_percent: float = column(
+        "above the limit",
+        unit="%",
+        format=".2f",
+        help="Residual over the limit, less 1; nan where there is no limit, or it is 0",
+    )
+    worst_nm: float = column(
+        "worst residual",
+        unit="nm",
+        format=".2f",
+        help="Largest residual with all true vibrations moved within the range of errors, rms",
+    )
+    above_band_limit_percent: float = column(
+        "above the band limit",
+        unit="%",
+        format=".2f",
+        help="The same over the limit for the band, less 1; nan where there is none",
+    )
+    stable: bool = column(help="Whether the loop is stable with the real sensor gain")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

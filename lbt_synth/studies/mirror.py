@@ -3,39 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+import numpy as np
 
 from lbt_synth.design import Design, kalman, lqg, optimal_integrator
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, settling_error, strehl
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import require_instance
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class MirrorRow:
-    """One design on the real mirror.
+    """One design on the real mirror; what an unstable loop does not have is nan."""
 
-    Attributes
-    ----------
-    design : str
-        Its name: for ours, what it assumes about the mirror.
-    stable : bool
-        Whether its loop is stable; the other numbers are nan where it is not.
-    residual_nm : float
-        Residual under the truth [nm rms].
-    strehl : float
-        Strehl ratio in [0, 1].
-    unsettled_nm : float
-        What is left of the assumption that the mirror has settled, for the commands of this
-        design: settled less real position [nm rms].
-    """
-
-    design: str
-    stable: bool
-    residual_nm: float
-    strehl: float
-    unsettled_nm: float
+    design: str = column("design", help="Its name: for ours, what it assumes about the mirror")
+    stable: bool = column(help="Whether its loop is stable")
+    residual_nm: float = column(
+        "residual",
+        unit="nm",
+        format=".2f",
+        missing="unstable",
+        help="Residual under the truth, rms",
+        default=np.nan,
+    )
+    strehl: float = column(
+        "Strehl", unit="%", scale=100, format=".2f", help="Strehl ratio in [0, 1]", default=np.nan
+    )
+    unsettled_nm: float = column(
+        "settled less real position",
+        unit="nm",
+        format=".2f",
+        help="What is left of the assumption that the mirror has settled, for the commands of "
+        "this design: settled less real position, rms",
+        default=np.nan,
+    )
 
 
 def mirror(
@@ -111,13 +115,12 @@ def _row(
     name: str, design: Design, hardware: LoopHardware, truth: Truth, imaging: Imaging
 ) -> MirrorRow:
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    row = MirrorRow(design=name, stable=loop.is_stable)
     if not loop.is_stable:
-        nan = float("nan")
-        return MirrorRow(design=name, stable=False, residual_nm=nan, strehl=nan, unsettled_nm=nan)
+        return row
     budget = residual_budget(loop, truth)
-    return MirrorRow(
-        design=name,
-        stable=True,
+    return replace(
+        row,
         residual_nm=budget.rms_nm,
         strehl=strehl(budget, imaging),
         unsettled_nm=settling_error(loop, truth).rms_nm,

@@ -3,50 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from lbt_synth.design import FilterDesign, hinf, kalman
-from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.models import TipTiltPlant, Truth, retuned_plant
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, number
 
 METHODS = ("kalman", "hinf")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class RobustnessRow:
-    """One design at one frequency error.
+    """One design at one frequency error; what an unstable loop does not have is nan."""
 
-    Attributes
-    ----------
-    error_hz : float
-        Frequency in the model less the true one [Hz].
-    method : str
-        "kalman" or "hinf".
-    strehl : float
-        Strehl ratio in [0, 1]; nan if the loop is unstable.
-    residual_nm : float
-        Residual of tip and tilt [nm rms]; nan if the loop is unstable.
-    vibration_nm, turbulence_nm, noise_nm : float
-        Its parts [nm rms].
-    stable : bool
-        Whether the loop is stable with the real sensor gain.
-    gamma : float
-        H-infinity norm that the design achieves.
-    """
-
-    error_hz: float
-    method: str
-    strehl: float
-    residual_nm: float
-    vibration_nm: float
-    turbulence_nm: float
-    noise_nm: float
-    stable: bool
-    gamma: float
+    error_hz: float = column(
+        "error", unit="Hz", format="+.2f", help="Frequency in the model less the true one"
+    )
+    method: str = column("method", help='"kalman" or "hinf"')
+    strehl: float = column(
+        "Strehl", unit="%", scale=100, format=".2f", help="Strehl ratio in [0, 1]", default=np.nan
+    )
+    residual_nm: float = column(
+        "residual", unit="nm", format=".1f", help="Residual of tip and tilt, rms", default=np.nan
+    )
+    vibration_nm: float = column(
+        "vibration", unit="nm", format=".1f", help="Its part of vibrations, rms", default=np.nan
+    )
+    turbulence_nm: float = column(
+        "turbulence", unit="nm", format=".1f", help="Its part of turbulence, rms", default=np.nan
+    )
+    noise_nm: float = column(
+        "noise", unit="nm", format=".1f", help="Its part of noise, rms", default=np.nan
+    )
+    stable: bool = column("stable", help="Whether the loop is stable with the real sensor gain")
+    gamma: float = column(unit="nm", help="H-infinity norm that the design achieves")
 
 
 def robustness(
@@ -120,38 +114,30 @@ def robustness(
         )
     for method in methods:
         choice(method, "method", METHODS)
+    ratio = gamma_ratio if gamma is None else None
     for error in errors_hz:
         moved = retuned_plant(plant, number(error, "errors_hz"), hold=hold)
         for method in methods:
-            if method == "kalman":
-                design = kalman(moved)
-            elif gamma is not None:
-                design = hinf(moved, gamma=gamma, route="riccati")
-            else:
-                design = hinf(moved, gamma_ratio=gamma_ratio, route="riccati")
+            design = (
+                kalman(moved)
+                if method == "kalman"
+                else hinf(moved, gamma=gamma, gamma_ratio=ratio, route="riccati")
+            )
             yield _row(design, truth, imaging, float(error))
 
 
 def _row(design: FilterDesign, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
     assert design.hardware is not None  # this module designs for plants
     loop = close_loop(design.hardware, design.controller, sensor_gain=truth.sensor_gain)
-    try:
-        budget = residual_budget(loop, truth)
-    except UnstableLoopError:
-        values = dict.fromkeys(
-            ("strehl", "residual_nm", "vibration_nm", "turbulence_nm", "noise_nm"), np.nan
-        )
-        return RobustnessRow(
-            error_hz=error, method=design.method, stable=False, gamma=design.gamma, **values
-        )
-    return RobustnessRow(
-        error_hz=error,
-        method=design.method,
+    known = {"error_hz": error, "stable": loop.is_stable}
+    if not loop.is_stable:
+        return fill_row(RobustnessRow, design, **known)
+    budget = residual_budget(loop, truth)
+    return fill_row(
+        RobustnessRow,
+        budget,
+        design,
+        **known,
         strehl=strehl(budget, imaging),
         residual_nm=budget.rms_nm,
-        vibration_nm=budget.vibration_nm,
-        turbulence_nm=budget.turbulence_nm,
-        noise_nm=budget.noise_nm,
-        stable=True,
-        gamma=design.gamma,
     )

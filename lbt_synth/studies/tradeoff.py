@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import field
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, integer
 
 FAMILIES = ("mixed", "central")
@@ -20,37 +21,37 @@ _MOST_POINTS = 200
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@table_row
 class TradeoffPoint:
-    """One filter of the trade-off.
+    """One filter of the trade-off, ``design``; a problem without a loop has no margins, but nan."""
 
-    Attributes
-    ----------
-    family : str
-        "mixed": least variance of all filters with this norm; "central": the H-infinity
-        filter whose norm this is.
-    gamma : float
-        H-infinity norm of its estimation error, recomputed.
-    gamma_ratio : float
-        The same over the least norm of any filter.
-    rms : float
-        Standard deviation of its estimation error, recomputed.
-    gain_low, gain_high : float
-        Sensor gains between which its loop is stable; nan for a problem without a loop.
-    modulus : float
-        Modulus margin of its loop; nan for a problem without a loop.
-    design : FilterDesign
-        The filter.
-    """
-
-    family: str
-    gamma: float
-    gamma_ratio: float
-    rms: float
-    gain_low: float
-    gain_high: float
-    modulus: float
-    design: FilterDesign
+    family: str = column(
+        "filter",
+        help='"mixed": least variance of all filters with this norm; "central": the H-infinity '
+        "filter whose norm this is",
+    )
+    gamma: float = column(
+        "norm", unit="nm", format=".2f", help="H-infinity norm of its estimation error, recomputed"
+    )
+    gamma_ratio: float = column(
+        "norm / least", format=".4f", help="The same over the least norm of any filter"
+    )
+    rms: float = column(
+        "rms",
+        unit="nm",
+        format=".2f",
+        help="Standard deviation of its estimation error, recomputed",
+    )
+    gain_low: float = column(
+        "gain from", format=".3f", help="Least stable sensor gain", default=np.nan
+    )
+    gain_high: float = column(
+        "gain to", format=".3f", help="Greatest stable sensor gain", default=np.nan
+    )
+    modulus: float = column(
+        "modulus margin", format=".3f", help="Modulus margin of its loop", default=np.nan
+    )
+    design: FilterDesign = field(compare=False, repr=False)
 
 
 def tradeoff(
@@ -133,17 +134,8 @@ def _points(
 
 
 def _point(design: FilterDesign, family: str, least: float) -> TradeoffPoint:
-    low = high = modulus = float("nan")
+    margins = None
     if design.hardware is not None:
         margins = loop_margins(close_loop(design.hardware, design.controller))
-        low, high, modulus = margins.gain_low, margins.gain_high, margins.modulus
-    return TradeoffPoint(
-        family=family,
-        gamma=design.gamma,
-        gamma_ratio=max(design.gamma / least, 1.0),
-        rms=design.rms,
-        gain_low=low,
-        gain_high=high,
-        modulus=modulus,
-        design=design,
-    )
+    ratio = max(design.gamma / least, 1.0)
+    return fill_row(TradeoffPoint, design, margins, family=family, gamma_ratio=ratio, design=design)

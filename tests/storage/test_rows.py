@@ -14,6 +14,7 @@ from lbt_synth.storage.rows import (
     columns,
     csv_rows,
     fact_table,
+    fill_row,
     json_record,
     json_units,
     row_table,
@@ -123,6 +124,19 @@ def test_rows_are_frozen_and_compared_by_value():
         ROWS[0].gamma = 1.0
     with pytest.raises(TypeError, match="missing 5 required keyword-only arguments"):
         Loop(name="a")
+
+
+def test_a_row_takes_what_is_not_given_from_its_sources():
+    class Margins:
+        gamma = 3.0
+        strehl = 0.5
+
+    row = fill_row(Loop, Margins(), ROWS[0], name="c", stable=False)
+    assert (row.name, row.stable) == ("c", False)
+    assert (row.gamma, row.strehl) == (3.0, 0.5)
+    assert (row.method, row.error_hz) == ("kalman", -0.001)
+    with pytest.raises(TypeError, match="missing"):
+        fill_row(Loop, Margins(), name="c")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import functools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +19,10 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
 from lbt_synth.storage import run_cases
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.published import TABLE_II, TABLE_III, TableII, TableIII
-from lbt_synth.validation import choice
+from lbt_synth.validation import choice, set_fields
 
 CLASSICAL_GAIN = 0.5
 # "by increasing the integrator's gain"; this times the optical gain of the loop, 0.55, is the
@@ -44,52 +45,63 @@ class PlannedRow:
     cases: dict[str, dict[str, Any]]  # by name
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class EndToEndEntry:
-    """One row of a table for one controller, simulated.
+    """One row of a table for one controller, simulated; ``strehls`` are those of each seed [%]."""
 
-    Attributes
-    ----------
-    table, label, method : str
-        Table, row and controller.
-    error_hz : float or None
-        Frequency of the model less that of the vibration [Hz].
-    strehls : tuple of float
-        Strehl ratio of each seed [%].
-    paper : float
-        The paper's [%], or nan.
-    modal : float
-        Prediction of the modal analysis with the measured optical gain and the measured
-        Strehl ratio of the other modes, mean over seeds [%]; 0 where the loop is unstable.
-    optical_gain : float
-        Optical gain of tip and tilt, mean over seeds.
-    tip_rms_nm, tilt_rms_nm : float
-        Residuals, root mean square over seeds [nm].
-    other_modes : float
-        Strehl ratio without tip and tilt, mean over seeds [%].
-    """
+    table: str = column(help='Table, "II" or "III"')
+    label: str = column("row", key="row", help="Its row")
+    method: str = column("method", help="Its controller")
+    error_hz: float | None = column(
+        unit="Hz", help="Frequency of the model less that of the vibration"
+    )
+    strehls: tuple[float, ...] = field()
+    strehl: float = column(
+        "end to end",
+        key="strehl_percent",
+        format=".1f",
+        help="Mean Strehl ratio over seeds [%]",
+        init=False,
+    )
+    scatter: float = column(
+        "scatter",
+        key="scatter_points",
+        format=".1f",
+        help="Standard deviation over seeds [points]; nan for one",
+        init=False,
+    )
+    seeds: int = column("seeds", help="How many there are", init=False)
+    paper: float = column(
+        "paper", key="paper_strehl_percent", format=".1f", help="The paper's [%], or nan"
+    )
+    modal: float = column(
+        "modal",
+        key="modal_strehl_percent",
+        format=".1f",
+        help="Prediction of the modal analysis with the measured optical gain and the measured "
+        "Strehl ratio of the other modes, mean over seeds [%]; 0 where the loop is unstable",
+    )
+    optical_gain: float = column(
+        "optical gain", format=".3f", help="Optical gain of tip and tilt, mean over seeds"
+    )
+    tip_rms_nm: float = column("tip", unit="nm", format=".0f", help="Residual, rms over seeds")
+    tilt_rms_nm: float = column("tilt", unit="nm", format=".0f", help="Residual, rms over seeds")
+    other_modes: float = column(
+        "other modes",
+        unit="%",
+        key="other_modes_strehl_percent",
+        format=".1f",
+        help="Strehl ratio without tip and tilt, mean over seeds",
+    )
 
-    table: str
-    label: str
-    method: str
-    error_hz: float | None
-    strehls: tuple[float, ...]
-    paper: float
-    modal: float
-    optical_gain: float
-    tip_rms_nm: float
-    tilt_rms_nm: float
-    other_modes: float
-
-    @property
-    def strehl(self) -> float:
-        """Mean over seeds [%]."""
-        return float(np.mean(self.strehls))
-
-    @property
-    def scatter(self) -> float:
-        """Standard deviation over seeds [points]; nan for one."""
-        return float(np.std(self.strehls, ddof=1)) if len(self.strehls) > 1 else float("nan")
+    def __post_init__(self) -> None:
+        strehls = np.array(self.strehls)
+        set_fields(
+            self,
+            strehl=float(np.mean(strehls)),
+            scatter=float(np.std(strehls, ddof=1)) if strehls.size > 1 else np.nan,
+            seeds=strehls.size,
+        )
 
 
 def plan_tables(
@@ -115,114 +127,93 @@ def plan_tables(
             f"{given.DELAY_FRAMES:g} frames; got {hardware.frame_rate_hz:g} Hz and "
             f"{hardware.delay_frames:g} frames."
         )
-    rows: list[PlannedRow] = []
-    fixed = dict(designs or {})
-    for name, design in fixed.items():
+    for name, design in (designs or {}).items():
         setup.controller(design)  # refuses a filter of another loop or of other sizes
         if name in ("classical", *_FILTERS):
             raise ProblemError(f"the name {name} is taken by the paper's own; rename the file.")
+    lines: list[_Line] = []
     if "II" in tables:
-        rows += _plan_table_ii(setup, fixed, seeds)
+        for row in TABLE_II:
+            label, error = ("vibration", 0.0) if row.vibration else ("no vibration", None)
+            lines.append(_Line("II", label, error, seeds, row))
     if "III" in tables:
-        rows += _plan_table_iii(setup, fixed, seeds, row_seeds)
-    return rows
+        for line in TABLE_III:
+            error = line.model_hz - given.VIBRATION_HZ
+            own = seeds if error == 0 else row_seeds
+            lines.append(_Line("III", f"{line.model_hz:.1f} Hz", error, own, line))
+    return [row for line in lines for row in _plan_line(setup, line, designs or {})]
 
 
-class _TableRow(NamedTuple):
+class _Line(NamedTuple):
     """One row of a table, for all its controllers."""
 
     table: str
     label: str
-    error_hz: float | None
-    model_hz: float
+    error_hz: float | None  # None without vibration
     seeds: Sequence[int]
-
-    @property
-    def truth_hz(self) -> float | None:
-        """Frequency of the vibration if the model moves; None without vibration."""
-        return None if self.error_hz is None else given.VIBRATION_HZ
-
-    @property
-    def moved_hz(self) -> float | None:
-        """Frequency of the vibration if the design stays; None without vibration."""
-        return None if self.error_hz is None else given.VIBRATION_HZ - self.error_hz
+    published: TableII | TableIII
 
 
-def _plan_table_ii(
-    setup: EndToEndSetup, fixed: Mapping[str, Design], seeds: Sequence[int]
+def _plan_line(
+    setup: EndToEndSetup, line: _Line, designs: Mapping[str, Design]
 ) -> Iterator[PlannedRow]:
-    for published in TABLE_II:
-        shaken = published.vibration
-        row = _TableRow(
-            table="II",
-            label="vibration" if shaken else "no vibration",
-            error_hz=0.0 if shaken else None,
-            model_hz=given.VIBRATION_HZ,
-            seeds=seeds,
-        )
-        gain = CLASSICAL_GAIN_VIBRATION if shaken else CLASSICAL_GAIN
+    """Yield the paper's controllers, then the fixed designs.
+
+    The paper's filters follow the frequency of the model; under the others the vibration moves.
+    """
+    true_hz = moved_hz = None
+    model_hz = given.VIBRATION_HZ
+    if line.error_hz is not None:
+        true_hz, moved_hz = given.VIBRATION_HZ, given.VIBRATION_HZ - line.error_hz
+        model_hz += line.error_hz
+    if isinstance(line.published, TableII):
+        gain = CLASSICAL_GAIN_VIBRATION if line.published.vibration else CLASSICAL_GAIN
         classical = integrator(setup.system.hardware, gain=gain).controller
-        yield _plan_row(setup, row, "classical", classical, published.classical)
-        yield from _plan_controllers(setup, row, published, fixed)
-
-
-def _plan_table_iii(
-    setup: EndToEndSetup,
-    fixed: Mapping[str, Design],
-    seeds: Sequence[int],
-    row_seeds: Sequence[int],
-) -> Iterator[PlannedRow]:
-    for published in TABLE_III:
-        error = published.model_hz - given.VIBRATION_HZ
-        row = _TableRow(
-            table="III",
-            label=f"{published.model_hz:.1f} Hz",
-            error_hz=error,
-            model_hz=published.model_hz,
-            seeds=seeds if error == 0 else row_seeds,
-        )
-        yield from _plan_controllers(setup, row, published, fixed)
-
-
-def _plan_controllers(
-    setup: EndToEndSetup,
-    row: _TableRow,
-    published: TableII | TableIII,
-    designs: Mapping[str, Design],
-) -> Iterator[PlannedRow]:
-    """Yield the paper's filters, then the fixed designs."""
+        paper = line.published.classical
+        yield _plan_row(setup, line, "classical", classical, moved_hz, paper=paper)
     for method in _FILTERS:
-        controller = _paper_filter(method, row.model_hz)
-        yield _plan_row(setup, row, method, controller, getattr(published, method))
+        yield _plan_row(
+            setup,
+            line,
+            method,
+            _paper_filter(method, model_hz),
+            true_hz,
+            tuned=f"-{model_hz:g}hz",
+            paper=getattr(line.published, method),
+        )
     for name, design in designs.items():
-        yield _plan_row(setup, row, name, design.controller, float("nan"))
+        yield _plan_row(setup, line, name, design.controller, moved_hz)
 
 
 def _plan_row(
-    setup: EndToEndSetup, row: _TableRow, method: str, controller: Controller, paper: float
+    setup: EndToEndSetup,
+    line: _Line,
+    method: str,
+    controller: Controller,
+    true_hz: float | None,
+    *,
+    tuned: str = "",
+    paper: float = np.nan,
 ) -> PlannedRow:
-    tuned = method in _FILTERS
-    true_hz = row.truth_hz if tuned else row.moved_hz
     lines: tuple[SinusoidalVibration, ...] = ()
     if true_hz is not None:
         shake = given.PAPER_TRUTH.vibrations[0]
         assert isinstance(shake, SinusoidalVibration)
         lines = (replace(shake, frequency_hz=true_hz),)
     vibration = "none" if true_hz is None else f"{true_hz:g}hz"
-    name = f"{method}-{row.model_hz:g}hz" if tuned else method
     return PlannedRow(
-        table=row.table,
-        label=row.label,
+        table=line.table,
+        label=line.label,
         method=method,
-        error_hz=row.error_hz,
+        error_hz=line.error_hz,
         paper=paper,
         controller=controller,
         truth=replace(given.PAPER_TRUTH, vibrations=lines),
         cases={
-            f"{name}-vibration-{vibration}-seed-{seed}": make_case(
+            f"{method}{tuned}-vibration-{vibration}-seed-{seed}": make_case(
                 setup, controller, vibrations=lines, seed=seed
             )
-            for seed in row.seeds
+            for seed in line.seeds
         },
     )
 
@@ -335,29 +326,26 @@ def make_entries(
     rows: Iterable[PlannedRow], results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
 ) -> list[EndToEndEntry]:
     """Make the entries of the tables from the results of their cases."""
-    entries = []
-    for row in rows:
-        found = [results[name] for name in row.cases]
-        entries.append(
-            EndToEndEntry(
-                table=row.table,
-                label=row.label,
-                method=row.method,
-                error_hz=row.error_hz,
-                paper=row.paper,
-                strehls=tuple(100 * one["strehl"] for one in found),
-                modal=_mean([_predict_strehl(row, one, setup) for one in found]),
-                optical_gain=_mean([one["tip_tilt_gain"] for one in found]),
-                tip_rms_nm=_mean([one["tip_rms_nm"] ** 2 for one in found]) ** 0.5,
-                tilt_rms_nm=_mean([one["tilt_rms_nm"] ** 2 for one in found]) ** 0.5,
-                other_modes=100 * _mean([one["other_modes_strehl"] for one in found]),
-            )
-        )
-    return entries
+    return [_make_entry(row, [results[name] for name in row.cases], setup) for row in rows]
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values))
+def _make_entry(
+    row: PlannedRow, found: Sequence[Mapping[str, Any]], setup: EndToEndSetup
+) -> EndToEndEntry:
+    strehls, gain, tip, tilt, others = (
+        np.array([one[name] for one in found])
+        for name in ("strehl", "tip_tilt_gain", "tip_rms_nm", "tilt_rms_nm", "other_modes_strehl")
+    )
+    return fill_row(
+        EndToEndEntry,
+        row,
+        strehls=tuple(100 * float(one) for one in strehls),
+        modal=float(np.mean([_predict_strehl(row, one, setup) for one in found])),
+        optical_gain=float(np.mean(gain)),
+        tip_rms_nm=float(np.mean(tip**2) ** 0.5),
+        tilt_rms_nm=float(np.mean(tilt**2) ** 0.5),
+        other_modes=100 * float(np.mean(others)),
+    )
 
 
 def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndSetup) -> float:
