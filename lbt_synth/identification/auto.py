@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from lbt_synth.design import Design, hinf, kalman, lqg
+from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
@@ -19,13 +19,13 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.required_length import require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.loop import Imaging, close_loop
-from lbt_synth.models import TipTiltPlant
+from lbt_synth.methods.plant_inputs import PlantInputs
+from lbt_synth.methods.registry import record_methods, reference_methods
+from lbt_synth.methods.request import design_request
 from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
 _APART = 3.0  # standard errors between gains that disagree
-_NAMES = {"kalman": "Kalman filter", "hinf": "H-infinity filter", "lqg": "LQG controller"}
-METHODS = tuple(_NAMES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,7 +60,7 @@ class RecordedDesign:
 def design_from_record(
     record: LoopRecord,
     *,
-    method: Literal["kalman", "hinf", "lqg"] = "kalman",
+    method: str | None = None,
     gamma_ratio: float = _GAMMA_RATIO,
     sensor_gain: float | Sequence[float] | None = None,
     assumed_gain: float = 1.0,
@@ -80,10 +80,10 @@ def design_from_record(
     ----------
     record : LoopRecord
         What the loop recorded; the delay must be known.
-    method : {"kalman", "hinf", "lqg"}, optional
-        How the controller is designed.
+    method : str, optional
+        Method of synthesis that needs no more than a plant; the Kalman filter by default.
     gamma_ratio : float, optional
-        For "hinf": the norm as a multiple of the least one.
+        For methods with a bound: the norm as a multiple of the least one.
     sensor_gain, assumed_gain, announced
         As for :func:`identify`.
     imaging : Imaging, optional
@@ -127,7 +127,8 @@ def design_from_record(
     True
     """
     require_instance(record, LoopRecord)
-    choice(method, "method", METHODS)
+    chosen = reference_methods(estimators_only=True)[0].name if method is None else method
+    choice(chosen, "method", record_methods())
     number(
         gamma_ratio,
         "gamma_ratio",
@@ -155,11 +156,17 @@ def design_from_record(
     half = identify(record, stretches=fit, **found)
     step()
     plant = half.plant()
-    name = _NAMES[method]
+    request = design_request(chosen, {})
+
+    def design_for(model: IdentifiedModel) -> Design:
+        plant = PlantInputs(plant=model.plant(), design_defaults={"gamma_ratio": gamma_ratio})
+        return request.build(plant)
+
+    name = request.method.title
     held_out = prediction_against_data(
         plant,
         record.pseudo_open_loop(half.sensor_gains),
-        {name: _design(plant, method, gamma_ratio)},
+        {name: design_for(half)},
         fit=fit,
         test=test,
         measurements=None if record.commands is None else record.measurements,
@@ -169,7 +176,7 @@ def design_from_record(
     )
     step()
     model = identify(record, start=half, **found)
-    design = _design(model.plant(), method, gamma_ratio)
+    design = design_for(model)
     step()
     return RecordedDesign(
         model=model,
@@ -202,11 +209,3 @@ def _check_gains(model: IdentifiedModel, half: IdentifiedModel, design: Design) 
                 "the record, and for commands that do not belong to it, or give the sensor gain."
             )
     return tuple(out)
-
-
-def _design(plant: TipTiltPlant, method: str, gamma_ratio: float) -> Design:
-    if method == "kalman":
-        return kalman(plant)
-    if method == "hinf":
-        return hinf(plant, gamma_ratio=gamma_ratio)
-    return lqg(plant)

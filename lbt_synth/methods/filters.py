@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from lbt_synth.methods.method import Description
+from lbt_synth.methods.method import Description, Method
 from lbt_synth.methods.section import Section
 from lbt_synth.storage.rows import column, table_row
 
@@ -69,7 +70,7 @@ def limit_facts(design: EstimatorDesign) -> dict[str, Any]:
     return {"limit_nm": limit_nm, "above_limit_percent": round(above, 6) + 0.0}
 
 
-def describe_filter(design: FilterDesign) -> Description:
+def _describe_filter(design: FilterDesign) -> Description:
     """Describe a filter."""
     return Description(
         facts=FilterFacts(
@@ -82,7 +83,7 @@ def describe_filter(design: FilterDesign) -> Description:
     )
 
 
-def pack_filter(design: FilterDesign) -> DesignRecord:
+def _pack_filter(design: FilterDesign) -> DesignRecord:
     """Record the gains and claims of a filter, with its problem."""
     from lbt_synth.design.record import DesignRecord, record_problem
 
@@ -93,7 +94,7 @@ def pack_filter(design: FilterDesign) -> DesignRecord:
     return DesignRecord(arrays, meta) | record_problem(design.problem)
 
 
-def unpack_filter(record: DesignRecord) -> FilterDesign:
+def _unpack_filter(record: DesignRecord) -> FilterDesign:
     """Rebuild a filter."""
     from lbt_synth.design import FilterDesign
     from lbt_synth.linear import Witness
@@ -118,3 +119,6 @@ def unpack_filter(record: DesignRecord) -> FilterDesign:
         if "WITNESS_X" in arrays
         else None,
     )
+
+
+filter_method = partial(Method, pack=_pack_filter, unpack=_unpack_filter, describe=_describe_filter)

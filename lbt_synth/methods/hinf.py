@@ -6,14 +6,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import (
-    BOUNDS,
-    BoundOptions,
-    describe_filter,
-    pack_filter,
-    unpack_filter,
-)
-from lbt_synth.methods.method import DesignInputs, Method
+from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method
+from lbt_synth.methods.method import DesignInputs
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import FilterDesign
@@ -33,15 +27,12 @@ def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign:
     return hinf(inputs.plant, **options.bound(), horizon=options.horizon, route=options.route)
 
 
-METHOD = Method(
+METHOD = filter_method(
     name="hinf",
     title="H-infinity filter",
     label=r"H$_\infty$",
     options=HinfOptions,
     build=_build,
-    pack=pack_filter,
-    unpack=unpack_filter,
-    describe=describe_filter,
     exclusive=BOUNDS,
     configurable=frozenset({"gamma_ratio"}),
     reference=(2, {"route": "riccati"}),

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import Horizon, describe_filter, pack_filter, unpack_filter
-from lbt_synth.methods.method import DesignInputs, Method
+from lbt_synth.methods.filters import Horizon, filter_method
+from lbt_synth.methods.method import DesignInputs
 from lbt_synth.methods.section import Section
 
 if TYPE_CHECKING:
@@ -27,15 +27,12 @@ def _build(inputs: DesignInputs, options: KalmanOptions) -> FilterDesign:
     return kalman(inputs.plant, horizon=options.horizon, route=options.route)
 
 
-METHOD = Method(
+METHOD = filter_method(
     name="kalman",
     title="Kalman filter",
     label="Kalman",
     options=KalmanOptions,
     build=_build,
-    pack=pack_filter,
-    unpack=unpack_filter,
-    describe=describe_filter,
     batched=True,
     reference=(1, {}),
 )

@@ -6,14 +6,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import (
-    BOUNDS,
-    BoundOptions,
-    describe_filter,
-    pack_filter,
-    unpack_filter,
-)
-from lbt_synth.methods.method import DesignInputs, Method
+from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method
+from lbt_synth.methods.method import DesignInputs
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import FilterDesign
@@ -40,15 +34,12 @@ def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign:
     return mixed(inputs.plant, **bound, taps=options.taps, horizon=options.horizon)
 
 
-METHOD = Method(
+METHOD = filter_method(
     name="mixed",
     title="mixed filter",
     label="mixed",
     options=MixedOptions,
     build=_build,
-    pack=pack_filter,
-    unpack=unpack_filter,
-    describe=describe_filter,
     exclusive=BOUNDS,
     configurable=frozenset({"gamma_ratio"}),
 )

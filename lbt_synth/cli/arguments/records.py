@@ -15,15 +15,15 @@ def add_identify(parser: ArgumentParser) -> None:
 
 def add_auto(parser: ArgumentParser) -> None:
     """Add the arguments of auto."""
+    from lbt_synth.methods.registry import record_methods
+
     _add_record(parser)
-    parser.add_argument(
-        "--method", choices=("kalman", "hinf", "lqg"), default="kalman", help="default kalman"
-    )
+    parser.add_argument("--method", choices=record_methods(), help="default: the Kalman filter")
     parser.add_argument(
         "--gamma-ratio",
         type=float,
         default=1.2,
-        help="hinf: norm as a multiple of the least norm (default 1.2)",
+        help="norm as a multiple of the least norm, for methods with a bound (default 1.2)",
     )
     parser.add_argument(
         "--model", help="configuration to write (default: the output's name, .yaml)"

@@ -160,23 +160,23 @@ class _Programme:
         C = cp.hstack([f.L - self.output @ f.inverse, self.output])
         P = cp.Variable((2 * n, 2 * n), symmetric=True)
         slack, none = G + G.T - P, np.zeros((2 * n, outputs))
-        if norm == "hinf":
-            across = np.zeros((2 * n, p))
-            whole = [
-                [slack, GA, GB, none],
-                [GA.T, P, across, C.T],
-                [GB.T, across.T, level * np.eye(p), np.zeros((p, outputs))],
-                [none.T, C, np.zeros((outputs, p)), np.eye(outputs)],
+        if norm == "h2":
+            W = cp.Variable((p, p), symmetric=True)
+            decay = [[slack, GA, none], [GA.T, P, C.T], [none.T, C, np.eye(outputs)]]
+            entry = [[slack, GB], [GB.T, W]]
+            return [
+                symmetrise(cp.bmat(decay)),
+                symmetrise(cp.bmat(entry)),
+                cp.reshape(level - cp.trace(W), (1, 1), order="C"),
             ]
-            return [symmetrise(cp.bmat(whole))]
-        W = cp.Variable((p, p), symmetric=True)
-        decay = [[slack, GA, none], [GA.T, P, C.T], [none.T, C, np.eye(outputs)]]
-        entry = [[slack, GB], [GB.T, W]]
-        return [
-            symmetrise(cp.bmat(decay)),
-            symmetrise(cp.bmat(entry)),
-            cp.reshape(level - cp.trace(W), (1, 1), order="C"),
+        across = np.zeros((2 * n, p))
+        whole = [
+            [slack, GA, GB, none],
+            [GA.T, P, across, C.T],
+            [GB.T, across.T, level * np.eye(p), np.zeros((p, outputs))],
+            [none.T, C, np.zeros((outputs, p)), np.eye(outputs)],
         ]
+        return [symmetrise(cp.bmat(whole))]
 
 
 def _coefficient(ends: Any, k: int) -> Any:
