@@ -197,3 +197,12 @@ def name_file(source: Path) -> Iterator[None]:
         yield
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}", path=error.path) from error
+
+
+@contextmanager
+def refuse_config(where: str, path: str = "") -> Iterator[None]:
+    """Turn any error of the package into a ConfigError that says where it came from."""
+    try:
+        yield
+    except LbtSynthError as error:
+        raise ConfigError(f"{where}: {error}", path=path) from error

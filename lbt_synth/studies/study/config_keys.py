@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any, cast
 
 from lbt_synth.config.samples import Keys
 from lbt_synth.errors import ConfigError
@@ -35,8 +36,8 @@ def parse_path(path: str) -> Keys:
     return tuple(keys)
 
 
-def require_number(content: Mapping[str, Any], path: str) -> None:
-    """Refuse a path that does not lead to a number."""
+def find_number(content: Mapping[str, Any], path: str) -> float:
+    """Return the number to which a path leads; refuse a path that leads to none."""
     here: Any = content
     parent: Any = {}
     walked = ""
@@ -63,14 +64,15 @@ def require_number(content: Mapping[str, Any], path: str) -> None:
             walked += f".{key}" if walked else key
         parent, here = here, here[key]
     if here is None:
-        entries = parent.items() if isinstance(parent, Mapping) else ()
+        entries = parent.items() if isinstance(parent, dict) else ()
         there = [k for k, v in entries if type(v) in (int, float)]
         others = f" Numbers that are set there: {', '.join(sorted(there))}." if there else ""
         raise ConfigError(
             f"{path} is not set in the configuration, so it cannot be varied.{others}"
         )
-    if isinstance(here, bool | str) or not isinstance(here, int | float):
+    if type(here) not in (int, float):
         raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(here)}.")
+    return cast(float, here)
 
 
 def _describe(value: Any) -> str:
@@ -81,18 +83,10 @@ def _describe(value: Any) -> str:
     return "it is not set" if value is None else f"it is {value!r}"
 
 
-def is_integer(content: Mapping[str, Any], keys: Keys) -> bool:
-    """Whether a place that :func:`require_number` accepts takes integers only."""
-    here: Any = content
-    for key in keys:
-        here = here[key]
-    return isinstance(here, int)
-
-
 def set_number(
     content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]
 ) -> None:
-    """Set the number at a place that :func:`require_number` accepts in ``full``.
+    """Set the number at a place that :func:`find_number` finds in ``full``.
 
     ``full`` is the same configuration with its defaults. Missing sections on the way are added,
     missing lists copied from ``full``. An integer there stays an integer if the value is whole.
@@ -102,20 +96,7 @@ def set_number(
     for key in keys[:-1]:
         whole = whole[key]
         if isinstance(here, dict) and key not in here:
-            here[key] = _copy_nested(whole) if isinstance(whole, list) else {}
+            here[key] = deepcopy(whole) if isinstance(whole, list) else {}
         here = here[key]
     whole_number = isinstance(whole[keys[-1]], int) and float(value).is_integer()
     here[keys[-1]] = int(value) if whole_number else float(value)
-
-
-def nested_copy(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Copy a configuration with its sections and lists."""
-    return {key: _copy_nested(value) for key, value in content.items()}
-
-
-def _copy_nested(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return nested_copy(value)
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_copy_nested(item) for item in value]
-    return value

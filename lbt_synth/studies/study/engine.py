@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -14,7 +13,6 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,12 +34,6 @@ _MOST_DEATHS = 40  # in a row, without a batch that comes back
 _IN_FLIGHT = 2  # batches per worker, so that none waits
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    rows: RowRange
-    alone: bool
-
-
 class _InlineExecutor(Executor):
     """Executor that runs each call at once in this process."""
 
@@ -55,23 +47,16 @@ class _InlineExecutor(Executor):
 
 
 class _Workers:
-    """An executor: that of the caller, one in this process, or a pool that can be renewed."""
+    """What evaluates batches: the caller's executor, this process, or a pool of its own."""
 
-    def __init__(self, jobs: int, executor: Executor | None) -> None:
-        self._jobs = jobs
+    def __init__(
+        self, study: Study, evaluate: Evaluate, jobs: int, executor: Executor | None
+    ) -> None:
+        self._study, self._evaluate, self._jobs = study, evaluate, jobs
         self._pool = WorkerPool(jobs) if executor is None and jobs > 1 else None
-        self.executor = self._pool.executor if self._pool else executor or _InlineExecutor()
-
-    def renew(self, error: BaseException) -> None:
-        """Start new processes after some died."""
-        if self._pool is None:
-            raise NumericalError(
-                f"the executor broke: {error or type(error).__name__}. What is finished is kept: "
-                "start again, with a new executor."
-            ) from error
-        self._pool.close()
-        self._pool = WorkerPool(self._jobs)
-        self.executor = self._pool.executor
+        self._executor = self._pool.executor if self._pool else executor or _InlineExecutor()
+        self._broken: BrokenExecutor | None = None
+        self._deaths = 0  # in a row
 
     def __enter__(self) -> _Workers:
         return self
@@ -81,6 +66,65 @@ class _Workers:
             self._pool.kill()
         elif self._pool is not None:
             self._pool.close()
+
+    def submit(self, rows: RowRange) -> Future[TimedBatch]:
+        """Begin to evaluate some rows."""
+        study, evaluate = self._study, self._evaluate
+        try:
+            return self._executor.submit(
+                evaluate_timed, evaluate, study, study.values(*rows), rows[0]
+            )
+        except BrokenExecutor as error:
+            lost: Future[TimedBatch] = Future()
+            lost.set_exception(error)
+            return lost
+
+    def receive(self, future: Future[TimedBatch], rows: RowRange) -> TimedBatch | None:
+        """Wait for a batch and return it, None if its process died."""
+        error: BaseException | None
+        try:
+            error = future.exception()
+        except CancelledError as cancelled:
+            error = cancelled
+        finally:
+            future.cancel()  # where the wait is interrupted
+        if error is None:
+            self._deaths = 0
+            _require_whole(future.result()[0], rows, self._study)
+            return future.result()
+        if isinstance(error, BrokenExecutor):
+            self._broken = error
+        elif not is_death_of_workers(error):
+            raise _error_to_raise(error, rows)
+        return None
+
+    def failed_row(self, row: int) -> TimedBatch:
+        """Return the batch of a row that ends its process."""
+        failures = [
+            Failure(row=row, controller=controller.name, error=DIED, retry=True)
+            for controller in self._study.controllers
+        ]
+        columns = {name: np.full(1, np.nan) for name in self._study.result_columns}
+        return BatchResult(start=row, columns=columns, failures=tuple(failures)), 0.0
+
+    def recover(self) -> None:
+        """Start new processes after some died; refuse to go on after too many deaths in a row."""
+        error, self._broken = self._broken, None
+        if error is not None:
+            if self._pool is None:
+                raise NumericalError(
+                    f"the executor broke: {error or type(error).__name__}. What is finished is "
+                    "kept: start again, with a new executor."
+                ) from error
+            self._pool.close()
+            self._pool = WorkerPool(self._jobs)
+            self._executor = self._pool.executor
+        self._deaths += 1
+        if self._deaths > _MOST_DEATHS:
+            raise NumericalError(
+                f"{self._deaths} times one after the other a process ended without a word, for "
+                "want of memory perhaps. What is finished is kept: start again, with fewer jobs."
+            )
 
 
 def evaluate_timed(evaluate: Evaluate, study: Study, values: FloatArray, start: int) -> TimedBatch:
@@ -104,109 +148,59 @@ def run_batches(
     When a process dies, all batches in flight run again, each alone. One that kills its process
     again is halved, down to single rows, which fail.
     """
-    run = _BatchRun(study, evaluate, BatchQueue(ranges, workers or jobs))
+    queue = BatchQueue(ranges, workers or jobs)
     most = 1 if executor is None and jobs == 1 else _IN_FLIGHT * (workers or jobs)
     own = executor is None and jobs > 1
-    with limit_threads() if own else nullcontext(), _Workers(jobs, executor) as engine:
-        try:
-            while run.queue.left or run.suspects or run.running:
-                broken = run.submit(engine.executor, most)
-                dead: list[_Task] = []
-                for task, future in run.wait():
-                    raised = _future_error(future)
-                    if raised is None:
-                        yield run.receive(task, future)
-                        continue
-                    if isinstance(raised, BrokenExecutor):
-                        broken = raised
-                    elif not is_death_of_workers(raised):
-                        raise _error_to_raise(raised, task.rows)
-                    dead.append(task)
-                if broken is not None:
-                    dead += run.running.values()
-                    run.running.clear()
-                    engine.renew(broken)
-                if dead or broken is not None:
-                    run.count_death()
-                for row in run.suspect(dead):
-                    yield _failed_row(study, row), 0.0
-        finally:
-            for future in run.running:
-                future.cancel()
+    with (
+        limit_threads() if own else nullcontext(),
+        _Workers(study, evaluate, jobs, executor) as engine,
+    ):
+        while queue.left:
+            for rows in (yield from _run_until_death(engine, queue, most)):
+                yield from _run_alone(engine, rows)
 
 
-@dataclass(slots=True)
-class _BatchRun:
-    """Where the batches of a run are: in the queue, on a worker, or suspected of killing it."""
-
-    study: Study
-    evaluate: Evaluate
-    queue: BatchQueue
-    running: dict[Future[TimedBatch], _Task] = field(default_factory=dict)
-    suspects: deque[RowRange] = field(default_factory=deque)
-    deaths: int = 0  # since a batch came back
-
-    def submit(self, executor: Executor, most: int) -> BrokenExecutor | None:
-        """Keep the workers busy, or run one suspect alone; return what broke the executor."""
-        while (self.queue.left and not self.suspects and len(self.running) < most) or (
-            self.suspects and not self.running
-        ):
-            alone = bool(self.suspects)
-            rows = self.suspects[0] if alone else self.queue.take()
-            values = self.study.values(*rows)
-            try:
-                future = executor.submit(evaluate_timed, self.evaluate, self.study, values, rows[0])
-            except BrokenExecutor as error:
-                if not alone:
-                    self.suspects.append(rows)  # taken from the queue, but not run
-                return error
-            if alone:
-                self.suspects.popleft()
-            self.running[future] = _Task(rows=rows, alone=alone)
-        return None
-
-    def wait(self) -> Iterator[tuple[_Task, Future[TimedBatch]]]:
-        """Wait for a batch, and yield each one that has ended."""
-        if self.running:
-            done, _ = wait(self.running, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield self.running.pop(future), future
-
-    def receive(self, task: _Task, future: Future[TimedBatch]) -> TimedBatch:
-        """Return a batch that came back, with its seconds."""
-        self.deaths = 0
-        batch, seconds = future.result()
-        _require_whole(batch, task.rows, self.study)
-        self.queue.learn(task.rows[1] - task.rows[0], seconds)
-        return batch, seconds
-
-    def count_death(self) -> None:
-        """Count the death of a process, and refuse to go on after too many in a row."""
-        self.deaths += 1
-        if self.deaths > _MOST_DEATHS:
-            raise NumericalError(
-                f"{self.deaths} times one after the other a process ended without a word, for want "
-                "of memory perhaps. What is finished is kept: start again, with fewer jobs."
-            )
-
-    def suspect(self, dead: Sequence[_Task]) -> Iterator[int]:
-        """Let batches run again, each alone, or in halves; yield single rows that failed alone."""
-        for task in sorted(dead, key=lambda task: task.rows):
-            start, stop = task.rows
-            if not task.alone:
-                self.suspects.append(task.rows)
-            elif stop - start == 1:
-                yield start
-            else:
-                middle = (start + stop) // 2
-                self.suspects.extendleft([(middle, stop), (start, middle)])
-
-
-def _future_error(future: Future[TimedBatch]) -> BaseException | None:
+def _run_until_death(
+    engine: _Workers, queue: BatchQueue, most: int
+) -> Generator[TimedBatch, None, list[RowRange]]:
+    """Yield the batches of a queue until a process dies, and return those that were lost."""
+    running: dict[Future[TimedBatch], RowRange] = {}
+    dead: list[RowRange] = []
     try:
-        return future.exception()
-    except CancelledError as error:
-        return error
+        while running or (queue.left and not dead):
+            while queue.left and not dead and len(running) < most:
+                rows = queue.take()
+                running[engine.submit(rows)] = rows
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                rows = running.pop(future)
+                batch = engine.receive(future, rows)
+                if batch is None:
+                    dead.append(rows)
+                    continue
+                queue.learn(rows[1] - rows[0], batch[1])
+                yield batch
+    finally:
+        for future in running:
+            future.cancel()
+    if dead:
+        engine.recover()
+    return sorted(dead)
+
+
+def _run_alone(engine: _Workers, rows: RowRange) -> Iterator[TimedBatch]:
+    """Yield the results of rows of which one may have killed a process, in halves if it does."""
+    batch = engine.receive(engine.submit(rows), rows)
+    if batch is not None:
+        yield batch
+        return
+    engine.recover()
+    start, stop = rows
+    if stop - start == 1:
+        yield engine.failed_row(start)
+        return
+    middle = (start + stop) // 2
+    for half in ((start, middle), (middle, stop)):
+        yield from _run_alone(engine, half)
 
 
 def _error_to_raise(error: BaseException, rows: RowRange) -> BaseException:
@@ -241,15 +235,3 @@ def _require_whole(batch: BatchResult, rows: RowRange, study: Study) -> None:
             f"the evaluation must return a BatchResult of rows {rows[0]} to {rows[1] - 1} with the "
             "columns of the study, in their order; got something else."
         )
-
-
-def _failed_row(study: Study, row: int) -> BatchResult:
-    """Return the batch of a row that ends its process."""
-    return BatchResult(
-        start=row,
-        columns={name: np.full(1, np.nan) for name in study.result_columns},
-        failures=tuple(
-            Failure(row=row, controller=controller.name, error=DIED, retry=True)
-            for controller in study.controllers
-        ),
-    )

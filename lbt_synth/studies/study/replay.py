@@ -18,7 +18,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.studies.study.batch_result import Failure
-from lbt_synth.studies.study.config_keys import nested_copy
 from lbt_synth.studies.study.output_files import read_row
 from lbt_synth.studies.study.reference_evaluation import (
     design_for_sample,
@@ -151,7 +150,7 @@ def _write_files(study: Study, folder: Path, row: int, sample: Sample) -> tuple[
 
 def row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
     """Return the configuration of the real loop of a sample, and comments on it."""
-    content = nested_copy(sample.config.settings.model_dump(exclude_unset=True))
+    content = sample.config.settings.model_dump(exclude_unset=True)
     comments = {"": f"Row {row} of the study {study.source.name}: the real loop of the sample."}
     if sample.delay_error_frames != 0:
         content["loop"]["delay_frames"] = sample.hardware.delay_frames

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from lbt_synth.config import Config
 from lbt_synth.config.load import build_config, validate_sections
 from lbt_synth.config.schema import FileSection
-from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.errors import refuse_config
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.studies.study.config_keys import nested_copy, set_number
+from lbt_synth.studies.study.config_keys import set_number
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray
 
@@ -30,7 +30,7 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
     """Make the sample of a row of ``Study.values``."""
     base = study.config
     full = base.settings.model_dump()
-    content = nested_copy(base.settings.model_dump(exclude_unset=True))
+    content = base.settings.model_dump(exclude_unset=True)
     for parameter, value in zip(study.parameters, values, strict=True):
         for keys in parameter.places:
             set_number(content, keys, float(value), full=full)
@@ -39,15 +39,11 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
     delay_error = parameters.get(DELAY_ERROR, 0.0)
     factor = parameters.get(NOISE_FACTOR, 1.0)
     hardware, truth = config.hardware, config.truth
-    try:
+    with refuse_config(f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}"):
         if delay_error != 0:
             hardware = replace(hardware, delay_frames=hardware.delay_frames + delay_error)
         if factor != 1:
             truth = replace(truth, noise_nm=truth.noise_nm * factor)
-    except ProblemError as error:
-        raise ConfigError(
-            f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}: {error}"
-        ) from error
     return Sample(
         config=config,
         hardware=hardware,

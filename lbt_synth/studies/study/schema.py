@@ -6,55 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
-from lbt_synth.methods.section import Positive, Section
+from lbt_synth.methods.section import Section
+from lbt_synth.studies.study.distributions import ParameterSection
 
-KINDS = ("fixed", "uniform", "normal", "list")
 _CONTROLLER_NAME = r"^[A-Za-z][A-Za-z0-9_-]*$"
-
-
-class NormalSection(Section):
-    """A normal distribution, cut at low and high if they are given."""
-
-    mean: float
-    deviation: Positive
-    low: float | None = None
-    high: float | None = None
-
-    @model_validator(mode="after")
-    def _low_below_high(self) -> NormalSection:
-        if self.low is not None and self.high is not None and not self.low < self.high:
-            raise ValueError(f"low must be below high; got {self.low:g} and {self.high:g}")
-        return self
-
-
-class ParameterSection(Section):
-    """The distribution of one parameter; a bare number is fixed."""
-
-    fixed: float | None = None
-    uniform: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
-    normal: NormalSection | None = None
-    list_: Annotated[list[float], Field(min_length=1)] | None = Field(default=None, alias="list")
-    weights: Annotated[list[Positive], Field(min_length=1)] | None = None
-    also: list[str] = Field(default_factory=list)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _bare_number(cls, value: Any) -> Any:
-        return {"fixed": value} if isinstance(value, int | float) else value
-
-    @model_validator(mode="after")
-    def _one_distribution(self) -> ParameterSection:
-        given = [v is not None for v in (self.fixed, self.uniform, self.normal, self.list_)]
-        if sum(given) != 1:
-            raise ValueError(f"expected a number or exactly one of {', '.join(KINDS)}")
-        if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
-            low, high = self.uniform
-            raise ValueError(f"uniform: must be [low, high]; got [{low:g}, {high:g}]")
-        if self.weights is not None and (
-            self.list_ is None or len(self.weights) != len(self.list_)
-        ):
-            raise ValueError("weights goes with list, one for each of its values")
-        return self
 
 
 class ControllerSection(Section):

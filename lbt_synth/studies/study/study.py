@@ -13,7 +13,7 @@ from lbt_synth.config.samples import Keys
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.request import DesignRequest
-from lbt_synth.studies.study.distributions import Distribution
+from lbt_synth.studies.study.distributions import ParameterSection
 from lbt_synth.studies.study.sampling import unit_points
 from lbt_synth.studies.study.schema import StudySection
 from lbt_synth.validation import FloatArray, integer
@@ -25,13 +25,19 @@ EXACT_COLUMNS = ("strehl", "residual_nm", "turbulence_nm", "vibration_nm", "nois
 SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
 
 
+def result_columns(controller: str, evaluation: str) -> tuple[str, ...]:
+    """Return the names of the results of one controller."""
+    names = EXACT_COLUMNS if evaluation == "exact" else SIMULATED_COLUMNS
+    return tuple(f"{controller}.{name}" for name in names)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parameter:
     """A number that varies over the samples."""
 
     name: str  # path in the configuration, ``error.delay_frames`` or ``error.noise_factor``
     places: tuple[Keys, ...]  # keys of every place that it sets; none for the two errors
-    distribution: Distribution
+    distribution: ParameterSection
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,12 +104,8 @@ class Study:
     @property
     def result_columns(self) -> tuple[str, ...]:
         """Names of the results, controller by controller."""
-        exact = self.settings.evaluation == "exact"
-        return tuple(
-            f"{controller.name}.{name}"
-            for controller in self.controllers
-            for name in (EXACT_COLUMNS if exact else SIMULATED_COLUMNS)
-        )
+        evaluation = self.settings.evaluation
+        return tuple(c for each in self.controllers for c in result_columns(each.name, evaluation))
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 from support.studies import load_small_study
 
-from lbt_synth.studies.study.distributions import Listed
+from lbt_synth.studies.study.distributions import ParameterSection
 
 ONE = "truth.vibrations[0].rms_nm"
 
@@ -35,5 +35,6 @@ def test_distributions(tmp_path):
     found, counts = np.unique(values[:, 3], return_counts=True)
     assert found.tolist() == [10, 20, 30]
     assert counts.tolist() == [1024, 1024, 2048]
-    huge = Listed(values=(1.0, 2.0, 3.0), weights=(1e308, 1e308, 1e308))  # their sum is infinite
+    weights = [1e308, 1e308, 1e308]  # their sum is infinite
+    huge = ParameterSection.model_validate({"list": [1.0, 2.0, 3.0], "weights": weights})
     assert huge.quantile(np.array([0.1, 0.5, 0.9])).tolist() == [1, 2, 3]
