@@ -12,6 +12,7 @@ from .integrator import integrator_gain_limit as integrator_gain_limit
 from .integrator import model_integrator as model_integrator
 from .integrator import optimal_integrator as optimal_integrator
 from .kalman import kalman as kalman
+from .loop_shaping import ShapedDesign as ShapedDesign
 from .loop_shaping import shape as shape
 from .lqg import lqg as lqg
 from .lqg_design import LqgDesign as LqgDesign
@@ -24,4 +25,3 @@ from .result import FilterDesign as FilterDesign
 from .result import IntegratorDesign as IntegratorDesign
 from .result import SolverReport as SolverReport
 from .robust import robust as robust
-from .shaped_design import ShapedDesign as ShapedDesign

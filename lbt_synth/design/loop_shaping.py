@@ -1,27 +1,32 @@
-"""Loop shaping: the best controller for a specification, reduced to few states."""
+"""Loop shaping: the best controller for a specification, reduced to few states, certified."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
-from lbt_synth.design.result import UNCERTIFIED, SolverReport, with_certificate
-from lbt_synth.design.shaped_design import (
-    ShapedDesign,
-    controller_from_parameters,
-    require_separable,
-)
-from lbt_synth.design.shaping.basis import laguerre_basis
-from lbt_synth.design.shaping.channel import Channel
+import numpy as np
+from scipy.linalg import block_diag
+
+from lbt_synth.design.certificate import Certificate, Check, certify_loop, controller_difference
+from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
+from lbt_synth.design.shaping.channel import Channel, laguerre_basis
+from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
-from lbt_synth.design.shaping.single_mode_loop import mode_hardware
+from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, mode_hardware, mode_loop
 from lbt_synth.design.shaping.specification import Specification
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
+from lbt_synth.linear import Controller
+from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import integer, number, require_instance
+from lbt_synth.validation import ComplexArray, FloatArray, integer, number, require_instance
 
 _MOST_FUNCTIONS = 400
 _ROUNDED = 5e-7
+_SAME = 1e-9
+_RMS_TOLERANCE = 1e-6
+_TEST_HZ = (0.0, 0.003, 0.02, 0.11, 0.37)  # parts of the frame rate
 
 
 def shape(
@@ -148,3 +153,172 @@ def _specification_per_mode(
             f"give one specification, or one for each of {modes} modes; got {len(given)}."
         )
     return cast(tuple[Specification, ...], given)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class ShapedDesign(Design):
+    """A controller shaped in the closed loop, mode by mode.
+
+    Attributes
+    ----------
+    loop_hardware : LoopHardware
+        The loop.
+    specifications : tuple of Specification
+        One per mode.
+    parameters : tuple of Controller
+        Youla parameter of each mode, from its pseudo-open-loop measurement to its command.
+    objective_nm : tuple of float
+        Root of the objective of each mode that is claimed [nm].
+    long_objective_nm : tuple of float
+        The same of the long parameter, before it was reduced [nm].
+    long_functions : int
+        Functions of the long parameter.
+    """
+
+    loop_hardware: LoopHardware
+    specifications: tuple[Specification, ...]
+    parameters: tuple[Controller, ...]
+    objective_nm: tuple[float, ...]
+    long_objective_nm: tuple[float, ...]
+    long_functions: int
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the design is for."""
+        return self.loop_hardware
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles of the closed loop: those of the parameters, and the delays."""
+        return np.concatenate([p.to_statespace().poles for p in self.parameters])
+
+    @property
+    def states_per_mode(self) -> int:
+        """Largest number of states of one mode's controller, its past commands included."""
+        return max(loop.controller.n_states for loop in self._loops)
+
+    @property
+    def _loops(self) -> list[SingleModeLoop]:
+        return [mode_loop(self.loop_hardware, parameter) for parameter in self.parameters]
+
+    @property
+    def loss(self) -> float:
+        """Largest relative increase of a mode's objective by the reduction, of its root."""
+        pairs = zip(self.objective_nm, self.long_objective_nm, strict=True)
+        return max(short / long - 1 for short, long in pairs)
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether the parameters have fewer poles than the long one."""
+        return any(p.n_states < self.long_functions for p in self.parameters)
+
+    def demand_labels(self) -> tuple[tuple[int, str], ...]:
+        """Demands in words: mode, demand."""
+        return tuple(
+            (mode, demand.label)
+            for mode, spec in enumerate(self.specifications)
+            for demand in spec.demands
+        )
+
+    def __repr__(self) -> str:
+        """Return one line: what it is, not its matrices."""
+        return (
+            f"ShapedDesign(method={self.method!r}, modes={len(self.parameters)}, "
+            f"states_per_mode={self.states_per_mode}, objective_nm={self.objective_nm}, "
+            f"passed={self.certificate.passed})"
+        )
+
+    def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
+        """Residual of each term in the real loop: mode, what it is, [nm rms]."""
+        return tuple(
+            (mode, leaf.label, float(np.sqrt(leaf.measured_nm2(loop))))
+            for mode, (spec, loop) in enumerate(zip(self.specifications, self._loops, strict=True))
+            for leaf in leaves(spec.objective)
+        )
+
+    def recertify(self) -> Certificate:
+        """Compute the certificate again from the matrices."""
+        hardware, checks = self.loop_hardware, []
+        claims = list(zip(self.specifications, self.parameters, self.objective_nm, strict=True))
+        kinds = [(id(spec), id(parameter), claimed) for spec, parameter, claimed in claims]
+        for mode, claim in enumerate(claims):
+            if kinds.index(kinds[mode]) < mode:
+                continue
+            prefix = f"mode {mode + 1}: " if len(claims) > 1 else ""
+            checks += [replace(c, name=prefix + c.name) for c in _mode_checks(hardware, *claim)]
+        whole = controller_from_parameters(hardware, self.parameters)
+        difference = controller_difference(self.controller, whole)
+        checks += [
+            Check(
+                "controller against its parameters", difference, _SAME, "matrices assembled again"
+            ),
+            certify_loop(hardware, self.controller),
+        ]
+        if checks[-1].passed:
+            checks.append(self._decoupling_check())
+        return replace(UNCERTIFIED, checks=tuple(checks))
+
+    def _decoupling_check(self) -> Check:
+        """Check that the whole loop rejects what the loops of the single modes reject."""
+        f = np.array(_TEST_HZ) * self.loop_hardware.frame_rate_hz
+        whole = close_loop(self.loop_hardware, self.controller).sensitivity(f)
+        single = np.zeros_like(whole)
+        for mode, loop in enumerate(self._loops):
+            single[:, mode, mode] = loop.at(1.0).sensitivity(f)[:, 0, 0]
+        apart = float(np.max(np.abs(whole - single)))
+        how = f"sensitivity at {f.size} frequencies"
+        return Check("whole loop against its modes", apart, 1e-6, how)
+
+
+def _mode_checks(
+    hardware: LoopHardware, spec: Specification, parameter: Controller, objective_nm: float
+) -> list[Check]:
+    """Check the parameter of one mode: stable, its demands met, its objective as claimed."""
+    radius = parameter.to_statespace().spectral_radius
+    stable = Check("spectral radius of the parameter", radius, 1 - 1e-9, "eigenvalues")
+    if not stable.passed:
+        return [stable]
+    loop = mode_loop(hardware, parameter)
+    checks = spec.checks(loop)
+    try:
+        found = float(np.sqrt(spec.objective.measured_nm2(loop)))
+    except UnstableLoopError:
+        found = np.inf
+    name = "root of the objective, against the one claimed [nm]"
+    limit = objective_nm * (1 + _RMS_TOLERANCE)
+    return [stable, *checks, Check(name, found, limit, "closed loops in state space")]
+
+
+def require_separable(hardware: LoopHardware) -> None:
+    """Refuse a loop whose modes cannot be controlled one by one."""
+    n = hardware.modes
+    named = {"sensor_matrix": hardware.sensor, "influence_matrix": hardware.influence}
+    for name, response in named.items():
+        rank = np.linalg.matrix_rank(response)
+        if rank < n:
+            raise DimensionError(
+                f"{name} must have rank {n}, one for each mode, for a loop that is shaped mode by "
+                f"mode; got {response.shape} of rank {rank}."
+            )
+
+
+def controller_from_parameters(
+    hardware: LoopHardware, parameters: tuple[Controller, ...]
+) -> Controller:
+    """Join the Youla parameters of all modes in the controller of the whole loop."""
+    back = np.linalg.pinv(hardware.sensor)
+    A, B, C, D = (block_diag(*(getattr(p, name) for p in parameters)) for name in "ABCD")
+    whole = Controller(
+        A=A,
+        B=B @ back,
+        C=hardware.projector @ C,
+        D=hardware.projector @ D @ back,
+        dt_s=hardware.dt_s,
+    )
+    return youla_controller(hardware, whole)
+
+
+def noise_per_mode(hardware: LoopHardware, covariance: FloatArray) -> FloatArray:
+    """Return the deviation of each mode's noise, (n,), from the covariance of the measurements."""
+    back = np.linalg.pinv(hardware.sensor)
+    return np.asarray(np.sqrt(np.diag(back @ covariance @ back.T)))

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from lbt_synth.design.loop_shaping import ShapedDesign
 from lbt_synth.design.result import EstimatorDesign
-from lbt_synth.design.shaped_design import ShapedDesign
 from lbt_synth.design.shaping import ResidualVariance, VibrationBand
 from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.design.shaping.single_mode_loop import mode_hardware, mode_loop

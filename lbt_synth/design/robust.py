@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lbt_synth.design.loop_shaping import shape
-from lbt_synth.design.shaped_design import ShapedDesign, noise_per_mode
+from lbt_synth.design.loop_shaping import ShapedDesign, noise_per_mode, shape
 from lbt_synth.design.shaping.bounds import ModulusMargin
 from lbt_synth.design.shaping.objectives import ResidualVariance, Total, VibrationBand
 from lbt_synth.design.shaping.specification import Demand, Specification

@@ -16,8 +16,8 @@ from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:
+    from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.record import DesignRecord
-    from lbt_synth.design.shaped_design import ShapedDesign
     from lbt_synth.design.shaping.specification import Demand
     from lbt_synth.models import Spectrum
 
@@ -208,7 +208,7 @@ def _list_demands(
 def _list_command_bounds(
     inputs: DesignInputs, section: RobustSection, spectrum: Spectrum | None
 ) -> list[Demand]:
-    from lbt_synth.design.shaped_design import noise_per_mode
+    from lbt_synth.design.loop_shaping import noise_per_mode
     from lbt_synth.design.shaping import CommandRms
     from lbt_synth.models.spectra import spectrum_key
 
@@ -249,7 +249,7 @@ def _pack(design: ShapedDesign) -> DesignRecord:
 
 
 def _unpack(record: DesignRecord) -> ShapedDesign:
-    from lbt_synth.design.shaped_design import ShapedDesign
+    from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.shaping import Specification
     from lbt_synth.design.shaping.metadata import from_metadata
 

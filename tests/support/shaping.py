@@ -7,8 +7,7 @@ import functools
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping.basis import laguerre_basis
-from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.channel import Channel, laguerre_basis
 
 RATE = 800.0
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=RATE)

@@ -16,13 +16,14 @@ from lbt_synth.design.modal.closed_loops import (
     LoopBlock,
     block_variances,
     close_bank,
+    filter_phase,
+    phase_system,
     spectral_radii,
 )
 from lbt_synth.design.modal.filters import ModalFilters
 from lbt_synth.design.modal.mixed_controller import MixedController
 from lbt_synth.design.modal.plants import as_modal_turbulence, lines_per_mode, number_per_mode
 from lbt_synth.design.modal.reconstructor import name_modes
-from lbt_synth.design.modal.series import filter_phase, phase_system
 from lbt_synth.errors import (
     DimensionError,
     NonFiniteError,

@@ -62,31 +62,27 @@ def lines_per_mode(
         if i >= modes:
             raise ProblemError(f"a mode of vibrations must be from 0 to {modes - 1}; got {i}.")
         each = (given,) if isinstance(given, Vibration) else given
-        if not isinstance(each, list | tuple) or not all(
-            isinstance(line, Vibration) for line in each
-        ):
+        listed = isinstance(each, list | tuple)
+        if not listed or not all(isinstance(line, Vibration) for line in each):
             raise ProblemError(f"mode {i} must have a list of Vibration; got {given!r}.")
         lines[i] = tuple(each)
     return tuple(lines)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Disturbances:
-    """Total phase of some modes as linear systems: ``x+ = A x + B v``, ``phi_tot = row x``."""
+def disturbances(
+    turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Total phase of some modes as linear systems ``x+ = A x + B v``, ``phi_tot = row x``.
 
-    A: FloatArray  # (N, k, k); states: vibrations now and before, turbulence
-    B: FloatArray  # (N, k, p + 1), from white noise of unit variance
-    row: FloatArray  # (N, k), to the newest sample of the phase
-
-
-def disturbances(turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray) -> Disturbances:
-    """Return the systems of some modes, all of the size of the one with most vibrations."""
+    Return A (N, k, k), B (N, k, p + 1), from white noise of unit variance, and the rows (N, k) to
+    the newest sample. The states are vibrations now and before, and turbulence; all systems have
+    the size of the one with most vibrations.
+    """
     count, order = len(modes), turbulence.order
     p = max((len(lines[i]) for i in modes), default=0)
     size = 2 * p + order
     A, row = np.zeros((count, size, size)), np.zeros((count, size))
     B = np.zeros((count, size, p + 1))
-    now, before, tur = np.arange(p), np.arange(p, 2 * p), 2 * p
     each = [(i, j, line) for i, mode in enumerate(modes) for j, line in enumerate(lines[mode])]
     if each:
         i, j = np.array([place[:2] for place in each]).T
@@ -95,11 +91,11 @@ def disturbances(turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray) -
         coefficients, driving = sampled_lines(frequency, damping, rms, turbulence.frame_rate_hz)
         A[i, j, j], A[i, j, p + j] = coefficients.T
         B[i, j, j] = driving
-    A[:, before, now] = 1
-    A[:, tur:, tur:] = turbulence.companions[modes]
-    B[:, tur, p] = turbulence.driving_rms_nm[modes]
-    row[:, :p] = row[:, tur] = 1
-    return Disturbances(A=A, B=B, row=row)
+    A[:, p : 2 * p, :p] = np.eye(p)
+    A[:, 2 * p :, 2 * p :] = turbulence.companions[modes]
+    B[:, 2 * p, p] = turbulence.driving_rms_nm[modes]
+    row[:, :p] = row[:, 2 * p] = 1
+    return A, B, row
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,16 +147,16 @@ def plant_batches(
     batches = []
     for lines_each in np.unique(counts):
         modes = np.flatnonzero(counts == lines_each)
-        d = disturbances(turbulence, lines, modes)
-        count, k = d.row.shape
+        models, drives, row = disturbances(turbulence, lines, modes)
+        count, k = row.shape
         s = k + chain
         A, Q = np.zeros((2, count, s, s))
-        A[:, :k, :k], A[:, k, :k] = d.A, d.row
+        A[:, :k, :k], A[:, k, :k] = models, row
         A[:, k + 1 :, k : s - 1] = np.eye(chain - 1)
-        Q[:, :k, :k] = d.B @ transpose(d.B)
+        Q[:, :k, :k] = drives @ transpose(drives)
         C, L = np.zeros((2, count, 1, s))
         C[:, 0, -1] = sensor_gain[modes]
-        L[:, 0, :k], L[:, 0, k] = (1 - late) * d.row, late
+        L[:, 0, :k], L[:, 0, k] = (1 - late) * row, late
         R = noise_nm[modes, None, None] ** 2
         batches.append(PlantBatch(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
     return batches

@@ -5,7 +5,13 @@ With ``u = Q ybar`` and ``Q = sum c_i Phi_i``, at unit sensor gain::
     T = z^-1 M Q    (complementary sensitivity),    S = 1 - T
     residual = S phi - M Q w,    u = Q (z^-1 phi + w)
 
-M is the mirror's delay. At the sensor gain g all of it is divided by ``1 - (1 - g) T``.
+M is the delay of the mirror. At the sensor gain g all of it is divided by ``1 - (1 - g) T``.
+
+The functions Phi are orthonormal and have given poles: the states of a cascade of all-pass
+sections driven by one input span everything with the sections' poles (the Takenaka-Malmquist
+functions; B. Ninness, F. Gustafsson, IEEE Trans. Autom. Control 42, 515 (1997),
+doi:10.1109/9.566661). With all poles at zero they are the taps of an impulse response, with one
+repeated real pole the Laguerre functions.
 """
 
 from __future__ import annotations
@@ -13,10 +19,92 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import null_space, solve_discrete_lyapunov
 
-from lbt_synth.design.shaping.basis import Basis
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Basis:
+    """Orthonormal functions ``Phi(z) = z (z I - A)^-1 B``, ``A A' + B B' = I``."""
+
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n, 1)
+    dt_s: float
+
+    @property
+    def size(self) -> int:
+        """Number of functions."""
+        return len(self.A)
+
+    @property
+    def poles(self) -> ComplexArray:
+        """The poles, (n,)."""
+        return np.linalg.eigvals(self.A).astype(np.complex128)
+
+    def response(self, frequency_hz: FloatArray) -> ComplexArray:
+        """Responses of the functions, (f, n)."""
+        newest = StateSpace(A=self.A, B=self.B, C=self.A, D=self.B, dt_s=self.dt_s)
+        return newest.frequency_response(frequency_hz)[:, :, 0]
+
+    def parameter(self, coefficients: FloatArray) -> Controller:
+        """Return the filter ``sum of c_i Phi_i`` in new-state form."""
+        return Controller(
+            A=self.A, B=self.B, C=coefficients[None, :], D=np.zeros((1, 1)), dt_s=self.dt_s
+        )
+
+
+def orthonormal_basis(poles: ComplexArray, *, dt_s: float) -> Basis:
+    """Return the orthonormal functions with given poles, (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.design.shaping.channel import orthonormal_basis
+    >>> three = orthonormal_basis(np.array([0.5, 0.9 + 0.1j, 0.9 - 0.1j]), dt_s=1.0)
+    >>> bool(np.allclose(three.A @ three.A.T + three.B @ three.B.T, np.eye(3)))
+    True
+    """
+    given = np.atleast_1d(np.asarray(poles, dtype=np.complex128))
+    radius = float(np.max(np.abs(given)))
+    if not radius < 1:
+        raise ProblemError(
+            f"the poles of a basis must lie inside the unit circle; got a modulus of {radius:.9g}."
+        )
+    tiny = 1e-13
+    chosen = sorted((p for p in given if p.imag >= -tiny), key=abs)
+    A, B = np.zeros((0, 0)), np.zeros((0, 1))
+    C, D = np.zeros((1, 0)), np.ones((1, 1))  # of the all-pass so far
+    for pole in chosen:
+        a, b, c, d = _all_pass(pole if pole.imag > tiny else complex(pole.real))
+        corner = np.zeros((len(A), len(a)))
+        A = np.block([[A, corner], [b @ C, a]])
+        B = np.vstack([B, b @ D])
+        C, D = np.hstack([d @ C, c]), d @ D
+    if len(A) != given.size:
+        raise ProblemError("complex poles must come in conjugate pairs; one of them does not.")
+    return Basis(A=frozen_copy(A), B=frozen_copy(B), dt_s=dt_s)
+
+
+def laguerre_basis(size: int, pole: float, *, dt_s: float) -> Basis:
+    """Return Laguerre functions: one real pole, repeated; taps where it is zero."""
+    return orthonormal_basis(np.full(size, complex(pole)), dt_s=dt_s)
+
+
+def _all_pass(pole: complex) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """All-pass section of a real pole or of a conjugate pair: an orthogonal ``[A B; C D]``."""
+    if pole.imag == 0:
+        a, b = np.array([[pole.real]]), np.array([[np.sqrt((1 - pole.real) * (1 + pole.real))]])
+    else:
+        companion = np.array([[2 * pole.real, -(abs(pole) ** 2)], [1.0, 0.0]])
+        entry = np.array([[1.0], [0.0]])
+        root = np.linalg.cholesky(solve_discrete_lyapunov(companion, entry @ entry.T))
+        a, b = np.linalg.solve(root, companion @ root), np.linalg.solve(root, entry)
+    last = null_space(np.hstack([a, b])).T
+    return a, b, np.asarray(last[:, :-1]), np.asarray(last[:, -1:])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,8 +7,8 @@ import pytest
 from support.modal import HUM, LINE, RATE, single_plant, some_air
 
 import lbt_synth as lbt
-from lbt_synth.design.modal.certificate import batch_errors, modal_certificate
 from lbt_synth.design.modal.closed_loops import LoopBlock, LoopVariances
+from lbt_synth.design.modal.filters import batch_errors, modal_certificate
 from lbt_synth.design.modal.plants import plant_batches
 
 

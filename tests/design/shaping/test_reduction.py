@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lbt_synth.design.shaping.pole_fitting import WeightedResponse, fit_poles
+from lbt_synth.design.shaping.reduction import WeightedResponse, fit_poles
 
 
 def test_poles_of_a_response_are_found():

@@ -9,7 +9,7 @@ from support.shaping import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping.basis import laguerre_basis, orthonormal_basis
+from lbt_synth.design.shaping.channel import laguerre_basis, orthonormal_basis
 
 
 @settings(max_examples=30, deadline=None)
