@@ -12,7 +12,7 @@ from lbt_synth.cli.output import Facts, Report, TableText, fact_table
 from lbt_synth.cli.output_files import write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
-from lbt_synth.files.telemetry.native_layout import LAYERS
+from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.validation import FloatArray

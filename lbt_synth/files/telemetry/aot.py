@@ -11,13 +11,11 @@ from __future__ import annotations
 import io
 import json
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lbt_synth.errors import FileError, OutputError, TelemetryError
 from lbt_synth.files.telemetry.native_layout import check_taps
@@ -28,10 +26,11 @@ from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.fits import has_card
 from lbt_synth.validation import FloatArray
 
-_MakeImage: TypeAlias = Callable[..., Any]  # from a name and an array
-
 _OWN_CARD = "LBTSYNTH"  # one card with what the standard has no field for, JSON
-_OWN_FIELDS = ("seed", "name", "controller_name", "controller_digest", "metadata")
+_OWN_FIELDS = (
+    *("seed", "name", "controller_name", "controller_digest", "metadata"),
+    *("integrator_gains", "psf_pixel_mas"),
+)
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
 _RAD_PER_MAS = np.pi / 180 / 3600e3
 _FOREIGN = "that of another program: the AOT standard does not say which exposure a row is of"
@@ -78,30 +77,46 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
 
 def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     """Describe telemetry as an ``AOSystem`` of aotpy."""
-    obstruction = None
-    if seen.diameter_m is not None and seen.obstruction is not None:
-        obstruction = seen.diameter_m * seen.obstruction
+    diameter, ratio, m = seen.diameter_m, seen.obstruction, seen.commands.shape[1]
     telescope = aotpy.MainTelescope(
         "Telescope",
-        enclosing_diameter=seen.diameter_m,
-        inscribed_diameter=seen.diameter_m,
-        obstruction_diameter=obstruction,
+        enclosing_diameter=diameter,
+        inscribed_diameter=diameter,
+        obstruction_diameter=None if diameter is None or ratio is None else diameter * ratio,
     )
     star = aotpy.NaturalGuideStar("Guide star")
     clock = aotpy.Time("Frames", frame_numbers=list(map(float, range(seen.frames))))
     if seen.times_s is not None:
         clock.timestamps = seen.times_s.tolist()
-
-    def image(
-        name: str, data: npt.NDArray[Any] | None, unit: str = "", *, timed: bool = False
-    ) -> Any:
-        if data is None:
-            return None
-        stored = data.astype(np.float32 if timed and precision == "float32" else np.float64)
-        return aotpy.Image(name, stored, unit=unit or None, time=clock if timed else None)
-
-    sensor = _sensor(aotpy, seen, image, star)
-    m = seen.commands.shape[1]
+    units = _units(seen)  # of the series, which have a clock
+    images: dict[str, Any] = {}
+    for name, data in _arrays(seen).items():
+        text, timed = name.upper().replace("_", " "), name in units
+        images[name] = (
+            data
+            if data is None
+            else aotpy.Image(
+                text,
+                data.astype(precision if timed else np.float64),
+                unit=units.get(name) or None,
+                time=clock if timed else None,
+            )
+        )
+    sensor = aotpy.Pyramid(
+        "Pyramid",
+        source=star,
+        dimensions=seen.subaperture_axes,
+        n_valid_subapertures=seen.sensed.shape[1] // seen.subaperture_axes,
+        n_sides=4,
+        measurements=images.pop("measurements"),
+        optical_gain=images.pop("optical_gain"),
+    )
+    cameras, picture = [], images.pop("psf")
+    if picture is not None:
+        pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
+        detector = aotpy.Detector("Camera detector", pixel_intensities=picture, pixel_scale=pixel)
+        camera = aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))
+        cameras.append(camera)
     if m == 2:
         mirror = aotpy.TipTiltMirror("Mirror", telescope=telescope)
     else:
@@ -113,7 +128,7 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         time=clock,
         framerate=seen.frame_rate_hz,
         delay=seen.delay_frames,
-        **_loop_images(seen, image),
+        **images,
     )
     return aotpy.AOSystem(
         ao_mode="SCAO",
@@ -123,7 +138,7 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         + " Time filters: sum b_i z^i / sum a_i z^i, after the control matrix.",
         main_telescope=telescope,
         sources=[star],
-        scoring_cameras=_cameras(aotpy, seen, image),
+        scoring_cameras=cameras,
         wavefront_sensors=[sensor],
         wavefront_correctors=[mirror],
         loops=[loop],
@@ -131,69 +146,58 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     )
 
 
-def _sensor(aotpy: Any, seen: Telemetry, image: _MakeImage, star: Any) -> Any:
-    axes, subapertures = seen.subaperture_axes, seen.sensed.shape[1] // seen.subaperture_axes
-    unit = seen.measurement_unit if seen.slopes is None else seen.slope_unit
-    measured = seen.sensed.reshape(seen.frames, axes, subapertures)
-    gain = None if seen.sensor_gain is None else np.array([seen.sensor_gain])
-    return aotpy.Pyramid(
-        "Pyramid",
-        source=star,
-        dimensions=axes,
-        n_valid_subapertures=subapertures,
-        n_sides=4,
-        measurements=image("MEASUREMENTS", measured, unit, timed=True),
-        optical_gain=image("OPTICAL GAIN", gain),
-    )
-
-
-def _loop_images(seen: Telemetry, image: _MakeImage) -> dict[str, Any]:
-    """Series, matrices and time filters of a control loop, by aotpy's names."""
-    metres, unit = (1e-9, "m") if seen.command_unit == "nm" else (1.0, seen.command_unit)
-    axes, modal, matrix = seen.subaperture_axes, None, None
-    numerators, denominators, residual = None, None, None
-    if (filters := _filters(seen)) is not None:
-        matrix, numerators, denominators = filters.matrix, filters.numerators, filters.denominators
-        residual = metres * seen.measurements @ matrix.T
-    if seen.slopes is not None:
-        modal = seen.measurements
-        if matrix is not None:
-            matrix = None if seen.reconstructor is None else matrix @ seen.reconstructor
-    response = seen.interaction_matrix
-    if response is not None:  # (s, n) to (s_v, d, n)
-        response = response.reshape(axes, -1, response.shape[1]).transpose(1, 0, 2)
-    back = _split_by_subaperture(seen.reconstructor, axes)
+def _units(seen: Telemetry) -> dict[str, str]:
+    """Return the unit of each series, by aotpy's names."""
+    unit = "m" if seen.command_unit == "nm" else seen.command_unit
     return {
-        "commands": image("COMMANDS", metres * seen.commands, unit, timed=True),
-        "time_filter_num": image("TIME FILTER NUM", numerators),
-        "time_filter_den": image("TIME FILTER DEN", denominators),
-        "modes": image("MODES", seen.mode_maps),
-        "modal_coefficients": image("MODAL COEFFICIENTS", modal, seen.measurement_unit, timed=True),
-        "control_matrix": image("CONTROL MATRIX", _split_by_subaperture(matrix, axes)),
-        "residual_commands": image("RESIDUAL COMMANDS", residual, unit, timed=True),
-        "measurements_to_modes": image("MEASUREMENTS TO MODES", back),
-        "modes_to_measurements": image("MODES TO MEASUREMENTS", response),
-        "commands_to_modes": image("COMMANDS TO MODES", seen.influence_matrix),
+        "commands": unit,
+        "residual_commands": unit,
+        "measurements": seen.measurement_unit if seen.slopes is None else seen.slope_unit,
+        "modal_coefficients": seen.measurement_unit,
     }
 
 
-def _cameras(aotpy: Any, seen: Telemetry, image: _MakeImage) -> list[Any]:
-    """Return the camera that took the image, if there is one."""
-    if seen.psf is None:
-        return []
-    pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
-    detector = aotpy.Detector(
-        "Camera detector", pixel_intensities=image("PSF", seen.psf[None]), pixel_scale=pixel
+def _arrays(seen: Telemetry) -> dict[str, FloatArray | None]:
+    """Return series, matrices, images and time filters, by aotpy's names."""
+    out: dict[str, FloatArray | None] = dict.fromkeys(
+        ("residual_commands", "control_matrix", "time_filter_num", "time_filter_den")
     )
-    return [aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))]
+    metres, axes = 1e-9 if seen.command_unit == "nm" else 1.0, seen.subaperture_axes
+    back, response = seen.reconstructor, seen.interaction_matrix
+    if (filters := _filters(seen)) is not None:
+        out["residual_commands"] = metres * seen.measurements @ filters.matrix.T
+        out["time_filter_num"], out["time_filter_den"] = filters.numerators, filters.denominators
+        if seen.slopes is None:
+            out["control_matrix"] = _by_subaperture(filters.matrix, axes)
+        elif back is not None:
+            out["control_matrix"] = _by_subaperture(filters.matrix @ back, axes)
+    return out | {
+        "commands": metres * seen.commands,
+        "measurements": _by_subaperture(seen.sensed, axes),
+        "modal_coefficients": None if seen.slopes is None else seen.measurements,
+        "optical_gain": None if seen.sensor_gain is None else np.array([seen.sensor_gain]),
+        "modes": seen.mode_maps,
+        "measurements_to_modes": None if back is None else _by_subaperture(back, axes),
+        "modes_to_measurements": (  # (s_v, d, n)
+            None if response is None else _by_subaperture(response.T, axes).transpose(2, 1, 0)
+        ),
+        "commands_to_modes": seen.influence_matrix,
+        "psf": None if seen.psf is None else seen.psf[None],
+    }
+
+
+def _by_subaperture(matrix: FloatArray, axes: int) -> FloatArray:
+    """Reshape (rows, s) to (rows, d, s_v), d values from each of s_v subapertures."""
+    return matrix.reshape(len(matrix), axes, -1)
 
 
 def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     """Cards of the primary header, for what the tables have no place for."""
     own = {name: getattr(seen, name) for name in _OWN_FIELDS} | {"metadata": dict(seen.metadata)}
-    gains = seen.integrator_gains
-    own["integrator_gains"] = None if gains is None else gains.tolist()
-    own["psf_pixel_mas"] = seen.psf_pixel_mas if seen.psf is None else None
+    if seen.integrator_gains is not None:
+        own["integrator_gains"] = seen.integrator_gains.tolist()
+    if seen.psf is not None:  # beside the image
+        own["psf_pixel_mas"] = None
     if seen.mirror is not None and seen.mirror_taps is not None:
         # the standard does not say what its TFZ_NUM and TFZ_DEN of a corrector act on, nor with
         # which delay
@@ -223,14 +227,8 @@ def _filters(seen: Telemetry) -> TimeFilters | None:
     )
 
 
-def _split_by_subaperture(matrix: FloatArray | None, axes: int) -> FloatArray | None:
-    """Reshape (rows, s) to (rows, d, s_v), d values from each of s_v subapertures."""
-    return None if matrix is None else matrix.reshape(len(matrix), axes, -1)
-
-
 def _wavelength_m(seen: Telemetry) -> float | None:
-    wavelength = seen.imaging_wavelength_um
-    return None if wavelength is None else wavelength * 1e-6
+    return None if seen.imaging_wavelength_um is None else seen.imaging_wavelength_um * 1e-6
 
 
 def _to_ascii(text: str) -> str:
@@ -267,7 +265,7 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
         raise TelemetryError(
             f"{source} has no control loop with commands and measurements.", path=source
         )
-    fields = _series_fields(loops[0]) | _system_fields(system)
+    fields = _loop_fields(loops[0]) | _system_fields(system)
     if len(loops) > 1:
         fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
     taps = fields.pop("mirror_taps", None)
@@ -281,9 +279,7 @@ def _system_fields(system: Any) -> dict[str, Any]:
     for datum in system.metadata:
         if datum.key == _OWN_CARD:
             own = json.loads(datum.value)
-            facts |= {
-                name: own[name] for name in (*_OWN_FIELDS, "integrator_gains", "psf_pixel_mas")
-            }
+            facts |= {name: own[name] for name in _OWN_FIELDS}
             if "mirror" in own:
                 facts["mirror"] = PositionLoop(**own["mirror"])
                 facts["mirror_taps"] = own["mirror_taps"]
@@ -295,76 +291,64 @@ def _system_fields(system: Any) -> dict[str, Any]:
     wavelength = system.strehl_wavelength
     for camera in system.scoring_cameras[:1]:
         wavelength = camera.wavelength if wavelength is None else wavelength
-        detector = camera.detector
-        if detector is not None and detector.pixel_intensities is not None:
-            frames = np.asarray(detector.pixel_intensities.data, dtype=np.float64)
+        frames = _data(getattr(camera.detector, "pixel_intensities", None))
+        if frames is not None:
             facts["psf"] = frames.mean(axis=0) if frames.ndim == 3 else frames
-            if detector.pixel_scale is not None:
-                facts["psf_pixel_mas"] = detector.pixel_scale / _RAD_PER_MAS
+            if camera.detector.pixel_scale is not None:
+                facts["psf_pixel_mas"] = camera.detector.pixel_scale / _RAD_PER_MAS
     facts["imaging_wavelength_um"] = None if wavelength is None else wavelength * 1e6
     return facts
 
 
-def _series_fields(loop: Any) -> dict[str, Any]:
+def _loop_fields(loop: Any) -> dict[str, Any]:
     """Fields that belong to a loop and its sensor."""
-    sensor = loop.input_sensor
-    measured, unit = _image_data(sensor.measurements), sensor.measurements.unit
-    commands, command_unit = _to_nm(_image_data(loop.commands), loop.commands.unit or "m")
+    sensor, modal, clock = loop.input_sensor, loop.modal_coefficients, loop.time
+    commands, command_unit = _in_nm(loop.commands, "m")
+    gain, response = _data(sensor.optical_gain), _data(loop.modes_to_measurements)
+    sensed, back = _data(sensor.measurements), _data(loop.measurements_to_modes)
     fields: dict[str, Any] = {
         "commands": commands,
         "command_unit": command_unit,
         "delay_frames": loop.delay,
-        "subaperture_axes": measured.shape[1] if measured.ndim == 3 else 1,
-        "influence_matrix": _image_data(loop.commands_to_modes),
-        "mode_maps": _image_data(loop.modes),
+        "subaperture_axes": sensed.shape[1] if sensed.ndim == 3 else 1,
+        "influence_matrix": _data(loop.commands_to_modes),
+        "mode_maps": _data(loop.modes),
+        "interaction_matrix": response,
+        "reconstructor": None if back is None else back.reshape(len(back), -1),
+        "sensor_gain": None if gain is None else float(np.mean(gain)),
+        "times_s": getattr(clock or loop.commands.time, "timestamps", None) or None,
     }
-    flat = measured.reshape(len(measured), -1)
-    if loop.modal_coefficients is not None:
-        modal = loop.modal_coefficients
-        fields["slopes"], fields["slope_unit"] = flat, unit or ""
-        fields["measurements"], fields["measurement_unit"] = _to_nm(
-            _image_data(modal), modal.unit or ""
-        )
-    else:
-        fields["measurements"], fields["measurement_unit"] = _to_nm(flat, unit or "")
-    back = _image_data(loop.measurements_to_modes)
-    fields["reconstructor"] = None if back is None else back.reshape(len(back), -1)
-    response = _image_data(loop.modes_to_measurements)
-    if response is not None:
-        if response.ndim == 3:  # (s_v, d, n) to (d s_v, n)
-            response = response.transpose(1, 0, 2).reshape(-1, response.shape[2])
-        fields["interaction_matrix"] = response
-    if sensor.optical_gain is not None:
-        fields["sensor_gain"] = float(np.mean(_image_data(sensor.optical_gain)))
-    clock = loop.time or loop.commands.time
-    if clock is not None and clock.timestamps:
-        fields["times_s"] = clock.timestamps
-    fields["frame_rate_hz"] = _frame_rate(loop, fields.get("times_s"))
-    if loop.time_filter_num is not None and loop.time_filter_den is not None:
-        pair = (np.atleast_2d(_image_data(f)) for f in (loop.time_filter_num, loop.time_filter_den))
-        gains = integrator_gains(*pair)
-        m = commands.shape[-1]
-        if gains is not None and len(gains) in (1, m):  # one row serves all
-            fields["integrator_gains"] = np.broadcast_to(gains, (m,))
+    fields["frame_rate_hz"] = _frame_rate(loop, fields["times_s"])
+    y, fields["measurement_unit"] = _in_nm(sensor.measurements if modal is None else modal)
+    fields["measurements"] = y.reshape(len(y), -1) if modal is None else y
+    if modal is not None:
+        fields["slopes"] = sensed.reshape(len(sensed), -1)
+        fields["slope_unit"] = sensor.measurements.unit or ""
+    if response is not None and response.ndim == 3:  # (s_v, d, n) to (d s_v, n)
+        fields["interaction_matrix"] = response.transpose(1, 0, 2).reshape(-1, response.shape[2])
+    filters = [_data(loop.time_filter_num), _data(loop.time_filter_den)]
+    if all(each is not None for each in filters):
+        gains = integrator_gains(*map(np.atleast_2d, filters))
+        if gains is not None and len(gains) in (1, commands.shape[-1]):  # one row serves all
+            fields["integrator_gains"] = np.broadcast_to(gains, commands.shape[-1:])
     return fields
 
 
 def _frame_rate(loop: Any, times: list[float] | None) -> float:
-    if loop.framerate is not None:
-        return float(loop.framerate)
-    detector = loop.input_sensor.detector
-    if detector is not None and detector.frame_rate is not None:
-        return float(detector.frame_rate)
+    for rate in (loop.framerate, getattr(loop.input_sensor.detector, "frame_rate", None)):
+        if rate is not None:
+            return float(rate)
     if times is not None and len(times) > 1 and times[-1] > times[0]:
         return float((len(times) - 1) / (times[-1] - times[0]))
     raise KeyError("the frame rate")
 
 
-def _image_data(image: Any) -> Any:
+def _data(image: Any) -> Any:
     return None if image is None else np.asarray(image.data, dtype=np.float64)
 
 
-def _to_nm(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
-    """Return lengths in nm, and other values in their own unit."""
+def _in_nm(image: Any, unit: str = "") -> tuple[FloatArray, str]:
+    """Return lengths in nm, and other values in their own unit, or in a default one."""
+    unit = image.unit or unit
     factor = _NM.get(unit)
-    return (values, unit) if factor is None else (factor * values, "nm")
+    return (_data(image), unit) if factor is None else (factor * _data(image), "nm")

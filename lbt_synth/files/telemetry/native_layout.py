@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 import lbt_synth
 from lbt_synth.errors import ProblemError
+from lbt_synth.files.telemetry.fields import FACTS, LAYERS
 from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.linear import Controller
 from lbt_synth.models import PositionLoop
@@ -21,76 +22,7 @@ SCHEMA_VERSION = 1
 PRECISIONS = ("float64", "float32")
 Arrays = dict[str, npt.NDArray[Any]]
 Meta = dict[str, Any]
-
-
-class Layer(NamedTuple):
-    """One array of the file: its field, its axes in numpy's order, its unit and its meaning.
-
-    A unit that begins with an underscore is read from the field of that name.
-    """
-
-    field: str
-    axes: str
-    unit: str
-    meaning: str
-
-    @property
-    def is_series(self) -> bool:
-        """Whether it has one row per frame."""
-        return self.axes.startswith("frame")
-
-    def unit_in(self, telemetry: Telemetry) -> str:
-        """Return the unit that it has in a telemetry."""
-        return str(getattr(telemetry, self.unit[1:])) if self.unit[:1] == "_" else self.unit
-
-
-_TAPS = "c: phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...)"
-_MEASURED = "y(k), of the exposure of frame k-1"
-LAYERS = {
-    "COMMANDS": Layer("commands", "frame, command", "_command_unit", "u(k)"),
-    "MEASURE": Layer("measurements", "frame, measurement", "_measurement_unit", _MEASURED),
-    "RESIDUAL": Layer("residual_nm", "frame, mode", "nm", "phi_res(k), corrected phase"),
-    "TOTAL": Layer("total_nm", "frame, mode", "nm", "phi_tot(k), before correction"),
-    "SLOPES": Layer("slopes", "frame, slope", "_slope_unit", "what the sensor gave"),
-    "TIMES": Layer("times_s", "frame", "s", "time of each frame"),
-    "INTERACT": Layer("interaction_matrix", "sensed, mode", "", "S"),
-    "RECONST": Layer("reconstructor", "mode, slope", "", "slopes to modes"),
-    "INFLUENC": Layer("influence_matrix", "mode, command", "", "N"),
-    "MODES": Layer("mode_maps", "mode, row, column", "", "modes, of rms 1"),
-    "PSF": Layer("psf", "row, column", "", "image of the camera"),
-    "INTGAINS": Layer("integrator_gains", "command", "", "integrator gains"),
-    "MIRROR_TAPS": Layer("mirror_taps", "age", "", _TAPS),
-}
 _SAME_TAPS = 1e-9  # largest difference between the taps of a file and those of its mirror
-_FACTS = (
-    "frame_rate_hz",
-    "delay_frames",
-    "sensor_gain",
-    "strehl",
-    "imaging_wavelength_um",
-    "psf_pixel_mas",
-    "diameter_m",
-    "obstruction",
-    "seed",
-    "subaperture_axes",
-    "name",
-    "command_unit",
-    "measurement_unit",
-    "slope_unit",
-    "controller_name",
-    "controller_digest",
-)
-_CARDS = {
-    "RATE_HZ": ("frame_rate_hz", "[Hz] frame rate"),
-    "DELAY": ("delay_frames", "[frames] total delay"),
-    "SENSGAIN": ("sensor_gain", "sensor gain over the interaction matrix"),
-    "STREHL": ("strehl", "Strehl ratio"),
-    "WAVELEN": ("imaging_wavelength_um", "[um] of the image and the Strehl ratio"),
-    "PSFPIX": ("psf_pixel_mas", "[mas] pixel of the image"),
-    "DIAMETER": ("diameter_m", "[m] telescope"),
-    "OBSTRUCT": ("obstruction", "central obstruction over the diameter"),
-    "SEED": ("seed", "of the simulation"),
-}
 _LARGEST_CARD = 2**63 - 1
 
 
@@ -107,7 +39,7 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
         "schema_version": SCHEMA_VERSION,
         "library_version": lbt_synth.__version__,
         "convention": telemetry.convention,
-        **{name: getattr(telemetry, name) for name in _FACTS},
+        **{name: getattr(telemetry, name) for name in FACTS},
         "metadata": dict(telemetry.metadata),
     }
     if (k := telemetry.controller) is not None:
@@ -146,7 +78,7 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
     taps = fields.pop("mirror_taps", None)
     if "mirror" in meta:  # a mirror that settles at once is not in the file
         fields["mirror"] = PositionLoop(**meta["mirror"])
-    fields |= {name: meta[name] for name in _FACTS}
+    fields |= {name: meta[name] for name in FACTS}
     return check_taps(Telemetry(**fields, metadata=dict(meta["metadata"])), taps)
 
 
@@ -170,10 +102,11 @@ def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]
         "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
         "LBTTELEM": (SCHEMA_VERSION, "version of the lbt_synth telemetry layout"),
     }
-    for key, (name, comment) in _CARDS.items():
+    for name, fact in FACTS.items():
         value = getattr(telemetry, name)
-        if value is not None and not (isinstance(value, int) and value > _LARGEST_CARD):
-            cards[key] = (value, comment)
+        too_large = isinstance(value, int) and value > _LARGEST_CARD
+        if fact.card and value is not None and not too_large:
+            cards[fact.card] = (value, fact.comment)
     cards["TIMING"] = (telemetry.convention, "")
     cards["SHA256"] = (meta["digest"], "")
     return cards

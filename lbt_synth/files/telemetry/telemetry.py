@@ -3,50 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import Any, TypeAlias
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.files.telemetry.conventions import CONVENTION, MOVING_CONVENTION
+from lbt_synth.files.telemetry.fields import ARRAYS, FACTS, Scalar, check_metadata
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
-from lbt_synth.validation import (
-    FloatArray,
-    frozen_copy,
-    integer,
-    matrix,
-    number,
-    real_array,
-    require_instance,
-    set_fields,
-)
+from lbt_synth.validation import FloatArray, frozen_copy, real_array, require_instance, set_fields
 
-Scalar: TypeAlias = str | float | int | bool
-
-_BOUNDED: dict[str, dict[str, Any]] = {
-    "delay_frames": {"at_least": 0, "at_most": 1000},
-    "psf_pixel_mas": {"above": 0},
-    "imaging_wavelength_um": {"above": 0},
-    "strehl": {"at_least": 0, "at_most": 1},
-    "sensor_gain": {"above": 0},
-    "diameter_m": {"above": 0},
-    "obstruction": {"at_least": 0, "below": 1},
-}
-_MODE_AXES = {
-    "residual_nm": 1,
-    "total_nm": 1,
-    "interaction_matrix": 1,
-    "reconstructor": 0,
-    "influence_matrix": 0,
-    "mode_maps": 0,
-}
-_UNITS = ("command_unit", "measurement_unit", "slope_unit")
-_LENGTHS = ("pm", "um", "mm", "m")
-_LONGEST_UNIT = 24
+_REQUIRED = ("commands", "measurements")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -177,144 +146,69 @@ class Telemetry:
     metadata: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        set_fields(self, frame_rate_hz=number(self.frame_rate_hz, "frame_rate_hz", above=0))
-        for name, value in self._given(_BOUNDED).items():
-            set_fields(self, **{name: number(value, name, **_BOUNDED[name])})
-        if self.seed is not None:
-            set_fields(self, seed=integer(self.seed, "seed", at_least=0))
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if each.name in FACTS and (value is not None or each.default is not None):
+                set_fields(self, **{each.name: FACTS[each.name].check(value, each.name)})
+        set_fields(self, metadata=check_metadata(self.metadata))
+        self._check_arrays()
         if self.mirror is not None:
             require_instance(self.mirror, PositionLoop)
             if self.delay_frames is None:
                 raise ProblemError("telemetry of a mirror with dynamics needs delay_frames.")
             _ = self.mirror_taps  # what does not fit is refused
-        self._check_series()
-        self._check_matrices()
-        self._check_words()
-        self._check_controller()
+        if self.controller is not None:
+            self._check_controller(self.controller)
 
-    def _given(self, names: Iterable[str]) -> dict[str, Any]:
-        """Return those of some fields that are set."""
-        return {name: value for name in names if (value := getattr(self, name)) is not None}
-
-    def _check_series(self) -> None:
-        commands = matrix(self.commands, "commands")
-        if commands.size == 0:
-            raise DimensionError(
-                f"commands must have a frame and a command at least; got {commands.shape}."
-            )
-        set_fields(self, commands=commands)
-        rows = (len(commands), f"to match commands {commands.shape}")
-        others = self._given(("residual_nm", "total_nm", "slopes"))
-        for name, value in {"measurements": self.measurements, **others}.items():
-            series = matrix(value, name, rows=rows)
-            if series.shape[1] == 0:
-                raise DimensionError(f"{name} must have a column at least; got {series.shape}.")
-            set_fields(self, **{name: series})
-        if self.times_s is not None:
-            times = real_array(self.times_s, "times_s")
-            if times.shape != (self.frames,):
+    def _check_arrays(self) -> None:
+        """Refuse arrays of other sizes than their axes have in the arrays before them."""
+        same = {"sensed": "measurement", "slope": "measurement"}
+        if self.slopes is not None:
+            same = {"sensed": "slope", "measurement": "mode"}
+        sizes: dict[str, tuple[int, str]] = {}  # of each axis, and the field that gave it
+        for layer in ARRAYS:
+            if (value := getattr(self, layer.field)) is None and layer.field not in _REQUIRED:
+                continue
+            array, axes = real_array(value, layer.field), layer.axes.split(", ")
+            if array.ndim == 0 and len(axes) == 2:
+                array = frozen_copy(array.reshape(1, 1))
+            if array.ndim != len(axes) or array.size == 0:
                 raise DimensionError(
-                    f"times_s must have shape ({self.frames},) to match commands "
-                    f"{commands.shape}; got {times.shape}."
+                    f"{layer.field} must be {len(axes)}-D ({layer.axes}) and not empty; got shape "
+                    f"{array.shape}."
                 )
-            if np.any(np.diff(times) <= 0):
-                raise ProblemError("times_s must rise from frame to frame.")
-            set_fields(self, times_s=times)
-        axes = integer(self.subaperture_axes, "subaperture_axes", at_least=1)
-        if self.sensed.shape[1] % axes:
+            for axis, size in zip(axes, array.shape, strict=True):
+                if axis in ("row", "column"):  # each image has its own
+                    continue
+                word = same.get(axis, axis)
+                needed, giver = sizes.setdefault(word, (size, layer.field))
+                if size != needed:
+                    words = f"{needed} {word}{'' if needed == 1 else 's'} to match {giver}"
+                    raise DimensionError(
+                        f"{layer.field} must have {words}; got shape {array.shape}."
+                    )
+            set_fields(self, **{layer.field: array})
+        if self.times_s is not None and np.any(np.diff(self.times_s) <= 0):
+            raise ProblemError("times_s must rise from frame to frame.")
+        if self.sensed.shape[1] % self.subaperture_axes:
             raise DimensionError(
                 f"subaperture_axes must divide the {self.sensed.shape[1]} values that the sensor "
-                f"gives; got {axes}."
+                f"gives; got {self.subaperture_axes}."
             )
-        set_fields(self, subaperture_axes=axes)
 
-    def _check_matrices(self) -> None:
-        s, m = self.sensed.shape[1], self.commands.shape[1]
-        sensed = (s, "to match what the sensor gives")
-        commanded = (m, f"to match commands {self.commands.shape}")
-        sizes: dict[str, dict[str, Any]] = {
-            "interaction_matrix": {"rows": sensed},
-            "reconstructor": {"cols": sensed},
-            "influence_matrix": {"cols": commanded},
-        }
-        for name, value in self._given(sizes).items():
-            set_fields(self, **{name: matrix(value, name, **sizes[name])})
-        dimensions = {"mode_maps": 3, "psf": 2}
-        for name, value in self._given(dimensions).items():
-            image = real_array(value, name)
-            if image.ndim != dimensions[name] or image.size == 0:
-                raise DimensionError(
-                    f"{name} must be {dimensions[name]}-D and not empty; got shape {image.shape}."
-                )
-            set_fields(self, **{name: image})
-        counts = self._mode_counts()
-        if len(set(counts.values())) > 1:
-            found = ", ".join(f"{count} in {name}" for name, count in counts.items())
-            raise DimensionError(f"the number of modes must be the same everywhere; got {found}.")
-        if 0 in counts.values():
-            raise DimensionError("there must be one mode at least; got none.")
-
-    def _mode_counts(self) -> dict[str, int]:
-        """Return the number of modes according to each field that has it."""
-        counts = {
-            name: int(array.shape[_MODE_AXES[name]])
-            for name, array in self._given(_MODE_AXES).items()
-        }
-        if self.slopes is not None:
-            counts["measurements, of which there are slopes"] = int(self.measurements.shape[1])
-        return counts
-
-    def _check_words(self) -> None:
-        for name in _UNITS:
-            unit = getattr(self, name)
-            if (
-                not isinstance(unit, str)
-                or not (unit.isascii() and (unit.isprintable() and unit.strip() == unit))
-                or len(unit) > _LONGEST_UNIT
-                or "'" in unit  # a FITS card does not keep it in every place
-            ):
-                raise ProblemError(
-                    f"{name} must be a word of at most {_LONGEST_UNIT} ASCII signs without a "
-                    f"quote; got {unit!r}."
-                )
-            if name != "slope_unit" and unit in _LENGTHS:
-                raise ProblemError(f"{name} must be nm for lengths; got {unit!r}. Convert them.")
-        if not self.command_unit:
-            raise ProblemError("command_unit must not be empty; write 1 for pure numbers.")
-        for name in ("name", "controller_name", "controller_digest"):
-            text = getattr(self, name)
-            if not isinstance(text, str) and (name == "name" or text is not None):
-                raise ProblemError(f"{name} must be a text; got {text!r}.")
-        if not isinstance(self.metadata, Mapping):
-            raise ProblemError(f"metadata must be a mapping; got {type(self.metadata).__name__}.")
-        checked = {
-            _check_key(key): _check_scalar(value, key) for key, value in self.metadata.items()
-        }
-        set_fields(self, metadata=MappingProxyType(checked))
-
-    def _check_controller(self) -> None:
+    def _check_controller(self, controller: Controller) -> None:
+        if not isinstance(controller, Controller):
+            raise ProblemError(f"controller must be a Controller; got {type(controller).__name__}.")
         m, q = self.commands.shape[1], self.measurements.shape[1]
-        if self.integrator_gains is not None:
-            gains = real_array(self.integrator_gains, "integrator_gains")
-            if gains.shape != (m,):
-                raise DimensionError(
-                    f"integrator_gains must have shape ({m},), one per command; got {gains.shape}."
-                )
-            set_fields(self, integrator_gains=gains)
-        k = self.controller
-        if k is None:
-            return
-        if not isinstance(k, Controller):
-            raise ProblemError(f"controller must be a Controller; got {type(k).__name__}.")
-        if k.D.shape != (m, q):
+        if controller.D.shape != (m, q):
             raise DimensionError(
-                f"controller must map {q} measurements to {m} commands; got {k.D.shape[1]} to "
-                f"{k.D.shape[0]}."
+                f"controller must map {q} measurements to {m} commands; got "
+                f"{controller.D.shape[1]} to {controller.D.shape[0]}."
             )
-        if not math.isclose(k.dt_s * self.frame_rate_hz, 1, rel_tol=1e-9):
+        if not math.isclose(controller.dt_s * self.frame_rate_hz, 1, rel_tol=1e-9):
             raise ProblemError(
                 f"controller must run at {self.frame_rate_hz:.9g} Hz; got one for "
-                f"{1 / k.dt_s:.9g} Hz."
+                f"{1 / controller.dt_s:.9g} Hz."
             )
 
     @property
@@ -325,7 +219,11 @@ class Telemetry:
     @property
     def modes(self) -> int:
         """Number of modes n; that of the measurements, where no field gives it."""
-        return next(iter(self._mode_counts().values()), int(self.measurements.shape[1]))
+        for layer in ARRAYS:
+            array, axes = getattr(self, layer.field), layer.axes.split(", ")
+            if array is not None and "mode" in axes:
+                return int(array.shape[axes.index("mode")])
+        return int(self.measurements.shape[1])
 
     @property
     def sensed(self) -> FloatArray:
@@ -378,21 +276,3 @@ class Telemetry:
             influence_matrix=np.eye(n) if influence is None else influence,
             mirror=self.mirror,
         )
-
-
-def _check_key(key: Any) -> str:
-    if not isinstance(key, str) or not key:
-        raise ProblemError(f"the keys of metadata must be words; got {key!r}.")
-    return key
-
-
-def _check_scalar(value: Any, key: Any) -> Scalar:
-    out = value.item() if isinstance(value, np.generic) else value
-    if not isinstance(out, str | float | int | bool):
-        raise ProblemError(
-            f"metadata must hold texts, numbers and truth values; got {type(value).__name__} for "
-            f"{key!r}."
-        )
-    if isinstance(out, float) and not math.isfinite(out):
-        raise NonFiniteError(f"metadata must be finite; got {out} for {key!r}.")
-    return out

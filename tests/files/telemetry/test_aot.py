@@ -334,7 +334,7 @@ def still(system):
         (drop("commands"), "has no control loop with commands and measurements"),
         (no_clock, "the frame rate is missing"),
         (with_nan, "commands must be finite"),
-        (short, "measurements must have 2 rows to match commands"),
+        (short, "measurements must have 2 frames to match commands"),
         (still, "the frame rate is missing"),
         (lambda s: s.metadata.append(aotpy.Metadatum("LBTSYNTH", "{")), "inconsistent"),
         (lambda s: s.metadata.append(aotpy.Metadatum("LBTSYNTH", "{}")), "seed is missing"),

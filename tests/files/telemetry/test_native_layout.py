@@ -10,7 +10,7 @@ from support.telemetry import full
 import lbt_synth as lbt
 from lbt_synth.files.telemetry import native_layout
 from lbt_synth.files.telemetry.conventions import CONVENTION
-from lbt_synth.files.telemetry.native_layout import LAYERS
+from lbt_synth.files.telemetry.fields import LAYERS
 
 
 def test_the_fits_file_explains_itself(tmp_path):

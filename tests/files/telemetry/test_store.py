@@ -16,7 +16,7 @@ from support.telemetry import ENDINGS, SHELL, full, same, telemetries
 import lbt_synth as lbt
 from lbt_synth.files.telemetry import native_layout
 from lbt_synth.files.telemetry.aot import lost_fields
-from lbt_synth.files.telemetry.native_layout import LAYERS
+from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.storage import array_file as archive
 
 
@@ -223,7 +223,7 @@ def edited(tmp_path, change, *, resign=True):
         (lambda a, m: a.pop("CTRL_B"), True, "inconsistent: CTRL_B is missing"),
         (lambda a, m: m.pop("seed"), True, "inconsistent: seed is missing"),
         (lambda a, m: a.update(EXTRA=np.ones(2)), True, "arrays that no telemetry has: EXTRA"),
-        (lambda a, m: a.update(MEASURE=np.ones((2, 2))), True, "measurements must have 6 rows"),
+        (lambda a, m: a.update(MEASURE=np.ones((2, 2))), True, "measurements must have 6 frames"),
         (lambda a, m: a["SLOPES"].fill(np.nan), True, "slopes must be finite"),
         (lambda a, m: m.update(frame_rate_hz="fast"), True, "frame_rate_hz must be a number"),
         (lambda a, m: m.update(metadata=3), True, "inconsistent"),
