@@ -12,8 +12,8 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -84,11 +84,8 @@ def run_cases(
     jobs = integer(jobs, "jobs", at_least=1)
     digests = {name: _digest(name, case) for name, case in cases.items()}
     with exclusive_lock(folder, "computation"):
-        results = {}
-        for name, expected in digests.items():
-            found = _read(folder / f"{name}.json", expected)
-            if found is not None:
-                results[name] = found
+        found = {name: _read(folder / f"{name}.json", digests[name]) for name in cases}
+        results = {name: result for name, result in found.items() if result is not None}
         if progress is not None and results:
             progress(len(results))
         missing = {name: case for name, case in cases.items() if name not in results}
@@ -107,47 +104,39 @@ def _run_cases(
     executor: Executor | None,
 ) -> Generator[tuple[str, Mapping[str, Any]], None, None]:
     """Yield results as they come; if a case fails, wait for those that are running."""
-    if not cases:
-        return
-    if executor is None and (jobs == 1 or len(cases) == 1):
+    if executor is None and (jobs == 1 or len(cases) <= 1):
         for name, case in cases.items():
             yield name, function(case)
         return
-    with contextlib.ExitStack() as stack:
-        if executor is None:
-            executor = stack.enter_context(_pool(min(jobs, len(cases))))
-        futures = {executor.submit(function, dict(case)): name for name, case in cases.items()}
-        failure: BaseException | None = None
+    workers = min(jobs, len(cases))
+    with _processes(workers) if executor is None else contextlib.nullcontext(executor) as pool:
+        futures = {pool.submit(function, dict(case)): name for name, case in cases.items()}
         try:
-            pending: set[Future[Mapping[str, Any]]] = set(futures)
-            while pending:
-                done, pending = wait(pending, return_when=FIRST_COMPLETED)
-                for future in done:
-                    if future.cancelled():
-                        continue
-                    error = future.exception()
-                    if error is None:
-                        yield futures[future], future.result()
-                    elif failure is None:
-                        failure = error
-                        for other in pending:
-                            other.cancel()
+            for future in as_completed(futures):
+                if not future.cancelled() and future.exception() is None:
+                    yield futures[future], future.result()
+                else:
+                    _cancel(futures)
         finally:
-            for future in futures:
-                future.cancel()
-        if failure is not None:
-            raise failure
+            _cancel(futures)
+        for future in futures:  # raise what failed first, in the order of the cases
+            if not future.cancelled():
+                future.result()
+
+
+def _cancel(futures: Iterable[Future[Any]]) -> None:
+    for future in futures:
+        future.cancel()
 
 
 @contextlib.contextmanager
-def _pool(workers: int) -> Iterator[Executor]:
+def _processes(workers: int) -> Iterator[Executor]:
     """Provide processes, which are waited for unless this one is interrupted."""
     with limit_threads():
         pool = WorkerPool(workers)
         try:
             yield pool.executor
         except BrokenExecutor as error:
-            pool.close()
             raise NumericalError(
                 "a worker process ended without a word, perhaps for want of memory. "
                 "Finished results are kept: start again, with fewer jobs."
@@ -155,10 +144,8 @@ def _pool(workers: int) -> Iterator[Executor]:
         except (KeyboardInterrupt, SystemExit, GeneratorExit):
             pool.kill()
             raise
-        except BaseException:
+        finally:
             pool.close()
-            raise
-        pool.close()
 
 
 def _digest(name: str, case: Case) -> str:

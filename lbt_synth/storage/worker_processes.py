@@ -53,15 +53,13 @@ class WorkerPool:
 @contextlib.contextmanager
 def limit_threads() -> Iterator[None]:
     """Limit the processes that are started in the block to one thread of linear algebra."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    for name in _THREADS:
-        os.environ.setdefault(name, "1")
+    free = [name for name in _THREADS if name not in os.environ]
+    os.environ.update(dict.fromkeys(free, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
+        for name in free:
+            del os.environ[name]
 
 
 def _watch_parent(parent: int) -> None:

@@ -57,6 +57,7 @@ LAYERS = {  # by their names in files
     "INTGAINS": Layer("integrator_gains", "command", "", "integrator gains"),
     "MIRROR_TAPS": Layer("mirror_taps", "age", "", _TAPS),  # follows from other fields
 }
+REQUIRED = ("commands", "measurements")
 ARRAYS = tuple(layer for layer in LAYERS.values() if layer.field != "mirror_taps")
 
 

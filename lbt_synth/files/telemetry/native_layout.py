@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 import lbt_synth
 from lbt_synth.errors import ProblemError
-from lbt_synth.files.telemetry.fields import FACTS, LAYERS
+from lbt_synth.files.telemetry.fields import FACTS, LAYERS, REQUIRED
 from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.linear import Controller
 from lbt_synth.models import PositionLoop
@@ -32,8 +32,14 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
     for name, layer in LAYERS.items():
         if (value := getattr(telemetry, layer.field)) is None:
             continue
-        exact = not layer.is_series or layer.field == "times_s"  # times need their digits
-        arrays[name] = value if exact else _round_series(value, precision, layer.field)
+        arrays[name] = value
+        if precision == "float32" and layer.is_series and layer.field != "times_s":
+            with np.errstate(over="ignore"):
+                arrays[name] = value.astype(np.float32)
+            if not np.all(np.isfinite(arrays[name])):
+                raise ProblemError(
+                    f"{layer.field} has values beyond the range of float32; write float64."
+                )
     meta: Meta = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -50,25 +56,14 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[Arrays, Meta]:
     return arrays, meta
 
 
-def _round_series(series: FloatArray, precision: str, name: str) -> npt.NDArray[Any]:
-    if precision == "float64":
-        return series
-    with np.errstate(over="ignore"):
-        short = series.astype(np.float32)
-    if not np.all(np.isfinite(short)):
-        raise ProblemError(f"{name} has values beyond the range of float32; write float64.")
-    return short
-
-
 def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
     """Rebuild telemetry; missing keys raise KeyError, what does not fit a ProblemError."""
     left = dict(arrays)
     fields: dict[str, Any] = {
-        layer.field: left.pop(name) for name, layer in LAYERS.items() if name in left
+        layer.field: left.pop(name)
+        for name, layer in LAYERS.items()
+        if name in left or layer.field in REQUIRED
     }
-    for name in ("COMMANDS", "MEASURE"):
-        if name not in arrays:
-            raise KeyError(name)
     if "controller_dt_s" in meta:
         fields["controller"] = Controller(
             **{name: left.pop(f"CTRL_{name}") for name in "ABCD"}, dt_s=meta["controller_dt_s"]

@@ -25,6 +25,7 @@ from lbt_synth.validation import choice
 
 FORMATS = ("fits", "npz", "aot")
 _ENDINGS = ".fits, .npz or .aot.fits"
+_KINDS = {".aot.fits": "aot", ".fits": "fits", ".npz": "npz"}  # the longer ending first
 _KIND = FileKind(
     name="telemetry file",
     schema=SCHEMA,
@@ -37,17 +38,16 @@ _KIND = FileKind(
 def require_telemetry_name(path: str | os.PathLike[str], format: str | None = None) -> str:  # noqa: A002
     """Return the format of a file that is to be written."""
     target = Path(path)
-    ending = target.suffix.lower()
-    if ending not in (".fits", ".npz"):
+    by_name = next((_KINDS[end] for end in _KINDS if target.name.lower().endswith(end)), None)
+    if by_name is None:
         raise OutputError(f"telemetry must end in {_ENDINGS}; got {target.name!r}.", path=target)
-    by_name = "aot" if target.name.lower().endswith(".aot.fits") else ending[1:]
     kind = by_name if format is None else format
     if kind not in FORMATS:
         raise OutputError(
             f"the format of telemetry must be one of {', '.join(FORMATS)}; got {format!r}.",
             path=target,
         )
-    if (kind == "npz") != (ending == ".npz") or (by_name == "aot" and kind != "aot"):
+    if kind != by_name and (by_name, kind) != ("fits", "aot"):
         raise OutputError(
             f"the name {target.name!r} does not fit the format {format!r}: fits ends in .fits, "
             "npz in .npz, aot in .aot.fits or .fits.",

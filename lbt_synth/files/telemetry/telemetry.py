@@ -10,12 +10,10 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.files.telemetry.conventions import CONVENTION, MOVING_CONVENTION
-from lbt_synth.files.telemetry.fields import ARRAYS, FACTS, Scalar, check_metadata
+from lbt_synth.files.telemetry.fields import ARRAYS, FACTS, REQUIRED, Scalar, check_metadata
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.validation import FloatArray, frozen_copy, real_array, require_instance, set_fields
-
-_REQUIRED = ("commands", "measurements")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,7 +165,7 @@ class Telemetry:
             same = {"sensed": "slope", "measurement": "mode"}
         sizes: dict[str, tuple[int, str]] = {}  # of each axis, and the field that gave it
         for layer in ARRAYS:
-            if (value := getattr(self, layer.field)) is None and layer.field not in _REQUIRED:
+            if (value := getattr(self, layer.field)) is None and layer.field not in REQUIRED:
                 continue
             array, axes = real_array(value, layer.field), layer.axes.split(", ")
             if array.ndim == 0 and len(axes) == 2:

@@ -50,10 +50,12 @@ def time_filters(controller: Controller) -> TimeFilters | None:
         rows.append(row)
         polynomials.append((numerator, denominator))
     size = max(len(denominator) for _, denominator in polynomials)
-    out = np.zeros((2, len(rows), size))
-    for i, pair in enumerate(polynomials):
-        for part, polynomial in enumerate(pair):
-            out[part, i, : len(polynomial)] = polynomial[::-1]
+    out = np.array(
+        [
+            [np.pad(p[::-1], (0, size - len(p))) for p in part]
+            for part in zip(*polynomials, strict=True)
+        ]
+    )
     return TimeFilters(matrix=np.array(rows), numerators=out[0], denominators=out[1])
 
 
@@ -89,9 +91,8 @@ def _transfer_function(
     b, c = system.B @ row / (row @ row), system.C[output]
     d = float(system.D[output] @ row / (row @ row))
     linked = np.abs(system.A) > _NOTHING * np.max(np.abs(system.A), initial=0.0)
-    inside = _reachable_states(linked, _significant(b)) & _reachable_states(
-        linked.T, _significant(c)
-    )
+    reached = np.linalg.matrix_power(linked | np.eye(len(linked), dtype=np.bool_), len(linked))
+    inside = (reached @ _significant(b)) & (_significant(c) @ reached)
     A, b, c = system.A[np.ix_(inside, inside)], b[inside], c[inside]
     if not inside.any():
         return np.array([d]), np.array([1.0])
@@ -103,11 +104,3 @@ def _transfer_function(
 
 def _significant(vector: FloatArray) -> BoolArray:
     return np.asarray(np.abs(vector) > _NOTHING * np.max(np.abs(vector), initial=0.0))
-
-
-def _reachable_states(linked: BoolArray, start: BoolArray) -> BoolArray:
-    """States that the starting ones drive, and the starting ones."""
-    inside = start
-    for _ in range(len(linked)):
-        inside = inside | (linked[:, inside].any(axis=1))
-    return inside

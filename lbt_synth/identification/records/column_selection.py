@@ -175,25 +175,25 @@ def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> 
     if not of_axes:
         return found
     ordered = sorted(found, key=lambda each: each.axis or 0)
-    if axes is None:
-        if len(ordered) > 2:
+    return [ordered[i] for i in choose_axes(axes, "axes", len(found), f"columns of {role}")]
+
+
+def choose_axes(given: Any, name: str, count: int, what: str) -> list[int]:
+    """Return the numbers of one or two axes among some series: those given, or all."""
+    if given is None:
+        if count > 2:
             raise ProblemError(
-                f"there are {len(ordered)} columns of {role}; say which are tip and tilt: "
-                "axes=(0, 1) for the first two."
+                f"there are {count} {what}; say which are tip and tilt: {name}=(0, 1) for the "
+                "first two."
             )
-        return ordered
-    return [ordered[axis] for axis in check_axes(axes, "axes", len(ordered), f"columns of {role}")]
-
-
-def check_axes(axes: Any, name: str, count: int, what: str) -> list[int]:
-    """Return one or two different numbers below a count."""
-    given = [integer(axis, name, at_least=0) for axis in sequence(axes, name)]
-    if not 1 <= len(given) <= 2 or len(set(given)) < len(given) or max(given) >= count:
+        return list(range(count))
+    axes = [integer(axis, name, at_least=0) for axis in sequence(given, name)]
+    if not 1 <= len(axes) <= 2 or len(set(axes)) < len(axes) or max(axes) >= count:
         raise ProblemError(
-            f"{name} must be one or two different numbers below {count}, the {what}; got "
-            f"{list(axes)}."
+            f"{name} must be one or two different numbers below {count}, the number of {what}; "
+            f"got {list(given)}."
         )
-    return given
+    return axes
 
 
 def _require_same_axes(chosen: Roles) -> None:

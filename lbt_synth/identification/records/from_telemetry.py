@@ -9,11 +9,12 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry
+from lbt_synth.identification.records.column_selection import choose_axes
 from lbt_synth.identification.records.from_arrays import loop_record
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.units import unit_name
 from lbt_synth.models import PositionLoop
-from lbt_synth.validation import FloatArray, integer, number, require_instance, sequence
+from lbt_synth.validation import FloatArray, number, require_instance
 
 _FOREIGN = "timing"  # key of metadata in telemetry of other programs
 _CONDITION = 1e8
@@ -95,108 +96,86 @@ def record_from_telemetry(
             raise ProblemError(
                 f"frame_rate_hz must be that of the telemetry, {own:.9g} Hz; got {rate:.9g} Hz."
             )
-    n, q, m = telemetry.modes, telemetry.measurements.shape[1], telemetry.commands.shape[1]
-    chosen = _check_modes(modes, n)
-    y, y_unit = _modal_measurements(telemetry, chosen, unit, notes)
-    u, u_unit = _modal_commands(telemetry, chosen, command_unit or unit, notes)
-    for word, given in (
-        ("delay_frames", delay_frames),
-        ("diameter_m", diameter_m),
-        ("obstruction", obstruction),
-    ):
-        there = getattr(telemetry, word)
-        if given is not None and there is not None and given != there:
-            notes.append(f"{word} {given:g} was given; the telemetry has {there:g}")
-    if n > len(chosen) or max(q, m) > len(chosen):
-        notes.append(f"axes are modes {', '.join(map(str, chosen))} of {n}")
+    chosen = choose_axes(modes, "modes", telemetry.modes, "modes")
+    y, y_unit = _modal_measurements(telemetry, unit, notes)
+    u, u_unit = _modal_commands(telemetry, command_unit or unit, notes)
+    facts: dict[str, Any] = {
+        "delay_frames": delay_frames,
+        "diameter_m": diameter_m,
+        "obstruction": obstruction,
+        "mirror": mirror,
+    }
+    for name, given in facts.items():
+        there = getattr(telemetry, name)
+        if given is None:
+            facts[name] = there
+        elif name != "mirror" and there not in (None, given):
+            notes.append(f"{name} {given:g} was given; the telemetry has {there:g}")
+    if max(telemetry.modes, y.shape[1], telemetry.commands.shape[1]) > len(chosen):
+        notes.append(f"axes are modes {', '.join(map(str, chosen))} of {telemetry.modes}")
     if _FOREIGN in telemetry.metadata:
         notes.append(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
     return loop_record(
-        y,
-        u,
+        y[:, chosen],
+        u[:, chosen],
         frame_rate_hz=telemetry.frame_rate_hz,
         times_s=telemetry.times_s,
         unit=y_unit,
         command_unit=u_unit,
-        delay_frames=telemetry.delay_frames if delay_frames is None else delay_frames,
-        mirror=telemetry.mirror if mirror is None else mirror,
-        diameter_m=telemetry.diameter_m if diameter_m is None else diameter_m,
-        obstruction=telemetry.obstruction if obstruction is None else obstruction,
         source=(telemetry.name or "telemetry") if source is None else source,
         notes=notes,
+        **facts,
     )
 
 
-def _check_modes(modes: Any, n: int) -> list[int]:
-    if modes is None:
-        if n > 2:
-            raise ProblemError(
-                f"this telemetry has {n} modes; say which are tip and tilt: modes=(0, 1) for the "
-                "first two."
-            )
-        return list(range(n))
-    given = [integer(mode, "modes", at_least=0) for mode in sequence(modes, "modes")]
-    if not 1 <= len(given) <= 2 or len(set(given)) != len(given) or max(given) >= n:
-        raise ProblemError(f"modes must be one or two different modes below {n}; got {modes}.")
-    return given
-
-
 def _modal_measurements(
-    seen: Telemetry, chosen: list[int], unit: str | None, notes: list[str]
+    seen: Telemetry, unit: str | None, notes: list[str]
 ) -> tuple[FloatArray, str]:
-    """Return the measurements of the chosen modes, and their unit."""
+    """Return the measurements of all modes, and their unit."""
     y, n, q = seen.measurements, seen.modes, seen.measurements.shape[1]
     response = seen.interaction_matrix
     if seen.slopes is not None and response is not None:
         response = None if seen.reconstructor is None else seen.reconstructor @ response
-    if response is None and q != n:
-        raise ProblemError(_slopes_message(q, n))
+    if (response is None and q != n) or (response is not None and q > n > 2):
+        raise ProblemError(
+            f"this telemetry has {q} measurements and {f'{n} modes' if n != q else 'no modes'}: "
+            "slopes without modal coefficients. Multiply them by the reconstructor of the loop: "
+            "Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R, ...)."
+        )
     if response is None or np.array_equal(response, np.eye(n)):
-        return y[:, chosen], _choose_unit(seen.measurement_unit, unit, "measurements")
-    if q > n > 2:
-        raise ProblemError(_slopes_message(q, n))
+        return y, _choose_unit(seen.measurement_unit, unit, "measurements")
     if q < n or np.linalg.cond(response) > _CONDITION:
         raise ProblemError(
             f"the interaction matrix {response.shape} has no inverse: the {q} measurements do not "
             f"tell {n} modes apart. Give telemetry of tip and tilt alone."
         )
     notes.append("measurements: the inverse of the interaction matrix times what was recorded")
-    modal = y @ np.linalg.pinv(response).T
-    own = "nm" if unit_name(seen.measurement_unit) else ""
-    if not own and _FOREIGN not in seen.metadata:
-        own = "nm"  # the modes of our own telemetry are
-    return modal[:, chosen], _choose_unit(own, unit, "modes behind the interaction matrix")
-
-
-def _slopes_message(q: int, n: int) -> str:
-    many = f"{n} modes" if n != q else "no modes"
-    return (
-        f"this telemetry has {q} measurements and {many}: slopes without modal coefficients. "
-        "Multiply them by the reconstructor of the loop: Telemetry(measurements=slopes @ R.T, "
-        "slopes=slopes, reconstructor=R, ...)."
+    own = _unit_of_modes(seen, seen.measurement_unit)
+    return y @ np.linalg.pinv(response).T, _choose_unit(
+        own, unit, "modes behind the interaction matrix"
     )
 
 
-def _modal_commands(
-    seen: Telemetry, chosen: list[int], unit: str | None, notes: list[str]
-) -> tuple[FloatArray, str]:
-    """Return the commands of the chosen modes, and their unit."""
-    u, n, m = seen.commands, seen.modes, seen.commands.shape[1]
-    influence = seen.influence_matrix
+def _modal_commands(seen: Telemetry, unit: str | None, notes: list[str]) -> tuple[FloatArray, str]:
+    """Return the commands of all modes, and their unit."""
+    u, n, m, influence = seen.commands, seen.modes, seen.commands.shape[1], seen.influence_matrix
     if influence is None and m != n:
         raise ProblemError(
             f"this telemetry has {m} commands of {n} modes, and no influence matrix; give it "
             "to Telemetry(influence_matrix=...), (modes, commands)."
         )
     if influence is None or np.array_equal(influence, np.eye(n)):
-        return u[:, chosen], _choose_unit(seen.command_unit, unit, "commands")
+        return u, _choose_unit(seen.command_unit, unit, "commands")
     notes.append("commands: the influence matrix times what was recorded")
-    own = "nm" if unit_name(seen.command_unit) or _FOREIGN not in seen.metadata else ""
-    return (u @ influence.T)[:, chosen], _choose_unit(
-        own, unit, "modes behind the influence matrix"
-    )
+    own = _unit_of_modes(seen, seen.command_unit)
+    return u @ influence.T, _choose_unit(own, unit, "modes behind the influence matrix")
+
+
+def _unit_of_modes(seen: Telemetry, unit: str) -> str:
+    """Return the unit of the modes behind a matrix: nm in our own telemetry, and of lengths."""
+    return "nm" if unit_name(unit) or _FOREIGN not in seen.metadata else ""
 
 
 def _choose_unit(own: str, given: str | None, what: str) -> str:

@@ -53,7 +53,7 @@ def test_modes_of_many():
     y, u = rng.standard_normal((2, 60, 5))
     many = telemetry(measurements=y, commands=u, diameter_m=8.0, name="night")
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"has 5 modes; say which are tip and tilt: modes="
+        lbt.errors.ProblemError, match=r"there are 5 modes; say which are tip and tilt: modes="
     ):
         lbt.identification.record_from_telemetry(many)
     seen = lbt.identification.record_from_telemetry(many, modes=(1, 0))
@@ -63,7 +63,7 @@ def test_modes_of_many():
     assert (seen.diameter_m, seen.source) == (8.0, "night")
     assert lbt.identification.record_from_telemetry(many, modes=[3]).axes == 1
     for bad in ((0, 0), (5,), (0, 1, 2), ()):
-        with pytest.raises(lbt.errors.ProblemError, match="one or two different modes below 5"):
+        with pytest.raises(lbt.errors.ProblemError, match="modes must be one or two different numbers below 5"):
             lbt.identification.record_from_telemetry(many, modes=bad)
 
 
