@@ -8,13 +8,13 @@ from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identified_model import IdentifiedTurbulence as IdentifiedTurbulence
 from .fit.whiteness import Whiteness as Whiteness
+from .prediction.comparison import PredictionRow as PredictionRow
+from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .prediction.predictor import LeastSquaresPredictor as LeastSquaresPredictor
 from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import replayed_residual as replayed_residual
 from .prediction.residual_estimate import ResidualEstimate as ResidualEstimate
-from .prediction.table import PredictionRow as PredictionRow
-from .prediction.table import PredictionTable as PredictionTable
 from .records.from_arrays import loop_record as loop_record
 from .records.from_file import load_record as load_record
 from .records.from_telemetry import record_from_telemetry as record_from_telemetry

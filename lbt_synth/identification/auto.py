@@ -12,8 +12,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.prediction.comparison import prediction_against_data
-from lbt_synth.identification.prediction.table import PredictionTable
+from lbt_synth.identification.prediction.comparison import PredictionTable, prediction_against_data
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.required_length import require_length

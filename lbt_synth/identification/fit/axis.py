@@ -156,9 +156,9 @@ def identify_axis(
     if sensor_gain is not None:
         relative = given_error / sensor_gain
         note = "given" if data.closed else "given: the series is divided by it"
-        return describe_axis(search, model, relative or None, note, known=relative)
+        return describe_axis(search, model, relative or None, note)
     if not data.closed:
-        return describe_axis(search, model, None, "1: of an open loop it has no meaning", known=0.0)
+        return describe_axis(search, model, None, "1: of an open loop it has no meaning")
     error = _gain_error(search, model)
     if error <= GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
@@ -169,7 +169,7 @@ def identify_axis(
         f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
-    return describe_axis(search, search_model(search, model.spectrum), None, note, known=0.0)
+    return describe_axis(search, search_model(search, model.spectrum), None, note)
 
 
 def identify_spectrum(
@@ -259,7 +259,7 @@ def identify_spectrum(
     )
     search = Search(data=data, gain=1.0, **options)
     note = "1: of a spectrum it has no meaning"
-    return describe_axis(search, search_model(search), None, note, known=0.0)
+    return describe_axis(search, search_model(search), None, note)
 
 
 def estimate_averages(density: FloatArray) -> float | None:

@@ -12,10 +12,14 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.fit.axis import estimate_averages, identify_axis, identify_spectrum
-from lbt_synth.identification.fit.delay import better_delay
 from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
-from lbt_synth.identification.fit.jumps import cut_at_jumps, find_correction_jumps, find_jumps
+from lbt_synth.identification.fit.record_doubts import (
+    better_delay,
+    cut_at_jumps,
+    find_correction_jumps,
+    find_jumps,
+)
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
@@ -232,9 +236,7 @@ def _gain_per_axis(given: Any, count: int) -> list[float | None]:
 
 
 def _pool_gains(
-    axes: list[IdentifiedAxis],
-    found_gain: list[int],
-    fit: Callable[..., list[IdentifiedAxis]],
+    axes: list[IdentifiedAxis], found_gain: list[int], fit: Callable[..., list[IdentifiedAxis]]
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of the gains that were found, if they agree."""
     gains = np.array([axes[i].sensor_gain for i in found_gain])

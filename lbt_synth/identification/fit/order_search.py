@@ -33,10 +33,7 @@ from lbt_synth.identification.fit.line_candidates import (
     measure_excess,
     smooth_background,
 )
-from lbt_synth.identification.fit.parameters import (
-    Kind,
-    SpectrumModel,
-)
+from lbt_synth.identification.fit.parameters import Kind, SpectrumModel
 from lbt_synth.identification.fit.whittle import FittedModel, density, minimise
 
 _STARTING_GAINS = (0.35, 0.6, 1.0)

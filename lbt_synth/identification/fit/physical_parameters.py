@@ -23,20 +23,14 @@ _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measur
 _DIFFERENCE = 1e-4  # of a logarithm
 
 
-def parameter_covariance(model: FittedModel, gain_error: float | None = None) -> FloatArray:
-    """Return the covariance of the packed parameters, (p, p).
-
-    It is the inverse of the information; ``gain_error`` is the standard error of the logarithm
-    of a gain that was given.
-    """
+def parameter_covariance(model: FittedModel) -> FloatArray:
+    """Return the covariance of the packed parameters, the inverse of the information, (p, p)."""
     moves = np.flatnonzero(np.diag(model.information) > 0)
     block = model.information[np.ix_(moves, moves)]
     scale = 1 / np.sqrt(np.diag(block))
     both = np.outer(scale, scale)
     out = np.zeros_like(model.information)
     out[np.ix_(moves, moves)] = np.linalg.pinv(block * both, hermitian=True) * both
-    if gain_error is not None:
-        out[GAIN, GAIN] = gain_error**2
     return out
 
 
@@ -46,21 +40,17 @@ def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> Spectrum
 
 
 def describe_axis(
-    search: Search,
-    model: FittedModel,
-    gain_error: float | None,
-    note: str,
-    *,
-    known: float | None = None,
+    search: Search, model: FittedModel, gain_error: float | None, note: str
 ) -> IdentifiedAxis:
     """Return a fitted model in the units of the phase.
 
-    ``gain_error`` is the standard error of the logarithm of the gain, None where the data do not
-    show it; ``known`` that of a given gain.
+    ``gain_error`` is the standard error of the logarithm of the gain, None where it is unknown.
     """
     data, spectrum, gain = search.data, model.spectrum, model.spectrum.gain
     rate = data.frame_rate_hz
-    covariance = parameter_covariance(model, known)
+    covariance = parameter_covariance(model)
+    if gain_error is not None and not search.finds_gain:
+        covariance[GAIN, GAIN] = gain_error**2
     errors = standard_errors(spectrum, covariance)
     density, _, _ = densities(data, spectrum)
     fitted = density.sum(axis=0)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import ProblemError, UnstableLoopError
@@ -13,42 +16,158 @@ from lbt_synth.identification.prediction.predictor import least_squares_predicto
 from lbt_synth.identification.prediction.residual import (
     PredictionData,
     check_series,
+    choose_settling,
     drop_settling,
-    frames_to_settle,
     inverse_sensor,
     predict_residual,
     prediction_data,
 )
-from lbt_synth.identification.prediction.residual_estimate import (
-    ResidualEstimate,
-    estimate_residual,
-)
-from lbt_synth.identification.prediction.table import PredictionRow, PredictionTable
+from lbt_synth.identification.prediction.residual_estimate import ResidualEstimate
 from lbt_synth.identification.stretches import Stretches, checked_stretches, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
-from lbt_synth.models import TipTiltPlant
-from lbt_synth.validation import FloatArray, frozen_copy, integer, require_instance
+from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 RAN = "what ran"
 INTEGRATOR = "best integrator"
 PREDICTOR = "least-squares predictor"
 LIMIT = "limit of performance"
 _RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
+_AXES = ("tip", "tilt")
+_COLUMNS = {  # attribute of a row by heading
+    "data_nm": "replayed_nm",
+    "data_error_nm": "replayed_error_nm",
+    "model_nm": "model_nm",
+    "data_over_model": "ratio",
+    "strehl": "strehl",
+    "model_strehl": "model_strehl",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PredictionRow:
+    """One controller on the data, and by the model.
+
+    Attributes
+    ----------
+    name : str
+        What it is.
+    replayed : ResidualEstimate or None
+        Residual on the test data; None for the limit, which is no controller.
+    model_nm2 : (n, n) ndarray or None
+        Covariance that the model promises [nm^2]; None for what ran, unless its controller is
+        known.
+    strehl, model_strehl : float
+        Strehl ratios of the two; nan where there is none.
+    """
+
+    name: str
+    replayed: ResidualEstimate | None
+    model_nm2: FloatArray | None
+    strehl: float
+    model_strehl: float
+
+    @property
+    def model_nm(self) -> float:
+        """Residual over all axes that the model promises [nm rms]; nan if unknown."""
+        return float(np.sqrt(np.trace(self.model_nm2))) if self.model_nm2 is not None else np.nan
+
+    @property
+    def model_axis_nm(self) -> FloatArray | None:
+        """The same of each axis, (n,) [nm rms]."""
+        return None if self.model_nm2 is None else frozen_copy(np.sqrt(np.diag(self.model_nm2)))
+
+    @property
+    def replayed_nm(self) -> float:
+        """Residual over all axes on the data [nm rms]; nan if negative within its error."""
+        return np.nan if self.replayed is None else self.replayed.rms_nm
+
+    @property
+    def replayed_error_nm(self) -> float:
+        """Standard error of that [nm]."""
+        return np.nan if self.replayed is None else self.replayed.rms_error_nm
+
+    @property
+    def ratio(self) -> float:
+        """Residual on the data over what the model promises; nan where either is unknown."""
+        return self.replayed_nm / self.model_nm if self.model_nm > 0 else np.nan
+
+    @property
+    def deviations(self) -> float:
+        """Variance on the data less that of the model, in standard errors; nan if unknown."""
+        if self.replayed is None or self.model_nm2 is None:
+            return np.nan
+        difference = self.replayed.total_nm2 - float(np.trace(self.model_nm2))
+        error = self.replayed.total_error_nm2
+        return difference / error if error > 0 else np.nan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PredictionTable:
+    """What ran, controllers, a predictor without a model, and the limit, on the same data.
+
+    Attributes
+    ----------
+    entries : tuple of PredictionRow
+        The rows.
+    fit, test : tuple of (start, stop)
+        Frames that the predictor was fitted to, and those that all rows are measured on.
+    settle_frames : int
+        Frames dropped before each stretch of the test.
+    notes : tuple of str
+        What is left out of the table or cannot be, and why.
+    """
+
+    entries: tuple[PredictionRow, ...]
+    fit: Stretches
+    test: Stretches
+    settle_frames: int
+    notes: tuple[str, ...]
+
+    def __getitem__(self, name: str) -> PredictionRow:
+        """Return the row of a name."""
+        for entry in self.entries:
+            if entry.name == name:
+                return entry
+        raise ProblemError(
+            f"the table has the rows {', '.join(entry.name for entry in self.entries)}; got "
+            f"{name!r}."
+        )
+
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """Names of the columns of :meth:`rows`, with their units."""
+        n = next(e.replayed.noise_nm2.shape[0] for e in self.entries if e.replayed is not None)
+        axes = _AXES[:n] if n <= len(_AXES) else tuple(f"axis_{i}" for i in range(n))
+        return "controller", *(f"{axis}_nm" for axis in axes), *_COLUMNS
+
+    def rows(self) -> tuple[tuple[Any, ...], ...]:
+        """Return a tuple per row, in the order of :attr:`headings`; nan where nothing is known.
+
+        The axes' columns are of the data, except in the row of the limit.
+        """
+        out = []
+        for entry in self.entries:
+            axes = entry.model_axis_nm if entry.replayed is None else entry.replayed.axis_rms_nm
+            assert axes is not None
+            values = (getattr(entry, name) for name in _COLUMNS.values())
+            out.append((entry.name, *axes.tolist(), *values))
+        return tuple(out)
 
 
 def prediction_against_data(
     plant: TipTiltPlant,
-    open_loop: Any,
+    open_loop: ArrayLike,
     controllers: Mapping[str, Controller | Design],
     *,
     stretches: Sequence[tuple[int, int]] | None = None,
     fit: Sequence[tuple[int, int]] | None = None,
     test: Sequence[tuple[int, int]] | None = None,
-    measurements: Any = None,
+    measurements: ArrayLike | None = None,
     running: Controller | Design | None = None,
-    noise_error_nm: Any = 0.0,
+    noise_error_nm: ArrayLike = 0.0,
     imaging: Imaging | None = None,
     taps: int = 32,
     settle_frames: int | None = None,
@@ -123,105 +242,87 @@ def prediction_against_data(
     if imaging is not None:
         require_instance(imaging, Imaging)
     hardware = plant.hardware
-    n = hardware.modes
-    series, usable = check_series(open_loop, n, stretches)
+    series, usable = check_series(open_loop, hardware.modes, stretches)
     fitted, tested = _split_frames(usable, fit, test, len(series))
     data = prediction_data(
-        series,
-        hardware,
-        noise_nm2=plant.R,
-        noise_error_nm=noise_error_nm,
-        sensor_gain=1.0,
-        stretches=tested,
+        series, hardware, plant.R, noise_error_nm=noise_error_nm, stretches=tested
     )
-    chosen = {INTEGRATOR: model_integrator(plant).controller}
-    for name, thing in controllers.items():
+    for name in controllers:
         if name in _RESERVED or not isinstance(name, str):
             raise ProblemError(
                 f"a controller may not be called {name!r}; its row is taken. Give another name."
             )
-        chosen[name] = _as_controller(thing)
-    predictor = least_squares_predictor(series, hardware, taps=taps, stretches=fitted)
+    predictor = least_squares_predictor(series, hardware, taps=taps, stretches=fitted).controller
+    chosen = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
     loops = {name: _close_stable_loop(plant, name, one) for name, one in chosen.items()}
-    loops[PREDICTOR] = _close_stable_loop(plant, PREDICTOR, predictor.controller)
-    settle = (
-        max(frames_to_settle(loop) for loop in loops.values())
-        if settle_frames is None
-        else integer(settle_frames, "settle_frames", at_least=0)
-    )
-    entries = []
+    settle = choose_settling(settle_frames, loops.values())
+    found: dict[str, tuple[ResidualEstimate | None, FloatArray | None]] = {}
     if measurements is not None:
         promised = None
         if running is not None:
-            loop = _close_stable_loop(plant, RAN, _as_controller(running))
-            promised = model_budget(loop, plant).total_nm2
-        ran = _measured_residual(data, plant, measurements, settle)
-        entries.append(_build_row(RAN, ran, promised, imaging))
+            promised = model_budget(_close_stable_loop(plant, RAN, running), plant).total_nm2
+        found[RAN] = _measured_residual(data, hardware, measurements, settle), promised
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
     for name, loop in loops.items():
-        found = predict_residual(data, loop, settle)
-        entries.append(_build_row(name, found, model_budget(loop, plant).total_nm2, imaging))
-    notes: tuple[str, ...] = ()
+        replayed = predict_residual(data, loop, settle)
+        found[name] = replayed, model_budget(loop, plant).total_nm2
+    notes = _note_refuted(found)
     try:
         limit = least_model_residual(plant)
+        found[LIMIT] = None, limit.directions.T * limit.variance_nm2 @ limit.directions
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
-        notes = (f"no {LIMIT}: {error}",)
-    else:
-        along = limit.directions.T * limit.variance_nm2 @ limit.directions
-        entries.append(_build_row(LIMIT, None, along, imaging))
-    notes += _note_refuted(entries)
+        notes = [f"no {LIMIT}: {error}", *notes]
     return PredictionTable(
-        entries=tuple(entries),
+        entries=tuple(_build_row(name, *row, imaging) for name, row in found.items()),
         fit=fitted,
         test=drop_settling(tested, settle),
         settle_frames=settle,
-        notes=notes,
+        notes=tuple(notes),
     )
 
 
-def _note_refuted(entries: Sequence[PredictionRow]) -> tuple[str, ...]:
-    """Note rows for which the noise cannot be right."""
+def _note_refuted(
+    found: Mapping[str, tuple[ResidualEstimate | None, FloatArray | None]],
+) -> list[str]:
+    """Return a note on the rows for which the noise cannot be right."""
     below = {
-        entry.name: entry.replayed.errors_below_zero
-        for entry in entries
-        if entry.replayed is not None and entry.replayed.refuted
+        name: replayed.errors_below_zero
+        for name, (replayed, _) in found.items()
+        if replayed is not None and replayed.refuted
     }
     if not below:
-        return ()
-    return (
+        return []
+    return [
         f"no residual on the data of {', '.join(below)}: its variance is {max(below.values()):.3g} "
         "standard errors below zero, more than chance; the model has more noise than the data, or "
-        "another sensor gain. Identify the noise again.",
-    )
+        "another sensor gain. Identify the noise again."
+    ]
 
 
 def _split_frames(
-    usable: Stretches, fit: Any, test: Any, frames: int
+    usable: Stretches,
+    fit: Sequence[tuple[int, int]] | None,
+    test: Sequence[tuple[int, int]] | None,
+    frames: int,
 ) -> tuple[Stretches, Stretches]:
     if (fit is None) != (test is None):
         raise ProblemError("fit and test must both be given, or neither; got one of them.")
     if fit is None:
         return split_halves(usable, frames)
     fitted, tested = checked_stretches(fit, frames), checked_stretches(test, frames)
-    for a, b in fitted:
-        for c, d in tested:
-            if a < d and c < b:
-                raise ProblemError(
-                    f"the test must have frames that the fit has not; got ({a}, {b}) to fit and "
-                    f"({c}, {d}) to test."
-                )
+    for (a, b), (c, d) in product(fitted, tested):
+        if a < d and c < b:
+            raise ProblemError(
+                f"the test must have frames that the fit has not; got ({a}, {b}) to fit and "
+                f"({c}, {d}) to test."
+            )
     return fitted, tested
 
 
-def _as_controller(thing: Controller | Design) -> Controller:
-    if isinstance(thing, Design):
-        return thing.controller
-    require_instance(thing, Controller)
-    return thing
-
-
-def _close_stable_loop(plant: TipTiltPlant, name: str, controller: Controller) -> ClosedLoop:
+def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Design) -> ClosedLoop:
+    controller = thing.controller if isinstance(thing, Design) else thing
+    require_instance(controller, Controller)
     loop = close_loop(plant.hardware, controller)
     try:
         loop.require_stable()
@@ -233,33 +334,27 @@ def _close_stable_loop(plant: TipTiltPlant, name: str, controller: Controller) -
 
 
 def _measured_residual(
-    data: PredictionData, plant: TipTiltPlant, measurements: Any, settle: int
+    data: PredictionData, hardware: LoopHardware, measurements: ArrayLike, settle: int
 ) -> ResidualEstimate:
     """Return the residual of the loop that ran, from its own measurements on the same frames."""
-    q = plant.hardware.n_measurements
-    y, _ = check_series(measurements, q, data.stretches, "measurements")
+    y, _ = check_series(measurements, hardware.n_measurements, data.stretches, "measurements")
     if len(y) != len(data.open_loop):
         raise ProblemError(
             f"measurements must have the {len(data.open_loop)} frames of open_loop; got {len(y)}."
         )
+    residual = y @ inverse_sensor(hardware).T
     kept = drop_settling(data.stretches, settle)
-    back = inverse_sensor(plant.hardware)
-    return estimate_residual(
-        np.concatenate([y[start:stop] @ back.T for start, stop in kept]),
-        kept,
-        noise_nm2=data.noise_nm2,
-        noise_error_nm4=data.noise_error_nm4,
-    )
+    return data.estimate([residual[start:stop] for start, stop in kept], kept)
 
 
 def _build_row(
     name: str, found: ResidualEstimate | None, promised: FloatArray | None, imaging: Imaging | None
 ) -> PredictionRow:
     strehl = promised_strehl = float("nan")
-    if imaging is not None:
-        strehl = strehl if found is None else found.strehl(imaging)
-        if promised is not None:
-            promised_strehl = jitter_strehl(promised, imaging=imaging)
+    if imaging is not None and found is not None:
+        strehl = found.strehl(imaging)
+    if imaging is not None and promised is not None:
+        promised_strehl = jitter_strehl(promised, imaging=imaging)
     return PredictionRow(
         name=name,
         replayed=found,

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.linalg import qr
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.prediction.residual import check_series, inverse_sensor
@@ -160,17 +159,11 @@ def _regression(
 def _solve_least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[FloatArray, float]:
     """Return the least-squares coefficients of least norm, and the mean square that is left."""
     unknowns = X.shape[1]
-    together = np.column_stack([X, z])
-    # the triangle of the data has their squares, and no digit is lost by squaring
-    triangle = qr(together, mode="r", overwrite_a=True, check_finite=False)[0][: unknowns + 1]
-    left, right = triangle[:, :unknowns], triangle[:, unknowns]
-    if share > 0:
-        weight = np.sqrt(share * np.mean(np.sum(left**2, axis=0)))
-        left = np.vstack([left, weight * np.eye(unknowns)])
-        right = np.concatenate([right, np.zeros(unknowns)])
-    found = np.linalg.lstsq(left, right, rcond=None)[0]
-    rest = triangle[:, unknowns] - triangle[:, :unknowns] @ found
-    return np.asarray(found), float(rest @ rest / len(X))
+    weight = np.sqrt(share * np.mean(np.sum(X**2, axis=0)))
+    left = np.vstack([X, weight * np.eye(unknowns)])
+    right = np.concatenate([z, np.zeros(unknowns)])
+    found = np.linalg.lstsq(left, right, rcond=np.finfo(float).eps * (unknowns + 1))[0]
+    return np.asarray(found), float(np.mean((z - X @ found) ** 2))
 
 
 def _build_controller(

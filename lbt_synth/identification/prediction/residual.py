@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.prediction.residual_estimate import (
@@ -37,14 +37,23 @@ class PredictionData:
     noise_nm2: FloatArray  # (n, n): covariance of the noise in z
     noise_error_nm4: FloatArray  # (n, n): covariance of the errors of the noise variances
 
+    def estimate(self, measured: Sequence[FloatArray], stretches: Stretches) -> ResidualEstimate:
+        """Return the residual of some stretches from its measured values in each."""
+        return estimate_residual(
+            np.concatenate(measured),
+            stretches,
+            noise_nm2=self.noise_nm2,
+            noise_error_nm4=self.noise_error_nm4,
+        )
+
 
 def replayed_residual(
-    open_loop: Any,
+    open_loop: ArrayLike,
     controller: Controller,
     hardware: LoopHardware,
     *,
-    noise_nm: Any,
-    noise_error_nm: Any = 0.0,
+    noise_nm: ArrayLike,
+    noise_error_nm: ArrayLike = 0.0,
     sensor_gain: float = 1.0,
     stretches: Sequence[tuple[int, int]] | None = None,
     settle_frames: int | None = None,
@@ -109,32 +118,28 @@ def replayed_residual(
     True
     """
     require_instance(hardware, LoopHardware)
-    deviation = _per_measurement(noise_nm, "noise_nm", hardware.n_measurements)
+    deviation = _per_measurement(noise_nm, "noise_nm", hardware)
     data = prediction_data(
         open_loop,
         hardware,
-        noise_nm2=np.diag(deviation**2),
+        np.diag(deviation**2),
         noise_error_nm=noise_error_nm,
         sensor_gain=sensor_gain,
         stretches=stretches,
     )
     loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
     loop.require_stable()
-    default = frames_to_settle(loop)
-    settle = (
-        default if settle_frames is None else integer(settle_frames, "settle_frames", at_least=0)
-    )
-    return predict_residual(data, loop, settle)
+    return predict_residual(data, loop, choose_settling(settle_frames, [loop]))
 
 
 def prediction_data(
-    open_loop: Any,
+    open_loop: ArrayLike,
     hardware: LoopHardware,
-    *,
     noise_nm2: FloatArray,
-    noise_error_nm: Any,
-    sensor_gain: float,
-    stretches: Any,
+    *,
+    noise_error_nm: ArrayLike,
+    sensor_gain: float = 1.0,
+    stretches: Sequence[tuple[int, int]] | None,
 ) -> PredictionData:
     """Check a recorded series against a loop, and refer the noise to the modes.
 
@@ -142,11 +147,10 @@ def prediction_data(
     standard deviations are independent, and leave its correlations as they are: an error of one
     measurement is common to all modes that it is seen in.
     """
-    require_instance(hardware, LoopHardware)
     gain = number(sensor_gain, "sensor_gain", above=0)
     series, parts = check_series(open_loop, hardware.modes, stretches)
     back = inverse_sensor(hardware) / gain
-    error = _per_measurement(noise_error_nm, "noise_error_nm", hardware.n_measurements)
+    error = _per_measurement(noise_error_nm, "noise_error_nm", hardware)
     deviation = np.sqrt(np.diag(noise_nm2))
     # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2
     slope = 2 * back * (back @ noise_nm2) / np.where(deviation > 0, deviation, np.inf)
@@ -159,7 +163,10 @@ def prediction_data(
 
 
 def check_series(
-    open_loop: Any, modes: int, stretches: Any, name: str = "open_loop"
+    open_loop: ArrayLike,
+    modes: int,
+    stretches: Sequence[tuple[int, int]] | None,
+    name: str = "open_loop",
 ) -> tuple[FloatArray, Stretches]:
     """Return a series (frames, modes) that is finite within its stretches, and the stretches."""
     series = float_array(open_loop, name)
@@ -186,8 +193,8 @@ def inverse_sensor(hardware: LoopHardware) -> FloatArray:
     return np.asarray(np.linalg.inv(S))
 
 
-def _per_measurement(value: Any, name: str, count: int) -> FloatArray:
-    out = real_array(value, name)
+def _per_measurement(value: ArrayLike, name: str, hardware: LoopHardware) -> FloatArray:
+    out, count = real_array(value, name), hardware.n_measurements
     if out.ndim > 1 or (out.ndim == 1 and out.size != count):
         raise DimensionError(f"{name} must be a number or {count}, one per measurement; got {out}.")
     if np.any(out < 0):
@@ -195,9 +202,11 @@ def _per_measurement(value: Any, name: str, count: int) -> FloatArray:
     return np.broadcast_to(out, (count,))
 
 
-def frames_to_settle(loop: ClosedLoop) -> int:
-    """Return the frames after which a loop has forgotten its start."""
-    return max(settling_frames(loop.spectral_radius), loop.system.n_states)
+def choose_settling(given: int | None, loops: Iterable[ClosedLoop]) -> int:
+    """Return the given frames, or those after which the slowest loop has forgotten its start."""
+    if given is not None:
+        return integer(given, "settle_frames", at_least=0)
+    return max(max(settling_frames(loop.spectral_radius), loop.system.n_states) for loop in loops)
 
 
 def predict_residual(data: PredictionData, loop: ClosedLoop, settle: int) -> ResidualEstimate:
@@ -205,12 +214,8 @@ def predict_residual(data: PredictionData, loop: ClosedLoop, settle: int) -> Res
     kept = drop_settling(data.stretches, settle)
     # z(k) for phi_tot(k-1), and no noise: the residual of frame k-1 is e(k)
     path = loop.rejection()
-    parts = [
-        filter_series(path, data.open_loop[start - settle : stop])[settle:] for start, stop in kept
-    ]
-    return estimate_residual(
-        np.concatenate(parts), kept, noise_nm2=data.noise_nm2, noise_error_nm4=data.noise_error_nm4
-    )
+    pieces = [data.open_loop[start - settle : stop] for start, stop in kept]
+    return data.estimate([filter_series(path, piece)[settle:] for piece in pieces], kept)
 
 
 def drop_settling(stretches: Stretches, settle: int) -> Stretches:

@@ -16,7 +16,7 @@ from scipy.fft import rfft
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.loop import Imaging, jitter_strehl
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 _FEWEST = 100  # frames that give a standard error
 _TOO_FAR = 4.0  # standard errors below zero that chance does not explain
@@ -200,26 +200,22 @@ def _mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) -
     total, start = np.zeros((n, n)), 0
     for begin, end in stretches:
         length = end - begin
-        x, y = (
-            rfft(one[start : start + length], axis=0),
-            rfft(other[start : start + length], axis=0),
-        )
+        x, y = (rfft(series[start : start + length], axis=0) for series in (one, other))
         weight = np.full(len(x), 2.0)  # a frequency and its negative
         weight[0] = 1.0
         weight[-1] = 2.0 if length % 2 else 1.0
         weight /= length**2
-        total += np.diag(weight @ (np.abs(x) ** 2 * np.abs(y) ** 2))
-        for i in range(n):
-            for j in range(i):
-                pairs = ((x[:, i], x[:, j], y[:, i], y[:, j]), (x[:, i], y[:, j], y[:, i], x[:, j]))
-                part = sum(
-                    float(weight @ np.real(a * b.conj() * np.roll(c.conj() * d, 1)))
-                    for a, b, c, d in pairs
-                )
-                total[i, j] += part
-                total[j, i] += part
+        part = _products(x, x) * np.roll(_products(y, y).conj(), 1, axis=0)
+        part += _products(x, y) * np.roll(_products(y, x).conj(), 1, axis=0)
+        lower = np.tril(np.tensordot(weight, part.real, 1), -1)
+        total += lower + lower.T + np.diag(weight @ (np.abs(x) ** 2 * np.abs(y) ** 2))
         start += length
     total /= frames**2
     # a covariance is at most the product of the deviations
     most = np.sqrt(np.outer(np.diag(total), np.diag(total)))
     return np.asarray(np.clip(total, -most, most))
+
+
+def _products(x: ComplexArray, y: ComplexArray) -> ComplexArray:
+    """Return ``x_i conj(y_j)`` at each frequency, (f, n, n)."""
+    return x[:, :, None] * y.conj()[:, None, :]

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
 import numpy as np
+from scipy.optimize import minimize
+from scipy.signal import periodogram
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.tracking.line_fit import LineFit, LineSearch
-from lbt_synth.models import TipTiltPlant
+from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.validation import FloatArray, number, require_instance
 
 _LEAST_BINS = 8
+# Least half width with which a line is seen: that of the window, or for lines beside each other
+# half of it, next to that of the window's own peak, so that it does not cover its neighbours.
+_WIDTH, _WIDTH_BESIDE = 1.0, 0.5  # bins
 _ALIGNED = 0.9  # cosine between directions along which lines may be mistaken
+_EVIDENCE = 20.0  # twice the gain in log likelihood that makes a line
+_MOST_ROUNDS = 4
+_SETTLED_HZ = 1e-3
+_RESOLUTION = 2.0  # bins from the top of a line to the first zero of a Hann window's spectrum
 
 
 class LineFollower:
@@ -85,30 +99,39 @@ class LineFollower:
             )
         open_loop = measurements @ self._inverse.T + corrections
         frames, rate = len(open_loop), hw.frame_rate_hz
-        taper = np.sqrt(8 / 3) * np.sin(np.pi * (np.arange(frames) + 0.5) / frames) ** 2
+        taper = np.sin(np.pi * (np.arange(frames) + 0.5) / frames) ** 2
         directions = np.array([line.direction for line in self._lines])
-        series = (open_loop - open_loop.mean(axis=0)) @ directions.T
-        powers = 2 / (rate * frames) * np.abs(np.fft.rfft(series * taper[:, None], axis=0)) ** 2
-        grid = np.asarray(np.fft.rfftfreq(frames, 1 / rate), dtype=np.float64)
+        grid, powers = periodogram(  # type: ignore[call-overload]
+            open_loop @ directions.T, rate, window=taper, detrend="constant", axis=0
+        )
         inside = (grid > 0) & (grid < rate / 2)
         grid, powers = grid[inside], powers[inside]
         shared = (directions @ directions.T) ** 2
         found = list(self._lines)
         for group in self._groups(shared):
+            width_bins = _WIDTH if len(group) == 1 else _WIDTH_BESIDE
             searches = []
             for i in group:
                 line = self._lines[i]
                 bins = np.abs(grid - line.frequency_hz) <= self._span_hz
                 if np.count_nonzero(bins) < _LEAST_BINS:
                     return None
-                rest = self._background(group, i, grid)
-                searches.append(LineSearch(line=line, bins=bins, power=powers[:, i], rest=rest))
-            fit = LineFit(grid, length_s=frames / rate, frame_rate_hz=rate, beside=len(group) > 1)
+                searches.append(
+                    _LineSearch(
+                        line=line,
+                        frequency_hz=grid[bins],
+                        power=powers[bins, i],
+                        rest=self._background(group, i, grid[bins]),
+                        width_hz=max(line.damping * line.frequency_hz, width_bins * rate / frames),
+                        bin_hz=rate / frames,
+                        frame_rate_hz=rate,
+                    )
+                )
             if len(group) == 1:
-                alone = fit.fit_alone(searches[0])
+                alone = _fit_line(searches[0])
                 frequencies = None if alone is None else [alone]
             else:
-                frequencies = fit.fit_together(searches, shared[np.ix_(group, group)])
+                frequencies = _fit_neighbours(searches, shared[np.ix_(group, group)])
             if frequencies is None:
                 return None
             for i, frequency in zip(group, frequencies, strict=True):
@@ -118,22 +141,12 @@ class LineFollower:
 
     def _groups(self, shared: FloatArray) -> list[list[int]]:
         """Return groups of lines that could be found on one peak, by rising frequency."""
-        frequency = [line.frequency_hz for line in self._lines]
-        groups: list[list[int]] = []
-        for i in np.argsort(frequency, kind="stable").tolist():
-            near = [
-                group
-                for group in groups
-                if any(
-                    shared[i, j] > _ALIGNED**2 and frequency[i] - frequency[j] <= 2 * self._span_hz
-                    for j in group
-                )
-            ]
-            groups = [group for group in groups if group not in near]
-            groups.append(
-                sorted({i, *(j for group in near for j in group)}, key=frequency.__getitem__)
-            )
-        return groups
+        frequency = np.array([line.frequency_hz for line in self._lines])
+        apart = np.abs(frequency - frequency[:, None])
+        near = (shared > _ALIGNED**2) & (apart <= 2 * self._span_hz)
+        count, label = connected_components(near)
+        order = np.argsort(frequency, kind="stable")
+        return [order[label[order] == k].tolist() for k in range(count)]
 
     def _background(self, group: list[int], index: int, frequency_hz: FloatArray) -> FloatArray:
         """Return the spectrum along a line without the lines of its group [nm^2/Hz]."""
@@ -148,3 +161,160 @@ class LineFollower:
                 weight = float(along @ np.array(line.direction)) ** 2
                 out += weight * line.ar_model(rate).psd(frequency_hz)
         return out
+
+
+class _Peak(NamedTuple):
+    """What is fitted of a line."""
+
+    frequency_hz: float
+    log_rms: float  # logarithm of its rms over that of the line as it was found last
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _LineSearch:
+    """The bins in which a line is searched for, and what they hold."""
+
+    line: Vibration  # as it was found last
+    frequency_hz: FloatArray  # (k,): where it may be
+    power: FloatArray  # (k,): periodogram along its direction [nm^2/Hz]
+    rest: FloatArray  # (k,): spectrum without the lines that are fitted [nm^2/Hz]
+    width_hz: float  # half width with which it is seen
+    bin_hz: float
+    frame_rate_hz: float
+
+    @property
+    def bounds_hz(self) -> tuple[float, float]:
+        """Least and highest frequency."""
+        low, high = float(self.frequency_hz[0]), float(self.frequency_hz[-1])
+        return max(low, 1.01 * self.width_hz), high
+
+    def spectrum(self, peak: _Peak, frequency_hz: FloatArray) -> FloatArray:
+        """Return the spectrum of the line, (f,)."""
+        there = Vibration(
+            frequency_hz=peak.frequency_hz,
+            damping=self.width_hz / peak.frequency_hz,
+            rms_nm=self.line.rms_nm * float(np.exp(peak.log_rms)),
+            direction=(1.0,),
+        )
+        return there.ar_model(self.frame_rate_hz).psd(frequency_hz)
+
+    def contrast(self, rest: FloatArray, peak: _Peak | None = None) -> float:
+        """Return minus the log likelihood of the rest, alone or with the line."""
+        model = rest if peak is None else rest + self.spectrum(peak, self.frequency_hz)
+        return float(np.sum(np.log(model) + self.power / model))
+
+
+def _fit_line(search: _LineSearch) -> float | None:
+    """Return the frequency of a line without neighbours [Hz]; None if it is not there."""
+    highest = float(search.frequency_hz[np.argmax(search.power / search.rest)])
+    found = _fit_peak(search, search.rest, _Peak(highest, 0.0))
+    return found.frequency_hz if found and _is_there(search, search.rest, found) else None
+
+
+def _fit_neighbours(searches: Sequence[_LineSearch], shared: FloatArray) -> list[float] | None:
+    """Return the frequencies of neighbouring lines, in the order that they had [Hz].
+
+    Each is fitted beside the others in turn, from the highest peaks and from where they were last;
+    the likelier end counts. ``shared`` (m, m) is the power that one line has along another.
+    """
+    ends = []
+    for frequencies in ([s.line.frequency_hz for s in searches], _highest_peaks(searches)):
+        start = [_start_at(s, f) for s, f in zip(searches, frequencies, strict=False)]
+        end = _fit_in_turn(searches, shared, start, 1) if len(start) == len(searches) else None
+        ends += [end] if end else []
+
+    def contrast(peaks: Sequence[_Peak]) -> float:
+        rests = (_rest_beside(searches, shared, peaks, i) for i in range(len(peaks)))
+        each = zip(searches, rests, peaks, strict=True)
+        return sum(search.contrast(rest, peak) for search, rest, peak in each)
+
+    if not ends:
+        return None
+    peaks = _fit_in_turn(searches, shared, min(ends, key=contrast), _MOST_ROUNDS)
+    if peaks is None:
+        return None
+    for i, search in enumerate(searches):
+        if not _is_there(search, _rest_beside(searches, shared, peaks, i), peaks[i]):
+            return None
+    found = [peak.frequency_hz for peak in peaks]
+    for i, j in combinations(range(len(found)), 2):
+        if found[j] - found[i] < (_RESOLUTION * searches[i].bin_hz if shared[i, j] > 0 else 0):
+            return None
+    return found
+
+
+def _start_at(search: _LineSearch, frequency_hz: float) -> _Peak:
+    """Return the start of a fit: a line as high as the periodogram there."""
+    low, high = search.bounds_hz
+    frequency = float(np.clip(frequency_hz, low, max(low, high)))
+    nearest = [np.argmin(np.abs(search.frequency_hz - frequency))]
+    line = search.spectrum(_Peak(frequency, 0.0), search.frequency_hz[nearest])
+    ratio = float(search.power[nearest][0] / line[0])
+    return _Peak(frequency, float(np.clip(0.5 * np.log(max(ratio, 1e-6)), -9, 9)))
+
+
+def _highest_peaks(searches: Sequence[_LineSearch]) -> list[float]:
+    """Return the frequencies of as many peaks as there are lines, or fewer."""
+    frequency = np.concatenate([search.frequency_hz for search in searches])
+    ratio = np.concatenate([search.power / search.rest for search in searches])
+    found: list[float] = []
+    while len(found) < len(searches) and frequency.size:
+        found.append(float(frequency[np.argmax(ratio)]))
+        far = np.abs(frequency - found[-1]) >= (_RESOLUTION + 0.5) * searches[0].bin_hz
+        frequency, ratio = frequency[far], ratio[far]
+    return sorted(found)
+
+
+def _rest_beside(
+    searches: Sequence[_LineSearch], shared: FloatArray, peaks: Sequence[_Peak], i: int
+) -> FloatArray:
+    """Return the spectrum of everything but line i, along it."""
+    rest = searches[i].rest
+    for j, other in enumerate(searches):
+        if j != i and shared[i, j] > 0:
+            rest = rest + shared[i, j] * other.spectrum(peaks[j], searches[i].frequency_hz)
+    return rest
+
+
+def _fit_in_turn(
+    searches: Sequence[_LineSearch], shared: FloatArray, start: Sequence[_Peak], most: int
+) -> list[_Peak] | None:
+    """Fit each line beside the others until they stay; None if a fit does not settle."""
+    peaks = list(start)
+    for _ in range(most):
+        before = list(peaks)
+        rms = [np.log(s.line.rms_nm) + p.log_rms for s, p in zip(searches, peaks, strict=True)]
+        for i in np.argsort(rms)[::-1].tolist():  # the strongest first
+            found = _fit_peak(searches[i], _rest_beside(searches, shared, peaks, i), peaks[i])
+            if found is None:
+                return None
+            peaks[i] = found
+        moves = [abs(p.frequency_hz - q.frequency_hz) for p, q in zip(peaks, before, strict=True)]
+        if max(moves) < _SETTLED_HZ:
+            break
+    return peaks
+
+
+def _fit_peak(search: _LineSearch, rest: FloatArray, start: _Peak) -> _Peak | None:
+    """Fit a line over the rest of the spectrum; None if the fit does not settle."""
+    low, high = search.bounds_hz
+
+    def contrast(p: FloatArray) -> float:
+        peak = _Peak(*p.tolist())
+        inside = low <= peak.frequency_hz <= high and -10 < peak.log_rms < 10
+        return search.contrast(rest, peak) if inside else np.inf
+
+    f, log_rms = float(np.clip(start.frequency_hz, low, max(low, high))), start.log_rms
+    simplex = np.array([[f, log_rms], [f + 0.25 * search.bin_hz, log_rms], [f, log_rms + 0.3]])
+    fit = minimize(
+        contrast,
+        simplex[0],
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 400},
+    )
+    return _Peak(*fit.x.tolist()) if fit.success and np.isfinite(fit.fun) else None
+
+
+def _is_there(search: _LineSearch, rest: FloatArray, found: _Peak) -> bool:
+    """Whether a line makes the data likelier by enough."""
+    return 2 * (search.contrast(rest) - search.contrast(rest, found)) > _EVIDENCE

@@ -11,15 +11,15 @@ every filter.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import FilterDesign
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.simulation.block_filtering import last_state
 from lbt_synth.models import LoopHardware, TipTiltPlant
-from lbt_synth.validation import BoolArray, FloatArray, float_array, number
+from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,9 +76,7 @@ class SwitchedController:
     """
 
     def __init__(self, design: FilterDesign, *, memory_s: float = 8.0) -> None:
-        plant = _plant(design)
-        self._hardware = plant.hardware
-        self._first = design
+        self._first, self._hardware = design, _plant(design).hardware
         frames = number(memory_s, "memory_s", above=0) * self._hardware.frame_rate_hz
         self._memory = int(number(frames, "memory_s in frames", at_least=1, at_most=1e7))
         self._mirror = self._hardware.mirror_system.whole
@@ -114,9 +112,9 @@ class SwitchedController:
         self._position = np.zeros((self._mirror.n_states, hw.n_commands))
         self._command = np.zeros(hw.n_commands)
         self._take(self._first)
-        self._state = np.zeros(len(self._F))
+        self._state = np.zeros(self._plant.A.shape[0])
 
-    def step(self, y: Any) -> FloatArray:
+    def step(self, y: ArrayLike) -> FloatArray:
         """Take the measurements y(k), (q,), and return the command u(k), (m,).
 
         Parameters
@@ -136,24 +134,25 @@ class SwitchedController:
         DimensionError
             If there is another number of measurements.
         """
+        F, K, C, S, to_command = self._filter
         measured = float_array(y, "y")
-        if measured.shape != (len(self._S),):
+        if measured.shape != (len(S),):
             raise DimensionError(
-                f"y must have shape ({len(self._S)},) to match the sensor matrix "
-                f"{self._S.shape}; got {measured.shape}."
+                f"y must have shape ({len(S)},) to match the sensor matrix {S.shape}; got "
+                f"{measured.shape}."
             )
         mirror, row = self._mirror, self._frames % self._memory
         seen = mirror.C @ self._position + mirror.D * self._command
         correction = self._hardware.influence @ seen
         self._position = mirror.A @ self._position + np.outer(mirror.B, self._command)
-        known = self._S @ correction
+        known = S @ correction
         usable = bool(np.isfinite(measured).all())
         if not usable:  # what the filter expects leaves it without an innovation
-            measured = self._C @ self._state - known
+            measured = C @ self._state - known
             self._spoilt += 1
-        self._state = self._F @ self._state + self._K @ (measured + known)
+        self._state = F @ self._state + K @ (measured + known)
         if usable:
-            self._command = self._to_command @ self._state
+            self._command = to_command @ self._state
         self._measurements[row], self._corrections[row] = measured, correction
         self._usable[row] = usable
         self._frames += 1
@@ -182,14 +181,14 @@ class SwitchedController:
             If the design is of another kind, or for another loop.
         """
         require_same_loop(_plant(design), self._hardware)
-        old = (self._F, self._K, self._C, self._S, self._to_command)
+        old = self._filter
         self._take(design)
-        new = (self._F, self._K, self._C, self._S, self._to_command)
-        if all(np.array_equal(a, b) for a, b in zip(old, new, strict=True)):
+        if all(np.array_equal(a, b) for a, b in zip(old, self._filter, strict=True)):
             return SwitchReport(copied=True, frames=0, left=0.0)
+        F, K, _, S, _ = self._filter
         measurements, corrections = self.window()
-        self._state = last_state(self._F, (measurements + corrections @ self._S.T) @ self._K.T)
-        radius = float(np.max(np.abs(np.linalg.eigvals(self._F))))
+        self._state = last_state(F, (measurements + corrections @ S.T) @ K.T)
+        radius = float(np.max(np.abs(np.linalg.eigvals(F))))
         left = 0.0 if self._frames <= self._memory else radius ** len(measurements)
         return SwitchReport(copied=False, frames=len(measurements), left=left)
 
@@ -242,17 +241,16 @@ class SwitchedController:
         usable = self.usable(frames)
         return 1.0 - float(np.mean(usable)) if usable.size else 0.0
 
-    def _rows(self, frames: int | None) -> np.ndarray[Any, np.dtype[np.int64]]:
+    def _rows(self, frames: int | None) -> IntArray:
         there = min(self._frames, self._memory)
         count = there if frames is None else min(frames, there)
         return np.arange(self._frames - count, self._frames, dtype=np.int64) % self._memory
 
     def _take(self, design: FilterDesign) -> None:
-        plant = _plant(design)
-        self._design = design
-        self._K, self._C, self._S = design.gain_predictor, plant.C, plant.hardware.sensor
-        self._F = plant.A - design.gain_predictor @ plant.C
-        self._to_command = plant.hardware.projector @ plant.L
+        """Set the filter: its matrices F, K, C, the sensor matrix, and from state to command."""
+        self._design, self._plant = design, _plant(design)
+        plant, hw, K = self._plant, self._plant.hardware, design.gain_predictor
+        self._filter = plant.A - K @ plant.C, K, plant.C, hw.sensor, hw.projector @ plant.L
 
 
 def _plant(design: object) -> TipTiltPlant:
@@ -267,16 +265,17 @@ def _plant(design: object) -> TipTiltPlant:
 
 def require_same_loop(plant: TipTiltPlant, hardware: LoopHardware) -> None:
     """Refuse a plant of another loop; its sensor gain may differ."""
-    mine, theirs = hardware, plant.hardware
+    theirs = plant.hardware
     if (
-        (theirs.frame_rate_hz, theirs.delay_frames) != (mine.frame_rate_hz, mine.delay_frames)
-        or theirs.mirror != mine.mirror
-        or not np.array_equal(theirs.influence, mine.influence)
-        or theirs.sensor.shape != mine.sensor.shape
+        (theirs.frame_rate_hz, theirs.delay_frames)
+        != (hardware.frame_rate_hz, hardware.delay_frames)
+        or theirs.mirror != hardware.mirror
+        or not np.array_equal(theirs.influence, hardware.influence)
+        or theirs.sensor.shape != hardware.sensor.shape
     ):
         raise ProblemError(
-            f"the filter must be for the running loop ({mine.frame_rate_hz:g} Hz, "
-            f"{mine.delay_frames:g} frames, {mine.n_measurements} measurements, the same mirror "
-            f"and influence matrix); got one for {theirs.frame_rate_hz:g} Hz, "
+            f"the filter must be for the running loop ({hardware.frame_rate_hz:g} Hz, "
+            f"{hardware.delay_frames:g} frames, {hardware.n_measurements} measurements, the same "
+            f"mirror and influence matrix); got one for {theirs.frame_rate_hz:g} Hz, "
             f"{theirs.delay_frames:g} frames and {theirs.n_measurements} measurements."
         )

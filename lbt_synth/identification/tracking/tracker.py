@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import FilterDesign, kalman
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -15,7 +16,7 @@ from lbt_synth.identification.tracking.glitches import bridge_frames, find_glitc
 from lbt_synth.identification.tracking.loop_identifier import LoopIdentifier
 from lbt_synth.identification.tracking.switching import SwitchedController, require_same_loop
 from lbt_synth.identification.tracking.trend import LineTrack, match_tracks
-from lbt_synth.models import LoopHardware, TipTiltPlant, Vibration
+from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.validation import FloatArray, number, require_instance
 
@@ -82,7 +83,7 @@ class _KeepFilterError(Exception):
     """The reason why the running filter is kept."""
 
 
-class TrackingController:
+class TrackingController(SwitchedController):
     """A controller that identifies and redesigns its filter while it runs.
 
     Every ``update_s`` seconds the last ``window_s`` seconds of measurements and commands are
@@ -171,23 +172,11 @@ class TrackingController:
         self._window_s = number(window_s, "window_s", at_least=_LEAST_FRAMES / rate)
         self._update_s = number(update_s, "update_s", at_least=1 / rate)
         longer = max(2 * self._window_s, 5 * self._update_s)
-        trend = longer if trend_s is None else trend_s
-        self._trend_s = number(trend, "trend_s", at_least=0)
+        self._trend_s = number(longer if trend_s is None else trend_s, "trend_s", at_least=0)
         self._window, self._every = round(self._window_s * rate), round(self._update_s * rate)
         self._rate, self._extrapolate = rate, bool(extrapolate)
-        self._identify, self._design = identifier, design
-        self._running = SwitchedController(design(plant), memory_s=self._window / rate)
-        self.reset()
-
-    @property
-    def hardware(self) -> LoopHardware:
-        """The loop."""
-        return self._running.hardware
-
-    @property
-    def design(self) -> FilterDesign:
-        """The filter that runs."""
-        return self._running.design
+        self._identify, self._make_design = identifier, design
+        super().__init__(design(plant), memory_s=self._window / rate)
 
     @property
     def history(self) -> tuple[TrackingUpdate, ...]:
@@ -199,80 +188,64 @@ class TrackingController:
         """Updates since the reset at which the running filter was kept."""
         return sum(not update.switched for update in self._history)
 
-    @property
-    def spoilt(self) -> int:
-        """Frames since the reset whose measurement was not finite."""
-        return self._running.spoilt
-
     def reset(self) -> None:
         """Return to the first filter, and forget everything."""
-        self._running.reset()
+        super().reset()
         self._history: list[TrackingUpdate] = []
         self._tracks: list[LineTrack] = []
-        self._left_out = 0
         reset = getattr(self._identify, "reset", None)
         if callable(reset):
             reset()
 
-    def step(self, y: Any) -> FloatArray:
-        """Take the measurements y(k), (q,), and return the command u(k), (m,).
+    def step(self, y: ArrayLike) -> FloatArray:
+        """Take measurements and return the command, as the base class does; update if it is time.
 
         Parameters
         ----------
         y : (q,) array_like
-            Measurements; where one of them is not finite the command is held.
+            Measurements y(k); where one of them is not finite the command is held.
 
         Returns
         -------
         (m,) ndarray
-            The command.
-
-        Raises
-        ------
-        ProblemError
-            If they are no real numbers.
-        DimensionError
-            If there is another number of measurements.
+            The command u(k).
         """
-        command = self._running.step(y)
-        frames = self._running.frames
-        if frames >= self._window and (frames - self._window) % self._every == 0:
-            self._update(frames / self._rate)
+        command = super().step(y)
+        if self.frames >= self._window and (self.frames - self._window) % self._every == 0:
+            self._update(self.frames / self._rate)
         return command
 
     def _update(self, time_s: float) -> None:
-        fitted_hz: tuple[float, ...] = ()
+        """Identify the last window, and take the filter that is designed for it."""
+        found: TipTiltPlant | None = None
         self._left_out = 0
         reason, clock = "", [time.perf_counter()]
         try:
             found = self._identify_window()
-            fitted_hz = tuple(line.frequency_hz for line in found.vibrations)
             clock.append(time.perf_counter())
             designed = self._design_filter(self._extrapolate_lines(found, time_s))
             clock.append(time.perf_counter())
-            self._running.switch(designed)
+            self.switch(designed)
         except _KeepFilterError as kept:
             reason = str(kept)
         except LbtSynthError as error:
             reason = f"{type(error).__name__}: {error}"
         clock += [time.perf_counter()] * (4 - len(clock))
-        identify_s, design_s, switch_s = np.diff(clock)
-        plant = self.design.problem
-        assert isinstance(plant, TipTiltPlant)  # SwitchedController takes no other
+        identify_s, design_s, switch_s = np.diff(clock).tolist()
         self._history.append(
             TrackingUpdate(
                 time_s=time_s,
                 middle_s=time_s - self._window_s / 2,
-                fitted_hz=fitted_hz,
-                frequencies_hz=tuple(line.frequency_hz for line in plant.vibrations),
-                rms_nm=tuple(line.rms_nm for line in plant.vibrations),
-                noise_nm=tuple(float(v) for v in np.sqrt(np.diag(plant.R))),
+                fitted_hz=tuple(line.frequency_hz for line in found.vibrations) if found else (),
+                frequencies_hz=tuple(line.frequency_hz for line in self._plant.vibrations),
+                rms_nm=tuple(line.rms_nm for line in self._plant.vibrations),
+                noise_nm=tuple(np.sqrt(np.diag(self._plant.R)).tolist()),
                 left_out=self._left_out,
                 switched=not reason,
                 reason=reason,
-                identify_s=float(identify_s),
-                design_s=float(design_s),
-                switch_s=float(switch_s),
+                identify_s=identify_s,
+                design_s=design_s,
+                switch_s=switch_s,
             )
         )
 
@@ -292,11 +265,9 @@ class TrackingController:
 
     def _clean_window(self) -> tuple[FloatArray, FloatArray]:
         """Return measurements and corrections of the last window, without outliers."""
-        measurements, corrections = self._running.window(self._window)
-        missing = ~self._running.usable(self._window)
-        plant = self.design.problem
-        assert isinstance(plant, TipTiltPlant)
-        seen = corrections @ plant.hardware.sensor.T  # with the sensor gain found last
+        measurements, corrections = self.window(self._window)
+        missing = ~self.usable(self._window)
+        seen = corrections @ self._plant.hardware.sensor.T  # with the sensor gain found last
         wrong = find_glitches(measurements + seen)
         self._left_out = int(np.count_nonzero(missing | wrong))
         share = 100 * self._left_out / len(missing)
@@ -315,7 +286,7 @@ class TrackingController:
     def _design_filter(self, plant: TipTiltPlant) -> FilterDesign:
         """Return the certified filter of a plant."""
         try:
-            return self._design(plant)
+            return self._make_design(plant)
         except Exception as error:  # as above
             raise _KeepFilterError(f"the design failed: {type(error).__name__}: {error}") from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import linregress, theilslopes
 
 from lbt_synth.models import Vibration
 from lbt_synth.validation import FloatArray
@@ -37,25 +38,19 @@ def extrapolate(
     last = float(frequency_hz[-1])
     if time_s.size < _LEAST_POINTS:
         return last, float("nan"), float("nan")
-    one, other = np.triu_indices(time_s.size, 1)
-    steep = np.median((frequency_hz[other] - frequency_hz[one]) / (time_s[other] - time_s[one]))
-    rest = frequency_hz - steep * time_s
+    rest = frequency_hz - theilslopes(frequency_hz, time_s).slope * time_s
     rest = np.abs(rest - np.median(rest))
     inside = rest <= max(_OUTLIER * float(np.median(rest)), 1e-9 * abs(last))
     changed = not inside[-2:].any()  # one frequency may be wrong, two are another trend
     if changed or np.count_nonzero(inside) < _LEAST_POINTS:
         return last, float("nan"), float("nan")
-    t, f = time_s[inside], frequency_hz[inside]
-    t_mean, f_mean = float(np.mean(t)), float(np.mean(f))
-    spread = float(np.sum((t - t_mean) ** 2))
-    slope = float(np.sum((t - t_mean) * (f - f_mean))) / spread
-    misfit = float(np.sum((f - f_mean - slope * (t - t_mean)) ** 2)) / (t.size - 2)
-    error = float(np.sqrt(max(1.0, overlap) * misfit / spread))
+    line = linregress(time_s[inside], frequency_hz[inside])
+    slope, error = float(line.slope), float(line.stderr * np.sqrt(max(1.0, overlap)))
     if slope == 0:
         return last, slope, error
-    on_line = f_mean + slope * (at_s - t_mean)
-    start = last if inside[-1] else f_mean + slope * (float(time_s[-1]) - t_mean)
-    return start + (on_line - start) / (1 + (error / slope) ** 2), slope, error
+    on_line = line.intercept + slope * at_s
+    start = last if inside[-1] else line.intercept + slope * float(time_s[-1])
+    return float(start + (on_line - start) / (1 + (error / slope) ** 2)), slope, error
 
 
 @dataclass(slots=True, eq=False)
