@@ -10,7 +10,8 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
-from lbt_synth.design import Design, hinf, kalman, optimal_integrator
+from lbt_synth.design import Design
+from lbt_synth.methods.registry import reference_methods
 from lbt_synth.report.figures import limits_figure
 
 
@@ -58,9 +59,9 @@ def run(arguments: Namespace) -> Report:
 
 def _config_designs(config: Config) -> dict[str, Design]:
     return {
-        "integrator": optimal_integrator(config.hardware, config.truth),
-        "kalman": kalman(config.plant),
-        "hinf": hinf(config.plant, gamma_ratio=config.settings.design.gamma_ratio, route="riccati"),
+        method.name: config.design(method.name, **method.reference[1])
+        for method in reference_methods()
+        if method.reference is not None
     }
 
 

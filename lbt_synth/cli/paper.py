@@ -8,12 +8,11 @@ from typing import Any
 from lbt_synth.cli.output import Report, TableText
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import track_progress
+from lbt_synth.methods.registry import design_title
 from lbt_synth.report.paper import PaperResult, write_paper
 from lbt_synth.studies.paper.parameters import PARAMETERS
 from lbt_synth.studies.paper.published import TABLE_III
 from lbt_synth.studies.paper.tables import TableEntry, rms_difference, table_iii
-
-_NAMES = {"classical": "classical", "kalman": "mixed Kalman", "hinf": "mixed H-inf"}
 
 
 def run(arguments: Namespace) -> Report:
@@ -27,7 +26,7 @@ def run(arguments: Namespace) -> Report:
     result = write_paper(folder, rows)
     columns = {
         method: rms_difference([e for e in result.table_iii if e.method == method])
-        for method in ("kalman", "hinf")
+        for method in dict.fromkeys(entry.method for entry in result.table_iii)
     }
     return Report(
         data={
@@ -46,8 +45,8 @@ def run(arguments: Namespace) -> Report:
             _comparison_table("Table III: Strehl ratio [%] at 2.2 um", result.table_iii),
         ],
         notes=[
-            f"Table III, rms difference: Kalman {columns['kalman']:.2f} points, "
-            f"H-infinity {columns['hinf']:.2f} points",
+            "Table III, rms difference: "
+            + ", ".join(f"{design_title(m)} {d:.2f} points" for m, d in columns.items()),
             f"H-infinity: bound at {_gamma_ratio(result):.3f} times the least at 20 Hz",
             *(f"written: {path}" for path in result.files),
         ],
@@ -76,7 +75,7 @@ def _comparison_table(title: str, entries: list[TableEntry]) -> TableText:
     cells = {(e.label, e.method): e for e in entries}
     headings = ["row"]
     for method in methods:
-        headings += [f"{_NAMES[method]}, ours", "paper", "difference"]
+        headings += [f"{design_title(method)}, ours", "paper", "difference"]
     rows = []
     for label in dict.fromkeys(e.label for e in entries):
         row = [label]

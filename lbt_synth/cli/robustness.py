@@ -20,7 +20,7 @@ from lbt_synth.loop import stable_sensor_gains
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.studies import RobustnessMap, robustness_map
-from lbt_synth.studies.robustness import METHODS
+from lbt_synth.studies.robustness import default_methods
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _MOST_VALUES = 2001  # of frequency errors or sensor gains
@@ -68,7 +68,7 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
                 gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
                 hold=settings.robustness.hold,
             ),
-            total=len(errors) * len(METHODS),
+            total=len(errors) * len(default_methods()),
             what="designs",
             quiet=arguments.json,
         )

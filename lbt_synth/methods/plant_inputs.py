@@ -7,8 +7,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.methods.registry import method_named
+from lbt_synth.methods.request import design_request
 
 if TYPE_CHECKING:
+    from lbt_synth.design import Design
     from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 
 
@@ -39,3 +42,11 @@ class PlantInputs:
         if entry.rms_nm is None:
             raise ProblemError(f"{key}: expected rms_nm, as a plant knows no telescope.")
         return float(entry.rms_nm)
+
+
+def reference_design(name: str, plant: TipTiltPlant, options: Mapping[str, Any]) -> Design:
+    """Design a method for a plant as studies do that compare with it; it takes what it knows."""
+    method = method_named(name)
+    own = {key: value for key, value in options.items() if key in method.options.model_fields}
+    reference = {} if method.reference is None else method.reference[1]
+    return design_request(name, {**reference, **own}).build(PlantInputs(plant=plant))

@@ -142,6 +142,14 @@ def option_names() -> list[str]:
     return sorted({name for m in all_methods().values() for name in m.options.model_fields})
 
 
+def design_title(name: str) -> str:
+    """Return what sentences call a design with a name in ``Design.method``, else the name."""
+    try:
+        return method_of_design(name).title
+    except ProblemError:
+        return name
+
+
 def design_label(design: Design) -> str:
     """Return what figures call a design: the label of its method, else its method's name."""
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lbt_synth.design import FilterDesign
 from lbt_synth.files import save_gain
+from lbt_synth.methods.registry import design_label
 from lbt_synth.report.figures.robustness import robustness_figure
 from lbt_synth.report.figures.sigma import sigma_figure
 from lbt_synth.report.figures.style import save_figure
@@ -55,10 +56,10 @@ def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) ->
         )
     )
     published = {
-        method: [(row.model_hz - VIBRATION_HZ, getattr(row, method)) for row in TABLE_III]
-        for method in ("kalman", "hinf")
+        name: [(row.model_hz - VIBRATION_HZ, getattr(row, name)) for row in TABLE_III]
+        for name in (kalman_design.method, hinf_design.method)
     }
-    filters = {"Kalman": kalman_design, r"H$_\infty$": hinf_design}
+    filters = {design_label(design): design for design in (kalman_design, hinf_design)}
     for name, figure in (
         ("robustness", robustness_figure(rows, published)),
         ("sigma", sigma_figure(filters, unit_weights=True)),

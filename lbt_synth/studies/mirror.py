@@ -101,11 +101,12 @@ def mirror(
     require_instance(imaging, Imaging)
     hardware = plant.hardware
     settled = replace(plant, hardware=replace(hardware, mirror=None))
+    regulated = lqg(plant, command_weight=command_weight)
     designs: dict[str, Design] = {
         "integrator, best gain": optimal_integrator(hardware, truth),
         "kalman, settled mirror": kalman(settled),
         "kalman, real positions": kalman(plant),
-        "lqg": lqg(plant, command_weight=command_weight),
+        regulated.method: regulated,
         **(more or {}),
     }
     return tuple(_row(name, design, hardware, truth, imaging) for name, design in designs.items())

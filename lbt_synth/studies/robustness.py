@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from lbt_synth.design import FilterDesign, hinf, kalman
+from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
+from lbt_synth.methods.plant_inputs import reference_design
+from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.models import TipTiltPlant, Truth, retuned_plant
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, number
-
-METHODS = ("kalman", "hinf")
 
 
 @table_row
@@ -23,7 +23,7 @@ class RobustnessRow:
     error_hz: float = column(
         "error", unit="Hz", format="+.2f", help="Frequency in the model less the true one"
     )
-    method: str = column("method", help='"kalman" or "hinf"')
+    method: str = column("method", help="Method of synthesis")
     strehl: float = column(
         "Strehl", unit="%", scale=100, format=".2f", help="Strehl ratio in [0, 1]", default=np.nan
     )
@@ -49,7 +49,7 @@ def robustness(
     imaging: Imaging,
     *,
     errors_hz: Sequence[float],
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] | None = None,
     gamma_ratio: float = 1.2,
     gamma: float | None = None,
     hold: str = "driving",
@@ -66,8 +66,9 @@ def robustness(
         The camera.
     errors_hz : sequence of float
         Errors of the model's frequency [Hz].
-    methods : sequence of {"kalman", "hinf"}, optional
-        Methods of design.
+    methods : sequence of str, optional
+        Methods of synthesis that design for a plant; by default the Kalman and the H-infinity
+        filter.
     gamma_ratio : float, optional
         H-infinity bound as a multiple of each row's least gamma.
     gamma : float, optional
@@ -112,21 +113,22 @@ def robustness(
         raise ProblemError(
             "a frequency error needs a vibration in the model; got a plant without any."
         )
-    for method in methods:
-        choice(method, "method", METHODS)
-    ratio = gamma_ratio if gamma is None else None
+    names = default_methods() if methods is None else methods
+    for name in names:
+        choice(name, "method", record_methods())
+    bound = {"gamma_ratio": gamma_ratio} if gamma is None else {"gamma": gamma}
     for error in errors_hz:
         moved = retuned_plant(plant, number(error, "errors_hz"), hold=hold)
-        for method in methods:
-            design = (
-                kalman(moved)
-                if method == "kalman"
-                else hinf(moved, gamma=gamma, gamma_ratio=ratio, route="riccati")
-            )
-            yield _row(design, truth, imaging, float(error))
+        for name in names:
+            yield _row(reference_design(name, moved, bound), truth, imaging, float(error))
 
 
-def _row(design: FilterDesign, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
+def default_methods() -> list[str]:
+    """Return the methods whose rows are computed unless others are named."""
+    return [method.name for method in reference_methods(estimators_only=True)]
+
+
+def _row(design: Design, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
     assert design.hardware is not None  # this module designs for plants
     loop = close_loop(design.hardware, design.controller, sensor_gain=truth.sensor_gain)
     known = {"error_hz": error, "stable": loop.is_stable}

@@ -13,10 +13,11 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.methods.mixed import METHOD as MIXED
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, integer
 
-FAMILIES = ("mixed", "central")
+FAMILIES = (MIXED.name, "central")
 _MOST_POINTS = 200
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 
@@ -126,7 +127,7 @@ def _points(
                 design = least
             elif i == count - 1:
                 design = best
-            elif family == "mixed":
+            elif family == MIXED.name:
                 design = mixed(problem, gamma=level, taps=taps)
             else:
                 design = central_filter(problem, gamma=level)

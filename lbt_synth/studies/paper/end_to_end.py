@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lbt_synth.design import Design, hinf, integrator, kalman
+from lbt_synth.design import Design, integrator
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.interop import EndToEndSetup, calibrate
 from lbt_synth.interop.specula.json_cases import make_case, run_case
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
+from lbt_synth.methods.plant_inputs import reference_design
 from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.rows import column, fill_row, table_row
@@ -28,7 +29,6 @@ CLASSICAL_GAIN = 0.5
 # "by increasing the integrator's gain"; this times the optical gain of the loop, 0.55, is the
 # effective gain that fits Table II (parameters.CLASSICAL_EFFECTIVE_GAIN)
 CLASSICAL_GAIN_VIBRATION = 0.56
-_FILTERS = ("kalman", "hinf")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,7 +129,7 @@ def plan_tables(
         )
     for name, design in (designs or {}).items():
         setup.controller(design)  # refuses a filter of another loop or of other sizes
-        if name in ("classical", *_FILTERS):
+        if name in ("classical", *given.filter_problems()):
             raise ProblemError(f"the name {name} is taken by the paper's own; rename the file.")
     lines: list[_Line] = []
     if "II" in tables:
@@ -171,12 +171,14 @@ def _plan_line(
         classical = integrator(setup.system.hardware, gain=gain).controller
         paper = line.published.classical
         yield _plan_row(setup, line, "classical", classical, moved_hz, paper=paper)
-    for method in _FILTERS:
+    for method, (plant, gamma) in given.filter_problems().items():
+        tuned = retuned_plant(plant, model_hz - given.VIBRATION_HZ, hold="driving")
+        options = {} if gamma is None else {"gamma": gamma}
         yield _plan_row(
             setup,
             line,
             method,
-            _paper_filter(method, model_hz),
+            reference_design(method, tuned, options).controller,
             true_hz,
             tuned=f"-{model_hz:g}hz",
             paper=getattr(line.published, method),
@@ -216,14 +218,6 @@ def _plan_row(
             for seed in line.seeds
         },
     )
-
-
-def _paper_filter(method: str, model_hz: float) -> Controller:
-    plant = given.kalman_plant() if method == "kalman" else given.hinf_plant()
-    plant = retuned_plant(plant, model_hz - given.VIBRATION_HZ, hold="driving")
-    if method == "kalman":
-        return kalman(plant).controller
-    return hinf(plant, gamma=given.HINF_GAMMA * given.NOISE_NM, route="riccati").controller
 
 
 def end_to_end_tables(

@@ -10,6 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from lbt_synth.loop import Imaging
+from lbt_synth.methods.hinf import METHOD as HINF
+from lbt_synth.methods.kalman import METHOD as KALMAN
 from lbt_synth.models import (
     ARModel,
     Atmosphere,
@@ -89,6 +91,14 @@ def hinf_plant() -> TipTiltPlant:
     unit = Vibration(frequency_hz=VIBRATION_HZ, damping=HINF_DAMPING, rms_nm=1.0)
     driving = unit.ar_model(FRAME_RATE_HZ).driving_rms_nm
     return _plant(turbulence, HINF_VIBRATION_WEIGHT * NOISE_NM / driving, HINF_DAMPING)
+
+
+def filter_problems() -> dict[str, tuple[TipTiltPlant, float | None]]:
+    """Plant of each of the paper's two filters, and its bound [nm] if it has one, by method."""
+    return {
+        KALMAN.name: (kalman_plant(), None),
+        HINF.name: (hinf_plant(), HINF_GAMMA * NOISE_NM),
+    }
 
 
 def _plant(turbulence: ARModel, vibration_nm: float, damping: float) -> TipTiltPlant:

@@ -21,7 +21,7 @@ class TableEntry:
 
     table: str  # "II" or "III"
     label: str  # of the row
-    method: str  # "classical", "kalman" or "hinf"
+    method: str  # "classical", or the method of the filter
     ours: float  # Strehl ratio [%]
     paper: float  # Strehl ratio [%]
 
@@ -46,7 +46,7 @@ def paper_filters() -> tuple[FilterDesign, FilterDesign]:
 
 def table_ii() -> list[TableEntry]:
     """Table II: three controllers without and with the vibration."""
-    kalman_design, hinf_design = paper_filters()
+    filters = paper_filters()
     hardware = given.kalman_plant().hardware
     out = []
     for row in TABLE_II:
@@ -58,18 +58,15 @@ def table_ii() -> list[TableEntry]:
             classical = integrator(hardware, gain=gain)
         else:
             classical = optimal_integrator(hardware, truth)
-        for method, design, published in (
-            ("classical", classical, row.classical),
-            ("kalman", kalman_design, row.kalman),
-            ("hinf", hinf_design, row.hinf),
-        ):
+        named = {"classical": classical, **{design.method: design for design in filters}}
+        for method, design in named.items():
             out.append(
                 TableEntry(
                     table="II",
                     label="vibration" if row.vibration else "no vibration",
                     method=method,
                     ours=_strehl_percent(design, truth),
-                    paper=published,
+                    paper=getattr(row, method),
                 )
             )
     return out
@@ -78,10 +75,7 @@ def table_ii() -> list[TableEntry]:
 def table_iii() -> Iterator[RobustnessRow]:
     """Yield the rows of Table III, two per frequency: Kalman, then H-infinity."""
     for row in TABLE_III:
-        for plant, method, gamma in (
-            (given.kalman_plant(), "kalman", None),
-            (given.hinf_plant(), "hinf", given.HINF_GAMMA * given.NOISE_NM),
-        ):
+        for method, (plant, gamma) in given.filter_problems().items():
             yield from robustness(
                 plant,
                 given.PAPER_TRUTH,
