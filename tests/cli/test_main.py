@@ -17,7 +17,7 @@ from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.cli.parser import COMMANDS
+from lbt_synth.cli.parser import COMMANDS, build_parser, whole_parser
 from lbt_synth.config.schema import FileSection
 
 CONFIG = str(LBT_YAML)
@@ -112,6 +112,30 @@ def test_every_command_has_a_module_of_its_name(command):
     module = importlib.import_module(f"lbt_synth.cli.{command.replace('-', '_')}")
     assert callable(module.run)
     assert module.__doc__.startswith(f"The command {command}: ")
+
+
+def test_shells_complete_every_option():
+    names = {}
+    for parser in (build_parser("tradeoff"), whole_parser()):
+        (commands,) = parser._subparsers._group_actions
+        assert list(commands.choices) == list(COMMANDS)
+        for command, own in commands.choices.items():
+            names.setdefault(command, []).append(set(own._option_string_actions))
+    short, full = names["tradeoff"]
+    assert short == full >= {"--json", "--points", "--taps", "-o", "--output"}
+    short, full = names["study"]
+    assert short == {"-h", "--help", "--json"}
+    assert full > short | {"--jobs", "--dask", "--dry-run", "--row"}
+
+
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [("tradeoff", "2 to 200 (default 9)"), ("identify", "[Hz] (default 0.1)")],
+)
+def test_help_says_the_defaults(capsys, command, text):
+    status, out, _ = run(capsys, command, "--help")
+    assert status == 0
+    assert text in " ".join(out.split())
 
 
 def loaded_after(code):

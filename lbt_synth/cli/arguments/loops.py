@@ -4,58 +4,52 @@ from __future__ import annotations
 
 from argparse import ArgumentParser
 
-from lbt_synth.cli.arguments.shared import FIGURE, add_config, add_gain, add_gains, add_output
+from lbt_synth.cli.arguments.shared import (
+    FIGURE,
+    add_config,
+    add_gain,
+    add_gains,
+    add_option,
+    add_output,
+)
 
 
-def add_simulate(parser: ArgumentParser) -> None:
-    """Add the arguments of simulate."""
+def simulate(parser: ArgumentParser) -> None:
+    """Close the loop in the time domain, beside the exact answer."""
     add_config(parser)
     add_gain(parser)
-    parser.add_argument("--frames", type=int, help="frames to keep")
-    parser.add_argument("--cases", type=int, help="independent runs")
-    parser.add_argument("--seed", type=int, help="seed of the random series")
-    parser.add_argument("--sensor-gain", type=float, help="real sensor gain")
+    add_option(parser, "--frames", int, "frames to keep")
+    add_option(parser, "--cases", int, "independent runs")
+    add_option(parser, "--seed", int, "seed of the random series")
+    add_option(parser, "--sensor-gain", float, "real sensor gain")
     add_output(parser, FIGURE, required=False)
-    parser.add_argument(
-        "--telemetry",
-        metavar="FILE",
-        help="write the series of the first run (.fits, .npz or .aot.fits)",
-    )
+    text = "write the series of the first run (.fits, .npz or .aot.fits)"
+    add_option(parser, "--telemetry", str, text, metavar="FILE")
 
 
-def add_telemetry(parser: ArgumentParser) -> None:
-    """Add the arguments of telemetry."""
+def telemetry(parser: ArgumentParser) -> None:
+    """Show what a telemetry file holds, and write it in another format."""
     parser.add_argument("file", help="telemetry (.fits or .npz; FITS of the AOT standard, too)")
     add_output(parser, "file to write (.fits, .npz or .aot.fits)", required=False)
-    parser.add_argument(
-        "--format",
-        choices=("fits", "npz", "aot"),
-        help="of the file to write (default: its ending)",
-    )
-    parser.add_argument(
-        "--precision",
-        choices=("float64", "float32"),
-        help="of the series written (default float64)",
-    )
+    endings = ("fits", "npz", "aot")
+    add_option(parser, "--format", endings, "of the file to write (default: its ending)")
+    types = ("float64", "float32")
+    add_option(parser, "--precision", types, "of the series written (default float64)")
 
 
-def add_end_to_end(parser: ArgumentParser) -> None:
-    """Add the arguments of end-to-end."""
+def end_to_end(parser: ArgumentParser) -> None:
+    """Close the loop end to end: pyramid, mirror and moving air."""
     _add_simulator(parser)
     add_gain(parser)
 
 
-def add_end_to_end_table(parser: ArgumentParser) -> None:
-    """Add the arguments of end-to-end-table."""
+def end_to_end_table(parser: ArgumentParser) -> None:
+    """Run Tables II and III of Agapito et al. 2008 end to end."""
     _add_simulator(parser)
     add_gains(parser, text="gain files to run beside the paper's filters")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
-    parser.add_argument(
-        "--seeds", type=int, default=3, help="seeds of Table II and of 20 Hz (default 3)"
-    )
-    parser.add_argument(
-        "--row-seeds", type=int, default=1, help="seeds of the other rows (default 1)"
-    )
+    add_option(parser, "--jobs", int, "processes", 1)
+    add_option(parser, "--seeds", int, "seeds of Table II and of 20 Hz", 3)
+    add_option(parser, "--row-seeds", int, "seeds of the other rows", 1)
     parser.add_argument(
         "--tables", nargs="+", choices=("II", "III"), default=["II", "III"], help="default both"
     )
@@ -63,9 +57,9 @@ def add_end_to_end_table(parser: ArgumentParser) -> None:
 
 def _add_simulator(parser: ArgumentParser) -> None:
     add_config(parser)
-    parser.add_argument("--pixels", type=int, help="pixels across the pupil, even")
-    parser.add_argument("--frames", type=int, help="frames of an exposure")
-    parser.add_argument("--settle-frames", type=int, help="frames to settle before, at least 200")
-    parser.add_argument("--seed", type=int, help="seed of the random parts, the first of several")
-    parser.add_argument("--cache", help="directory for calibrations and phase screens")
+    add_option(parser, "--pixels", int, "pixels across the pupil, even")
+    add_option(parser, "--frames", int, "frames of an exposure")
+    add_option(parser, "--settle-frames", int, "frames to settle before, at least 200")
+    add_option(parser, "--seed", int, "seed of the random parts, the first of several")
+    add_option(parser, "--cache", str, "directory for calibrations and phase screens")
     add_output(parser, "directory to write into")

@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, _ActionsContainer
+from collections.abc import Sequence
+from typing import Any
 
 GAIN_FILE = "gain file (.fits, .npz or .json)"
 FIGURE = "figure (.png, .pdf or .svg)"
+
+
+def add_option(
+    parser: _ActionsContainer,
+    name: str,
+    kind: type[Any] | Sequence[str],
+    text: str = "",
+    default: float | None = None,
+    **more: Any,
+) -> None:
+    """Add an option of a type or of some choices; its help ends with its default."""
+    if default is not None:
+        text += f" (default {default:g})"
+    more |= {"type": kind} if isinstance(kind, type) else {"choices": kind}
+    parser.add_argument(name, help=text, default=default, **more)
+
+
+def add_switch(parser: _ActionsContainer, name: str, text: str) -> None:
+    """Add an option without a value."""
+    parser.add_argument(name, action="store_true", help=text)
 
 
 def add_config(parser: ArgumentParser) -> None:
@@ -30,10 +52,5 @@ def add_output(parser: ArgumentParser, text: str, *, required: bool = True) -> N
 
 def add_outputs(parser: ArgumentParser) -> None:
     """Add any number of tables and figures."""
-    parser.add_argument(
-        "-o",
-        "--output",
-        action="append",
-        default=[],
-        help="table (.csv) or figure (.png, .pdf, .svg); repeatable",
-    )
+    text = "table (.csv) or figure (.png, .pdf, .svg); repeatable"
+    parser.add_argument("-o", "--output", action="append", default=[], help=text)

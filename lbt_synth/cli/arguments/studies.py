@@ -1,63 +1,55 @@
-"""Arguments of the studies: robustness, tradeoff, limits, mirror, modal, study, paper."""
+"""Arguments of the studies."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser
 
-from lbt_synth.cli.arguments.shared import add_config, add_gains, add_output, add_outputs
+from lbt_synth.cli.arguments.shared import (
+    add_config,
+    add_gains,
+    add_option,
+    add_output,
+    add_outputs,
+    add_switch,
+)
 
 
-def add_robustness(parser: ArgumentParser) -> None:
-    """Add the arguments of robustness."""
+def robustness(parser: ArgumentParser) -> None:
+    """Compute the Strehl ratio against an error of all vibration frequencies.
+
+    It is that of filters redesigned at each error, or of the designs of gain files at many sensor
+    gains.
+    """
     add_config(parser)
     add_gains(parser)
     redesigned = parser.add_argument_group("without gain files")
-    redesigned.add_argument("--gamma-ratio", type=float, help="H-infinity bound of each row")
-    redesigned.add_argument("--sensor-gain", type=float, help="real sensor gain")
+    add_option(redesigned, "--gamma-ratio", float, "H-infinity bound of each row")
+    add_option(redesigned, "--sensor-gain", float, "real sensor gain")
     fixed = parser.add_argument_group("with gain files")
-    for option, text in (
+    ends = ("LOW", "HIGH", "COUNT")
+    for name, text in (
         ("--errors-hz", "frequency in the design less the true one [Hz]"),
         ("--sensor-gains", "real sensor gain"),
     ):
-        fixed.add_argument(
-            option,
-            nargs=3,
-            type=float,
-            metavar=("LOW", "HIGH", "COUNT"),
-            help=f"{text}: COUNT values (default: the configuration's)",
-        )
-    fixed.add_argument(
-        "--delay-errors",
-        nargs="+",
-        type=float,
-        metavar="FRAMES",
-        help="real delay less that of the design [frames] (default: the configuration's, else 0)",
-    )
+        text += ": COUNT values (default: the configuration's)"
+        add_option(fixed, name, float, text, nargs=3, metavar=ends)
+    text = "real delay less that of the design [frames] (default: the configuration's, else 0)"
+    add_option(fixed, "--delay-errors", float, text, nargs="+", metavar="FRAMES")
     add_outputs(parser)
 
 
-def add_tradeoff(parser: ArgumentParser) -> None:
-    """Add the arguments of tradeoff."""
+def tradeoff(parser: ArgumentParser) -> None:
+    """Design filters from the least norm to the least variance, and compare their sensor gains."""
     add_config(parser)
-    parser.add_argument(
-        "--points",
-        type=int,
-        default=9,
-        help="levels of the norm, from the least of any filter to that of the Kalman filter, 2 to "
-        "200 (default 9)",
-    )
-    parser.add_argument(
-        "--taps",
-        type=int,
-        default=16,
-        help="past innovations that the mixed filters (least variance at each norm) weigh, 1 to 64 "
-        "(default 16)",
-    )
+    text = "levels of the norm, from the least of any filter to that of the Kalman filter, 2 to 200"
+    add_option(parser, "--points", int, text, 9)
+    text = "past innovations that the mixed filters (least variance at each norm) weigh, 1 to 64"
+    add_option(parser, "--taps", int, text, 16)
     add_outputs(parser)
 
 
-def add_limits(parser: ArgumentParser) -> None:
-    """Add the arguments of limits."""
+def limits(parser: ArgumentParser) -> None:
+    """Show how far designs are from the least residual of any linear controller."""
     add_config(parser)
     add_gains(
         parser,
@@ -67,50 +59,35 @@ def add_limits(parser: ArgumentParser) -> None:
     add_outputs(parser)
 
 
-def add_mirror(parser: ArgumentParser) -> None:
-    """Add the arguments of mirror."""
+def mirror(parser: ArgumentParser) -> None:
+    """Show the step of the mirror's local loop, and what ignoring its dynamics costs."""
     add_config(parser)
-    parser.add_argument(
-        "--tolerance",
-        type=float,
-        default=0.1,
-        help="half width of the band in which the mirror counts as settled (default 0.1)",
-    )
+    text = "half width of the band in which the mirror counts as settled"
+    add_option(parser, "--tolerance", float, text, 0.1)
     add_outputs(parser)
 
 
-def add_modal(parser: ArgumentParser) -> None:
-    """Add the arguments of modal."""
+def modal(parser: ArgumentParser) -> None:
+    """Compare integrators, optimised gains and Kalman filters for all modes of the mirror."""
     add_config(parser)
-    parser.add_argument(
-        "--modes", type=int, help="number of modes, at least 2 (default: mirror.modes)"
-    )
+    add_option(parser, "--modes", int, "number of modes, at least 2 (default: mirror.modes)")
     add_outputs(parser)
 
 
-def add_study(parser: ArgumentParser) -> None:
-    """Add the arguments of study."""
+def study(parser: ArgumentParser) -> None:
+    """Try controllers on many samples of what the loop may meet; resumes if started again."""
     parser.add_argument("study", metavar="file", help="study file (YAML)")
     add_output(parser, "directory of the study")
     engine = parser.add_mutually_exclusive_group()
-    engine.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
-    engine.add_argument(
-        "--dask", metavar="ADDRESS", help="Dask scheduler that runs it instead, as tcp://host:8786"
-    )
-    parser.add_argument(
-        "--pdf", action="store_true", help="write the page as a PDF, too (summary.pdf)"
-    )
+    add_option(engine, "--jobs", int, "processes", 1)
+    text = "Dask scheduler that runs it instead, as tcp://host:8786"
+    add_option(engine, "--dask", str, text, metavar="ADDRESS")
+    add_switch(parser, "--pdf", "write the page as a PDF, too (summary.pdf)")
     instead = parser.add_mutually_exclusive_group()
-    instead.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="say how many samples and how long, and write nothing",
-    )
-    instead.add_argument(
-        "--row", type=int, help="recompute one row, and write it as a configuration"
-    )
+    add_switch(instead, "--dry-run", "say how many samples and how long, and write nothing")
+    add_option(instead, "--row", int, "recompute one row, and write it as a configuration")
 
 
-def add_paper(parser: ArgumentParser) -> None:
-    """Add the arguments of paper."""
+def paper(parser: ArgumentParser) -> None:
+    """Compute the tables and figures of Agapito et al. 2008, ours beside theirs."""
     add_output(parser, "directory to write into")
