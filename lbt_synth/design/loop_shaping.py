@@ -101,9 +101,7 @@ def shape(
             f"{type(hardware).__name__}."
         )
     specifications = _specification_per_mode(specification, hardware.modes)
-    size = integer(functions, "functions", at_least=1)
-    if size > _MOST_FUNCTIONS:
-        raise ProblemError(f"functions must be at most {_MOST_FUNCTIONS}; got {size}.")
+    size = integer(functions, "functions", at_least=1, at_most=_MOST_FUNCTIONS)
     common = number(pole, "pole", at_least=0, below=1)
     tolerance = number(loss, "loss", at_least=0)
     require_separable(hardware)
@@ -111,7 +109,7 @@ def shape(
     stored = single.mirror_system.whole.n_states
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
     for spec in specifications:
-        spec.require_fitting(hardware.frame_rate_hz)
+        spec.require_fitting(hardware)
     solved: dict[int, tuple[ModeSolution, ModeSolution]] = {}  # equal modes share a specification
     for spec in specifications:
         if id(spec) not in solved:

@@ -261,7 +261,7 @@ def _unpack(record: DesignRecord) -> ShapedDesign:
     if not all(isinstance(spec, Specification) for spec in specifications):
         raise ValueError("what it holds as specifications are none")
     for spec in specifications:
-        spec.require_fitting(hardware.frame_rate_hz)
+        spec.require_fitting(hardware)
     objective, long = (
         tuple(number(v, name, above=0) for v in shaped[name])
         for name in ("objective_nm", "long_objective_nm")

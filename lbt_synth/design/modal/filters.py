@@ -35,7 +35,7 @@ from lbt_synth.design.modal.plants import (
     plant_batches,
 )
 from lbt_synth.design.modal.reconstructor import name_modes
-from lbt_synth.errors import DetectabilityError, NumericalError, ProblemError
+from lbt_synth.errors import DetectabilityError, NumericalError
 from lbt_synth.linear import Controller, DareSolution, solve_dare
 from lbt_synth.linear.batched import frobenius_norms, transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
@@ -157,9 +157,7 @@ class ModalFilters:
         ProblemError
             If there is no such mode.
         """
-        i = integer(mode, "mode", at_least=0)
-        if i >= self.n_modes:
-            raise ProblemError(f"mode must be from 0 to {self.n_modes - 1}; got {i}.")
+        i = integer(mode, "mode", at_least=0, at_most=self.n_modes - 1)
         s = int(self.controller_states[i])
         A, B, C = self.A[i, :s, :s], self.B[i, :s], self.C[i, :, :s]
         return Controller(A=A, B=B, C=C, D=self.D[i], dt_s=self.dt_s)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polyadd, polyval
 from scipy.special import comb
 
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
@@ -20,6 +21,7 @@ from lbt_synth.design.modal.plants import lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import distinct_edges, pole_edges
+from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
@@ -138,7 +140,7 @@ def modal_gains(
         frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
     )
     rate = path.frame_rate_hz
-    densities, count, edges = _spectra_per_mode(spectra, rate)
+    densities, count, edges = _spectra_per_mode(spectra, path)
     lines = lines_per_mode(vibrations, count)
     models = [(mode, line.ar_model(rate)) for mode, own in enumerate(lines) for line in own]
 
@@ -159,14 +161,14 @@ def modal_gains(
 
 
 def _spectra_per_mode(
-    spectra: ModalTurbulence | Sequence[Spectrum], rate: float
+    spectra: ModalTurbulence | Sequence[Spectrum], path: LoopHardware
 ) -> tuple[Density, int, list[FloatArray]]:
     """Return the function from frequencies (f,) to all spectra (n, f), n, and edges of panels.
 
     The edges are where spectra have peaks or kinks, over the Nyquist frequency.
     """
     if isinstance(spectra, ModalTurbulence):
-        _require_rate(spectra.frame_rate_hz, rate)
+        require_loop_rate(spectra.frame_rate_hz, path)
         poles = _distinct_poles(np.linalg.eigvals(spectra.companions).ravel())
         return spectra.psd, spectra.n_modes, [pole_edges(poles)]
     each = tuple(spectra) if isinstance(spectra, Sequence) else ()
@@ -175,11 +177,11 @@ def _spectra_per_mode(
             "spectra must be ModalTurbulence, or a list with one spectrum per mode (objects with "
             f"psd(frequency_hz)); got {type(spectra).__name__}."
         )
-    distinct = {id(spectrum): spectrum for spectrum in each}
+    distinct, rate = {id(spectrum): spectrum for spectrum in each}, path.frame_rate_hz
     edges = [breakpoints_below(spectrum, rate / 2) * 2 / rate for spectrum in distinct.values()]
     for spectrum in distinct.values():
         if isinstance(spectrum, ARModel):
-            _require_rate(spectrum.frame_rate_hz, rate)
+            require_loop_rate(spectrum.frame_rate_hz, path)
             edges.append(_model_edges(spectrum))
 
     def evaluate(frequency: FloatArray) -> FloatArray:
@@ -191,13 +193,6 @@ def _spectra_per_mode(
 
 def _model_edges(model: ARModel) -> FloatArray:
     return pole_edges(np.linalg.eigvals(model.companion).astype(np.complex128))
-
-
-def _require_rate(own: float, rate: float) -> None:
-    if not np.isclose(own, rate, rtol=1e-9):
-        raise ProblemError(
-            f"a model must be sampled at the frame rate {rate:.6g} Hz; got {own:.6g} Hz."
-        )
 
 
 def _distinct_poles(poles: Any) -> ComplexArray:
@@ -237,7 +232,9 @@ def find_gains(
             "margin and sensor_gain must leave room for a gain; got gains of at most "
             f"{np.min(highest / gain):.3g} at a sensor gain of {np.min(gain):.3g}."
         )
-    poles = [np.roots(_characteristic_polynomial(taps, part * limit)) for part in _RESONANT]
+    # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
+    path_taps = np.append(0.0, taps)
+    poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
     edges = distinct_edges(
         np.concatenate([[0.0], np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), own_edges])
     )
@@ -298,14 +295,6 @@ def _is_settled(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, Flo
     return bool(variance < _SETTLED and np.max(np.abs(one[0] / other[0] - 1)) < 1e-4)
 
 
-def _characteristic_polynomial(taps: FloatArray, loop_gain: float) -> FloatArray:
-    """Coefficients of ``1 - z^-1 + h z^-1 M(z)`` in powers of z^-1."""
-    out = np.zeros(len(taps) + 1)
-    out[:2] = 1, -1
-    out[1:] += loop_gain * taps
-    return out
-
-
 def _transfers(
     turns: FloatArray, taps: FloatArray, loop_gains: FloatArray, differenced: bool
 ) -> tuple[FloatArray, FloatArray]:
@@ -314,7 +303,7 @@ def _transfers(
     ``differenced``: the phase is its difference of two frames.
     """
     delay = np.exp(-2j * np.pi * turns)
-    mirror: ComplexArray = np.polynomial.polynomial.polyval(delay, np.asarray(taps))
+    mirror: ComplexArray = polyval(delay, taps)
     difference = 1 - delay
     power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
     rejection = (1.0 if differenced else np.abs(difference) ** 2) / power

@@ -157,8 +157,7 @@ class ModalLoop:
             If rounding leaves too few digits: a process that is nearly a random walk.
         """
         self.require_stable()
-        air = as_modal_turbulence(turbulence, self.n_modes)
-        rate = self.frame_rate_hz
+        air, rate = as_modal_turbulence(turbulence, self.n_modes), self.frame_rate_hz
         if rate is not None and not np.isclose(air.frame_rate_hz, rate, rtol=1e-9):
             raise ProblemError(
                 f"turbulence must be sampled at the loop's frame rate, {rate:.6g} Hz; got "
@@ -169,15 +168,14 @@ class ModalLoop:
         out = np.zeros(self.n_modes)
         for block in self.blocks:
             left = block_variances(block, air, lines, noise)
-            equation = "the relative residual of the Lyapunov equation"
             for what, error, limit in (
-                (equation, left.residuals, RESIDUAL_TOLERANCE),
-                ("rounding of the variance, relative,", left.rounding, VARIANCE_TOLERANCE),
+                ("the residual of the Lyapunov equation", left.residuals, RESIDUAL_TOLERANCE),
+                ("rounding of the variance", left.rounding, VARIANCE_TOLERANCE),
             ):
                 bad = np.flatnonzero(~(error < limit))
                 if bad.size:
                     raise NumericalError(
-                        f"{what} must be below {limit:g}; got {np.max(error):.3g} in "
+                        f"{what} must be below {limit:g}, relative; got {np.max(error):.3g} in "
                         f"{name_modes(np.unique(block.modes[bad]))}. A process with a pole this "
                         "close to 1 is a random walk: move the pole inwards.",
                         status="lyapunov",
@@ -251,16 +249,12 @@ class ModalLoop:
         if not np.isfinite(residual[:, -1]).all() or not np.isfinite(rms).all():
             real_array(total, "total_nm"), real_array(noise, "noise_nm")
             raise NonFiniteError("the residual must be finite; its numbers ran out of range.")
-        series: list[Any] = [
-            None if each is None else read_only(each)[:, settle:]
-            for each in (residual, commands, measurements)
-        ]
-        return ModalRun(
-            residual_nm=series[0],
-            commands=series[1],
-            measurements=series[2],
-            rms_nm=frozen_copy(rms),
-        )
+        named = {"residual_nm": residual, "commands": commands, "measurements": measurements}
+        series: dict[str, Any] = {
+            name: None if each is None else read_only(each)[:, settle:]
+            for name, each in named.items()
+        }
+        return ModalRun(**series, rms_nm=frozen_copy(rms))
 
 
 def modal_loop(

@@ -58,9 +58,7 @@ def lines_per_mode(
             f"got {type(vibrations).__name__}."
         )
     for mode, given in vibrations.items():
-        i = integer(mode, "a mode of vibrations", at_least=0)
-        if i >= modes:
-            raise ProblemError(f"a mode of vibrations must be from 0 to {modes - 1}; got {i}.")
+        i = integer(mode, "a mode of vibrations", at_least=0, at_most=modes - 1)
         each = (given,) if isinstance(given, Vibration) else given
         listed = isinstance(each, list | tuple)
         if not listed or not all(isinstance(line, Vibration) for line in each):

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, TypeAlias, get_args
 
-import numpy as np
-
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, CommandRms, ModulusMargin, NoisePeak
 from lbt_synth.design.shaping.channel import Channel
@@ -22,7 +20,8 @@ from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.design.shaping.uncertainty import DelayError, MirrorUncertainty, SensorGainRange
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, Function
-from lbt_synth.models import ARModel, Spectrum
+from lbt_synth.loop.closed_loop import require_loop_rate
+from lbt_synth.models import ARModel, LoopHardware, Spectrum
 from lbt_synth.validation import sequence, set_fields
 
 Demand: TypeAlias = (
@@ -99,7 +98,7 @@ class Specification:
         found = [p.turbulence for p in parts if isinstance(p, ResidualVariance | CommandRms)]
         return tuple(spectrum for spectrum in found if spectrum is not None)
 
-    def require_fitting(self, frame_rate_hz: float) -> None:
+    def require_fitting(self, hardware: LoopHardware) -> None:
         """Refuse bands beyond the Nyquist frequency, and models of another frame rate.
 
         Raises
@@ -107,20 +106,16 @@ class Specification:
         ProblemError
             Naming the band or the rate.
         """
+        nyquist = hardware.frame_rate_hz / 2
         for low, high in self.bands_hz:
-            if high > frame_rate_hz / 2:
+            if high > nyquist:
                 raise ProblemError(
-                    f"a band must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; got "
+                    f"a band must lie below the Nyquist frequency {nyquist:.6g} Hz; got "
                     f"{low:g} to {high:g} Hz."
                 )
         for spectrum in self.spectra:
-            if isinstance(spectrum, ARModel) and not np.isclose(
-                spectrum.frame_rate_hz, frame_rate_hz, rtol=1e-9
-            ):
-                raise ProblemError(
-                    f"an ARModel must be sampled at the loop's {frame_rate_hz:.6g} Hz; got "
-                    f"{spectrum.frame_rate_hz:.6g} Hz."
-                )
+            if isinstance(spectrum, ARModel):
+                require_loop_rate(spectrum.frame_rate_hz, hardware)
 
     def grid(self, channel: Channel, *, fineness: int = 1) -> Grid:
         """Return the first grid of frequencies for a channel."""

@@ -218,13 +218,13 @@ def test_bad_input_is_refused(air):
             [ar1],
             {"noise_nm": 1, "frame_rate_hz": 500},
             lbt.errors.ProblemError,
-            "sampled at the frame",
+            "sampled at the loop's 500 Hz; got 800 Hz",
         ),
         (
             lbt.models.ModalTurbulence.of([ar1]),
             {"noise_nm": 1, "frame_rate_hz": 500},
             lbt.errors.ProblemError,
-            "sampled at the frame",
+            "sampled at the loop's 500 Hz; got 800 Hz",
         ),
     ):
         with pytest.raises(error, match=words):
