@@ -23,13 +23,9 @@ from typing import Any
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.report.figures.style import (
-    house_style,
-    new_figure,
-    number_ticks,
-    save_figure,
-)
-from lbt_synth.report.line_styles import line_styles
+from lbt_synth.report.charts.description import Axis, Curve, Panel, Rule
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.figures.style import save_figure
 
 FILE = Path(__file__).parent / "data" / "eris_vibrations_psd.fits"
 BACKGROUND_NM2_HZ = 4e4  # at 1 Hz, falling with the square of the frequency; see docs/eris.md
@@ -249,36 +245,28 @@ def figure(
     """Draw what the loops reject, and what they leave accumulated over the frequencies."""
     f = np.union1d(np.geomspace(0.5, 499.0, 1500), seen.frequency_hz)
     whole = met.whole.turbulence_per_mode(seen.axes)
-    with house_style():
-        drawn = new_figure(9.5, 7.2)
-        grid = drawn.subplots(
-            3, seen.axes, sharex=True, sharey="row", squeeze=False, height_ratios=(2, 2, 3)
-        )
-        for i in range(seen.axes):
-            spectrum, rejection, total = grid[:, i]
-            density = whole[i].psd(f)
-            lowest = 2 * NOISE_NM**2 / FRAME_RATE_HZ
-            spectrum.loglog(f, np.maximum(density, 1e-9), color="0.35", linewidth=0.7)
-            spectrum.axhline(lowest, color="0.6", linestyle=":", linewidth=1.0)
-            spectrum.set_ylim(0.1, 1e6)
-            spectrum.set_title(("tip", "tilt")[i])
-            for (name, loop), look in zip(loops.items(), line_styles(), strict=False):
-                rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
-                passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
-                rejection.loglog(f, np.sqrt(rejected), **(look | {"linewidth": 0.9}))
-                left = accumulated(f, rejected * density + passed * lowest)
-                total.semilogx(f, np.sqrt(left), **look, label=name)
-            rejection.set_ylim(5e-3, 5)
-            rejection.axhline(1.0, color="0.6", linewidth=0.6)
-            total.set_xlim(0.5, 499)
-            total.set_xlabel("frequency [Hz]")
-            number_ticks(total.xaxis)
-        grid[0, 0].set_ylabel("disturbance, and noise\n(dots) [nm$^2$/Hz]")
-        grid[1, 0].set_ylabel("rejection")
-        grid[2, 0].set_ylabel("residual up to the\nfrequency [nm rms]")
-        grid[2, 0].set_ylim(bottom=0)
-        grid[2, 0].legend(loc="upper left")
-    return drawn
+    noise = 2 * NOISE_NM**2 / FRAME_RATE_HZ
+    x = Axis(label="frequency", unit="Hz", log=True, low=0.5, high=499.0)
+    spectra, rejections, totals = [], [], []
+    for i in range(seen.axes):
+        density = whole[i].psd(f)
+        y = Axis(label="density", unit="nm²/Hz", log=True, low=0.1, high=1e6)
+        spectrum = Curve(name="disturbance", x=f, y=density, look=None, width=0.7)
+        level = Rule(name="noise", at=noise, axis="y", dash=3)
+        spectra.append(Panel(title=("tip", "tilt")[i], x=x, y=y, marks=(spectrum, level)))
+        rejection: list[Curve | Rule] = [Rule(name="", at=1.0, axis="y")]
+        total = []
+        for look, (name, loop) in enumerate(loops.items()):
+            rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
+            passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
+            left = accumulated(f, rejected * density + passed * noise)
+            rejection.append(Curve(name=name, x=f, y=np.sqrt(rejected), look=look, width=0.9))
+            total.append(Curve(name=name, x=f, y=np.sqrt(left), look=look))
+        y = Axis(label="rejection", unit="-", log=True, low=5e-3, high=5.0)
+        rejections.append(Panel(x=x, y=y, marks=tuple(rejection)))
+        y = Axis(label="residual up to the frequency", unit="nm rms", low=0.0)
+        totals.append(Panel(x=x, y=y, marks=tuple(total), height_in=2.6))
+    return draw_figure([*spectra, *rejections, *totals], columns=seen.axes)
 
 
 def accumulated(f: np.ndarray, density: np.ndarray) -> np.ndarray:

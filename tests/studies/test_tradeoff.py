@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.figures import legend
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -29,9 +30,8 @@ def test_the_front_of_the_lbt(plant):
         assert mixed.gain_low < central.gain_low  # it tolerates more, too
     figure = lbt.report.figures.tradeoff_figure(points)
     assert len(figure.axes) == 2
-    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert labels[0] == "least variance at this norm"
-    assert figure.axes[1].get_xlabel() == r"H$_\infty$ norm of the estimation error [nm]"
+    assert legend(figure.axes[0])[0] == "least variance at this norm"
+    assert figure.axes[1].get_xlabel() == "H∞ norm of the estimation error [nm]"
 
 
 def test_a_front_without_a_loop():

@@ -4,5 +4,8 @@ from __future__ import annotations
 
 
 def legend(axis):
-    """Texts of the legend of a plot."""
-    return [text.get_text() for text in axis.get_legend().get_texts()]
+    """Names of what is drawn in a plot, in order, all of which the legend of the figure shows."""
+    names = list(dict.fromkeys(axis.get_legend_handles_labels()[1]))
+    (shown,) = axis.figure.legends
+    assert set(names) <= {text.get_text() for text in shown.get_texts()}
+    return names

@@ -6,8 +6,19 @@ from html.parser import HTMLParser
 
 import numpy as np
 
+from lbt_synth.report.charts.description import (
+    Area,
+    Axis,
+    Bars,
+    Chart,
+    Curve,
+    Flags,
+    Map,
+    Panel,
+    Rule,
+    Span,
+)
 from lbt_synth.report.page.blocks import Listing, Notice, Page, Paragraph, Section
-from lbt_synth.report.page.charts import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule, Span
 from lbt_synth.storage.tables import Cell, Table
 
 HOSTILE = "</script><script>alert(1)</script><b>&\"'$x$ $$y$$ _z"
@@ -64,10 +75,20 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
                 marks=(
                     Span(name="band", low=10, high=20),
                     Area(name="spread", x=f, low=0.5 / f, high=2 / f, look=2),
+                    Area(name="", x=f[:9], low=1e-4 / f[:9], high=2e-4 / f[:9], look=2, solid=True),
                     Rule(name="line at 20 Hz", at=20.0, dash=3),
                     Curve(name=name, x=f, y=1 / f, look=0),
                     Curve(name="second", x=f, y=np.where(f < 5, np.nan, 1 / f**2), look=1),
-                    Curve(name="dots", x=f[::5], y=1 / f[::5], line=False, marker="own", look=3),
+                    Curve(
+                        name="dots",
+                        x=f[::5],
+                        y=1 / f[::5],
+                        error=0.5 / f[::5],
+                        line=False,
+                        marker="own",
+                        look=3,
+                    ),
+                    Flags(x=[2.0, 3.0], y=[0.5, 0.3], texts=(name, "flag")),
                     Curve(name="only named", x=[], y=[], look=4),
                 ),
             ),
@@ -77,7 +98,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
                 marks=(
                     Span(name="range", axis="y", low=0.1, high=0.2, look=5),
                     Rule(name="level", at=0.3, axis="y"),
-                    Curve(name=name, x=f, y=1 / f, step=True, look=0),
+                    Curve(name=name, x=f, y=1 / f, step="after", look=0),
                 ),
             ),
         ),
@@ -101,10 +122,11 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
                         x=np.arange(6.0),
                         y=[0.2, 0.4, 0.7, 1.0, 1.4],
                         values=values,
-                        low=0,
+                        low=1,
                         high=30,
                         label="ratio",
                         unit="%",
+                        log=title == "other",
                         levels=(10, 20),
                         blank="unstable",
                     ),

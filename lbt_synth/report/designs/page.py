@@ -8,12 +8,14 @@ from pathlib import Path
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
-from lbt_synth.report.designs.pole_and_step_charts import pole_and_step_charts
+from lbt_synth.report.designs.charts import (
+    pole_and_step_charts,
+    robustness_charts,
+    simulation_charts,
+    transfer_charts,
+)
 from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.designs.robustness_charts import robustness_charts
-from lbt_synth.report.designs.simulation_charts import simulation_charts
 from lbt_synth.report.designs.tables import certificate_table, summary_table
-from lbt_synth.report.designs.transfer_charts import transfer_charts
 from lbt_synth.report.designs.verdict import verdict
 from lbt_synth.report.number_text import listing_text, number_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section

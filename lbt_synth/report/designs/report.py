@@ -78,6 +78,11 @@ class DesignReport:
         return tuple(zip(self.assessments, self.limits.rows, strict=True))
 
     @property
+    def names(self) -> list[str]:
+        """Names of the designs."""
+        return [one.name for one in self.assessments]
+
+    @property
     def stable(self) -> tuple[DesignAssessment, ...]:
         """The designs whose loop is stable."""
         return tuple(one for one in self.assessments if one.stable)

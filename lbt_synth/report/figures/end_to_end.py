@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lbt_synth.interop import EndToEndRun
-from lbt_synth.report.figures.style import house_style, new_figure
-from lbt_synth.report.line_styles import COLOURS
+from lbt_synth.report.charts.description import Axis, Curve, Map, Panel
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _SHOWN_MAS = 700.0
+_FAINTEST = 1e-5  # of the peak
 
 
-def end_to_end_figure(run: EndToEndRun) -> Any:
+def end_to_end_figure(run: EndToEndRun, *, axes: Axes | Sequence[Axes] | None = None) -> Figure:
     """Image, tip and tilt over time, and residual of each mode of an end-to-end run.
 
     Parameters
     ----------
     run : EndToEndRun
         The run.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
         Three panels.
+
+    Raises
+    ------
+    ProblemError
+        If ``axes`` are not one per panel.
 
     Examples
     --------
@@ -47,44 +60,48 @@ def end_to_end_figure(run: EndToEndRun) -> Any:
     >>> len(lbt.report.figures.end_to_end_figure(run).axes)  # three panels and a colour bar
     4
     """
-    from matplotlib.colors import LogNorm
-
-    with house_style():
-        figure = new_figure(10.5, 3.4)
-        image, time, modes = figure.subplots(1, 3)
-        size = run.psf.shape[0]
-        reach = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
-        low, high = (np.array([-0.5, size - 0.5]) - size // 2) * run.psf_pixel_mas
-        peak = float(run.psf.max())
-        shown = image.imshow(
-            np.maximum(run.psf / peak, 1e-5),
-            norm=LogNorm(1e-5, 1),
-            cmap="magma",
-            origin="lower",
-            extent=(low, high, low, high),
-            interpolation="nearest",
-        )
-        image.set(
-            xlim=(-reach, reach),
-            ylim=(-reach, reach),
-            xlabel="x [mas]",
-            ylabel="y [mas]",
+    size = run.psf.shape[0]
+    place = (np.arange(size) - size // 2) * run.psf_pixel_mas
+    reach = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
+    image = Map(
+        x=place,
+        y=place,
+        values=np.maximum(run.psf / run.psf.max(), _FAINTEST),
+        label="intensity / peak",
+        low=_FAINTEST,
+        log=True,
+    )
+    seconds = np.arange(run.frames) / run.system.frame_rate_hz
+    number = np.arange(1.0, run.system.modes + 1)
+    panels = (
+        Panel(
             title=f"{run.system.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %",
-        )
-        image.grid(visible=False)
-        figure.colorbar(shown, ax=image, label="intensity / peak", shrink=0.85)
-        seconds = np.arange(run.frames) / run.system.frame_rate_hz
-        for axis, name in enumerate(("tip", "tilt")):
-            time.plot(
-                seconds,
-                run.residual_nm[:, axis],
-                color=COLOURS[axis],
-                linewidth=0.8,
-                label=f"{name}, {run.rms_nm[axis]:.0f} nm rms",
-            )
-        time.set(xlabel="time [s]", ylabel="residual [nm rms wavefront]", title="tip and tilt")
-        time.legend(loc="upper right")
-        number = np.arange(1, run.system.modes + 1)
-        modes.loglog(number, run.rms_nm, color=COLOURS[0], linewidth=0.8)
-        modes.set(xlabel="mode (1 tip, 2 tilt)", ylabel="residual [nm rms]", title="all modes")
-    return figure
+            x=Axis(label="x", unit="mas", low=-reach, high=reach),
+            y=Axis(label="y", unit="mas", low=-reach, high=reach),
+            marks=(image,),
+            equal=True,
+        ),
+        Panel(
+            title="all modes",
+            x=Axis(label="mode (1 tip, 2 tilt)", log=True),
+            y=Axis(label="residual", unit="nm rms", log=True),
+            marks=(Curve(name="", x=number, y=run.rms_nm, width=0.8),),
+        ),
+        Panel(
+            title="tip and tilt",
+            x=Axis(label="time", unit="s"),
+            y=Axis(label="residual", unit="nm rms wavefront"),
+            marks=tuple(
+                Curve(
+                    name=f"{name}, {run.rms_nm[axis]:.0f} nm rms",
+                    x=seconds,
+                    y=run.residual_nm[:, axis],
+                    look=axis,
+                    width=0.8,
+                    dash=0,
+                )
+                for axis, name in enumerate(("tip", "tilt"))
+            ),
+        ),
+    )
+    return draw_figure(panels, columns=2, axes=axes)

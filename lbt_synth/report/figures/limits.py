@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.figures.style import METHOD_LABELS, house_style, new_figure, number_ticks
-from lbt_synth.report.line_styles import line_styles
+from lbt_synth.report.charts.description import Axis, Curve, Panel, Rule
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.figures.loop import stable_curve
+from lbt_synth.report.figures.style import METHOD_LABELS
 from lbt_synth.studies import LimitStudy
+from lbt_synth.validation import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
-def limits_figure(study: LimitStudy) -> Any:
+def limits_figure(study: LimitStudy, *, axes: Axes | Sequence[Axes] | None = None) -> Figure:
     """Draw the residual of each design over the vibration's frequency, and the limits.
 
     Parameters
     ----------
     study : LimitStudy
         Result of :func:`limits`, of a truth with a vibration and a range of errors.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
@@ -28,7 +36,8 @@ def limits_figure(study: LimitStudy) -> Any:
     Raises
     ------
     ProblemError
-        If no vibration moves.
+        If no vibration moves,
+        or ``axes`` are not one per panel.
 
     Examples
     --------
@@ -51,31 +60,25 @@ def limits_figure(study: LimitStudy) -> Any:
             "a single error. Give truth.vibrations and robustness.errors_hz."
         )
     single = study.frequency_hz is not None
-    x = study.shift_hz + (study.frequency_hz or 0.0)
-    with house_style():
-        figure = new_figure(6.3, 3.8)
-        axis = figure.subplots()
-        for row, curve, style in zip(study.rows, study.residual_nm, line_styles(), strict=False):
-            label = METHOD_LABELS.get(row.design, row.design)
-            if row.stable:
-                axis.plot(x, curve, label=label, **style)
-            else:
-                axis.plot([], [], label=f"{label}: unstable", **style)
-        lines: dict[str, Any] = {"color": "0.25", "linewidth": 1.2, "zorder": 1.5}
-        if study.band is not None:
-            label = "limit, frequency anywhere in this range"
-            axis.axhline(study.band.rms_nm, linestyle=(0, (7, 2)), label=label, **lines)
-        if study.limit is not None and study.limit.rms_nm > 0:
-            label = "limit, frequency known"
-            axis.axhline(study.limit.rms_nm, linestyle=(0, (1, 1.5)), label=label, **lines)
-        axis.set_yscale("log")
-        number_ticks(axis.yaxis)
-        axis.set_xlim(float(x[0]), float(x[-1]))
-        low, high = axis.get_ylim()
-        drawn = study.residual_nm[np.isfinite(study.residual_nm)]
-        top = float(np.max(drawn)) if drawn.size else high
-        axis.set_ylim(low, top * (top / low) ** 0.05)
-        word = "frequency of the true vibration" if single else "shift of the true vibrations"
-        axis.set(xlabel=f"{word} [Hz]", ylabel="residual [nm rms]")
-        figure.legend(loc="outside upper center", ncols=3)
-    return figure
+    word = "frequency of the true vibration" if single else "shift of the true vibrations"
+    x = Axis(label=word, unit="Hz")
+    shifted = study.shift_hz + (study.frequency_hz or 0.0)
+    return draw_figure([limits_panel(study, x, shifted, METHOD_LABELS)], axes=axes)
+
+
+def limits_panel(
+    study: LimitStudy, x: Axis, places: FloatArray, labels: Mapping[str, str]
+) -> Panel:
+    """Return the residual of each design, and the limits, over places on an axis."""
+    names = [labels.get(row.design, row.design) for row in study.rows]
+    marks: list[Curve | Rule] = [
+        stable_curve(name, names, places, curve if row.stable else None)
+        for name, row, curve in zip(names, study.rows, study.residual_nm, strict=True)
+    ]
+    if study.limit is not None and study.limit.rms_nm > 0:
+        marks.append(Rule(name="limit, frequency known", at=study.limit.rms_nm, axis="y", dash=3))
+    if study.band is not None:
+        name = "limit, frequency anywhere in this range"
+        marks.append(Rule(name=name, at=study.band.rms_nm, axis="y", dash=1))
+    y = Axis(label="residual", unit="nm rms", log=True)
+    return Panel(x=x, y=y, marks=tuple(marks), height_in=2.5)

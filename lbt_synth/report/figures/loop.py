@@ -3,23 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop
-from lbt_synth.report.figures.style import house_style, new_figure
+from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
 from lbt_synth.report.frequency_grid import frequency_grid
-from lbt_synth.report.line_styles import line_styles
+from lbt_synth.validation import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FREQUENCY = Axis(label="frequency", unit="Hz", log=True)
+# Frequencies, largest singular values of the rejection and of the noise transfer, (f,) each; the
+# latter are None where the loop is unstable
+LoopNorms = tuple[FloatArray, FloatArray | None, FloatArray | None]
 
 
-def loop_figure(loops: Mapping[str, ClosedLoop]) -> Any:
+def loop_figure(
+    loops: Mapping[str, ClosedLoop], *, axes: Axes | Sequence[Axes] | None = None
+) -> Figure:
     """Rejection and noise transfer of closed loops.
 
     Parameters
     ----------
     loops : mapping of str to ClosedLoop
         Loops by the name they get in the legend.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
@@ -29,7 +46,8 @@ def loop_figure(loops: Mapping[str, ClosedLoop]) -> Any:
     Raises
     ------
     ProblemError
-        If there is no loop.
+        If there is no loop,
+        or ``axes`` are not one per panel.
 
     Examples
     --------
@@ -41,35 +59,50 @@ def loop_figure(loops: Mapping[str, ClosedLoop]) -> Any:
     """
     if not loops:
         raise ProblemError("a loop figure needs at least one loop; got none.")
-    with house_style():
-        figure = new_figure(6.3, 5.0)
-        top, bottom = figure.subplots(2, 1, sharex=True)
-        draw_loop_panels(top, bottom, loops, dict(zip(loops, line_styles(), strict=False)), [])
-        top.legend(loc="best")
-        bottom.legend(loc="best")
-        bottom.set_xlabel("frequency [Hz]")
-    return figure
+    norms = {name: loop_norms(loop) for name, loop in loops.items()}
+    return draw_figure(loop_panels(norms, [], list(loops)), axes=axes)
 
 
-def draw_loop_panels(
-    rejection: Any,
-    noise: Any,
-    loops: Mapping[str, ClosedLoop],
-    styles: Mapping[str, dict[str, Any]],
-    lines_hz: Sequence[float],
-) -> None:
-    """Draw rejection and noise transfer; a loop that is unstable is only named in the legend."""
-    for name, loop in loops.items():
-        if not loop.is_stable:
-            for axis in (rejection, noise):
-                axis.plot([], [], label=f"{name}: unstable", **styles[name])
-            continue
-        grid = frequency_grid(loop.hardware.frame_rate_hz, lines_hz)
-        for axis, response in (
-            (rejection, loop.sensitivity(grid)),
-            (noise, loop.noise_transfer(grid)),
-        ):
-            axis.loglog(grid, spectral_norms(response), label=name, **styles[name])
-    rejection.axhline(1, color="0.4", linewidth=0.8)
-    rejection.set_ylabel(r"$\bar\sigma$ phase $\to$ residual [-]")
-    noise.set_ylabel(r"$\bar\sigma$ noise $\to$ residual [-]")
+def loop_norms(loop: ClosedLoop, lines_hz: Sequence[float] = ()) -> LoopNorms:
+    """Return what is drawn of a loop, on a grid that is denser around lines."""
+    grid = frequency_grid(loop.hardware.frame_rate_hz, lines_hz)
+    if not loop.is_stable:
+        return grid, None, None
+    return grid, spectral_norms(loop.sensitivity(grid)), spectral_norms(loop.noise_transfer(grid))
+
+
+def loop_panels(
+    norms: Mapping[str, LoopNorms], lines_hz: Sequence[float], names: list[str], *, title: str = ""
+) -> tuple[Panel, Panel]:
+    """Return the panels of rejection and noise transfer; looks follow the order of names."""
+    first, second = (
+        [stable_curve(name, names, found[0], found[part]) for name, found in norms.items()]
+        for part in (1, 2)
+    )
+    unity = Rule(name="", at=1.0, axis="y")
+    return (
+        frequency_panel("phase to residual", "-", (*first, unity), lines_hz, title=title),
+        frequency_panel("noise to residual", "-", second, lines_hz),
+    )
+
+
+def frequency_panel(
+    label: str, unit: str, marks: Sequence[Mark], lines_hz: Sequence[float], *, title: str = ""
+) -> Panel:
+    """Return a panel of transfer functions in which vibrations are marked."""
+    rules = [Rule(name="vibration", at=frequency, dash=3) for frequency in lines_hz]
+    y = Axis(label=f"\u03c3\u0304, {label}", unit=unit, log=True)
+    return Panel(x=FREQUENCY, y=y, marks=(*marks, *rules), title=title)
+
+
+def stable_curve(
+    name: str, names: Sequence[str], x: ArrayLike, y: ArrayLike | None, *, step: str | None = None
+) -> Curve:
+    """Return the curve of a design; without values it is in the legend as unstable.
+
+    Its look is its place among the names.
+    """
+    look = list(names).index(name)
+    if y is None:
+        return Curve(name=f"{name}: unstable", x=np.zeros(0), y=np.zeros(0), look=look)
+    return Curve(name=name, x=np.asarray(x), y=np.asarray(y), look=look, step=step)

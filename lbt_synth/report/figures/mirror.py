@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.report.figures.style import house_style, new_figure
-from lbt_synth.report.line_styles import COLOURS
-from lbt_synth.validation import require_instance
+from lbt_synth.report.charts.description import Area, Axis, Curve, Panel, Rule, Span
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.validation import FloatArray, require_instance
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _MOST_POINTS = 4000
 _SHOWN = 5e-3  # taps after the last one of this size are not drawn
 
 
-def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
+def mirror_figure(
+    hardware: LoopHardware,
+    *,
+    tolerance: float = 0.1,
+    axes: Axes | Sequence[Axes] | None = None,
+) -> Figure:
     """Draw the mirror's answer to a step of its command, and its taps.
 
     Parameters
@@ -25,6 +35,8 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
         A loop with a mirror.
     tolerance : float, optional
         Half width of the band in which the mirror counts as settled.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
@@ -36,7 +48,8 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
     Raises
     ------
     ProblemError
-        If the loop has no mirror with dynamics.
+        If the loop has no mirror with dynamics,
+        or ``axes`` are not one per panel.
 
     Examples
     --------
@@ -49,8 +62,6 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
     ... )
     2
     """
-    from matplotlib.ticker import MaxNLocator
-
     require_instance(hardware, LoopHardware)
     if hardware.mirror is None:
         raise ProblemError(
@@ -58,51 +69,49 @@ def mirror_figure(hardware: LoopHardware, *, tolerance: float = 0.1) -> Any:
             "Try LoopHardware(..., mirror=PositionLoop(...))."
         )
     step = hardware.mirror.step_response(tolerance)
-    frame_ms = 1e3 * hardware.dt_s
-    end_ms = max(1.5 * 1e3 * step.settling_s, 2 * frame_ms)
+    settling_ms, frame_ms = 1e3 * step.settling_s, 1e3 * hardware.dt_s
+    end_ms = max(1.5 * settling_ms, 2 * frame_ms)
     time_ms = 1e3 * step.time_s
     if time_ms[-1] < end_ms:  # it has decayed: the rest is its final position
         time_ms = np.append(time_ms, end_ms)
     position = np.append(step.position, 1.0)[: time_ms.size]
     shown = np.flatnonzero(time_ms <= end_ms)
     shown = shown[:: max(1, shown.size // _MOST_POINTS)]
+    settled = f"settled to {100 * tolerance:g} %: {settling_ms:.2f} ms"
+    response = Panel(
+        x=Axis(label="time since the command arrived", unit="ms", low=0, high=end_ms),
+        y=Axis(label="position / final position"),
+        marks=(
+            Span(name="", axis="y", low=1 - tolerance, high=1 + tolerance),
+            Curve(name="this mirror", x=time_ms[shown], y=position[shown]),
+            *(
+                Rule(name="frames", at=k * frame_ms, dash=3)
+                for k in range(1, int(end_ms / frame_ms) + 1)
+            ),
+            Rule(name=settled, at=settling_ms, dash=1),
+        ),
+        height_in=2.4,
+    )
     taps = hardware.mirror_taps
-    settled = LoopHardware(
+    ideal = LoopHardware(
         frame_rate_hz=hardware.frame_rate_hz, delay_frames=hardware.delay_frames, modes=1
     ).mirror_taps
-    with house_style():
-        figure = new_figure(6.3, 3.2)
-        left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-        left.axhspan(1 - tolerance, 1 + tolerance, color="0.9", zorder=0)
-        for k in range(1, int(end_ms / frame_ms) + 1):
-            left.axvline(
-                k * frame_ms,
-                color="0.5",
-                linestyle=":",
-                linewidth=1,
-                label="frames" if k == 1 else None,
-            )
-        left.plot(time_ms[shown], position[shown], color=COLOURS[0])
-        left.axvline(
-            1e3 * step.settling_s,
-            color=COLOURS[1],
-            linestyle="--",
-            linewidth=1.2,
-            label=f"settled to {100 * tolerance:g} %: {1e3 * step.settling_s:.2f} ms",
-        )
-        left.set(xlabel="time since the command arrived [ms]", ylabel="position / final position")
-        left.set_xlim(0, end_ms)
-        left.legend(loc="lower right")
-        count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN)[-1]) + 1, settled.size)
-        index = np.arange(count)
-        for shift, name, values, colour in (
-            (-0.2, "settled at once", settled, "0.7"),
-            (0.2, "this mirror", taps, COLOURS[0]),
-        ):
-            heights = np.zeros(count)
-            heights[: min(count, values.size)] = values[:count]
-            right.bar(index + shift, heights, width=0.4, color=colour, label=name)
-        right.set(xlabel="frames after the command", ylabel="weight in the exposure")
-        right.xaxis.set_major_locator(MaxNLocator(integer=True))
-        right.legend(loc="upper right")
-    return figure
+    count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN)[-1]) + 1, ideal.size)
+    weights = Panel(
+        x=Axis(label="frames after the command", low=-0.6, high=count - 0.4),
+        y=Axis(label="weight in the exposure"),
+        marks=(
+            _columns("this mirror", taps[:count], 0.0, look=0),
+            _columns("settled at once", ideal[:count], -0.4, look=None),
+        ),
+        height_in=2.4,
+    )
+    return draw_figure((response, weights), columns=2, axes=axes)
+
+
+def _columns(name: str, heights: FloatArray, offset: float, *, look: int | None) -> Area:
+    """Return upright bars of width 0.4 that begin at an offset from 0, 1 and so on."""
+    left = np.arange(heights.size) + offset
+    x = np.column_stack((left, left, left + 0.4, left + 0.4)).ravel()
+    high = np.column_stack((0 * heights, heights, heights, 0 * heights)).ravel()
+    return Area(name=name, x=x, low=np.zeros(x.size), high=high, look=look, solid=look is not None)

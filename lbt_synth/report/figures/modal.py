@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.report.figures.style import house_style, new_figure, number_ticks
-from lbt_synth.report.line_styles import line_styles
+from lbt_synth.report.charts.description import Axis, Curve, Panel
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
 from lbt_synth.validation import FloatArray, real_array
 
-_STEPS = "steps-mid"  # modes are counted, there is nothing between them
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def modal_figure(
-    residuals_nm: Mapping[str, Any], *, gains: Any = None, turbulence_nm: Any = None
-) -> Any:
+    residuals_nm: Mapping[str, ArrayLike],
+    *,
+    gains: ArrayLike | None = None,
+    turbulence_nm: ArrayLike | None = None,
+    axes: Axes | Sequence[Axes] | None = None,
+) -> Figure:
     """Draw the residual of each mode under several controllers, and integrator gains.
 
     Parameters
@@ -28,6 +35,8 @@ def modal_figure(
         Integrator gain of each mode, for a panel of its own.
     turbulence_nm : (n,) array_like, optional
         Turbulence of each mode [nm rms], before any correction.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
@@ -37,7 +46,8 @@ def modal_figure(
     Raises
     ------
     ProblemError
-        If there is no controller, a value is not finite or not positive, or lengths differ.
+        If there is no controller, a value is not finite or not positive, or lengths differ,
+        or ``axes`` are not one per panel.
 
     Examples
     --------
@@ -45,57 +55,50 @@ def modal_figure(
     >>> len(lbt.report.figures.modal_figure({"integrator": [9.0, 5.0]}, gains=[0.5, 0.4]).axes)
     2
     """
-    from matplotlib.ticker import FuncFormatter
-
     if not residuals_nm:
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
-    curves = {name: _check_curve(values, name) for name, values in residuals_nm.items()}
-    count = len(next(iter(curves.values())))
-    others = {
-        name: _check_curve(values, name)
-        for name, values in (("gains", gains), ("turbulence_nm", turbulence_nm))
+    given = {"turbulence_nm": turbulence_nm, "gains": gains}
+    curves = {
+        name: _require_modes(values, name)
+        for name, values in (*residuals_nm.items(), *given.items())
         if values is not None
     }
-    for name, values in (curves | others).items():
+    count = curves[next(iter(residuals_nm))].size
+    for name, values in curves.items():
         if values.size != count:
             raise DimensionError(
                 f"{name} must have {count} modes like the others; got {values.size}."
             )
-    modes = np.arange(1, count + 1)
-    with house_style():
-        figure = new_figure(6.3, 5.2 if gains is not None else 3.6)
-        if gains is not None:
-            above, axis = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
-            above.plot(modes, others["gains"], color="0.25", linewidth=1.2, drawstyle=_STEPS)
-            above.set_ylabel("integrator gain")
-            above.set_ylim(bottom=0)
-        else:
-            axis = figure.subplots()
-        if turbulence_nm is not None:
-            axis.plot(
-                modes,
-                others["turbulence_nm"],
-                color="0.6",
-                linewidth=1.2,
-                drawstyle=_STEPS,
-                label="turbulence",
-            )
-        for (name, values), style in zip(curves.items(), line_styles(), strict=False):
-            axis.plot(modes, values, label=name, drawstyle=_STEPS, **style)
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        number_ticks(axis.yaxis)
-        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_xlim(1, max(count, 2))
-        axis.set(xlabel="mode, in Noll's order from tip on", ylabel="residual [nm rms]")
-        figure.legend(loc="outside upper center", ncols=min(4, len(curves) + 1))
-    return figure
+    modes = np.arange(1.0, count + 1)
+    x = Axis(label="mode, in Noll's order from tip on", log=True, low=1, high=max(count, 2))
+    panels = []
+    if gains is not None:
+        above = Curve(name="", x=modes, y=curves["gains"], look=None, width=1.2, step="center")
+        y = Axis(label="integrator gain", low=0)
+        panels.append(Panel(x=x, y=y, marks=(above,), height_in=1.7))
+    # modes are counted, there is nothing between them
+    marks = [
+        Curve(name=name, x=modes, y=curves[name], look=look, step="center")
+        for look, name in enumerate(residuals_nm)
+    ]
+    if turbulence_nm is not None:
+        y_turbulence = curves["turbulence_nm"]
+        marks.insert(
+            0,
+            Curve(name="turbulence", x=modes, y=y_turbulence, look=None, width=1.0, step="center"),
+        )
+    y = Axis(label="residual", unit="nm rms", log=True)
+    panels.append(Panel(x=x, y=y, marks=tuple(marks), height_in=2.6))
+    return draw_figure(panels, axes=axes)
 
 
-def _check_curve(values: Any, name: str) -> FloatArray:
+def _require_modes(values: ArrayLike, name: str) -> FloatArray:
+    """Return a positive number per mode, (n,)."""
     curve = real_array(values, name)
     if curve.ndim != 1 or curve.size == 0:
-        raise DimensionError(f"{name} must be a list, one number a mode; got shape {curve.shape}.")
+        raise DimensionError(
+            f"{name} must be a list, one number per mode; got shape {curve.shape}."
+        )
     if np.any(curve <= 0):
         raise ProblemError(f"{name} must be above 0; got {curve.min():.6g}.")
     return curve

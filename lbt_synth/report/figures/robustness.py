@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.figures.style import METHOD_LABELS, house_style, new_figure
-from lbt_synth.report.line_styles import MARKERS, line_styles
+from lbt_synth.report.charts.description import Axis, Curve, Panel
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.figures.style import METHOD_LABELS
 from lbt_synth.studies import RobustnessRow
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FREQUENCY_ERROR = Axis(label="frequency error, design less truth", unit="Hz")
 
 
 def robustness_figure(
     rows: Sequence[RobustnessRow],
     published: Mapping[str, Sequence[tuple[float, float]]] | None = None,
-) -> Any:
+    *,
+    axes: Axes | Sequence[Axes] | None = None,
+) -> Figure:
     """Strehl ratio over the error of the model's vibration frequency.
 
     Parameters
@@ -23,6 +34,8 @@ def robustness_figure(
         Rows of :func:`lbt_synth.studies.robustness`.
     published : mapping, optional
         For each method, pairs (error [Hz], Strehl ratio [%]) drawn as open markers.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
@@ -32,7 +45,8 @@ def robustness_figure(
     Raises
     ------
     ProblemError
-        If there are no rows.
+        If there are no rows,
+        or ``axes`` are not one per panel.
 
     Examples
     --------
@@ -53,47 +67,29 @@ def robustness_figure(
     """
     if not rows:
         raise ProblemError("a robustness figure needs at least one row; got none.")
-    methods = list(dict.fromkeys(row.method for row in rows))
-    with house_style():
-        figure = new_figure(6.3, 3.8)
-        axis = figure.subplots()
-        for method, style, marker in zip(methods, line_styles(), MARKERS, strict=False):
-            own = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
-            label = METHOD_LABELS.get(method, method)
-            axis.plot(
-                [r.error_hz for r in own],
-                [100 * r.strehl for r in own],
-                marker=marker,
-                markersize=4,
-                label=label if any(r.stable for r in own) else None,
-                **style,
+    curves = []
+    for look, method in enumerate(dict.fromkeys(row.method for row in rows)):
+        own = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
+        label = METHOD_LABELS.get(method, method)
+        stable = [r for r in own if r.stable]
+        unstable = np.array([r.error_hz for r in own if not r.stable])
+        if stable:
+            x = np.array([r.error_hz for r in own])
+            y = np.array([100 * r.strehl if r.stable else np.nan for r in own])
+            curves.append(Curve(name=label, x=x, y=y, look=look, marker="own", size=4.0))
+        if unstable.size:
+            name, zero = f"{label}: unstable", np.zeros(unstable.size)
+            curves.append(
+                Curve(name=name, x=unstable, y=zero, look=look, line=False, marker="cross")
             )
-            unstable = [r.error_hz for r in own if not r.stable]
-            if unstable:
-                axis.plot(
-                    unstable,
-                    [0.0] * len(unstable),
-                    linestyle="none",
-                    marker="x",
-                    clip_on=False,
-                    color=style["color"],
-                    label=f"{label}: unstable",
-                )
-            if published is not None and method in published:
-                errors, values = zip(*published[method], strict=True)
-                axis.plot(
-                    errors,
-                    values,
-                    linestyle="none",
-                    marker=marker,
-                    markersize=7,
-                    markerfacecolor="none",
-                    markeredgecolor=style["color"],
-                    label=f"{label}, paper",
-                )
-        axis.set(
-            xlabel="error of the vibration frequency in the model [Hz]", ylabel="Strehl ratio [%]"
-        )
-        axis.set_ylim(0, 1.06 * axis.get_ylim()[1])
-        axis.legend(loc="best")
-    return figure
+        if published is not None and method in published:
+            x, y = np.array(published[method], dtype=float).T
+            style: dict[str, Any] = {"line": False, "marker": "own", "filled": False, "size": 7.0}
+            curves.append(Curve(name=f"{label}, paper", x=x, y=y, look=look, **style))
+    return draw_figure([strehl_panel(curves)], axes=axes)
+
+
+def strehl_panel(curves: Sequence[Curve], low: float = 0.0) -> Panel:
+    """Return curves of the Strehl ratio over the frequency error."""
+    y = Axis(label="Strehl ratio", unit="%", low=low)
+    return Panel(x=FREQUENCY_ERROR, y=y, marks=tuple(curves), height_in=2.5)

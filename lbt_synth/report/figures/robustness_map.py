@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.figures.style import house_style, new_figure
-from lbt_synth.report.map_cells import (
-    STREHL_LEVELS,
-    cell_edges,
-    draw_cells,
-    marked_intervals,
-    strehl_scale,
-)
+from lbt_synth.report.charts.description import Axis, Map, Panel, Rule
+from lbt_synth.report.charts.map_cells import STREHL_LEVELS, strehl_scale
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.scales import count_columns
+from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
 from lbt_synth.studies import RobustnessMap
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
+
+def robustness_map_figure(
+    maps: Mapping[str, RobustnessMap], *, axes: Axes | Sequence[Axes] | None = None
+) -> Figure:
     """Draw the Strehl ratio of designs over frequency error and sensor gain.
 
     Parameters
     ----------
     maps : mapping of str to RobustnessMap
         Maps of :func:`robustness_map` by the names of their designs.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
@@ -36,7 +41,8 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
     Raises
     ------
     ProblemError
-        If there is no map, or the maps have different delay errors.
+        If there is no map, or the maps have different delay errors,
+        or ``axes`` are not one per panel.
 
     Examples
     --------
@@ -63,46 +69,39 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap]) -> Any:
                 f"the maps must have the same delay errors {delays.tolist()}; got "
                 f"{found.delay_errors_frames.tolist()} for {name}."
             )
+    columns = min(len(maps), 3) if len(delays) > 1 else count_columns(len(maps))
+    return draw_figure(map_panels(maps), columns=columns, axes=axes)
+
+
+def map_panels(
+    maps: Mapping[str, RobustnessMap], *, real_gain: float | None = None
+) -> tuple[Panel, ...]:
+    """Return a map per delay error and design on one scale of colours."""
     low, high = strehl_scale([found.strehl for found in maps.values()])
-    with house_style():
-        columns, rows = len(maps), len(delays)
-        figure = new_figure(max(4.4, 1.3 + 2.6 * columns), 0.7 + 2.5 * rows)
-        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        for column, (name, found) in enumerate(maps.items()):
-            for row, panel in enumerate(panels[:, column]):
-                mesh = _draw_panel(panel, found, row, low, high)
-                panel.label_outer()
-            panels[0, column].set_title(name)
-        for row, delay in enumerate(delays):
-            late = f"delay error {delay:+g} frames\n" if rows > 1 or delay != 0 else ""
-            panels[row, 0].set_ylabel(f"{late}sensor gain [-]")
-        figure.supxlabel("frequency in the design less the true one [Hz]", fontsize=9)
-        bar = figure.colorbar(mesh, ax=panels, pad=0.02, fraction=0.06, aspect=22 * rows)
-        bar.set_label("Strehl ratio [%]")
-        bar.outline.set_visible(False)
-    return figure
-
-
-def _draw_panel(panel: Any, found: RobustnessMap, row: int, low: float, high: float) -> Any:
-    across, up = np.argsort(found.errors_hz), np.argsort(found.sensor_gains)
-    errors, gains = found.errors_hz[across], found.sensor_gains[up]
-    percent = 100 * found.strehl[row][np.ix_(up, across)]
-    mesh = draw_cells(panel, errors, gains, percent, low=low, high=high, levels=STREHL_LEVELS)
-    x, y = cell_edges(errors), cell_edges(gains)
-    height = y[-1] - y[0]
-    for bottom, top in marked_intervals(~found.stable[row][up], y):
-        panel.axhspan(bottom, top, facecolor="0.85", edgecolor="0.55", hatch="////", linewidth=0)
-        if top - bottom < 0.08 * height:  # no room for a word
-            continue
-        panel.text(
-            (x[0] + x[-1]) / 2,
-            np.clip((bottom + top) / 2, y[0] + 0.05 * height, y[-1] - 0.05 * height),
-            "unstable",
-            ha="center",
-            va="center",
-            fontsize=8,
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
-        )
-    panel.set_xlim(x[0], x[-1])
-    panel.set_ylim(y[0], y[-1])
-    return mesh
+    delays = next(iter(maps.values())).delay_errors_frames
+    # the long name of the axis does not fit three columns
+    x = FREQUENCY_ERROR if len(maps) in (1, 2, 4) else Axis(label="frequency error", unit="Hz")
+    panels = []
+    for row, delay in enumerate(delays):
+        late = f", delay error {delay:+g} frames" if len(delays) > 1 or delay != 0 else ""
+        for name, found in maps.items():
+            across, up = np.argsort(found.errors_hz), np.argsort(found.sensor_gains)
+            gains = found.sensor_gains[up]
+            marks: list[Map | Rule] = [
+                Map(
+                    x=found.errors_hz[across],
+                    y=gains,
+                    values=100 * found.strehl[row][np.ix_(up, across)],
+                    label="Strehl ratio",
+                    unit="%",
+                    low=low,
+                    high=high,
+                    levels=STREHL_LEVELS,
+                    blank="unstable loop",
+                )
+            ]
+            if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
+                marks.append(Rule(name="real sensor gain", at=real_gain, axis="y", dash=1))
+            y = Axis(label="sensor gain", unit="-")
+            panels.append(Panel(title=f"{name}{late}", x=x, y=y, marks=tuple(marks), height_in=2.3))
+    return tuple(panels)

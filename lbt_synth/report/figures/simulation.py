@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from itertools import cycle
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lbt_synth.loop import Simulation
-from lbt_synth.report.figures.style import house_style, new_figure
-from lbt_synth.report.line_styles import COLOURS
+from lbt_synth.report.charts.description import Axis, Curve, Panel
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.figures.loop import FREQUENCY
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
-def simulation_figure(run: Simulation, *, title: str = "") -> Any:
+def simulation_figure(
+    run: Simulation, *, title: str = "", axes: Axes | Sequence[Axes] | None = None
+) -> Figure:
     """Residual series and spectra before and after the correction.
 
     Parameters
@@ -21,11 +28,18 @@ def simulation_figure(run: Simulation, *, title: str = "") -> Any:
         A run; its first case is drawn, the spectra are means over all cases.
     title : str, optional
         Title of the figure.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
         Series above, spectra below.
+
+    Raises
+    ------
+    ProblemError
+        If ``axes`` are not one per panel.
 
     Examples
     --------
@@ -42,32 +56,31 @@ def simulation_figure(run: Simulation, *, title: str = "") -> Any:
 
     _, frames, n = run.residual_nm.shape
     names = ("tip", "tilt") if n <= 2 else [f"mode {i}" for i in range(n)]
-    with house_style():
-        figure = new_figure(6.3, 5.2)
-        series, spectrum = figure.subplots(2, 1)
-        time = np.arange(frames) / run.frame_rate_hz
-        length = min(frames, 2048)
-        for i, colour in zip(range(n), cycle(COLOURS), strict=False):
-            residual = run.residual_nm[0, :, i]
-            series.plot(time, residual, label=names[i], linewidth=0.6, alpha=0.8, color=colour)
-            for data, word, line in (
-                (run.total_nm, "open loop", ":"),
-                (run.residual_nm, "residual", "-"),
-            ):
-                f, s = welch(data[:, :, i], fs=run.frame_rate_hz, nperseg=length, axis=1)
-                mean = np.maximum(s.mean(axis=0)[1:], 1e-12)
-                spectrum.loglog(
-                    f[1:],
-                    mean,
-                    linestyle=line,
-                    color=colour,
-                    label=f"{names[i]}, {word}",
-                    linewidth=1.0,
-                )
-        series.set(xlabel="time [s]", ylabel="residual [nm rms wavefront]")
-        series.legend(loc="upper right")
-        spectrum.set(xlabel="frequency [Hz]", ylabel=r"power spectrum [nm$^2$/Hz]")
-        spectrum.legend(loc="best", ncols=2)
-        if title:
-            figure.suptitle(title, fontsize=10)
-    return figure
+    time = np.arange(frames) / run.frame_rate_hz
+    series, spectra = [], []
+    for i in range(n):
+        y = run.residual_nm[0, :, i]
+        series.append(Curve(name=names[i], x=time, y=y, look=i, width=0.5, dash=0))
+        # the residual is solid, what there was before it is dotted
+        for data, word, dash in ((run.total_nm, "open loop", 3), (run.residual_nm, "residual", 0)):
+            f, s = welch(data[:, :, i], fs=run.frame_rate_hz, nperseg=min(frames, 2048), axis=1)
+            name, mean = f"{names[i]}, {word}", s.mean(axis=0)[1:]
+            spectra.append(Curve(name=name, x=f[1:], y=mean, look=i, width=1.0, dash=dash))
+    panels = (series_panel(series), spectra_panel(spectra))
+    return draw_figure(panels, title=title, axes=axes)
+
+
+def series_panel(
+    curves: Sequence[Curve], *, title: str = "", reach: float | None = None, height_in: float = 2.1
+) -> Panel:
+    """Return residuals over time on a scale that reaches as far on both sides of 0."""
+    low = None if reach is None else -reach
+    y = Axis(label="residual", unit="nm", low=low, high=reach)
+    x = Axis(label="time", unit="s")
+    return Panel(x=x, y=y, marks=tuple(curves), title=title, height_in=height_in)
+
+
+def spectra_panel(curves: Sequence[Curve], *, title: str = "") -> Panel:
+    """Return power spectra over frequency."""
+    y = Axis(label="power spectrum", unit="nm²/Hz", log=True)
+    return Panel(x=FREQUENCY, y=y, marks=tuple(curves), title=title, height_in=2.2)

@@ -1,4 +1,4 @@
-"""Settings and axes that all figures share, and how a figure becomes a file."""
+"""Settings that all figures share, and how a figure becomes a file."""
 
 from __future__ import annotations
 
@@ -7,17 +7,23 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
-METHOD_LABELS = {"kalman": "Kalman", "hinf": r"H$_\infty$"}
+METHOD_LABELS = {"kalman": "Kalman", "hinf": "H∞"}
 
 _STYLE: dict[str, Any] = {
-    "font.size": 9,
-    "axes.labelsize": 9,
-    "axes.titlesize": 9,
+    "font.size": 8.5,
+    "axes.labelsize": 8.5,
+    "axes.titlesize": 8.5,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "axes.formatter.useoffset": False,
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.spines.top": False,
@@ -31,7 +37,9 @@ _STYLE: dict[str, Any] = {
     "lines.linewidth": 1.5,
     "figure.dpi": 150,
     "savefig.dpi": 200,
+    "text.parse_math": False,  # names of files and designs are never read as mathematics
     "svg.hashsalt": "lbt_synth",
+    "pdf.fonttype": 42,
 }
 
 
@@ -44,37 +52,12 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def new_figure(width_in: float, height_in: float) -> Any:
-    """Return an empty figure that belongs to no window."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width_in, height_in), layout="constrained")
-
-
-def plain_ticks(axis: Any) -> None:
-    """Label an axis of less than two decades with plain numbers."""
-    low, high = axis.get_ylim()
-    if high / low < 3:
-        axis.set_yscale("linear")
-    elif high / low < 30:
-        number_ticks(axis.yaxis)
-
-
-def number_ticks(scale: Any) -> None:
-    """Label a logarithmic x or y axis with plain numbers: 0.1, 0.2, 0.5 and so on."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    scale.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    scale.set_minor_formatter(NullFormatter())
-
-
 def require_figure_name(path: str | os.PathLike[str]) -> Path:
     """Refuse a file name that is not that of a figure."""
     return require_ending(path, "a figure", FIGURE_ENDINGS)
 
 
-def save_figure(figure: Any, path: str | os.PathLike[str]) -> Path:
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure, whole or not at all."""
     target = require_figure_name(path)
     ending = target.suffix.lower()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,9 +11,13 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import TrackingUpdate
 from lbt_synth.loop import Simulation
 from lbt_synth.models import DriftingVibration
-from lbt_synth.report.figures.style import house_style, new_figure, plain_ticks
-from lbt_synth.report.line_styles import COLOURS, line_styles
+from lbt_synth.report.charts.description import Axis, Curve, Panel
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
 from lbt_synth.validation import FloatArray, number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def tracking_figure(
@@ -23,7 +27,8 @@ def tracking_figure(
     truth: Sequence[DriftingVibration] = (),
     start_s: float = 0.0,
     bin_s: float = 1.0,
-) -> Any:
+    axes: Axes | Sequence[Axes] | None = None,
+) -> Figure:
     """Draw the frequencies that a filter followed, and the residuals of several runs.
 
     Parameters
@@ -39,6 +44,8 @@ def tracking_figure(
         settling.
     bin_s : float, optional
         Length of the parts of which the residual is drawn [s].
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
     Returns
     -------
@@ -50,7 +57,8 @@ def tracking_figure(
     Raises
     ------
     ProblemError
-        If there is no update or no run, or a run is shorter than one part.
+        If there is no update or no run, or a run is shorter than one part,
+        or ``axes`` are not one per panel.
 
     Examples
     --------
@@ -76,56 +84,61 @@ def tracking_figure(
     number(start_s, "start_s")
     number(bin_s, "bin_s", above=0)
     residuals = {name: _rms_in_parts(name, run, bin_s) for name, run in runs.items()}
-    last_s = max(len(values) for values in residuals.values()) * bin_s
-    with house_style():
-        figure = new_figure(6.3, 5.0)
-        upper, lower = figure.subplots(2, 1, sharex=True)
-        time_s = np.linspace(min(0.0, history[0].time_s - start_s), last_s, 1000)
-        for i, line in enumerate(truth):
-            upper.plot(
-                time_s,
-                line.frequency_hz_at(time_s),
-                color="0.4",
-                linewidth=3,
-                alpha=0.5,
-                label="true frequency" if i == 0 else None,
-            )
-        _draw_history(upper, history, start_s, last_s)
-        upper.set(ylabel="frequency [Hz]")
-        upper.legend(loc="best")
-        for (name, values), look in zip(residuals.items(), line_styles(), strict=False):
-            middles = (np.arange(len(values)) + 0.5) * bin_s
-            lower.plot(middles, values, label=name, **look)
-        lower.set(xlabel="time [s]", ylabel=f"residual in {bin_s:g} s [nm rms]", yscale="log")
-        lower.set_xlim(0, last_s)
-        plain_ticks(lower)
-        lower.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
-    return figure
+    last_s = max(values.size for values in residuals.values()) * bin_s
+    time_s = np.linspace(min(0.0, history[0].time_s - start_s), last_s, 1000, dtype=np.float64)
+    frequencies = [
+        Curve(name="true frequency", x=time_s, y=line.frequency_hz_at(time_s), look=None, width=3.0)
+        for line in truth
+    ]
+    frequencies += _history_curves(history, start_s, last_s)
+    curves = [
+        Curve(
+            name=name,
+            x=(np.arange(values.size, dtype=np.float64) + 0.5) * bin_s,
+            y=values,
+            look=look,
+        )
+        for look, (name, values) in enumerate(residuals.items())
+    ]
+    x = Axis(label="time", unit="s", low=0, high=last_s)
+    panels = (
+        Panel(x=x, y=Axis(label="frequency", unit="Hz"), marks=tuple(frequencies), height_in=2.2),
+        Panel(
+            x=x,
+            y=Axis(label=f"residual in {bin_s:g} s", unit="nm rms", log=True),
+            marks=tuple(curves),
+            height_in=2.2,
+        ),
+    )
+    return draw_figure(panels, axes=axes)
 
 
-def _draw_history(
-    axis: Any, history: Sequence[TrackingUpdate], start_s: float, last_s: float
-) -> None:
+def _history_curves(
+    history: Sequence[TrackingUpdate], start_s: float, last_s: float
+) -> list[Curve]:
+    """Return the frequencies of the filter and of the windows, and those that it kept."""
     ends = [update.time_s - start_s for update in history[1:]]
     ends.append(max(last_s, history[-1].time_s - start_s))
-    fitted, kept, first = [], [], True
+    held: list[tuple[float, float]] = []
+    fitted: list[tuple[float, float]] = []
+    kept: list[tuple[float, float]] = []
     for update, end_s in zip(history, ends, strict=True):
         begin_s = update.time_s - start_s
-        for frequency in update.frequencies_hz:
-            axis.plot(
-                [begin_s, end_s],
-                [frequency, frequency],
-                color=COLOURS[0],
-                label="the filter's" if first else None,
-            )
-            first = False
+        for frequency in update.frequencies_hz:  # lines that are not joined
+            held += [(begin_s, frequency), (end_s, frequency), (np.nan, np.nan)]
             if not update.switched:
                 kept.append((begin_s, frequency))
         fitted += [(update.middle_s - start_s, value) for value in update.fitted_hz]
-    marks = (("window, at its middle", ".", COLOURS[1], fitted), ("kept", "x", COLOURS[3], kept))
-    for name, marker, colour, points in marks:
-        if points:
-            axis.plot(*zip(*points, strict=True), marker, color=colour, markersize=4, label=name)
+    styles = (
+        ("the filter's", held, {"look": 0}),
+        ("window, at its middle", fitted, {"look": 1, "line": False, "marker": "circle"}),
+        ("kept", kept, {"look": 3, "line": False, "marker": "cross"}),
+    )
+    return [
+        Curve(name=name, x=np.array(points)[:, 0], y=np.array(points)[:, 1], size=3.0, **style)
+        for name, points, style in styles
+        if points
+    ]
 
 
 def _rms_in_parts(name: str, run: Simulation, bin_s: float) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.page.charts import Chart, require_key
+from lbt_synth.report.charts.description import Chart, require_key
 from lbt_synth.storage.tables import TONES, Table
 from lbt_synth.validation import choice
 

@@ -6,10 +6,8 @@ import json
 from importlib.resources import files
 from typing import Any
 
-from lbt_synth.report.line_styles import GREY, PALE, colour, dashes, marker_name
-from lbt_synth.report.page.blocks import Listing, Notice, Page, Paragraph
-from lbt_synth.report.page.bokeh_charts import bokeh_script, embed_charts
-from lbt_synth.report.page.charts import (
+from lbt_synth.report.charts.bokeh_charts import bokeh_script, embed_charts
+from lbt_synth.report.charts.description import (
     Area,
     Bars,
     Chart,
@@ -20,7 +18,9 @@ from lbt_synth.report.page.charts import (
     Span,
     legend_entries,
 )
-from lbt_synth.report.page.matplotlib_charts import chart_svg
+from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
+from lbt_synth.report.charts.matplotlib_charts import chart_svg
+from lbt_synth.report.page.blocks import Listing, Notice, Page, Paragraph
 from lbt_synth.storage.tables import Table
 
 _KINDS = {
@@ -83,7 +83,7 @@ def swatch(mark: Mark) -> str:
         if isinstance(mark, Rule):
             strokes, shade, width = dashes(mark.dash), GREY, 1.2
         else:
-            strokes = dashes(mark.look) if mark.dashed else ()
+            strokes = dashes(mark.look if mark.dash is None else mark.dash)
             shade, width = colour(mark.look), max(mark.width, 1.2)
         if isinstance(mark, Rule) or mark.line:
             pattern = " ".join(f"{2.0 * s:g}" for s in strokes)
@@ -97,7 +97,7 @@ def swatch(mark: Mark) -> str:
         inside = f'<path d="M4 1H30V13H4Z" fill="{PALE}"/>'
         inside += f'<path d="M6 13L18 1M14 13L26 1M22 13L30 5M4 7L10 1" stroke="{GREY}"/>'
     elif isinstance(mark, Area | Span | Bars):
-        alpha = 1 if isinstance(mark, Bars) else 0.25
+        alpha = 1 if isinstance(mark, Bars) else SHADE
         inside = f'<path d="M4 1H30V13H4Z" fill="{colour(mark.look)}" fill-opacity="{alpha}"/>'
     return (
         '<svg class="swatch" viewBox="0 0 34 14" width="34" height="14" aria-hidden="true" '

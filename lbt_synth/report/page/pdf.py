@@ -1,38 +1,37 @@
-"""A page on sheets of A4, drawn by matplotlib."""
+"""A page on sheets of A4, set by fpdf2."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+import logging
+import math
+import re
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
-from typing import Any
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from lbt_synth.report.charts.description import Chart, Map, Panel
+from lbt_synth.report.charts.matplotlib_charts import chart_height, chart_png, chart_svg
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
-from lbt_synth.report.page.charts import Chart, Panel
-from lbt_synth.report.page.line_breaking import (
-    BODY,
-    BOLD,
-    LINE,
-    MONO,
-    Style,
-    mono_lines,
-    text_width,
-    wrap,
-)
-from lbt_synth.report.page.matplotlib_charts import chart_height, chart_style, draw_chart
 from lbt_synth.storage.tables import Cell, Table
+
+if TYPE_CHECKING:
+    from fpdf import FPDF
 
 WIDTH, HEIGHT = 8.27, 11.69  # A4 [inch]
 _SIDE, _TOP, _BOTTOM = 0.635, 0.6, 0.65
 INSIDE = WIDTH - 2 * _SIDE
 _COLUMNS = 6  # that fit beside the first one of a table
 _ROOM = HEIGHT - _TOP - _BOTTOM - 0.5  # of a sheet below the heading of a section [inch]
-_TOGETHER = 12  # lines of a paragraph or rows of a table that stay on one sheet
-_PAD = 0.05  # around the text of a cell
+_TOGETHER = 12  # rows of a table that stay on one sheet
+_PAD = 0.05  # around the text of a cell [inch]
 _INKS = {"bad": "#a40e26", "good": "#116329", "note": "#6a4b00", "plain": "#1b1f24"}
-_TINTS = {"bad": "#fdecee", "good": "#e9f5ec", "note": "#fff6dc"}
-Draw = Callable[[Any], None]
+_TINTS = {"bad": "#fdecee", "good": "#e9f5ec", "note": "#fff6dc", "plain": "#f4f6f8"}
+_DATE = re.compile(rb"/CreationDate \([^)]*\)")
+_PIXELS = re.compile(r"(font-size: [\d.]+)px")
+_SANS, _MONO = "DejaVu Sans", "DejaVu Sans Mono"  # as in the drawings
 
 
 def page_pdf(page: Page) -> bytes:
@@ -40,238 +39,213 @@ def page_pdf(page: Page) -> bytes:
 
     The first section stands on the title page. Without a date, the same page is the same file.
     """
-    from matplotlib.backends.backend_pdf import PdfPages
-    from matplotlib.figure import Figure
+    import matplotlib as mpl
+    from fpdf import FPDF
 
-    with chart_style():
-        sheets = _Sheets()
-        sheets.add_words(page.title, Style(size=19, weight="bold"), after=0.08)
-        sheets.add_words(page.subtitle, Style(size=9, ink="#4a5560"), after=0.25)
-        for number, section in enumerate(page.sections):
-            sheets.add_section(section, first=number == 0)
-        buffer = io.BytesIO()
-        facts = {
-            "Title": page.title,
-            "Author": page.creator,
-            "Creator": page.creator,
-            "CreationDate": None,
-        }
-        with PdfPages(buffer, metadata=facts) as pdf:
-            for number, draws in enumerate(sheets.pages):
-                figure = Figure(figsize=(WIDTH, HEIGHT))
-                for draw in draws:
-                    draw(figure)
-                foot = f"page {number + 1} of {len(sheets.pages)}"
-                _draw_text(figure, WIDTH - _SIDE - text_width(foot, LINE), 0.35, foot, LINE)
-                room = INSIDE - text_width(foot, LINE) - 0.3
-                _draw_text(figure, _SIDE, 0.35, wrap(page.title, LINE, room)[0], LINE)
-                pdf.savefig(figure)
-    return buffer.getvalue()
+    class Sheets(FPDF):
+        def footer(self) -> None:
+            self.set_y(-0.45)
+            _set_style(self, 8)
+            title = page.title
+            while self.get_string_width(title) > INSIDE - 1.2:
+                title = title[: int(0.9 * len(title))] + "…"
+            self.cell(INSIDE - 1.2, text=title)
+            self.cell(1.2, text=f"page {self.page_no()} of {{nb}}", align="R")
 
-
-class _Sheets:
-    """Sheets that are filled from the top, and the drawings on each of them."""
-
-    def __init__(self) -> None:
-        self.pages: list[list[Draw]] = [[]]
-        self.y = HEIGHT - _TOP
-
-    def take(self, height: float) -> float:
-        """Return the top of a place of that height, on a new sheet if there is no room."""
-        if self.y - height < _BOTTOM and self.pages[-1]:
-            self.pages.append([])
-            self.y = HEIGHT - _TOP
-        top = self.y
-        self.y -= height
-        return top
-
-    def make_room(self, height: float) -> bool:
-        """Go on to a new sheet if there is no such height left, and return whether it is so."""
-        missing = self.y - height < _BOTTOM
-        if missing:
-            self.y = 0.0
-        return missing
-
-    def draw(self, what: Draw) -> None:
-        self.pages[-1].append(what)
-
-    def draw_line(self, text: str, style: Style, *, top: float, left: float = _SIDE) -> None:
-        self.draw(partial(_draw_line, top=top, left=left, text=text, style=style))
-
-    def add_section(self, section: Section, *, first: bool) -> None:
-        """Set a section; its heading is not left alone at the foot of a sheet."""
-        head = Style(size=14, weight="bold")
-        opening = 0.0
-        for block in section.blocks:  # up to the first thing that is no text
-            first_part = next(split_by_sheets(block)) if isinstance(block, Chart) else block
-            opening += block_height(first_part)
-            if not isinstance(block, Paragraph | Notice):
-                break
-        if not first:
-            self.make_room(0.45 + min(opening, _ROOM))
-        self.add_words(section.title, head, after=0.1)
-        for block in section.blocks:
-            self.add_block(block)
-        self.y -= 0.15
-
-    def add_block(self, block: Block) -> None:
-        if isinstance(block, Paragraph):
-            self.add_words(block.text, BODY, after=0.1)
-        elif isinstance(block, Notice):
-            self.add_notice(block)
-        elif isinstance(block, Listing):
-            self.add_listing(block)
-        elif isinstance(block, Table):
-            for part in block.by_columns(_COLUMNS):
-                self.add_table(part)
-        else:
-            for chart in split_by_sheets(block):
-                self.add_chart(chart)
-
-    def add_words(self, text: str, style: Style, *, after: float) -> None:
-        """Set a text; a short one is kept together."""
-        lines = wrap(text, style, INSIDE)
-        if len(lines) <= _TOGETHER:
-            self.make_room(len(lines) * style.leading)
-        for line in lines:
-            self.draw_line(line, style, top=self.take(style.leading))
-        self.y -= after
-
-    def add_notice(self, notice: Notice) -> None:
-        style = Style(
-            size=9, weight="bold" if notice.tone == "bad" else "normal", ink=_INKS[notice.tone]
-        )
-        lines = wrap(notice.text, style, INSIDE - 0.3)
-        height = len(lines) * style.leading + 0.16
-        top = self.take(height + 0.1)
-        tint = _TINTS.get(notice.tone, "#f4f6f8")
-        self.draw(partial(_draw_box, left=_SIDE, top=top, width=INSIDE, height=height, shade=tint))
-        self.draw(
-            partial(
-                _draw_box, left=_SIDE, top=top, width=0.05, height=height, shade=_INKS[notice.tone]
-            )
-        )
-        for i, line in enumerate(lines):
-            at = top - 0.08 - i * style.leading
-            self.draw_line(line, style, top=at, left=_SIDE + 0.18)
-
-    def add_listing(self, listing: Listing) -> None:
-        lines = mono_lines(listing.text, INSIDE)
-        self.take(BOLD.leading + 4 * MONO.leading)  # not the heading alone
-        self.y += BOLD.leading + 4 * MONO.leading
-        self.add_words(listing.caption, BOLD, after=0.05)
-        for line in lines:
-            self.draw_line(line, MONO, top=self.take(MONO.leading))
-        self.y -= 0.1
-
-    def add_chart(self, chart: Chart) -> None:
-        caption = wrap(chart.caption, LINE, INSIDE)
-        title = wrap(chart.title, BOLD, INSIDE)
-        top = self.take(block_height(chart))
-        for line in title:
-            self.draw_line(line, BOLD, top=top)
-            top -= BOLD.leading
-        top -= 0.05
-        self.draw(partial(draw_chart, chart=chart, left=_SIDE, top=top, width=INSIDE))
-        top -= chart_height(chart, INSIDE) + 0.05
-        for line in caption:
-            self.draw_line(line, LINE, top=top)
-            top -= LINE.leading
-
-    def add_table(self, table: Table) -> None:
-        """Set a table, its headings repeated on each sheet."""
-        rows = list(table.cells())
-        head = tuple(Cell(text=text) for text in table.headings)
-        widths = column_widths([head, *rows])
-        top_row = _Row(head, widths, table.words, heading=True)
-        body = [_Row(cells, widths, table.words) for cells in rows]
-        kept = body if len(body) <= _TOGETHER else body[:1]
-        start = top_row.height + sum(row.height for row in kept)
-        self.make_room(start + BOLD.leading + 0.1)
-        self.add_words(table.caption, BOLD, after=0.03)
-        self.add_row(top_row)
-        for row in body:
-            if self.make_room(row.height):
-                self.add_row(top_row)
-            self.add_row(row)
-        self.y -= 0.2
-
-    def add_row(self, row: _Row) -> None:
-        self.draw(partial(row.draw, top=self.take(row.height)))
+    # a name in a script that the font does not have stays a name
+    logging.getLogger("fpdf").setLevel(logging.ERROR)
+    pdf = Sheets(unit="in", format=(WIDTH, HEIGHT))
+    pdf.creation_date = datetime.fromtimestamp(0, UTC)  # blanked below
+    pdf.set_title(page.title)
+    pdf.set_author(page.creator)
+    pdf.set_creator(page.creator)
+    pdf.set_margins(_SIDE, _TOP)
+    pdf.set_auto_page_break(auto=True, margin=_BOTTOM)
+    pdf.c_margin = 0.0
+    fonts = Path(mpl.get_data_path()) / "fonts" / "ttf"
+    pdf.add_font(_SANS, "", fonts / "DejaVuSans.ttf")
+    pdf.add_font(_SANS, "B", fonts / "DejaVuSans-Bold.ttf")
+    pdf.add_font(_MONO, "", fonts / "DejaVuSansMono.ttf")
+    pdf.add_page()
+    _write(pdf, page.title, 19, bold=True, after=0.08)
+    _write(pdf, page.subtitle, 9, ink="#4a5560", after=0.25)
+    for number, section in enumerate(page.sections):
+        _write_section(pdf, section, first=number == 0)
+    # fpdf2 always writes a date; blanks of the same length leave all offsets as they are
+    return _DATE.sub(lambda found: b" " * len(found[0]), bytes(pdf.output()))
 
 
-class _Row:
-    """A row of a table with its cells wrapped."""
+def _set_style(
+    pdf: FPDF, size: float, *, bold: bool = False, ink: str = _INKS["plain"], family: str = _SANS
+) -> None:
+    pdf.set_font(family, "B" if bold else "", size)
+    pdf.set_text_color(ink)
 
-    def __init__(
-        self,
-        cells: tuple[Cell, ...],
-        widths: list[float],
-        words: tuple[int, ...],
-        *,
-        heading: bool = False,
-    ) -> None:
-        self.cells, self.words, self.heading = cells, words, heading
-        self.group = len(cells) == 1 and len(widths) > 1
-        self.widths = [sum(widths)] if self.group else widths
-        self.lines = [
-            wrap(cell.text, self._style(cell), width - 2 * _PAD)
-            for cell, width in zip(cells, self.widths, strict=True)
-        ]
-        self.height = max(len(lines) for lines in self.lines) * LINE.leading + 0.07
 
-    def _style(self, cell: Cell) -> Style:
-        bold = self.heading or self.group or cell.tone == "bad"
-        return Style(size=LINE.size, weight="bold" if bold else "normal", ink=_INKS[cell.tone])
+def _leading(size: float) -> float:
+    """Distance of lines [inch] of a size [points]."""
+    return 1.35 * size / 72
 
-    def draw(self, figure: Any, *, top: float) -> None:
-        """Draw the row on a sheet."""
-        left = _SIDE
-        bottom = top - self.height
-        if self.group:
-            _draw_box(
-                figure,
-                left=left,
-                top=top,
-                width=sum(self.widths),
-                height=self.height,
-                shade="#f4f6f8",
-            )
-        for i, (cell, lines, width) in enumerate(
-            zip(self.cells, self.lines, self.widths, strict=True)
-        ):
-            style = self._style(cell)
-            if cell.tone == "bad":
-                _draw_box(
-                    figure, left=left, top=top, width=width, height=self.height, shade=_TINTS["bad"]
+
+def _write(
+    pdf: FPDF,
+    text: str,
+    size: float,
+    *,
+    bold: bool = False,
+    ink: str = _INKS["plain"],
+    family: str = _SANS,
+    after: float,
+) -> None:
+    """Write a text in lines as wide as the sheet; a short one is kept together."""
+    from fpdf.enums import WrapMode
+
+    _set_style(pdf, size, bold=bold, ink=ink, family=family)
+    lines = len(text) / 90
+    if lines < _TOGETHER and family != _MONO:
+        _make_room(pdf, math.ceil(lines) * _leading(size))
+    mode = WrapMode.CHAR if family == _MONO else WrapMode.WORD
+    pdf.multi_cell(
+        INSIDE, _leading(size), text, align="L", wrapmode=mode, new_x="LMARGIN", new_y="NEXT"
+    )
+    pdf.y += after
+
+
+def _make_room(pdf: FPDF, height: float) -> None:
+    """Go on to a new sheet if there is no such height left."""
+    if pdf.y + height > HEIGHT - _BOTTOM and pdf.y > _TOP:
+        pdf.add_page()
+
+
+def _write_section(pdf: FPDF, section: Section, *, first: bool) -> None:
+    """Set a section; its heading is not left alone at the foot of a sheet."""
+    opening = 0.0
+    for block in section.blocks:  # up to the first thing that is no text
+        opening += block_height(next(split_by_sheets(block)) if isinstance(block, Chart) else block)
+        if not isinstance(block, Paragraph | Notice):
+            break
+    if not first:
+        _make_room(pdf, 0.45 + min(opening, _ROOM))
+    _write(pdf, section.title, 14, bold=True, after=0.1)
+    for block in section.blocks:
+        match block:
+            case Paragraph():
+                _write(pdf, block.text, 9, after=0.1)
+            case Notice():
+                _write_notice(pdf, block)
+            case Listing():
+                _make_room(pdf, 0.8)  # not the heading alone
+                _write(pdf, block.caption, 9, bold=True, after=0.05)
+                _write(pdf, block.text.expandtabs(4), 7, family=_MONO, after=0.1)
+            case Table():
+                for part in block.by_columns(_COLUMNS):
+                    _write_table(pdf, part)
+            case Chart():
+                for chart in split_by_sheets(block):
+                    _write_chart(pdf, chart)
+    pdf.y += 0.15
+
+
+def _write_notice(pdf: FPDF, notice: Notice) -> None:
+    from fpdf.util import Padding
+
+    ink, tint = _INKS[notice.tone], _TINTS[notice.tone]
+    _set_style(pdf, 9, bold=notice.tone == "bad", ink=ink)
+    _make_room(pdf, block_height(notice))
+    pdf.set_fill_color(tint)
+    top = pdf.y
+    pdf.multi_cell(
+        INSIDE,
+        _leading(9),
+        notice.text,
+        align="L",
+        fill=True,
+        padding=Padding(0.08, 0.1, 0.08, 0.18),
+        new_x="LMARGIN",
+        new_y="NEXT",
+    )
+    pdf.set_fill_color(ink)
+    pdf.rect(_SIDE, top, 0.05, pdf.y - top, style="F")
+    pdf.set_fill_color("#000000")  # that of letters in drawings
+    pdf.y += 0.1
+
+
+def _write_chart(pdf: FPDF, chart: Chart) -> None:
+    _make_room(pdf, block_height(chart))
+    _write(pdf, chart.title, 9, bold=True, after=0.0)
+    # fpdf2 knows neither the hatching nor the images in an SVG of a map
+    mapped = any(panel.select(Map) for panel in chart.panels)
+    # and takes a size in px for less than the unit of the drawing, which is a point
+    drawing = chart_png(chart) if mapped else _PIXELS.sub(r"\1pt", chart_svg(chart)).encode()
+    pdf.image(
+        io.BytesIO(drawing),
+        w=INSIDE,
+        h=chart_height(chart.panels, chart.columns),
+        alt_text=chart.alt,
+    )
+    pdf.y += 0.05
+    _write(pdf, chart.caption, 8, after=0.2)
+
+
+def _write_table(pdf: FPDF, table: Table) -> None:
+    """Set a table, its headings repeated on each sheet."""
+    from fpdf.fonts import FontFace
+
+    rows = list(table.cells())
+    head = tuple(Cell(text=text) for text in table.headings)
+    _make_room(pdf, 0.2 * (2 + min(len(rows), 3 if len(rows) > _TOGETHER else len(rows))))
+    _write(pdf, table.caption, 9, bold=True, after=0.03)
+    _set_style(pdf, 8)
+    widths = _column_widths(pdf, [head, *rows])
+    left = {0, *table.words}
+    pdf.set_draw_color("#c9d1d9")
+    pdf.set_line_width(0.005)
+    with pdf.table(
+        align="LEFT",
+        width=sum(widths),
+        col_widths=widths,
+        text_align=tuple("LEFT" if i in left else "RIGHT" for i in range(len(widths))),
+        line_height=_leading(8),
+        padding=(0.035, _PAD),
+        borders_layout="HORIZONTAL_LINES",
+        headings_style=FontFace(emphasis="BOLD"),
+        v_align="TOP",
+    ) as grid:
+        for cells in (head, *rows):
+            row = grid.row()
+            group = len(cells) == 1 and len(widths) > 1
+            for cell in cells:
+                tint = _TINTS["bad" if cell.tone == "bad" else "plain"]
+                style = FontFace(
+                    emphasis="BOLD" if cells is head or group or cell.tone == "bad" else None,
+                    color=_INKS[cell.tone],
+                    fill_color=tint if group or cell.tone == "bad" else "#ffffff",
                 )
-            for j, line in enumerate(lines):
-                at = left + _PAD
-                if i > 0 and i not in self.words:
-                    at = left + width - _PAD - text_width(line, style)
-                _draw_line(
-                    figure, top=top - 0.035 - j * style.leading, left=at, text=line, style=style
-                )
-            left += width
-        thickness = 0.012 if self.heading else 0.005
-        _draw_box(
-            figure,
-            left=_SIDE,
-            top=bottom + thickness,
-            width=left - _SIDE,
-            height=thickness,
-            shade="#1b1f24" if self.heading else "#c9d1d9",
-        )
+                row.cell(cell.text, style=style, colspan=len(widths) if group else 1)
+    pdf.y += 0.2
+
+
+def _column_widths(pdf: FPDF, rows: list[tuple[Cell, ...]]) -> list[float]:
+    """Widths of columns [inch] that fit the sheet; the widest are narrowed and their text wraps."""
+    count = max(map(len, rows))
+    _set_style(pdf, 8, bold=True)
+    natural = [
+        max(pdf.get_string_width(row[i].text) for row in rows if len(row) == count) + 2.4 * _PAD
+        for i in range(count)
+    ]
+    _set_style(pdf, 8)
+    cap = INSIDE
+    while sum(min(width, cap) for width in natural) > INSIDE:
+        cap *= 0.98
+    return [min(width, cap) for width in natural]
 
 
 def split_by_sheets(chart: Chart) -> Iterator[Chart]:
     """Yield charts that each fit a sheet below the heading of a section, in whole rows."""
-    panels = chart.panels
     parts: list[tuple[Panel, ...]] = [()]
-    for start in range(0, len(panels), chart.columns):
-        row = panels[start : start + chart.columns]
-        longer = replace(chart, panels=parts[-1] + row)
-        if parts[-1] and block_height(longer) > _ROOM:
+    for start in range(0, len(chart.panels), chart.columns):
+        row = chart.panels[start : start + chart.columns]
+        if parts[-1] and block_height(replace(chart, panels=parts[-1] + row)) > _ROOM:
             parts.append(row)
         else:
             parts[-1] += row
@@ -281,61 +255,14 @@ def split_by_sheets(chart: Chart) -> Iterator[Chart]:
 
 
 def block_height(block: Block) -> float:
-    """Height that a block needs on one sheet [inch]; that of its start for a table or listing."""
-    if isinstance(block, Chart):
-        caption, title = wrap(block.caption, LINE, INSIDE), wrap(block.title, BOLD, INSIDE)
-        words = len(caption) * LINE.leading + len(title) * BOLD.leading
-        return chart_height(block, INSIDE) + words + 0.35
-    if isinstance(block, Table | Listing):
-        return 1.0
-    return len(wrap(block.text, BODY, INSIDE)) * BODY.leading + 0.2
+    """Height that a block needs on one sheet [inch], or the start of a table or listing.
 
-
-def column_widths(rows: list[tuple[Cell, ...]]) -> list[float]:
-    """Widths of columns [inch] that fit the sheet; the widest are narrowed and their text wraps."""
-    bold = Style(size=LINE.size, weight="bold")
-    count = max(len(row) for row in rows)
-    natural = [
-        max(text_width(row[i].text, bold) for row in rows if len(row) == count) + 2 * _PAD + 0.02
-        for i in range(count)
-    ]
-    cap = INSIDE
-    while sum(min(width, cap) for width in natural) > INSIDE:
-        cap *= 0.98
-    return [min(width, cap) for width in natural]
-
-
-def _draw_text(figure: Any, x: float, y: float, text: str, style: Style) -> None:
-    figure.text(
-        x,
-        y,
-        text,
-        transform=figure.dpi_scale_trans,
-        fontsize=style.size,
-        color=style.ink,
-        fontweight=style.weight,
-        family=style.family,
-        va="baseline",
-    )
-
-
-def _draw_line(figure: Any, *, top: float, left: float, text: str, style: Style) -> None:
-    _draw_text(figure, left, top - 0.8 * style.leading, text, style)
-
-
-def _draw_box(
-    figure: Any, *, left: float, top: float, width: float, height: float, shade: str
-) -> None:
-    from matplotlib.patches import Rectangle
-
-    figure.add_artist(
-        Rectangle(
-            (left, top - height),
-            width,
-            height,
-            transform=figure.dpi_scale_trans,
-            facecolor=shade,
-            edgecolor="none",
-            zorder=0,
-        )
-    )
+    That of a text is estimated by its letters.
+    """
+    match block:
+        case Chart():
+            words = math.ceil(len(block.caption) / 95) + math.ceil(len(block.title) / 75)
+            return chart_height(block.panels, block.columns) + words * _leading(8) + 0.35
+        case Table() | Listing():
+            return 1.0
+    return math.ceil(len(block.text) / 80) * _leading(9) + 0.3

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from lbt_synth.report.charts.description import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
 from lbt_synth.report.number_text import listing_text
-from lbt_synth.report.page.charts import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
 from lbt_synth.studies import StudyStatistics
 from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
 from lbt_synth.studies.study.comparison import sample_losses
@@ -39,7 +39,7 @@ def distribution_chart(found: Sequence[ControllerSamples]) -> Chart | None:
     low = min(10.0, 10.0 ** np.floor(np.log10(100 * most)))
     plain, tail = (
         [
-            Curve(name=name, x=x[first:], y=y[first:], look=look, step=True, width=1.8)
+            Curve(name=name, x=x[first:], y=y[first:], look=look, step="after", width=1.8)
             for look, name, x, y in curves
         ]
         for first in (0, 1)
@@ -86,7 +86,7 @@ def loss_chart(found: Sequence[ControllerSamples]) -> Chart | None:
         level, part = cumulative_points(loss)
         x, y = np.concatenate(([0.0], level)), np.concatenate(([1.0], 1 - part))
         curves.append(
-            Curve(name=each.controller, x=100 * x, y=100 * y, look=look, step=True, width=1.8)
+            Curve(name=each.controller, x=100 * x, y=100 * y, look=look, step="after", width=1.8)
         )
     x_axis = Axis(label="loss of Strehl ratio", unit="points", low=0)
     y_axis = Axis(label="samples that lose more", unit="%", low=0, high=100)
@@ -118,7 +118,7 @@ def parameter_chart(parameters: Mapping[str, FloatArray], names: Mapping[str, st
             panels.append(
                 _histogram_panel(
                     names[name],
-                    Curve(name="", x=x, y=y, look=0, dashed=False, width=5, hover=False),
+                    Curve(name="", x=x, y=y, look=0, dash=0, width=5, hover=False),
                     Curve(name="", x=places, y=100 * part, look=0, line=False, marker="circle"),
                 )
             )
@@ -129,7 +129,7 @@ def parameter_chart(parameters: Mapping[str, FloatArray], names: Mapping[str, st
             _histogram_panel(
                 names[name],
                 Area(name="", x=x, low=np.zeros_like(y), high=y, look=0),
-                Curve(name="", x=x, y=y, look=0, dashed=False, hover=False),
+                Curve(name="", x=x, y=y, look=0, dash=0, hover=False),
             )
         )
     if not panels:

@@ -55,7 +55,7 @@ def test_the_page_is_complete(text, report, config):
         "Rejection and noise",
         "Strehl ratio over the frequency error",
         "Poles",
-        "Answer to a step",
+        "Step response",
         "Certificates",
         "Configuration and versions",
     ):

@@ -26,7 +26,7 @@ def test_bad_modal_figures_are_refused():
     for arguments, error, words in (
         (({},), lbt.errors.ProblemError, "got none"),
         (({"a": [1.0, 0.0]},), lbt.errors.ProblemError, "a must be above 0"),
-        (({"a": 1.0},), lbt.errors.DimensionError, "one number a mode"),
+        (({"a": 1.0},), lbt.errors.DimensionError, "one number per mode"),
         (({"a": [1.0], "b": [1.0, 2.0]},), lbt.errors.DimensionError, "b must have 1 modes"),
     ):
         with pytest.raises(error, match=words):

@@ -12,7 +12,7 @@ def test_robustness_figure_draws_the_paper_beside(config):
         lbt.studies.robustness(config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1])
     )
     (axis,) = lbt.report.figures.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
-    assert legend(axis) == ["Kalman", "Kalman, paper", r"H$_\infty$"]
+    assert legend(axis) == ["Kalman", "Kalman, paper", "H∞"]
     assert "[%]" in axis.get_ylabel()
     assert "[Hz]" in axis.get_xlabel()
 
@@ -27,4 +27,4 @@ def test_robustness_figure_of_an_unstable_method(config):
         )
     )
     (axis,) = lbt.report.figures.robustness_figure(rows).axes
-    assert legend(axis) == ["Kalman", r"H$_\infty$: unstable"]
+    assert legend(axis) == ["Kalman", "H∞: unstable"]

@@ -35,11 +35,12 @@ def maps(kalman, robust, settings):
 def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
     figure = lbt.report.figures.robustness_map_figure(maps)
     left, right, bar = figure.axes
-    assert [left.get_title(), right.get_title()] == ["Kalman", "H-infinity"]
-    assert bar.get_ylabel() == "Strehl ratio [%]"
+    assert [panel.get_title(loc="left") for panel in (left, right)] == ["Kalman", "H-infinity"]
+    assert bar.get_xlabel() == "Strehl ratio [%]"
     assert left.get_ylabel() == "sensor gain [-]"
-    assert figure.get_supxlabel() == "frequency in the design less the true one [Hz]"
-    unstable = [[t.get_text() for t in p.texts].count("unstable") for p in (left, right)]
+    assert left.get_xlabel() == "frequency error, design less truth [Hz]"
+    assert "unstable loop" in [text.get_text() for text in figure.legends[0].get_texts()]
+    unstable = [[c.get_hatch() for c in p.collections].count("////") for p in (left, right)]
     assert unstable == [1, 2]  # the Kalman filter at 3, the other at 0.3 as well
     assert left.collections[0].get_clim() == right.collections[0].get_clim()
     figure.savefig(tmp_path / "map.png")
@@ -60,7 +61,8 @@ def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, 
         {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
     )
     assert len(figure.axes) == 5
-    assert figure.axes[2].get_ylabel() == "delay error +0.1 frames\nsensor gain [-]"
+    assert figure.axes[2].get_title(loc="left") == "a, delay error +0.1 frames"
+    assert figure.axes[2].get_ylabel() == "sensor gain [-]"
     figure.savefig(tmp_path / "a.png")
     nowhere = lbt.report.figures.robustness_map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
     nowhere.savefig(tmp_path / "b.pdf")

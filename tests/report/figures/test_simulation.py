@@ -11,4 +11,4 @@ def test_simulation_figure(config):
     )
     series, spectrum = lbt.report.figures.simulation_figure(run, title="Kalman").axes
     assert series.get_xlabel() == "time [s]"
-    assert "[nm$^2$/Hz]" in spectrum.get_ylabel()
+    assert "[nm²/Hz]" in spectrum.get_ylabel()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.figures import legend
 from support.tracking import DRIFT, Oracle, axis, simulated
 
 import lbt_synth as lbt
@@ -22,8 +23,7 @@ def test_the_figure_has_the_frequencies_and_the_residuals():
     assert "[Hz]" in upper.get_ylabel()
     assert "[nm rms]" in lower.get_ylabel()
     assert lower.get_xlabel() == "time [s]"
-    legend = [text.get_text() for text in upper.get_legend().get_texts()]
-    assert legend == ["true frequency", "the filter's", "window, at its middle"]
+    assert legend(upper) == ["true frequency", "the filter's", "window, at its middle"]
     drawn = lower.get_lines()[0].get_ydata()
     power = runs["tracking"].residual_nm[0, :, 0] ** 2
     assert drawn == pytest.approx(np.sqrt(power.reshape(6, 400).mean(axis=1)))

@@ -7,8 +7,8 @@ import re
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.report.charts.description import Axis, Bars, Chart, Curve, Map, Panel
 from lbt_synth.report.page.blocks import Page, Section
-from lbt_synth.report.page.charts import Axis, Bars, Chart, Curve, Map, Panel
 from lbt_synth.storage.tables import Cell, Table
 
 X, Y = Axis(label="x"), Axis(label="y")

@@ -6,11 +6,11 @@ import re
 
 import numpy as np
 import pytest
+from fpdf import FPDF
 from support.pages import HOSTILE, many_panels, whole_page
 
+from lbt_synth.report.charts.description import Axis, Bars, Chart, Panel
 from lbt_synth.report.page.blocks import Listing, Page, Paragraph, Section
-from lbt_synth.report.page.charts import Axis, Bars, Chart, Panel
-from lbt_synth.report.page.line_breaking import MONO
 from lbt_synth.report.page.pdf import HEIGHT, block_height, page_pdf, split_by_sheets
 from lbt_synth.storage.tables import Table
 
@@ -30,7 +30,7 @@ def test_a_pdf_has_its_pages_and_no_date(sheets):
     assert pages_of(pdf) == 4
     assert b"CreationDate" not in pdf
     assert b"/Title (Page of first)" in pdf
-    assert b"/MediaBox [ 0 0 595.44 841.68 ]" in pdf
+    assert b"/MediaBox [0 0 595.44 841.68]" in pdf
     assert b"/Type3" not in pdf
     assert page_pdf(whole_page(HOSTILE)).startswith(b"%PDF")
 
@@ -70,9 +70,25 @@ def test_long_listings_and_tables_continue_on_the_next_sheet():
 
     inside = HEIGHT - 0.6 - 0.65
     assert count(Listing(caption="l", text="line\n" * 10)) == 1
-    used = 0.25 + 0.15 + 0.2 + 0.55 + 1000 * MONO.leading  # headings
+    used = 0.25 + 0.15 + 0.2 + 0.55 + 1000 * 1.35 * 7 / 72  # headings
     assert count(Listing(caption="l", text="line\n" * 1000)) == pytest.approx(
         np.ceil(used / inside), abs=1
     )
     rows = tuple((f"row {i}", "value") for i in range(200))
     assert 3 <= count(Table(caption="t", headings=("a", "b"), rows=rows)) <= 5
+
+
+def test_lines_fit_their_width():
+    pdf = FPDF(unit="in")
+    pdf.add_page()
+    pdf.set_font("helvetica", size=9)
+    pdf.c_margin = 0.0
+    words = "some words and an_extremely_long_name_" + 80 * "x" + " and the end"
+    lines = pdf.multi_cell(2.0, text=words, dry_run=True, output="LINES")
+    assert all(pdf.get_string_width(line) <= 2.0 for line in lines)
+    assert "".join(lines).replace(" ", "") == words.replace(" ", "")
+    code = {"wrapmode": "CHAR", "dry_run": True, "output": "LINES"}
+    assert all(
+        pdf.get_string_width(line) <= 3.0 for line in pdf.multi_cell(3, text=200 * "m", **code)
+    )
+    assert pdf.multi_cell(3, text="a\n\nb", **code) == ["a", "", "b"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.study_pages import CONTROLLERS, page_of, results
 
-from lbt_synth.report.page.bokeh_charts import embed_charts
+from lbt_synth.report.charts.bokeh_charts import embed_charts
 from lbt_synth.report.study.charts import distribution_chart, loss_chart
 from lbt_synth.studies.study.controller_samples import read_controller_samples
 

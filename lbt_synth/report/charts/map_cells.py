@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -63,30 +62,3 @@ def levels_within(values: FloatArray, levels: Sequence[float]) -> list[float]:
 def level_colour(level: float, low: float, high: float) -> str:
     """Colour in which a line of equal value is seen on a colour scale with these ends."""
     return "white" if level < (low + high) / 2 else "black"
-
-
-def draw_cells(
-    axes: Any,
-    x: FloatArray,
-    y: FloatArray,
-    values: FloatArray,
-    *,
-    low: float,
-    high: float,
-    levels: Sequence[float],
-) -> Any:
-    """Draw cells and lines of equal value with matplotlib, and return what a colour bar needs.
-
-    x (nx,) and y (ny,) are the centres, values (ny, nx); nan is not drawn.
-    """
-    axes.grid(visible=False)
-    shown = np.ma.masked_invalid(values)
-    mesh = axes.pcolormesh(
-        cell_edges(x), cell_edges(y), shown, cmap="viridis", vmin=low, vmax=high, rasterized=True
-    )
-    inner = levels_within(values, levels)
-    if inner:
-        colours = [level_colour(level, low, high) for level in inner]
-        lines = axes.contour(x, y, shown, levels=inner, linewidths=0.8, colors=colours)
-        axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
-    return mesh

@@ -1,7 +1,7 @@
-"""What a chart shows, independent of who draws it: axes, curves, areas, bars and maps.
+"""What a figure shows, whoever draws it: panels with axes, curves, areas, bars and maps.
 
-A description knows no drawing library. ``matplotlib_charts`` draws it for paper and
-``bokeh_charts`` for the screen, both from the same numbers and limits.
+A description knows no drawing library. ``matplotlib_charts`` draws it for files and
+``bokeh_charts`` for pages, both from the same numbers and limits.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.report.line_styles import MARKER_NAMES
-from lbt_synth.validation import FloatArray, choice, float_array, frozen_copy
+from lbt_synth.report.charts.line_styles import MARKERS
+from lbt_synth.validation import FloatArray, choice, float_array, frozen_copy, set_fields
 
 _KEY = re.compile(r"[a-z][a-z0-9-]*")
 
@@ -36,44 +36,50 @@ class Axis:
         return f"{self.label} [{self.unit}]" if self.unit else self.label
 
 
+# Every mark has a name for the legend. An empty name is not in the legend; marks with the same name
+# are one entry. A look is the number of a colour with its dashes and marker; None is dark grey.
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Curve:
     """Points, joined by a line or not."""
 
-    # What the legend calls it; an empty name is not in the legend. The same name in several panels
-    # of a chart is one entry.
     name: str
     # (n,): the points; nan breaks the line. Empty for a name that is in the legend only.
     x: FloatArray
     y: FloatArray
-    look: int | None = 0  # Number of its colour, dashes and marker; None is dark grey
+    error: FloatArray | None = None  # (n,): half lengths of vertical error bars; nan draws none
+    look: int | None = 0
     line: bool = True  # Whether the points are joined
-    step: bool = False  # Whether each value holds until the next point
-    # "own" for that of the look, or one of circle, square, triangle, diamond, cross, plus
-    marker: str | None = None
+    # "after": each value holds until the next point; "center": around its point
+    step: str | None = None
+    marker: str | None = None  # "own" for that of the look, or one of MARKERS
     filled: bool = True  # Whether markers are filled
     size: float = 5.0  # Size of a marker [points]
     width: float = 1.6  # Width of the line [points]
-    dashed: bool = True  # Whether the line has the dashes of its look; False draws it solid
+    dash: int | None = None  # Number of its dashes, 0 is solid; None is that of its look
     hover: bool = True  # Whether its values are shown under the pointer
 
     def __post_init__(self) -> None:
-        _take_columns(self, "x", "y")
+        _take_columns(self, "x", "y", "error")
+        if self.step is not None:
+            choice(self.step, "step", ("after", "center"))
         if self.marker is not None:
-            choice(self.marker, "marker", ("own", *MARKER_NAMES))
+            choice(self.marker, "marker", ("own", *MARKERS))
         if not self.line and self.marker is None:
             raise ProblemError("a curve must have a line or a marker; got neither.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Area:
-    """The area between two curves: an interval of confidence, a spread of quantiles."""
+    """The area between two curves: an interval of confidence, a spread, a histogram."""
 
-    name: str  # What the legend calls it
-    x: FloatArray  # (n,): where
+    name: str
+    x: FloatArray  # (n,)
     low: FloatArray  # (n,): lower edge
     high: FloatArray  # (n,): upper edge
-    look: int | None = 0  # Number of its colour; None is grey
+    look: int | None = 0
+    solid: bool = False  # Whether it hides what is below it
 
     def __post_init__(self) -> None:
         _take_columns(self, "x", "low", "high")
@@ -81,12 +87,12 @@ class Area:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
-    """A straight line across a panel."""
+    """A straight grey line across a panel, below its curves."""
 
-    name: str  # What the legend calls it
+    name: str
     at: float  # Where it is
     axis: str = "x"  # "x" or "y": the axis that ``at`` is a value of
-    dash: int = 0  # Number of its dashes; it is always grey
+    dash: int = 0  # Number of its dashes
 
     def __post_init__(self) -> None:
         choice(self.axis, "axis", ("x", "y"))
@@ -96,11 +102,11 @@ class Rule:
 class Span:
     """A shaded range of an axis, from end to end of the other."""
 
-    name: str  # What the legend calls it
-    low: float  # Where it begins
-    high: float  # Where it ends
+    name: str
+    low: float
+    high: float
     axis: str = "x"  # "x" or "y": the axis that these are values of
-    look: int | None = None  # Number of its colour; None is grey
+    look: int | None = None
 
     def __post_init__(self) -> None:
         choice(self.axis, "axis", ("x", "y"))
@@ -110,15 +116,27 @@ class Span:
 class Bars:
     """Bars along x, one per category of the panel, from the top; several series stand in groups."""
 
-    name: str  # What the legend calls the series
+    name: str
     values: FloatArray  # (c,): lengths; nan draws none
     low: FloatArray | None = None  # (c,): lower end of an interval around each value
     high: FloatArray | None = None  # (c,): its upper end
-    look: int | None = 0  # Number of its colour
+    look: int | None = 0
 
     def __post_init__(self) -> None:
-        given = ("low", "high") if self.low is not None and self.high is not None else ()
-        _take_columns(self, "values", *given)
+        _take_columns(self, "values", "low", "high")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Flags:
+    """Upright texts along the upper edge of a panel, each with a line down to its point."""
+
+    x: FloatArray  # (n,): increasing
+    y: FloatArray  # (n,)
+    texts: tuple[str, ...]  # n of them
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _take_columns(self, "x", "y")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -132,12 +150,13 @@ class Map:
     unit: str = ""  # Their unit
     low: float = 0.0  # Lower end of the colour scale
     high: float = 1.0  # Its upper end
+    log: bool = False  # Whether the colour scale is logarithmic
     levels: tuple[float, ...] = ()  # Where lines of equal value are drawn
     blank: str = "no value"  # What a hatched cell means
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "values"):
-            object.__setattr__(self, name, frozen_copy(float_array(getattr(self, name), name)))
+            set_fields(self, **{name: frozen_copy(float_array(getattr(self, name), name))})
         if self.values.shape != (self.y.size, self.x.size) or not self.values.size:
             raise DimensionError(
                 f"values must have a row for each of {self.y.size} y and a column for each of "
@@ -150,12 +169,18 @@ class Map:
             raise ProblemError(f"low must be below high; got {self.low:g} and {self.high:g}.")
 
     @property
+    def name(self) -> str:
+        """What the legend calls its hatched cells; empty if there are none."""
+        return self.blank if np.any(np.isnan(self.values)) else ""
+
+    @property
     def text(self) -> str:
         """Label and unit of the values."""
-        return f"{self.label} [{self.unit}]" if self.unit else self.label
+        return Axis(label=self.label, unit=self.unit).text
 
 
-Mark: TypeAlias = Curve | Area | Rule | Span | Bars | Map
+Mark: TypeAlias = Curve | Area | Rule | Span | Bars | Flags | Map
+Kind = TypeVar("Kind", Curve, Area, Rule, Span, Bars, Flags, Map)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,15 +189,14 @@ class Panel:
 
     x: Axis  # The axis along the bottom
     y: Axis  # The axis along the left
-    marks: tuple[Mark, ...]  # What is drawn
-    title: str = ""  # What distinguishes this panel from the others of its chart
+    marks: tuple[Mark, ...]
+    title: str = ""  # What distinguishes this panel from the others of its figure
     categories: tuple[str, ...] = ()  # Names along y, from the top, for bars
     equal: bool = False  # Whether both axes have the same scale
     height_in: float | None = None  # Height of the axes on paper [inch]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "marks", tuple(self.marks))
-        object.__setattr__(self, "categories", tuple(self.categories))
+        set_fields(self, marks=tuple(self.marks), categories=tuple(self.categories))
         for bars in self.select(Bars):
             if bars.values.size != len(self.categories):
                 raise DimensionError(
@@ -180,14 +204,14 @@ class Panel:
                     f"{bars.values.size}."
                 )
 
-    def select(self, kind: Any) -> list[Any]:
-        """Return what is drawn of one kind."""
+    def select(self, kind: type[Kind]) -> list[Kind]:
+        """Return the marks of one kind."""
         return [mark for mark in self.marks if isinstance(mark, kind)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Chart:
-    """A figure of one or several panels, with its words."""
+    """A figure of a page: one or several panels, with its words."""
 
     key: str  # Its anchor in the page: small letters, digits and hyphens; unique in the page
     title: str  # A short heading
@@ -197,18 +221,13 @@ class Chart:
     columns: int = 1  # Panels side by side, where there is room
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "panels", tuple(self.panels))
+        set_fields(self, panels=tuple(self.panels))
         require_key(self.key)
         for name in ("title", "caption", "alt"):
             if not getattr(self, name).strip():
                 raise ProblemError(f"a chart must have words for its {name}; got none.")
         if not self.panels or self.columns < 1:
             raise ProblemError("a chart must have at least one panel and one column.")
-
-    @property
-    def maps(self) -> list[Map]:
-        """All maps of the chart."""
-        return [found for panel in self.panels for found in panel.select(Map)]
 
 
 def require_key(key: str) -> str:
@@ -226,19 +245,17 @@ def legend_entries(panels: Sequence[Panel]) -> dict[str, Mark]:
     found: dict[str, Mark] = {}
     for panel in panels:
         for mark in panel.marks:
-            if isinstance(mark, Map):
-                if np.any(np.isnan(mark.values)):
-                    found.setdefault(mark.blank, mark)
-            elif mark.name:
+            if mark.name:
                 found.setdefault(mark.name, mark)
     return found
 
 
-def _take_columns(mark: Any, *names: str) -> None:
-    """Make columns of a mark read-only arrays of the same length."""
-    for name in names:
-        object.__setattr__(mark, name, frozen_copy(float_array(getattr(mark, name), name)))
-    shapes = {getattr(mark, name).shape for name in names}
+def _take_columns(mark: Mark, *names: str) -> None:
+    """Make those columns of a mark that are given read-only arrays of the same length."""
+    given = {name: getattr(mark, name) for name in names if getattr(mark, name) is not None}
+    columns = {name: frozen_copy(float_array(value, name)) for name, value in given.items()}
+    shapes = {column.shape for column in columns.values()}
     if len(shapes) != 1 or len(shapes.pop()) != 1:
-        listing = ", ".join(f"{name} {getattr(mark, name).shape}" for name in names)
+        listing = ", ".join(f"{name} {column.shape}" for name, column in columns.items())
         raise DimensionError(f"columns of a mark must be lists of the same length; got {listing}.")
+    set_fields(mark, **columns)

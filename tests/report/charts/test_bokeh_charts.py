@@ -7,13 +7,12 @@ import re
 import time
 
 import pytest
-from matplotlib.figure import Figure
 from support.browser import DESK, PHONE, WALK, chain, drawn_plots, opened, tooltips
 from support.pages import every_mark
 
-from lbt_synth.report.page.bokeh_charts import embed_charts
-from lbt_synth.report.page.charts import Axis, Chart, Curve, Panel, legend_entries
-from lbt_synth.report.page.matplotlib_charts import chart_height, draw_chart
+from lbt_synth.report.charts.bokeh_charts import embed_charts
+from lbt_synth.report.charts.description import Axis, Chart, Curve, Panel, legend_entries
+from lbt_synth.report.charts.matplotlib_charts import draw_figure
 
 
 def test_the_data_of_charts_are_those_given():
@@ -36,8 +35,7 @@ def test_both_renderers_leave_the_same_room():
     data = embed_charts([chart]).embedding["documents"]["page"]["roots"][0]["attributes"]
     ends = data["y_range"]["attributes"]
     assert (ends["start"], ends["end"]) == pytest.approx((-4.0, 104.0))
-    figure = Figure(figsize=(7, chart_height(chart)))
-    draw_chart(figure, chart, left=0, top=chart_height(chart))
+    figure = draw_figure(chart.panels)
     assert figure.axes[0].get_ylim() == pytest.approx((-4.0, 104.0))
 
 

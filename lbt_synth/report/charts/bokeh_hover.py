@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.report.page.charts import Curve, Panel
+from lbt_synth.report.charts.description import Curve, Panel
 from lbt_synth.validation import FloatArray
 
 

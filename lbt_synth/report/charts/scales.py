@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from lbt_synth.report.map_cells import cell_edges
-from lbt_synth.report.page.charts import Area, Axis, Bars, Curve, Map, Panel, Rule
+from lbt_synth.report.charts.description import Area, Axis, Bars, Curve, Map, Panel, Rule
+from lbt_synth.report.charts.map_cells import cell_edges
 from lbt_synth.validation import FloatArray
 
 _ROOM = 0.04  # around what is drawn, as a part of its extent
@@ -17,60 +17,42 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def scale_ends(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the ends of both scales of a panel."""
-    across, up = [], []
-    tight = False
+    across: list[FloatArray] = []
+    up: list[FloatArray] = []
     for mark in panel.marks:
-        if isinstance(mark, Curve):
-            across.append(mark.x)
-            up.append(mark.y)
-        elif isinstance(mark, Area):
-            across.append(mark.x)
-            up += [mark.low, mark.high]
-        elif isinstance(mark, Bars):
-            across += [
-                np.zeros(1),
-                *(v for v in (mark.values, mark.low, mark.high) if v is not None),
-            ]
-        elif isinstance(mark, Map):
-            across.append(cell_edges(mark.x))
-            up.append(cell_edges(mark.y))
-            tight = True
-        elif isinstance(mark, Rule) and mark.axis == "y":
-            up.append(np.array([mark.at]))
+        match mark:
+            case Curve():
+                across.append(mark.x)
+                up.append(mark.y)
+                if mark.error is not None:
+                    up += [mark.y - mark.error, mark.y + mark.error]
+            case Area():
+                across.append(mark.x)
+                up += [mark.low, mark.high]
+            case Bars():
+                ends = (mark.values, mark.low, mark.high)
+                across += [np.zeros(1), *(end for end in ends if end is not None)]
+            case Map():
+                across.append(cell_edges(mark.x))
+                up.append(cell_edges(mark.y))
+            case Rule(axis="y"):
+                up.append(np.array([mark.at]))
+    curves, tight = panel.select(Curve), bool(panel.select(Map))
+    # plain lines may reach from end to end
+    plain = not panel.categories and all(c.line and c.marker is None for c in curves)
     # a shaded area stands on its end of the scale; equal scales stay equal
-    drawn = (
-        []
-        if tight or panel.equal or panel.select(Area) or panel.select(Bars)
-        else panel.select(Curve)
-    )
-    x = _axis_ends(
-        panel.x,
-        across,
-        0.0 if tight or _has_only_lines(panel) else _ROOM,
-        [(curve.x, curve.marker is not None) for curve in drawn],
-    )
+    if panel.equal or any(isinstance(mark, Map | Area | Bars) for mark in panel.marks):
+        curves = []
+    x_room = 0.0 if tight or plain else _ROOM
+    x = _axis_ends(panel.x, across, x_room, [(c.x, c.marker is not None) for c in curves])
     if panel.categories:
         return x, (len(panel.categories) - 0.4, -0.6)
-    return x, _axis_ends(
-        panel.y,
-        up,
-        0.0 if tight else _ROOM,
-        [(curve.y, curve.marker is not None) for curve in drawn],
-    )
-
-
-def _has_only_lines(panel: Panel) -> bool:
-    """Whether all curves are plain lines, which may reach from end to end."""
-    return not panel.categories and all(
-        mark.line and mark.marker is None for mark in panel.select(Curve)
-    )
+    y_room = 0.0 if tight else _ROOM
+    return x, _axis_ends(panel.y, up, y_room, [(c.y, c.marker is not None) for c in curves])
 
 
 def _axis_ends(
-    axis: Axis,
-    values: Iterable[FloatArray],
-    room: float,
-    curves: Sequence[tuple[FloatArray, bool]],
+    axis: Axis, values: list[FloatArray], room: float, curves: list[tuple[FloatArray, bool]]
 ) -> tuple[float, float]:
     """Return the ends of a scale: those of the axis, else those of the values and some room.
 
@@ -86,22 +68,18 @@ def _axis_ends(
         half = 0.5 if axis.log or low == 0 else abs(low) / 10
         low, high = low - half, high + half
     given = [end if end is None or not axis.log else math.log(end) for end in (axis.low, axis.high)]
-    low, high = (
-        end if end is not None else own for end, own in zip(given, (low, high), strict=True)
-    )
+    low = low if given[0] is None else given[0]
+    high = high if given[1] is None else given[1]
     if high <= low:  # all values are beyond the end that is given
         low, high = (low, low + 1.0) if given[1] is None else (high - 1.0, high)
-    extent = high - low
     ends = []
     for end, own, sign in zip(given, (low, high), (-1, 1), strict=True):
         away = room
         if end is not None:
             exact = math.exp(end) if axis.log else end
-            cut = any(_is_cut(v, exact, marked=m) for v, m in curves)
-            away = _ROOM if cut else 0.0
-        ends.append(own + sign * away * extent)
-    if axis.log:
-        return math.exp(ends[0]), math.exp(ends[1])
+            away = _ROOM if any(_is_cut(v, exact, marked=m) for v, m in curves) else 0.0
+        place = own + sign * away * (high - low)
+        ends.append(math.exp(place) if axis.log else place)
     return ends[0], ends[1]
 
 
@@ -155,3 +133,20 @@ def bar_places(count: int) -> list[tuple[float, float]]:
     """Offset of each series of bars from its category, and the height of its bars."""
     height = 0.8 / max(count, 1)
     return [((i - (count - 1) / 2) * height, 0.9 * height) for i in range(count)]
+
+
+def spread_labels(places: FloatArray, width: float) -> FloatArray:
+    """Return places in (0, 1) for labels of that width near increasing ones; none overlap."""
+    gap = min(width, 1 / max(places.size, 1))
+    steps = gap * np.arange(places.size)
+    least = gap / 2 + steps
+    # pushed to the right where they are crowded, and back from the end
+    right = np.maximum.accumulate(np.maximum(places, least) - steps) + steps
+    ends = 1 - least[::-1]
+    left = np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps
+    return np.asarray(left)
+
+
+def count_columns(panels: int) -> int:
+    """Return how many panels stand side by side: three, but two if there are four."""
+    return 2 if panels == 4 else min(panels, 3)

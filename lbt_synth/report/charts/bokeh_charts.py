@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lbt_synth.report.page.bokeh_panels import panel_figure
-from lbt_synth.report.page.charts import Chart
+from lbt_synth.report.charts.bokeh_panels import panel_figure
+from lbt_synth.report.charts.description import Chart
 
 _IDENTIFIER = re.compile(r"p\d+")
 

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from lbt_synth.report.page.charts import Area, Axis, Curve, Panel
-from lbt_synth.report.page.scales import log_tick_texts, log_ticks, scale_ends, shorten
+from lbt_synth.report.charts.description import Area, Axis, Curve, Panel
+from lbt_synth.report.charts.scales import (
+    log_tick_texts,
+    log_ticks,
+    scale_ends,
+    shorten,
+    spread_labels,
+)
 
 
 @pytest.mark.parametrize(
@@ -65,3 +73,15 @@ def test_ticks():
     assert log_tick_texts([1e-6, 1.0, 2e5]) == ["10⁻⁶", "10⁰", "2·10⁵"]
     assert shorten("abcdefghij", 5) == "ab…ij"
     assert shorten("abc", 5) == "abc"
+
+
+@given(st.lists(st.floats(0, 1), max_size=40))
+def test_labels_do_not_overlap(wanted):
+    wanted = sorted(wanted)
+    places = spread_labels(np.array(wanted), 0.045)
+    gap = min(0.045, 1 / max(len(wanted), 1))
+    assert places.size == len(wanted)
+    assert np.all(np.diff(places) > gap - 1e-9)
+    assert np.all((places > 0) & (places < 1))
+    if wanted and np.all(np.diff([-0.03, *wanted, 1.03]) > 0.06):
+        assert places == pytest.approx(wanted)

@@ -1,0 +1,1 @@
+"""Figures described once, drawn by matplotlib for files and by Bokeh for pages."""

@@ -1,0 +1,282 @@
+"""One panel of a chart for the screen: its axes and marks, with their values on hover."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.report.charts.bokeh_hover import add_hover, hover_curves, value_format
+from lbt_synth.report.charts.description import (
+    Area,
+    Axis,
+    Bars,
+    Curve,
+    Flags,
+    Map,
+    Mark,
+    Panel,
+    Rule,
+    Span,
+)
+from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
+from lbt_synth.report.charts.map_cells import blank_cells, cell_edges, level_colour, levels_within
+from lbt_synth.report.charts.scales import (
+    bar_places,
+    log_tick_texts,
+    log_ticks,
+    scale_ends,
+    shorten,
+)
+
+_FONT = "system-ui, sans-serif"
+_HEIGHT = 300  # of a panel [px]
+_MAP_HEIGHT = 380  # of one with a colour scale [px]
+_SQUARE = 460  # width of one with equal scales, at most [px]
+_BAR = 22  # of one bar [px]
+_GLYPHS = {"cross": "x", "plus": "cross"}  # the others have our names
+_AXIS = {
+    "axis_label_text_font": _FONT,
+    "axis_label_text_font_size": "13px",
+    "axis_label_text_font_style": "normal",
+    "axis_label_text_color": "#222222",
+    "major_label_text_font": _FONT,
+    "major_label_text_font_size": "12px",
+    "major_label_text_color": "#222222",
+    "axis_line_color": "#808080",
+    "minor_tick_line_color": None,
+}
+
+
+def panel_figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -> Any:
+    """Return the figure of a panel.
+
+    Equal scales are taken from ``shared``; the models of each name are added to ``named``.
+    """
+    from bokeh.models import BoxZoomTool, PanTool, Range1d, ResetTool, WheelZoomTool
+    from bokeh.plotting import figure as new_figure
+
+    zoom = BoxZoomTool(match_aspect=panel.equal)
+    across, up = scale_ends(panel)
+    size: dict[str, Any] = {"height": _height(panel)}
+    if panel.equal:  # the borders are as wide as the toolbar and the labels are high
+        (x0, x1), (y0, y1) = across, up
+        size = {"aspect_ratio": abs((x1 - x0) / (y1 - y0)), "max_width": _SQUARE}
+    figure = new_figure(
+        x_axis_type="log" if panel.x.log else "linear",
+        y_axis_type="log" if panel.y.log else "linear",
+        x_range=shared.setdefault((panel.x.text, across), Range1d(start=across[0], end=across[1])),
+        y_range=Range1d(start=up[0], end=up[1]),
+        sizing_mode="stretch_width",
+        tools=[zoom, PanTool(), WheelZoomTool(), ResetTool()],
+        toolbar_location="above",
+        min_border_left=64,  # panels above each other are in line
+        min_border_right=12,
+        **size,
+    )
+    figure.toolbar.update(logo=None, active_drag=zoom, active_scroll=None)
+    figure.grid.grid_line_color = "#e0e0e0"
+    figure.outline_line_color = None
+    _style_axis(figure.xaxis[0], panel.x, across)
+    _style_axis(figure.yaxis[0], panel.y, up)
+    for mark in panel.marks:
+        models = _draw(figure, panel, mark)
+        if mark.name and models:
+            named.setdefault(mark.name, []).extend(model.id for model in models)
+    if panel.categories:
+        names = {i: shorten(name, 24) for i, name in enumerate(panel.categories)}
+        figure.yaxis[0].update(ticker=list(names), major_label_overrides=names, axis_label=None)
+        figure.ygrid.grid_line_color = None
+    hover_curves(figure, panel)
+    return figure
+
+
+def _height(panel: Panel) -> int:
+    if panel.categories:
+        return 90 + _BAR * len(panel.categories) * max(1, len(panel.select(Bars)))
+    if panel.select(Map):
+        return _MAP_HEIGHT
+    return _HEIGHT if panel.height_in is None else int(60 + 115 * panel.height_in)
+
+
+def _style_axis(axis: Any, own: Axis, ends: tuple[float, float]) -> None:
+    from bokeh.models import FixedTicker, PlainText
+
+    axis.update(axis_label=PlainText(text=own.text), **_AXIS)
+    if own.log:
+        ticks = log_ticks(*ends)
+        powers = range(*(int(np.floor(np.log10(end))) + i for i, end in enumerate(ends)))
+        # finer ones for readers who zoom in
+        fine = [f * 10.0**n for n in powers for f in range(1, 10)]
+        axis.ticker = FixedTicker(ticks=ticks, minor_ticks=[t for t in fine if t not in ticks])
+        axis.major_label_overrides = dict(zip(ticks, log_tick_texts(ticks), strict=True))
+
+
+def _draw(figure: Any, panel: Panel, mark: Mark) -> list[Any]:
+    """Draw a mark, and return the models that a legend hides with it."""
+    from bokeh.models import BoxAnnotation
+    from bokeh.models import Span as Line
+
+    match mark:
+        case Curve():
+            return _draw_curve(figure, panel, mark)
+        case Area():
+            alpha = 1.0 if mark.solid else SHADE
+            shade = colour(mark.look)
+            return [figure.varea(mark.x, mark.low, mark.high, color=shade, alpha=alpha)]
+        case Rule():
+            line = Line(
+                location=mark.at,
+                dimension="height" if mark.axis == "x" else "width",
+                line_color=GREY,
+                line_width=1.2,
+                line_dash=[round(3 * s) for s in dashes(mark.dash)],
+            )
+            figure.add_layout(line)
+            return [line]
+        case Span():
+            sides = ("left", "right") if mark.axis == "x" else ("bottom", "top")
+            ends = dict(zip(sides, (mark.low, mark.high), strict=True))
+            box = BoxAnnotation(
+                fill_color=colour(mark.look), fill_alpha=SHADE, line_color=None, **ends
+            )
+            figure.add_layout(box)
+            return [box]
+        case Bars():
+            return _draw_bars(figure, panel, mark)
+        case Flags():
+            style = {"angle": np.pi / 2, "text_font_size": "10px", "text_baseline": "middle"}
+            return [figure.text(mark.x, mark.y, text=list(mark.texts), x_offset=0, **style)]
+        case Map():
+            _draw_map(figure, panel, mark)
+    return []
+
+
+def _draw_curve(figure: Any, panel: Panel, curve: Curve) -> list[Any]:
+    if not curve.x.size:
+        return []
+    x = np.where(curve.x > 0, curve.x, np.nan) if panel.x.log else np.array(curve.x)
+    y = np.where(curve.y > 0, curve.y, np.nan) if panel.y.log else np.array(curve.y)
+    shade, drawn = colour(curve.look), []
+    if curve.line:
+        number = curve.look if curve.dash is None else curve.dash
+        strokes = [max(1, round(2.4 * s)) for s in dashes(number)]
+        style = {"line_color": shade, "line_width": 1.25 * curve.width, "line_dash": strokes}
+        if curve.step:
+            drawn.append(figure.step(x, y, mode=curve.step, **style))
+        else:
+            drawn.append(figure.line(x, y, **style))
+    if curve.error is not None:
+        drawn.append(figure.segment(x, y - curve.error, x, y + curve.error, line_color=shade))
+    if curve.marker is not None:
+        name = marker_name(curve.marker, curve.look)
+        drawn.append(
+            figure.scatter(
+                x,
+                y,
+                marker=_GLYPHS.get(name, name),
+                size=1.6 * curve.size,
+                line_color=shade,
+                fill_color=shade if curve.filled else None,
+                line_width=1.5,
+            )
+        )
+    return drawn
+
+
+def _draw_bars(figure: Any, panel: Panel, bars: Bars) -> list[Any]:
+    series = panel.select(Bars)
+    offset, height = bar_places(len(series))[series.index(bars)]
+    drawn = np.flatnonzero(np.isfinite(bars.values))
+    source = {
+        "y": drawn + offset,
+        "right": bars.values[drawn],
+        "category": [panel.categories[i] for i in drawn],
+    }
+    tips = [
+        (panel.y.label or "bar", "@category"),
+        (bars.name or panel.x.label, value_format("right", panel.x.unit)),
+    ]
+    ranged = bars.low is not None and bars.high is not None
+    if bars.low is not None and bars.high is not None:
+        source |= {"low": bars.low[drawn], "high": bars.high[drawn]}
+        tips.append(("interval", f"@low{{%.4g}} to {value_format('high', panel.x.unit)}"))
+    shade = colour(bars.look)
+    box = figure.hbar(y="y", right="right", height=height, color=shade, source=source)
+    add_hover(figure, box, tips, ("right", "low", "high"))
+    if not ranged:
+        return [box]
+    ends = {"x0": "low", "x1": "high", "y0": "y", "y1": "y"}
+    line = figure.segment(**ends, source=box.data_source, line_color="black", line_width=1.5)
+    return [box, line]
+
+
+def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
+    """Draw a map with its levels, blank cells and colour bar."""
+    from bokeh.models import ColorBar, LinearColorMapper, LogColorMapper, PlainText
+
+    figure.grid.grid_line_color = None
+    x, y = cell_edges(found.x), cell_edges(found.y)
+    known = np.isfinite(found.values)
+    rows, columns = np.nonzero(known)
+    kind = LogColorMapper if found.log else LinearColorMapper
+    mapper = kind(palette="Viridis256", low=found.low, high=found.high)
+    source = {
+        "left": x[columns],
+        "right": x[columns + 1],
+        "bottom": y[rows],
+        "top": y[rows + 1],
+        "value": found.values[known],
+        "x": found.x[columns],
+        "y": found.y[rows],
+    }
+    shade = {"field": "value", "transform": mapper}
+    # lines in the same colours leave no seams between cells
+    sides = {side: side for side in ("left", "right", "bottom", "top")}
+    cells = figure.quad(**sides, fill_color=shade, line_color=shade, source=source)
+    blank = np.array(list(blank_cells(~known, x, y))).reshape(-1, 4)
+    figure.quad(
+        left=blank[:, 0],
+        right=blank[:, 1],
+        bottom=blank[:, 2],
+        top=blank[:, 3],
+        fill_color=PALE,
+        line_color=None,
+        hatch_pattern="right_diagonal_line",
+        hatch_color=GREY,
+        hatch_alpha=0.5,
+        hatch_weight=0.8,
+        hatch_scale=10,
+    )
+    _draw_levels(figure, found)
+    bar = ColorBar(
+        color_mapper=mapper,
+        height=10,
+        title=PlainText(text=found.text),
+        padding=6,
+        title_text_font=_FONT,
+        title_text_font_size="12px",
+        title_text_font_style="normal",
+        major_label_text_font=_FONT,
+        major_label_text_font_size="12px",
+    )
+    figure.add_layout(bar, "below")
+    shown = (("x", panel.x), ("y", panel.y), ("value", found))
+    tips = [(what.label, value_format(column, what.unit)) for column, what in shown]
+    add_hover(figure, cells, tips, ("x", "y", "value"))
+
+
+def _draw_levels(figure: Any, found: Map) -> None:
+    from contourpy import contour_generator
+
+    levels = levels_within(found.values, found.levels)
+    if not levels:
+        return
+    generator = contour_generator(found.x, found.y, np.ma.masked_invalid(found.values))
+    lines = [(path, level) for level in levels for path in generator.lines(level)]
+    figure.multi_line(
+        [path[:, 0] for path, _ in lines],
+        [path[:, 1] for path, _ in lines],
+        line_color=[level_colour(level, found.low, found.high) for _, level in lines],
+        line_width=1.0,
+    )

@@ -1,0 +1,429 @@
+"""Figures drawn by matplotlib: as SVG in a page, as a file, or on a user's own axes.
+
+The layout is in inches and fixed, so that the same chart is always the same drawing.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.report.charts.description import (
+    Area,
+    Bars,
+    Chart,
+    Curve,
+    Flags,
+    Map,
+    Mark,
+    Panel,
+    Rule,
+    Span,
+    legend_entries,
+)
+from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
+from lbt_synth.report.charts.map_cells import blank_cells, cell_edges, level_colour, levels_within
+from lbt_synth.report.charts.scales import (
+    bar_places,
+    log_tick_texts,
+    log_ticks,
+    scale_ends,
+    shorten,
+    spread_labels,
+)
+from lbt_synth.report.figures.style import house_style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH_IN = 7.0
+_PANEL_IN, _BAR_IN = 2.1, 0.24  # height of a panel, and of one bar
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.62, 0.12, 0.42, 0.08
+_TITLE, _LEGEND_ROW, _SCALE = 0.22, 0.2, 0.62
+_LETTER = 0.068  # width of a letter at 8 points [inch], generously
+_FLAG_IN = 0.15  # width of an upright text
+_LONGEST = 60
+_HIGHEST = 7.5  # of a panel with bars [inch], so that it fits a sheet
+_MARKERS = {
+    "circle": "o",
+    "square": "s",
+    "triangle": "^",
+    "diamond": "D",
+    "cross": "x",
+    "plus": "+",
+}
+_STEPS = {None: "default", "after": "steps-post", "center": "steps-mid"}
+_BLANK: dict[str, Any] = {
+    "facecolor": PALE,
+    "edgecolor": "0.55",
+    "hatch": "////",
+    "linewidth": 0,
+}
+_SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+
+
+@contextmanager
+def _chart_style() -> Iterator[None]:
+    """Set the style of charts for the time of the block."""
+    import matplotlib as mpl
+
+    with house_style(), mpl.rc_context({"svg.fonttype": "none"}), warnings.catch_warnings():
+        # a name in a script that the font does not have stays a name
+        warnings.filterwarnings("ignore", message=r"Glyph .* missing")
+        yield
+
+
+def chart_svg(chart: Chart) -> str:
+    """Return a chart as an SVG element to be set into a page.
+
+    Its identifiers begin with the chart's key, its size follows the place that it gets.
+    """
+    buffer = io.BytesIO()
+    with _chart_style():
+        figure = draw_figure(chart.panels, columns=chart.columns)
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    root = ElementTree.fromstring(buffer.getvalue())
+    for child in root.findall(f"{{{_SVG}}}metadata"):
+        root.remove(child)
+    for name in ("width", "height"):
+        root.attrib.pop(name, None)
+    root.attrib |= {"role": "img", "aria-label": chart.alt}
+    seen: set[str] = set()
+    for element in root.iter():
+        if element.attrib.get("id") in seen:  # the same path, defined again
+            del element.attrib["id"]
+        for name, value in element.attrib.items():
+            if name == "id":
+                seen.add(value)
+                element.attrib[name] = f"{chart.key}_{value}"
+            elif name == f"{{{_LINK}}}href" and value.startswith("#"):
+                element.attrib[name] = f"#{chart.key}_{value[1:]}"
+            elif "url(#" in value and name != "aria-label":
+                element.attrib[name] = value.replace("url(#", f"url(#{chart.key}_")
+    ElementTree.register_namespace("", _SVG)
+    ElementTree.register_namespace("xlink", _LINK)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def chart_png(chart: Chart) -> bytes:
+    """Return a chart as a PNG file."""
+    buffer = io.BytesIO()
+    with _chart_style():
+        draw_figure(chart.panels, columns=chart.columns).savefig(buffer, format="png", dpi=220)
+    return buffer.getvalue()
+
+
+def draw_figure(
+    panels: Sequence[Panel],
+    *,
+    columns: int = 1,
+    title: str = "",
+    axes: Axes | Sequence[Axes] | None = None,
+) -> Figure:
+    """Draw panels, row by row, on a new figure, or each on one of the user's own axes."""
+    with _chart_style():
+        if axes is None:
+            figure, places = _new_places(panels, columns, title)
+        else:
+            places = _own_places(axes, len(panels))
+            figure = places[0].figure
+            for place, panel in zip(places, panels, strict=True):
+                _draw_legend(place, [panel], loc="best")
+        images = [_draw_panel(place, panel) for place, panel in zip(places, panels, strict=True)]
+        maps = [panel.select(Map) for panel in panels]
+        if any(maps):
+            mapped = [place for place, found in zip(places, maps, strict=True) if found]
+            image = next(image for image in images if image is not None)
+            text = next(found[0].text for found in maps if found)
+            _draw_colour_bar(figure, image, text, mapped, below=axes is None)
+    return figure
+
+
+def _own_places(axes: Axes | Sequence[Axes], count: int) -> list[Axes]:
+    """Return the user's axes as a list, one per panel."""
+    from matplotlib.axes import Axes as Place
+
+    places = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(places) != count or not all(isinstance(place, Place) for place in places):
+        given = ", ".join(type(place).__name__ for place in places) or "none"
+        raise ProblemError(
+            f"axes must be {count} matplotlib Axes, one per panel; got {len(places)} ({given})."
+        )
+    return places
+
+
+def _new_places(panels: Sequence[Panel], columns: int, title: str) -> tuple[Figure, list[Axes]]:
+    """Return a new figure with its title, its legend and the axes of its panels."""
+    from matplotlib.figure import Figure
+
+    height = chart_height(panels, columns) + bool(title) * _TITLE
+    figure = Figure(figsize=(WIDTH_IN, height))
+    y = height
+    if title:
+        figure.text(0.5, 1 - 0.05 / height, title, ha="center", va="top", fontsize=10)
+        y -= _TITLE
+    names = list(legend_entries(panels))
+    if names:
+        anchor = (0.5, y / height)
+        ncols = _legend_columns(names)
+        _draw_legend(figure, panels, loc="upper center", bbox_to_anchor=anchor, ncols=ncols)
+    y -= _legend_height(panels)
+    places = []
+    margin, cell = _left_margin(panels), WIDTH_IN / columns
+    for row, row_height in zip(_rows(panels, columns), _row_heights(panels, columns), strict=True):
+        y -= row_height
+        above, below = _row_margins(panels, row)
+        for i in range(len(row)):
+            left, bottom = i * cell + margin, y + below
+            size = cell - margin - _RIGHT, row_height - below - above
+            places.append(
+                figure.add_axes(
+                    (left / WIDTH_IN, bottom / height, size[0] / WIDTH_IN, size[1] / height)
+                )
+            )
+    return figure, places
+
+
+def chart_height(panels: Sequence[Panel], columns: int) -> float:
+    """Height of a figure [inch]."""
+    return _legend_height(panels) + sum(_row_heights(panels, columns))
+
+
+def _rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
+    return [panels[i : i + columns] for i in range(0, len(panels), columns)]
+
+
+def _row_heights(panels: Sequence[Panel], columns: int) -> list[float]:
+    """Heights of the rows [inch], with labels, titles and the colour scale."""
+    inside = WIDTH_IN / columns - _left_margin(panels) - _RIGHT
+
+    def own(panel: Panel) -> float:
+        if panel.height_in is not None:
+            return panel.height_in
+        if panel.equal:
+            (x0, x1), (y0, y1) = scale_ends(panel)
+            return min(inside * abs((y1 - y0) / (x1 - x0)), 5.0)
+        if panel.categories:
+            bars = len(panel.categories) * max(1, len(panel.select(Bars)))
+            return min(max(0.8, _BAR_IN * bars + 0.2), _HIGHEST)
+        return _PANEL_IN
+
+    return [max(map(own, row)) + sum(_row_margins(panels, row)) for row in _rows(panels, columns)]
+
+
+def _row_margins(panels: Sequence[Panel], row: Sequence[Panel]) -> tuple[float, float]:
+    """Room above and below the axes of a row [inch]."""
+    last_map = [panel for panel in panels if panel.select(Map)][-1:]
+    scale = _SCALE * any(panel in last_map for panel in row)  # one, below the last of the maps
+    return _TOP + _TITLE * any(panel.title for panel in row), _BOTTOM + scale
+
+
+def _left_margin(panels: Sequence[Panel]) -> float:
+    longest = max((len(shorten(name, 36)) for p in panels for name in p.categories), default=0)
+    return _LEFT if longest == 0 else 0.25 + _LETTER * longest
+
+
+def _legend_columns(names: Sequence[str]) -> int:
+    widest = 0.55 + _LETTER * max(len(shorten(name, _LONGEST)) for name in names)
+    return int(max(1, min(len(names), (WIDTH_IN - 0.2) // widest)))
+
+
+def _legend_height(panels: Sequence[Panel]) -> float:
+    names = list(legend_entries(panels))
+    return 0.1 + _LEGEND_ROW * -(-len(names) // _legend_columns(names)) if names else 0.0
+
+
+def _draw_legend(owner: Figure | Axes, panels: Sequence[Panel], **options: Any) -> None:
+    """Give a figure or axes the legend of panels, if anything in them has a name."""
+    entries = legend_entries(panels)
+    if not entries:
+        return
+    # a leading underscore would leave a name out
+    names = [f" {name}" if name.startswith("_") else name for name in entries]
+    owner.legend(
+        [_legend_handle(mark) for mark in entries.values()],
+        [shorten(name, _LONGEST) for name in names],
+        borderaxespad=0.0,
+        handlelength=3.2,
+        **options,
+    )
+
+
+def _legend_handle(mark: Mark) -> Any:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    match mark:
+        case Curve():
+            return Line2D([], [], **_curve_style(mark))
+        case Rule():
+            return Line2D([], [], **_rule_style(mark))
+        case Area() | Span() | Bars():
+            return Patch(**_fill_style(mark))
+    return Patch(**_BLANK)
+
+
+def _curve_style(curve: Curve) -> dict[str, Any]:
+    strokes = dashes(curve.look if curve.dash is None else curve.dash)
+    style: dict[str, Any] = {
+        "color": colour(curve.look),
+        "linewidth": curve.width,
+        "linestyle": ((0, strokes) if strokes else "-") if curve.line else "none",
+    }
+    if curve.marker is not None:
+        style |= {
+            "marker": _MARKERS[marker_name(curve.marker, curve.look)],
+            "markersize": curve.size,
+            "markerfacecolor": colour(curve.look) if curve.filled else "none",
+            "markeredgewidth": 0.4 if curve.filled and curve.line else 1.2,
+        }
+    return style
+
+
+def _rule_style(rule: Rule) -> dict[str, Any]:
+    strokes = dashes(rule.dash)
+    line = (0, strokes) if strokes else "-"
+    return {"color": GREY, "linewidth": 1.0, "linestyle": line, "zorder": 1.6}
+
+
+def _fill_style(mark: Area | Span | Bars) -> dict[str, Any]:
+    solid = isinstance(mark, Bars) or (isinstance(mark, Area) and mark.solid)
+    return {"color": colour(mark.look), "alpha": 1.0 if solid else SHADE, "linewidth": 0}
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> Any:
+    """Draw a panel, and return the image of its map if it has one."""
+    image = None
+    width_in = axes.get_window_extent().width / axes.figure.dpi
+    title = shorten(panel.title, max(8, int(width_in / _LETTER)))
+    axes.set_title(title, loc="left", parse_math=False)
+    for mark in panel.marks:
+        match mark:
+            case Curve():
+                step = _STEPS[mark.step]
+                style = _curve_style(mark) | {"drawstyle": step, "label": mark.name or None}
+                axes.plot(mark.x, mark.y, **style)
+                if mark.error is not None:
+                    ends = mark.y - mark.error, mark.y + mark.error
+                    axes.vlines(mark.x, *ends, color=colour(mark.look), linewidth=1.0)
+            case Area():
+                axes.fill_between(mark.x, mark.low, mark.high, **_fill_style(mark))
+            case Rule():
+                draw = axes.axvline if mark.axis == "x" else axes.axhline
+                draw(mark.at, label=mark.name or None, **_rule_style(mark))
+            case Span():
+                shade = axes.axvspan if mark.axis == "x" else axes.axhspan
+                shade(mark.low, mark.high, label=mark.name or None, **_fill_style(mark))
+            case Map():
+                image = _draw_map(axes, mark)
+    _draw_bars(axes, panel)
+    _set_scales(axes, panel)
+    for flags in panel.select(Flags):
+        _draw_flags(axes, flags, _FLAG_IN / width_in)
+    return image
+
+
+def _set_scales(axes: Axes, panel: Panel) -> None:
+    for end, own, scale in (("x", panel.x, axes.xaxis), ("y", panel.y, axes.yaxis)):
+        low, high = scale_ends(panel)[end == "y"]
+        if own.log:
+            getattr(axes, f"set_{end}scale")("log")
+            ticks = log_ticks(low, high)
+            scale.set_ticks(ticks, log_tick_texts(ticks))
+            scale.set_ticks([], minor=True)
+        getattr(axes, f"set_{end}lim")(low, high)
+        scale.set_label_text(own.text, parse_math=False)
+    if panel.categories:
+        names = [shorten(name, 36) for name in panel.categories]
+        axes.set_yticks(range(len(names)), names)
+        axes.set_ylabel("")
+        axes.tick_params(axis="y", length=0)
+        axes.grid(visible=False, axis="y")
+    if panel.equal:
+        axes.set_aspect("equal")
+
+
+def _draw_bars(axes: Axes, panel: Panel) -> None:
+    series = panel.select(Bars)
+    for bars, (offset, height) in zip(series, bar_places(len(series)), strict=True):
+        places = np.arange(len(panel.categories)) + offset
+        drawn = np.isfinite(bars.values)
+        axes.barh(places[drawn], bars.values[drawn], height=height, color=colour(bars.look))
+        if bars.low is not None and bars.high is not None:
+            axes.hlines(places, bars.low, bars.high, color="black", linewidth=1.0)
+
+
+def _draw_flags(axes: Axes, flags: Flags, width: float) -> None:
+    """Draw upright texts of a width, a part of that of the panel, without overlaps."""
+    points = np.column_stack((flags.x, flags.y))
+    across = axes.transAxes.inverted().transform(axes.transData.transform(points))[:, 0]
+    places = spread_labels(across, width)
+    for text, point, place in zip(flags.texts, points, places, strict=True):
+        axes.annotate(
+            text,
+            xy=(point[0], point[1]),
+            xytext=(float(place), 0.985),
+            textcoords="axes fraction",
+            fontsize=6.5,
+            rotation=90,
+            ha="center",
+            va="top",
+            color="0.15",
+            arrowprops={
+                "arrowstyle": "-",
+                "color": "0.6",
+                "linewidth": 0.5,
+                "relpos": (0.5, 0.0),
+                "shrinkA": 0,
+                "shrinkB": 0,
+            },
+        )
+
+
+def _draw_map(axes: Axes, found: Map) -> Any:
+    """Draw cells and lines of equal value, and return what a colour bar needs."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    axes.grid(visible=False)
+    x, y = cell_edges(found.x), cell_edges(found.y)
+    shown = np.ma.masked_invalid(found.values)
+    norm = (LogNorm if found.log else Normalize)(found.low, found.high)
+    image = axes.pcolormesh(x, y, shown, cmap="viridis", norm=norm, rasterized=True)
+    inner = levels_within(found.values, found.levels)
+    if inner:
+        shades = [level_colour(level, found.low, found.high) for level in inner]
+        lines = axes.contour(found.x, found.y, shown, levels=inner, linewidths=0.8, colors=shades)
+        axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+    for left, right, low, high in blank_cells(np.isnan(found.values), x, y):
+        axes.fill_between([left, right], low, high, **_BLANK)
+    return image
+
+
+def _draw_colour_bar(
+    figure: Figure, image: Any, text: str, mapped: list[Axes], *, below: bool
+) -> None:
+    """Draw one colour bar for all maps: below them on a new figure, beside them on own axes."""
+    from matplotlib.colors import LogNorm
+
+    if below:
+        boxes = [place.get_position() for place in mapped]
+        left, right = min(box.x0 for box in boxes), max(box.x1 for box in boxes)
+        height = figure.get_size_inches()[1]
+        lowest = min(box.y0 for box in boxes) - (_BOTTOM + _SCALE - 0.44) / height
+        where = (left + 0.2 * (right - left), lowest, 0.6 * (right - left), 0.11 / height)
+        bar = figure.colorbar(image, cax=figure.add_axes(where), orientation="horizontal")
+    else:
+        bar = figure.colorbar(image, ax=mapped)
+    if isinstance(image.norm, LogNorm):
+        ticks = log_ticks(image.norm.vmin, image.norm.vmax)
+        bar.set_ticks(ticks, labels=log_tick_texts(ticks))
+    bar.set_label(text)
+    bar.outline.set_visible(False)

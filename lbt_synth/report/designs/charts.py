@@ -1,0 +1,309 @@
+"""Charts of a report of designs, built like the figures of :mod:`lbt_synth.report.figures`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.report.charts.description import Axis, Chart, Curve, Panel, Rule
+from lbt_synth.report.charts.scales import count_columns
+from lbt_synth.report.designs.report import DesignReport
+from lbt_synth.report.designs.simulation import STEP_NM
+from lbt_synth.report.figures.limits import limits_panel
+from lbt_synth.report.figures.loop import frequency_panel, loop_panels, stable_curve
+from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, strehl_panel
+from lbt_synth.report.figures.robustness_map import map_panels
+from lbt_synth.report.figures.simulation import series_panel, spectra_panel
+from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
+from lbt_synth.validation import FloatArray
+
+_PANELS = 6  # of one chart that has a panel per design: they fit a sheet
+
+
+def transfer_charts(report: DesignReport) -> list[Chart]:
+    """Singular values of the estimation error, and of the closed loops."""
+    norms = {one.name: one.error_norms for one in report.assessments if one.error_norms is not None}
+    names, f = report.names, report.frequency_hz
+    lines = sorted({line.frequency_hz for line in report.config.truth.vibrations})  # type: ignore[union-attr]
+    charts = []
+    if norms:
+        curves = [stable_curve(name, names, f, values) for name, values in norms.items()]
+        peaks = [f"{name} {number_text(float(np.max(n)), 3)} nm" for name, n in norms.items()]
+        charts.append(
+            Chart(
+                key="sigma",
+                title="Estimation error of the design models",
+                caption="Largest singular value from the disturbances that each design assumes "
+                "(of unit size) to the error of its estimate; of an LQG, to its residual. The "
+                "peak is the H-infinity norm, the area under the square the variance. Designs "
+                "that estimate nothing, such as integrators and shaped controllers, have none.",
+                alt="Curves over frequency, one per design that estimates. Peaks on this grid: "
+                f"{listing_text(peaks)}.",
+                panels=(frequency_panel("disturbances to error", "nm", curves, lines),),
+            )
+        )
+    if not report.stable:
+        return charts
+    responses = {one.name: (f, one.rejection, one.noise_transfer) for one in report.assessments}
+    charts.append(
+        Chart(
+            key="loop",
+            title="Rejection and noise of the closed loops",
+            caption="Largest singular value at the real sensor gain of "
+            f"{number_text(report.real_gain)}: from the phase to "
+            "the residual (above; below 1 a disturbance is reduced) and from the measurement noise "
+            "to the residual (below). With several axes it is that of the worst one.",
+            alt="Two panels over frequency, one curve per design. "
+            f"Largest rejection: {_largest_text(report, 'rejection')}. "
+            f"Largest noise transfer: {_largest_text(report, 'noise_transfer')}.",
+            panels=loop_panels(responses, lines, names),
+        )
+    )
+    return charts
+
+
+def _largest_text(report: DesignReport, name: str) -> str:
+    """Return the largest value of a transfer function of each stable design."""
+    largest = {one.name: float(np.max(getattr(one, name))) for one in report.stable}
+    return listing_text([f"{name} {number_text(value, 3)}" for name, value in largest.items()])
+
+
+def robustness_charts(report: DesignReport) -> list[Chart]:
+    """Strehl ratio and residual over the frequency error, and maps with the sensor gain."""
+    if report.errors_hz.size == 1:
+        return [_sensor_gain_chart(report)]
+    charts = [_strehl_chart(report), _residual_chart(report)] if report.stable else []
+    maps = {one.name: one.map for one in report.assessments}
+    chart = Chart(
+        key="map",
+        title="Strehl ratio over frequency error and sensor gain",
+        caption="One scale of colours for all designs; lines at round values. Sensor gains "
+        "are relative to the sensor matrix of the configuration. Hatched: the loop is "
+        "unstable there.",
+        alt=f"One map per design. {_map_texts(report)}",
+        panels=map_panels(maps, real_gain=report.real_gain),
+        columns=count_columns(len(maps)),
+    )
+    return [*charts, *_split_by_sheets(chart)]
+
+
+def _strehl_chart(report: DesignReport) -> Chart:
+    worst = {one.name: one.curve.strehl[0, 0] for one in report.stable}
+    ends = [
+        f"{name} falls to {fixed_text(100 * float(np.min(strehl)), 1)} % at "
+        f"{signed_text(float(report.errors_hz[np.argmin(strehl)]))} Hz"
+        for name, strehl in worst.items()
+    ]
+    least = 100 * min(float(np.min(strehl)) for strehl in worst.values())
+    curves = [
+        stable_curve(
+            one.name,
+            report.names,
+            one.curve.errors_hz,
+            100 * one.curve.strehl[0, 0] if one.stable else None,
+        )
+        for one in report.assessments
+    ]
+    return Chart(
+        key="robustness",
+        title="Strehl ratio over the frequency error",
+        caption="Exact long-exposure Strehl ratio with every true vibration moved below the "
+        "frequency that the design believes by the error, its rms kept, at the real sensor gain of "
+        f"{number_text(report.real_gain)}.",
+        alt=f"One curve per design. {listing_text(ends)}.",
+        panels=(strehl_panel(curves, max(0.0, 10 * np.floor((least - 5) / 10))),),
+    )
+
+
+def _residual_chart(report: DesignReport) -> Chart:
+    study = report.limits
+    panel = limits_panel(study, FREQUENCY_ERROR, -study.shift_hz + 0.0, {})
+    limits = [f"{rule.name} {fixed_text(rule.at, 1)} nm" for rule in panel.select(Rule)]
+    worst = [f"{row.design} {fixed_text(row.worst_nm, 1)} nm" for row in study.rows if row.stable]
+    return Chart(
+        key="limits",
+        title="Residual over the frequency error, beside the limits",
+        caption="Exact residual. The lines are what no linear controller goes below: one that is "
+        "given the frequency, and one that has to serve the whole range. Where a limit cannot be "
+        "computed it is not drawn.",
+        alt=f"One curve per design. Worst residuals: {listing_text(worst)}."
+        + (f" Limits: {listing_text(limits)}." if limits else ""),
+        panels=(panel,),
+    )
+
+
+def _map_texts(report: DesignReport) -> str:
+    """Say of each design how far its Strehl ratio ranges over its map."""
+    texts = []
+    for one in report.assessments:
+        values = 100 * one.map.strehl[np.isfinite(one.map.strehl)]
+        if not values.size:
+            texts.append(f"{one.name}: unstable everywhere.")
+            continue
+        texts.append(
+            f"{one.name}: {fixed_text(float(values.min()), 1)} to "
+            f"{fixed_text(float(values.max()), 1)} %, stable at {int(one.map.stable.sum())} of "
+            f"{one.map.stable.size} sensor gains."
+        )
+    return " ".join(texts)
+
+
+def _sensor_gain_chart(report: DesignReport) -> Chart:
+    """Strehl ratio over the sensor gain, drawn for a truth without vibrations."""
+    marks = [
+        stable_curve(one.name, report.names, one.map.sensor_gains, 100 * one.map.strehl[0, :, 0])
+        for one in report.assessments
+    ]
+    panel = Panel(
+        x=Axis(label="sensor gain", unit="-"),
+        y=Axis(label="Strehl ratio", unit="%", low=0.0),
+        marks=(*marks, Rule(name="real sensor gain", at=report.real_gain, dash=3)),
+        height_in=2.5,
+    )
+    return Chart(
+        key="sensor-gain",
+        title="Strehl ratio over the sensor gain",
+        caption="Exact long-exposure Strehl ratio. Sensor gains are relative to the sensor matrix "
+        "of the configuration. Curves end where the loop becomes unstable.",
+        alt=f"One curve per design. {_map_texts(report)}",
+        panels=(panel,),
+    )
+
+
+def pole_and_step_charts(report: DesignReport) -> list[Chart]:
+    """Poles, and step responses."""
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
+    circle = Curve(name="unit circle", x=turn.real, y=turn.imag, look=None, width=1.0, hover=False)
+    poles = [np.append(one.loop_poles, one.controller_poles) for one in report.assessments]
+    reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for values in poles))
+    real, imaginary = (
+        Axis(label=f"{part} part", unit="-", low=-reach, high=reach)
+        for part in ("real", "imaginary")
+    )
+    ring: dict[str, Any] = {
+        "line": False,
+        "marker": "circle",
+        "filled": False,
+        "size": 6.0,
+        "look": 1,
+    }
+    cross: dict[str, Any] = {"line": False, "marker": "cross", "look": 0}
+    panels = tuple(
+        Panel(
+            title=one.name if one.stable else f"{one.name}: unstable",
+            x=real,
+            y=imaginary,
+            equal=True,
+            marks=(
+                circle,
+                *(
+                    Curve(name=name, x=values.real, y=values.imag, **style)
+                    for name, values, style in (
+                        ("controller alone", one.controller_poles, ring),
+                        ("closed loop", one.loop_poles, cross),
+                    )
+                ),
+            ),
+        )
+        for one in report.assessments
+    )
+    radii = [f"{one.name} {number_text(one.spectral_radius, 6)}" for one in report.assessments]
+    chart = Chart(
+        key="poles",
+        title="Poles",
+        caption="Poles of the closed loop (crosses) at the real sensor gain and of the "
+        "controller by itself (circles). The loop is stable if all crosses lie inside the "
+        "unit circle; near 1 they are slow, near the circle lightly damped.",
+        alt="One complex plane per design, with the unit circle. Largest modulus of the "
+        f"closed loop's poles: {listing_text(radii)}.",
+        panels=panels,
+        columns=count_columns(len(panels)),
+    )
+    return [*_split_by_sheets(chart), *([_step_chart(report)] if report.stable else [])]
+
+
+def _step_chart(report: DesignReport) -> Chart:
+    runs = {one.name: report.simulations[one.name] for one in report.stable}
+    peaks = [
+        f"{name} {fixed_text(float(np.max(np.abs(run.step_residual_nm[5:]))), 0)} nm"
+        for name, run in runs.items()
+    ]
+
+    def panel(label: str, values: Callable[[Any], FloatArray]) -> Panel:
+        return Panel(
+            x=Axis(label="time after the step", unit="ms"),
+            y=Axis(label=label, unit="nm"),
+            marks=tuple(
+                stable_curve(name, report.names, 1e3 * run.step_time_s, values(run), step="after")
+                for name, run in runs.items()
+            ),
+        )
+
+    return Chart(
+        key="step",
+        title="Step response",
+        caption=f"The disturbance of the first axis steps by {STEP_NM:g} nm; nothing else moves, "
+        "and there is no noise. Residual (above) and command (below) in frames of "
+        f"{number_text(1e3 / report.config.hardware.frame_rate_hz)} ms. A controller with a model "
+        "of a vibration rings at its frequency.",
+        alt="Two panels over time, one curve per design. Largest residual from the sixth frame on: "
+        f"{listing_text(peaks)}.",
+        panels=(
+            panel("residual", lambda run: run.step_residual_nm),
+            panel("command", lambda run: run.step_command_nm),
+        ),
+    )
+
+
+def simulation_charts(report: DesignReport) -> list[Chart]:
+    """Series and spectra of the simulated loops."""
+    runs = {one.name: report.simulations[one.name] for one in report.stable}
+    if not runs:
+        return []
+    duration = fixed_text(float(next(iter(runs.values())).time_s[-1]), 2)
+    reach = 1.05 * max(float(np.max(np.abs(run.series_nm[:, 0]))) for run in runs.values())
+    left = [f"{name} {fixed_text(run.residual_nm, 1)} nm rms" for name, run in runs.items()]
+    series, spectra = [], []
+    for name, run in runs.items():
+        look, f = report.names.index(name), run.frequency_hz
+        curve = Curve(name="", x=run.time_s, y=run.series_nm[:, 0], look=look, width=0.9, dash=0)
+        series.append(series_panel([curve], title=name, reach=reach, height_in=0.95))
+        curves = (
+            Curve(name="before the correction", x=f, y=run.open_nm2_hz, look=None, width=0.8),
+            Curve(name="residual, simulated", x=f, y=run.residual_nm2_hz, look=5, dash=0),
+            Curve(name="residual, exact", x=f, y=run.exact_nm2_hz, look=1, width=1.4),
+        )
+        spectra.append(spectra_panel(curves, title=name))
+    first = Chart(
+        key="series",
+        title="Simulated residual",
+        caption=f"First {duration} s of the first run, first axis; the same turbulence, vibrations "
+        "and noise for all designs.",
+        alt="One panel per design, all of the same scale, over time. Residuals over all runs: "
+        f"{listing_text(left)}.",
+        panels=tuple(series),
+    )
+    second = Chart(
+        key="spectra",
+        title="Spectra, simulated and exact",
+        caption="Welch's method over all runs, with a Hann window; sums over the axes. The exact "
+        "spectrum is that of the transfer functions, a sinusoid as the same window shows it.",
+        alt="One panel per design: the spectrum before the correction, and that of the residual "
+        "twice, simulated and exact, which lie on each other.",
+        panels=tuple(spectra),
+        columns=count_columns(len(spectra)),
+    )
+    return [*_split_by_sheets(first), *_split_by_sheets(second)]
+
+
+def _split_by_sheets(chart: Chart) -> Iterator[Chart]:
+    """Split a chart into charts that each fit a sheet of paper."""
+    for start in range(0, len(chart.panels), _PANELS):
+        part = replace(chart, panels=chart.panels[start : start + _PANELS])
+        if start:
+            key, title = f"{chart.key}-{start // _PANELS + 1}", f"{chart.title} (continued)"
+            part = replace(part, key=key, title=title)
+        yield part
