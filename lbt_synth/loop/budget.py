@@ -18,7 +18,13 @@ from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    frozen_copy,
+    require_instance,
+    set_fields,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,6 +43,10 @@ class ResidualBudget:
     noise_nm2: FloatArray
     random_vibration_nm2: FloatArray
     line_amplitudes_nm: ComplexArray
+
+    def __post_init__(self) -> None:
+        names = ("turbulence_nm2", "noise_nm2", "random_vibration_nm2")
+        set_fields(self, **{name: frozen_copy(getattr(self, name)) for name in names})
 
     @property
     def gaussian_nm2(self) -> FloatArray:
@@ -139,10 +149,11 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
         else:
             response = loop.sensitivity([vibration.frequency_hz])[0]
             lines.append(vibration.amplitude_nm * response @ direction)
+    noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
     return ResidualBudget(
-        turbulence_nm2=frozen_copy(turbulence),
-        noise_nm2=frozen_copy(_noise_covariance(loop, truth)),
-        random_vibration_nm2=frozen_copy(random_vibration),
+        turbulence_nm2=turbulence,
+        noise_nm2=_noise_covariance(loop, np.diag(noise_nm)),
+        random_vibration_nm2=random_vibration,
         line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
     )
 
@@ -196,29 +207,25 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
             "close_loop(plant.hardware, controller)."
         )
     loop.require_stable()
-    n, s = one.modes, loop.system
+    n, q = one.modes, one.n_measurements
     turbulence, vibration = np.zeros((2, n, n))
     for model, direction in zip(plant.turbulence, np.eye(n), strict=True):
         turbulence += ar_covariance(loop, model, direction[None])
     for line in plant.vibrations:
         direction = checked_direction(line, one)
         vibration += ar_covariance(loop, line.ar_model(one.frame_rate_hz), direction[None])
-    entry, through = s.B[:, n:], s.D[:n, n:]
-    states = stationary_covariance(s.A, entry @ plant.R @ entry.T)
-    noise = s.C[:n] @ states @ s.C[:n].T + through @ plant.R @ through.T
     return ResidualBudget(
-        turbulence_nm2=frozen_copy(turbulence),
-        noise_nm2=frozen_copy(noise),
-        random_vibration_nm2=frozen_copy(vibration),
+        turbulence_nm2=turbulence,
+        noise_nm2=_noise_covariance(loop, plant.D[:, -q:]),
+        random_vibration_nm2=vibration,
         line_amplitudes_nm=np.zeros((0, n), dtype=np.complex128),
     )
 
 
-def _noise_covariance(loop: ClosedLoop, truth: Truth) -> FloatArray:
-    """Covariance of the residual that white noise on each measurement leaves."""
+def _noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
+    """Covariance of the residual that white noise of covariance ``factor factor'`` leaves."""
     n, s = loop.hardware.modes, loop.system.balanced()
-    noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
-    B, D = s.B[:, n:] * noise_nm, s.D[:n, n:] * noise_nm
+    B, D = s.B[:, n:] @ factor, s.D[:n, n:] @ factor
     states = stationary_covariance(s.A, B @ B.T)
     return np.asarray(s.C[:n] @ states @ s.C[:n].T + D @ D.T)
 

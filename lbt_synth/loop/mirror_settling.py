@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lbt_synth.linear import StateSpace
 from lbt_synth.loop.budget import ResidualBudget, residual_budget
@@ -63,26 +64,21 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
 def _difference_loop(loop: ClosedLoop) -> StateSpace:
     """Loop whose first outputs are the settled mirror's position less the real one."""
     s, n, m = loop.system, loop.hardware.modes, loop.hardware.n_commands
-    each, command = np.eye(m), slice(n, n + m)
+    if loop.hardware.mirror is None:  # it leaves nothing, not even rounding
+        C, D = np.vstack([0 * s.C[:n], s.C[n:]]), np.vstack([0 * s.D[:n], s.D[n:]])
+        return replace(s, C=C, D=D)
     ideal = replace(loop.hardware, mirror=None).mirror_system.whole
     real = loop.hardware.mirror_system.whole
-    sizes = [s.n_states, ideal.n_states * m, real.n_states * m]
-    A = np.zeros((sum(sizes), sum(sizes)))
-    B = np.zeros((len(A), s.B.shape[1]))
-    C = np.zeros((len(s.C), len(A)))
-    A[: sizes[0], : sizes[0]], B[: sizes[0]], C[:, : sizes[0]] = s.A, s.B, s.C
-    D = s.D.copy()
-    start = sizes[0]
-    rows, direct = np.zeros((n, len(A))), np.zeros((n, s.B.shape[1]))
-    for sign, mirror, size in zip((1, -1), (ideal, real), sizes[1:], strict=True):
-        own, entry = slice(start, start + size), np.kron(mirror.B[:, None], each)
-        A[own, : sizes[0]], B[own] = entry @ s.C[command], entry @ s.D[command]
-        A[own, own] = np.kron(mirror.A, each)
-        shape = sign * loop.hardware.influence
-        rows[:, own] = shape @ np.kron(mirror.C, each)
-        rows[:, : sizes[0]] += mirror.D * shape @ s.C[command]
-        direct += mirror.D * shape @ s.D[command]
-        start += size
-    # a mirror that settles at once leaves nothing, not even rounding
-    C[:n], D[:n] = (0.0, 0.0) if loop.hardware.mirror is None else (rows, direct)
-    return StateSpace(A=A, B=B, C=C, D=D, dt_s=s.dt_s)
+    each, influence = np.eye(m), loop.hardware.influence
+    command, through = s.C[n : n + m], s.D[n : n + m]
+    entry = np.kron(np.concatenate([ideal.B, real.B])[:, None], each)
+    position = influence @ np.kron(np.concatenate([ideal.C, -real.C]), each)
+    direct = (ideal.D - real.D) * influence
+    past = np.kron(block_diag(ideal.A, real.A), each)
+    return StateSpace(
+        A=np.block([[s.A, np.zeros((s.n_states, len(past)))], [entry @ command, past]]),
+        B=np.vstack([s.B, entry @ through]),
+        C=np.block([[direct @ command, position], [s.C[n:], np.zeros((len(s.C) - n, len(past)))]]),
+        D=np.vstack([direct @ through, s.D[n:]]),
+        dt_s=s.dt_s,
+    )

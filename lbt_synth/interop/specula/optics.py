@@ -12,7 +12,7 @@ import importlib
 import io
 import logging
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,15 +52,23 @@ def specula_version() -> str:
     return found
 
 
-def _specula_class(module: str) -> Any:
+def _specula(name: str) -> Any:
     """Return a class or function of SPECULA (``module:name``); initialise the library first."""
     specula_version()
     import specula
 
     if specula.global_precision is None:  # not initialised yet: CPU, single precision
         specula.init(-1, precision=1, log_level=logging.ERROR)
-    path, _, name = module.rpartition(":")
-    return getattr(importlib.import_module(f"specula.{path}"), name)
+    module, _, name = name.rpartition(":")
+    return getattr(importlib.import_module(f"specula.{module}"), name)
+
+
+def _make(name: str, *arguments: Any, inputs: Mapping[str, Any] | None = None, **more: Any) -> Any:
+    """Make an object of SPECULA, and connect its inputs."""
+    made = _specula(name)(*arguments, **more)
+    for key, value in (inputs or {}).items():
+        made.inputs[key].set(value)
+    return made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,10 +87,9 @@ class Modes:
 
 def make_modes(system: EndToEndSystem) -> Modes:
     """Compute Karhunen-Loeve modes of the influence functions, after tip and tilt."""
-    influence = _specula_class("lib.compute_zonal_ifunc:compute_zonal_ifunc")
-    modal_base = _specula_class("lib.modal_base_generator:make_modal_base_from_ifs_fft")
     mask = _make_pupil(system, _make_parameters(system)).A
-    functions, _, _, _ = influence(
+    functions, _, _, _ = _make(
+        "lib.compute_zonal_ifunc:compute_zonal_ifunc",
         system.pixels,
         system.actuators_across,
         geom="circular",
@@ -97,26 +104,20 @@ def make_modes(system: EndToEndSystem) -> Modes:
             f"across a pupil of {system.pixels} pixels carry at most {most}. Try "
             f"actuators_across={system.actuators_across + 2}, more pixels, or fewer modes."
         )
-    shapes, _, _ = modal_base(
-        mask,
-        system.diameter_m,
-        functions,
-        1.0,
-        system.outer_scale_m,
-        zern_modes=2,
-        dtype=np.float64,
-    )
+    base = _specula("lib.modal_base_generator:make_modal_base_from_ifs_fft")
+    size, outer = system.diameter_m, system.outer_scale_m
+    shapes, _, _ = base(mask, size, functions, 1.0, outer, zern_modes=2, dtype=np.float64)
     return Modes(mask=mask > 0, shapes=np.ascontiguousarray(shapes[: system.modes], np.float32))
 
 
 def _make_parameters(system: EndToEndSystem) -> Any:
-    make = _specula_class("data_objects.simul_params:SimulParams")
-    return make(system.pixels, system.pixel_m, time_step=1 / system.frame_rate_hz)
+    name = "data_objects.simul_params:SimulParams"
+    return _make(name, system.pixels, system.pixel_m, time_step=1 / system.frame_rate_hz)
 
 
 def _make_pupil(system: EndToEndSystem, parameters: Any) -> Any:
-    make = _specula_class("data_objects.pupilstop:Pupilstop")
-    return make(parameters, mask_diam=1.0, obs_diam=system.obstruction)
+    name = "data_objects.pupilstop:Pupilstop"
+    return _make(name, parameters, mask_diam=1.0, obs_diam=system.obstruction)
 
 
 def _discard_damaged(files: Iterable[Path]) -> None:
@@ -153,36 +154,42 @@ class Optics:
         self._time_ns = 0
         self._weather: list[Any] = []  # seeing, speed and direction of the wind
         self._where = np.nonzero(modes.mask)
-        self._value = _specula_class("base_value:BaseValue")
-        parameters = _make_parameters(system)
-        self._pupil = _make_pupil(system, parameters)
+        self._parameters = _make_parameters(system)
+        self._pupil = _make_pupil(system, self._parameters)
         self._commands = self._make_input(np.zeros(len(modes.shapes)))
         self._tilts = self._make_input(np.zeros(2))
-        mirror = self._make_mirror(parameters, modes.shapes, self._commands, -1)
-        shaker = self._make_mirror(parameters, modes.shapes[:2], self._tilts, 1)
-        air = self._make_air(screens, frames, seed, parameters) if screens is not None else None
-        source = _specula_class("data_objects.source:Source")(
-            [0, 0], 0, 1e3 * system.sensing_wavelength_um
-        )
-        beam = _specula_class("processing_objects.atmo_propagation:AtmoPropagation")(
-            parameters, {"star": source}
-        )
-        if air is not None:
-            beam.inputs["atmo_layer_list"].set(air.outputs["layer_list"])
-        beam.inputs["common_layer_list"].set(
-            [self._pupil, mirror.outputs["out_layer"], shaker.outputs["out_layer"]]
+        mirror = self._make_mirror(modes.shapes, self._commands, -1)
+        shaker = self._make_mirror(modes.shapes[:2], self._tilts, 1)
+        layers = [self._pupil, mirror.outputs["out_layer"], shaker.outputs["out_layer"]]
+        inputs = {"common_layer_list": layers}
+        air = [] if screens is None else [self._make_air(screens, frames, seed)]
+        if air:
+            inputs["atmo_layer_list"] = air[0].outputs["layer_list"]
+        source = _make("data_objects.source:Source", [0, 0], 0, 1e3 * system.sensing_wavelength_um)
+        beam = _make(
+            "processing_objects.atmo_propagation:AtmoPropagation",
+            self._parameters,
+            {"star": source},
+            inputs=inputs,
         )
         self._field = beam.outputs["out_star_ef"]
-        pyramid, indices = self._make_pyramid(parameters)
-        detector = self._make_detector(parameters, pyramid, seed)
-        self._slopes = self._make_slope_computer(detector, indices)
-        self._camera = _specula_class("processing_objects.psf:PSF")(
-            parameters, 1e3 * system.imaging_wavelength_um, nd=_PSF_SAMPLING
+        pyramid, indices = self._make_pyramid()
+        detector = self._make_detector(pyramid, seed)
+        self._slopes = _make(
+            "processing_objects.pyr_slopec:PyrSlopec",
+            indices,
+            norm_factor=system.photons,
+            thr_value=NO_CLAMP,
+            inputs={"in_pixels": detector.outputs["out_pixels"]},
         )
-        self._camera.inputs["in_ef"].set(self._field)
-        self._train = [mirror, shaker, beam, pyramid, detector, self._slopes]
-        if air is not None:
-            self._train.insert(0, air)
+        self._camera = _make(
+            "processing_objects.psf:PSF",
+            self._parameters,
+            1e3 * system.imaging_wavelength_um,
+            nd=_PSF_SAMPLING,
+            inputs={"in_ef": self._field},
+        )
+        self._train = [*air, mirror, shaker, beam, pyramid, detector, self._slopes]
         for part in (*self._train, self._camera):
             part.setup()
         # photons per subaperture, over the whole detector
@@ -224,7 +231,8 @@ class Optics:
         return int(rows), int(columns)
 
     def _make_input(self, value: FloatArray) -> Any:
-        return self._value(value=np.array(value, dtype=np.float32), precision=1)
+        value = np.array(value, dtype=np.float32)
+        return _make("base_value:BaseValue", value=value, precision=1)
 
     def _trigger(self, parts: Sequence[Any]) -> None:
         for part in parts:
@@ -232,17 +240,13 @@ class Optics:
                 part.trigger()
                 part.post_trigger()
 
-    def _make_mirror(self, parameters: Any, shapes: Any, commands: Any, sign: int) -> Any:
-        functions = _specula_class("data_objects.ifunc:IFunc")(
-            ifunc=shapes, mask=self.modes.mask.astype(np.float32)
-        )
-        mirror = _specula_class("processing_objects.dm:DM")(
-            parameters, 0, ifunc=functions, sign=sign
-        )
-        mirror.inputs["in_command"].set(commands)
-        return mirror
+    def _make_mirror(self, shapes: Any, commands: Any, sign: int) -> Any:
+        mask = self.modes.mask.astype(np.float32)
+        functions = _make("data_objects.ifunc:IFunc", ifunc=shapes, mask=mask)
+        name, inputs = "processing_objects.dm:DM", {"in_command": commands}
+        return _make(name, self._parameters, 0, ifunc=functions, sign=sign, inputs=inputs)
 
-    def _make_air(self, screens: Path, frames: int, seed: int | None, parameters: Any) -> Any:
+    def _make_air(self, screens: Path, frames: int, seed: int | None) -> Any:
         system = self.system
         side = system.screen_pixels(frames)
         if side > _LARGEST_SCREEN:
@@ -251,35 +255,30 @@ class Optics:
                 f"at {system.wind_speed_m_s:g} m/s need {side}. Run fewer frames, with several "
                 "seeds."
             )
-        air = self._make_evolution(screens, side, (seed or 0) + 1, parameters)
-        self._weather = [
-            self._make_input(np.array([value]))
-            for value in (
-                system.reference_seeing_arcsec,
-                system.wind_speed_m_s,
-                system.wind_direction_deg,
-            )
-        ]
-        names = ("seeing", "wind_speed", "wind_direction")
-        for name, given in zip(names, self._weather, strict=True):
-            air.inputs[name].set(given)
-        return air
-
-    def _make_evolution(self, screens: Path, side: int, seed: int, parameters: Any) -> Any:
-        """Make air whose screen has its own directory: SPECULA's file name rounds the pixel."""
-        facts = [self.system.pixel_m, self.system.outer_scale_m, side, specula_version()]
+        weather = {
+            "seeing": system.reference_seeing_arcsec,
+            "wind_speed": system.wind_speed_m_s,
+            "wind_direction": system.wind_direction_deg,
+        }
+        inputs = {name: self._make_input(np.array([value])) for name, value in weather.items()}
+        self._weather = list(inputs.values())
+        # SPECULA's file name rounds the pixel, so each kind of screen has its own directory
+        facts = [system.pixel_m, system.outer_scale_m, side, specula_version()]
         folder = screens / hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+        seed = (seed or 0) + 1
         try:
             folder.mkdir(parents=True, exist_ok=True)
             _discard_damaged(folder.glob(f"ps_seed{seed}_*.fits"))
-            return _specula_class("processing_objects.atmo_evolution:AtmoEvolution")(
-                parameters,
-                self.system.outer_scale_m,
+            return _make(
+                "processing_objects.atmo_evolution:AtmoEvolution",
+                self._parameters,
+                system.outer_scale_m,
                 [0.0],
                 [1.0],
                 data_dir=str(folder),
                 pixel_phasescreens=side,
                 seed=seed,
+                inputs=inputs,
             )
         except OSError as error:
             raise OutputError(
@@ -288,14 +287,15 @@ class Optics:
                 path=folder,
             ) from error
 
-    def _make_pyramid(self, parameters: Any) -> tuple[Any, Any]:
+    def _make_pyramid(self) -> tuple[Any, Any]:
         system = self.system
         across = system.subapertures_across
         side = 2 * across + _PUPIL_GAP + 2 * _MARGIN
         natural = system.sensing_wavelength_um * 1e-6 / system.pixel_m * 180 * 3600 / np.pi
         steps = 4 * int(np.ceil(2 * np.pi * system.modulation_lambda_over_d / 4))
-        pyramid = _specula_class("processing_objects.modulated_pyramid:ModulatedPyramid")(
-            parameters,
+        pyramid = _make(
+            "processing_objects.modulated_pyramid:ModulatedPyramid",
+            self._parameters,
             1e3 * system.sensing_wavelength_um,
             min(natural, _FIELD_ARCSEC),
             across,
@@ -303,8 +303,8 @@ class Optics:
             mod_amp=system.modulation_lambda_over_d,
             mod_step=steps,
             pup_dist=across + _PUPIL_GAP,
+            inputs={"in_ef": self._field},
         )
-        pyramid.inputs["in_ef"].set(self._field)
         # the four pupils lie on whole pixels around the middle of the detector
         middle, apart = (side - 1) / 2, (across + _PUPIL_GAP) / 2
         x = middle + apart * np.array([1, -1, -1, 1])
@@ -313,16 +313,21 @@ class Optics:
         radius = np.hypot(columns - x[:, None, None], rows - y[:, None, None])
         lit = (radius <= across / 2) & (radius >= system.obstruction * across / 2)
         indices = np.stack([np.flatnonzero(one) for one in lit], axis=1)
-        return pyramid, _specula_class("data_objects.pupdata:PupData")(
-            ind_pup=indices, radius=np.full(4, across / 2), cx=x, cy=y, framesize=[side, side]
+        return pyramid, _make(
+            "data_objects.pupdata:PupData",
+            ind_pup=indices,
+            radius=np.full(4, across / 2),
+            cx=x,
+            cy=y,
+            framesize=[side, side],
         )
 
-    def _make_detector(self, parameters: Any, pyramid: Any, seed: int | None) -> Any:
-        side = pyramid.final_ccd_side
+    def _make_detector(self, pyramid: Any, seed: int | None) -> Any:
         noisy = seed is not None
-        detector = _specula_class("processing_objects.ccd:CCD")(
-            parameters,
-            [side, side],
+        return _make(
+            "processing_objects.ccd:CCD",
+            self._parameters,
+            [pyramid.final_ccd_side] * 2,
             1 / self.system.frame_rate_hz,
             1.0,
             photon_noise=noisy,
@@ -330,13 +335,5 @@ class Optics:
             readout_level=self.system.read_noise_electrons,
             photon_seed=2 * (seed or 0),
             readout_seed=2 * (seed or 0) + 1,
+            inputs={"in_i": pyramid.outputs["out_i"]},
         )
-        detector.inputs["in_i"].set(pyramid.outputs["out_i"])
-        return detector
-
-    def _make_slope_computer(self, detector: Any, indices: Any) -> Any:
-        computer = _specula_class("processing_objects.pyr_slopec:PyrSlopec")(
-            indices, norm_factor=self.system.photons, thr_value=NO_CLAMP
-        )
-        computer.inputs["in_pixels"].set(detector.outputs["out_pixels"])
-        return computer
