@@ -49,13 +49,9 @@ def _stack(left: FloatArray, right: FloatArray, rows: BoolArray) -> FloatArray:
 
 
 def adaptive_integral(
-    integrand: Callable[[FloatArray], FloatArray],
-    edges: FloatArray,
-    *,
-    tolerance: float = 1e-7,
-    order: int = 6,
+    integrand: Callable[[FloatArray], FloatArray], edges: FloatArray
 ) -> FloatArray:
-    """Integrate a matrix-valued function, halving panels until the integral converges.
+    """Integrate a matrix-valued function, halving panels until its trace converges to 1e-7.
 
     Examples
     --------
@@ -66,16 +62,16 @@ def adaptive_integral(
     3.14112
     """
     low, high = edges[:-1], edges[1:]
-    coarse = _panel_integrals(integrand, low, high, order)
+    coarse = _panel_integrals(integrand, low, high, 6)
     done = np.zeros(coarse.shape[1:])
     for _ in range(40):
         middle = (low + high) / 2
-        left = _panel_integrals(integrand, low, middle, order)
-        right = _panel_integrals(integrand, middle, high, order)
+        left = _panel_integrals(integrand, low, middle, 6)
+        right = _panel_integrals(integrand, middle, high, 6)
         fine = left + right
         total = np.trace(done + fine.sum(axis=0), axis1=-2, axis2=-1)
         change = np.abs(np.trace(fine - coarse, axis1=-2, axis2=-1))
-        open_ = np.any((change > tolerance * total).reshape(low.size, -1), axis=1)
+        open_ = np.any((change > 1e-7 * total).reshape(low.size, -1), axis=1)
         done = done + fine[~open_].sum(axis=0)
         if not open_.any():
             return np.asarray(done)
@@ -99,14 +95,9 @@ class RefinedPanels:
 
 
 def refine_panels(
-    integrand: Callable[[FloatArray], FloatArray],
-    edges: FloatArray,
-    *,
-    tolerance: float = 1e-10,
-    floor: float = 0.0,
-    order: int = 10,
+    integrand: Callable[[FloatArray], FloatArray], edges: FloatArray, *, floor: float = 0.0
 ) -> RefinedPanels:
-    """Halve panels until the integral of a vector of either sign converges.
+    """Halve panels until the integral of a vector of either sign converges to 1e-10.
 
     Examples
     --------
@@ -122,17 +113,17 @@ def refine_panels(
         return np.concatenate([values, np.abs(values[:, :1])], axis=1)
 
     low, high = edges[:-1], edges[1:]
-    coarse = _panel_integrals(with_size, low, high, order)
+    coarse = _panel_integrals(with_size, low, high, 10)
     done: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     done_size = moved = 0.0
     for _ in range(45):
         middle = (low + high) / 2
-        left = _panel_integrals(with_size, low, middle, order)
-        right = _panel_integrals(with_size, middle, high, order)
+        left = _panel_integrals(with_size, low, middle, 10)
+        right = _panel_integrals(with_size, middle, high, 10)
         fine = left + right
         scale = min(1.0, done_size + float(fine[:, -1].sum()))
         change = np.max(np.abs(fine - coarse)[:, :-1], axis=1)
-        open_ = change > np.maximum(tolerance * scale, floor * (high - low))
+        open_ = change > np.maximum(1e-10 * scale, floor * (high - low))
         done.append((low[~open_], high[~open_], fine[~open_, :-1]))
         done_size += float(fine[~open_, -1].sum())
         moved += float(change[~open_].sum())

@@ -15,8 +15,8 @@ from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins
 from .margins import stable_sensor_gains as stable_sensor_gains
 from .mirror_settling import settling_error as settling_error
-from .simulation.block_filtering import filter_series as filter_series
 from .simulation.run import Simulation as Simulation
+from .simulation.run import filter_series as filter_series
 from .simulation.run import simulate as simulate
 from .strehl import Imaging as Imaging
 from .strehl import jitter_strehl as jitter_strehl

@@ -31,8 +31,8 @@ from lbt_synth.errors import (
     ProblemError,
     UnstableLoopError,
 )
+from lbt_synth.linear.block_filtering import BatchedSystems
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.loop.simulation.block_filtering import BatchedSystems
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
 from lbt_synth.validation import (
     FloatArray,

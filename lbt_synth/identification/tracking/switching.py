@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design import FilterDesign
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.loop.simulation.block_filtering import last_state
+from lbt_synth.linear.block_filtering import last_state
 from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array, number
 

@@ -6,7 +6,7 @@ import importlib.metadata
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, replace
 from typing import Any
 
 from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
@@ -22,9 +22,6 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.vibration.in_a_loop import TrueVibration
 
-_SETUP = ("frames", "settle_frames", "seed", "gain", "leak", "leak_from_mode")
-_MATRICES = ("A", "B", "C", "D")
-
 
 def make_case(
     setup: EndToEndSetup,
@@ -37,26 +34,20 @@ def make_case(
 
     Vibrations and seed replace those of the set-up.
     """
-    system = {
-        field.name: getattr(setup.system, field.name)
-        for field in fields(EndToEndSystem)
-        if field.name != "hardware"
-    }
-    hardware = setup.system.hardware
+    case = asdict(replace(setup, vibrations=tuple(vibrations), seed=seed))
+    lines, system = list(case.pop("vibrations")), case.pop("system")
+    hardware = system.pop("hardware")
+    matrices = None
+    if controller is not None:
+        matrices = {name: getattr(controller, name).tolist() for name in "ABCD"}
+        matrices["dt_s"] = controller.dt_s
     return {
         "versions": {name: _installed_version(name) for name in ("lbt-synth", "specula")},
         "system": system,
-        "hardware": {
-            "frame_rate_hz": hardware.frame_rate_hz,
-            "delay_frames": hardware.delay_frames,
-            "mirror": None if hardware.mirror is None else asdict(hardware.mirror),
-        },
-        "setup": {**{name: getattr(setup, name) for name in _SETUP}, "seed": seed},
-        "vibrations": [asdict(line) for line in vibrations],
-        "controller": None
-        if controller is None
-        else {name: getattr(controller, name).tolist() for name in _MATRICES}
-        | {"dt_s": controller.dt_s},
+        "hardware": {name: hardware[name] for name in ("frame_rate_hz", "delay_frames", "mirror")},
+        "setup": case,
+        "vibrations": lines,
+        "controller": matrices,
     }
 
 

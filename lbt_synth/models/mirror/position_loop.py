@@ -10,7 +10,7 @@ and exact sampling by matrix exponentials.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated
 
@@ -20,6 +20,7 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
+from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.validation import (
     Count,
     FloatArray,
@@ -33,7 +34,6 @@ from lbt_synth.validation import (
 _STABLE = 1 - 1e-9
 _MOST_SAMPLES = 500_000
 _POINTS = 8  # of a step response per sample
-_BLOCK = 64  # samples of a step response that are computed at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -285,8 +285,8 @@ class PositionLoop:
         parts = [self._motion(p / _POINTS)[0] for p in range(_POINTS)]
         rows = np.stack(parts) / self.static_gain
         r = np.minimum(1.0, np.arange(1, samples + 1) / self.ramp_samples)
-        states = _driven_states(loop, r)
-        x = (states @ rows[:, :-1].T + r[:, None] * rows[:, -1]).ravel()
+        shown = replace(loop, C=rows[:, :-1], D=rows[:, -1:])
+        x = filter_series(shown, r[:, None]).ravel()
         time = np.arange(x.size) / (_POINTS * self.sampling_hz)
         return StepResponse(
             time_s=frozen_copy(time),
@@ -338,25 +338,6 @@ class PositionLoop:
         out = moved[:3, 3:] * acting
         out[:, :2] += moved[:3, :2]
         return np.asarray(out)
-
-
-def _driven_states(loop: StateSpace, command: FloatArray) -> FloatArray:
-    """States at each sample, (samples, n), starting from rest; many samples at once."""
-    n, blocks = loop.n_states, -(-command.size // _BLOCK)
-    powers = [np.eye(n)]
-    for _ in range(_BLOCK):
-        powers.append(powers[-1] @ loop.A)
-    reached = np.stack([power @ loop.B[:, 0] for power in powers[:-1]])
-    given = np.zeros((blocks, _BLOCK))
-    given.ravel()[: command.size] = command
-    lag = np.arange(_BLOCK + 1)[:, None] - 1 - np.arange(_BLOCK)  # after sample j, of sample i
-    kernel = np.where((lag >= 0)[..., None], reached[np.maximum(lag, 0)], 0.0)
-    inside = np.einsum("bi,jin->bjn", given, kernel)
-    observe, out, state = np.stack(powers), np.empty((blocks, _BLOCK, n)), np.zeros(n)
-    for block in range(blocks):
-        path = observe @ state + inside[block]
-        out[block], state = path[:-1], path[-1]
-    return out.reshape(-1, n)[: command.size]
 
 
 @lru_cache(maxsize=256)

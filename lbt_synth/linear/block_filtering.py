@@ -97,7 +97,7 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.loop.simulation.block_filtering import last_state
+    >>> from lbt_synth.linear.block_filtering import last_state
     >>> last_state(np.array([[0.5]]), np.array([[4.0], [2.0], [1.0]])).tolist()
     [3.0]
     """
@@ -121,7 +121,7 @@ class BatchedSystems:
     Examples
     --------
     >>> import numpy as np
-    >>> from lbt_synth.loop.simulation.block_filtering import BatchedSystems
+    >>> from lbt_synth.linear.block_filtering import BatchedSystems
     >>> one = np.ones((2, 1, 1))
     >>> sums = BatchedSystems(np.array([[[1.0]], [[0.5]]]), one, one, one)
     >>> sums.filter(np.ones((2, 3, 1)))[:, :, 0].tolist()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.block_filtering import BatchedSystems, last_state
+from lbt_synth.linear.block_filtering import BatchedSystems, last_state
 
 
 @given(
