@@ -1,12 +1,12 @@
 from .arithmetic_cost import FrameCost as FrameCost
 from .arithmetic_cost import frame_cost as frame_cost
 from .c.export import export_c as export_c
-from .exported_files import Exported as Exported
+from .export_checks import Exported as Exported
 from .iir.export import export_iir as export_iir
 from .matlab.export import export_mat as export_mat
 from .specula.calibration import Calibration as Calibration
 from .specula.calibration import calibrate as calibrate
 from .specula.end_to_end_run import EndToEndRun as EndToEndRun
-from .specula.setup import EndToEndSetup as EndToEndSetup
+from .specula.simulation import EndToEndSetup as EndToEndSetup
 from .specula.simulation import run_end_to_end as run_end_to_end
 from .specula.system import EndToEndSystem as EndToEndSystem

@@ -1,12 +1,17 @@
-"""Checks before an export: the certificate, and a rehearsal of the file beside the controller."""
+"""What all exports share: a rehearsal beside the controller, text on its origin, the result."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+import lbt_synth
 from lbt_synth.design import Design, certify_loop
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.arithmetic_cost import block_matrix
@@ -15,6 +20,9 @@ from lbt_synth.loop.simulation.run import SteppedController, step_loop
 from lbt_synth.validation import FloatArray, require_instance
 
 FRAMES = 2000
+# without *, \ and ? no text ends a comment, splices lines or makes a trigraph
+_UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 _POLE = 0.99  # of the random phase that disturbs the rehearsed loop
 
 
@@ -128,3 +136,66 @@ def rehearsal_error(design: Design, other: SteppedController) -> float:
     if not np.isfinite(error):
         return float("inf")
     return error / size if size > 0 else error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exported:
+    """Files that were written, and how far they are from the controller.
+
+    Attributes
+    ----------
+    files : tuple of pathlib.Path
+        The files.
+    error : float
+        Largest difference of the commands from those of the controller, over the largest
+        command, with the arithmetic of the file: in the closed loop where the design is of one,
+        on white noise elsewhere.
+    error_single : float
+        The same in single precision; inf if the loop is then unstable.
+    """
+
+    files: tuple[Path, ...]
+    error: float
+    error_single: float
+
+
+def plain_text(text: str) -> str:
+    """Replace every character that is not safe in a comment with an underscore."""
+    return _UNSAFE.sub("_", text)
+
+
+def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:
+    """Join each label and its text."""
+    return [f"{label}: {text}" if label else text for label, text in lines]
+
+
+def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
+    """Return labelled lines on a file: version, method, gain file, loop, units, certificate."""
+    if gain_digest is not None and not (
+        isinstance(gain_digest, str) and _DIGEST.fullmatch(gain_digest)
+    ):
+        raise ProblemError(
+            "gain_digest must be the SHA-256 of a gain file, 64 hexadecimal digits; "
+            f"got {gain_digest!r}."
+        )
+    lines = [
+        ("written by", f"lbt_synth {lbt_synth.__version__}"),
+        ("method", f"{design.method} ({design.solver.route})"),
+        ("gain file", "not named" if gain_digest is None else f"SHA-256 {gain_digest}"),
+    ]
+    if design.hardware is None:
+        lines += [
+            ("sampling", f"{design.controller.dt_s!r} s"),
+            ("units", "those of the problem"),
+        ]
+    else:
+        lines += [
+            ("frame rate", f"{design.hardware.frame_rate_hz!r} Hz"),
+            ("delay", f"{design.hardware.delay_frames!r} frames in total"),
+            ("units", "y: nm rms wavefront where the sensor matrix is the identity;"),
+            ("", "u: nm rms wavefront where the influence matrix is"),
+        ]
+    checks = design.certificate.checks
+    lines.append(("certificate", f"{len(checks)} checks passed"))
+    lines += [("", f"{c.name}: {c.value:.6g} (limit {c.limit:.6g})") for c in checks]
+    return [(label, plain_text(text)) for label, text in lines]

@@ -14,12 +14,12 @@ from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.interop.c.code import render_code
 from lbt_synth.interop.export_checks import (
     FRAMES,
+    Exported,
     WrittenTerms,
+    provenance_lines,
     rehearsal_error,
     require_exportable,
 )
-from lbt_synth.interop.exported_files import Exported
-from lbt_synth.interop.provenance import provenance_lines
 from lbt_synth.linear import Controller
 from lbt_synth.storage.atomic_files import write_together
 from lbt_synth.validation import choice

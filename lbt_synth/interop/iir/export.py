@@ -10,10 +10,14 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design import Design, certify_loop
 from lbt_synth.errors import NumericalError
-from lbt_synth.interop.export_checks import rehearsal_error, require_exportable
-from lbt_synth.interop.exported_files import Exported
+from lbt_synth.interop.export_checks import (
+    Exported,
+    join_labels,
+    provenance_lines,
+    rehearsal_error,
+    require_exportable,
+)
 from lbt_synth.interop.iir.polynomials import axis_polynomials
-from lbt_synth.interop.provenance import join_labels, provenance_lines
 from lbt_synth.linear import Controller
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.storage.fits import fits_bytes

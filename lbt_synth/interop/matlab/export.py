@@ -10,9 +10,14 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Design
-from lbt_synth.interop.export_checks import MatrixForm, rehearsal_error, require_exportable
-from lbt_synth.interop.exported_files import Exported
-from lbt_synth.interop.provenance import join_labels, provenance_lines
+from lbt_synth.interop.export_checks import (
+    Exported,
+    MatrixForm,
+    join_labels,
+    provenance_lines,
+    rehearsal_error,
+    require_exportable,
+)
 from lbt_synth.linear import StateSpace
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.validation import FloatArray

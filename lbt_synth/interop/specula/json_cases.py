@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
-from lbt_synth.interop.specula.setup import EndToEndSetup
+from lbt_synth.interop.specula.simulation import EndToEndSetup
 from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.linear import Controller
 from lbt_synth.models import (

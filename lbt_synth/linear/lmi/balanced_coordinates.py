@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.filter_gains import decorrelate, filter_gains
+from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.validation import FloatArray, frozen_copy
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import DetectabilityError
-from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.filter_gains import decorrelate
+from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
 from lbt_synth.validation import FloatArray, frozen_copy

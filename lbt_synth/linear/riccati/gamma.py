@@ -13,11 +13,10 @@ from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
 from lbt_synth.errors import InfeasibleError, NumericalError
-from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.filter_gains import decorrelate
-from lbt_synth.linear.riccati.doubling import doubling
+from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
+from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.validation import FloatArray, frozen_copy
 
 _RESIDUAL_LIMIT = 1e-9

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import eigh, null_space
 
-from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.filter_gains import decorrelate
+from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
 from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.validation import FloatArray, frozen_copy
