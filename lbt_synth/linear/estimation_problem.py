@@ -94,22 +94,10 @@ class EstimationProblem(LinearSystem):
         return frozen_copy(self.B @ self.D.T)
 
     def error_system(self, gain_predictor: FloatArray) -> StateSpace:
-        """System from w to the estimation error ``z - z_hat`` of a predictor gain.
+        """System ``(A - gain C, B - gain D, L, 0)`` from w to a predictor's error ``z - z_hat``.
 
-        Parameters
-        ----------
-        gain_predictor : (n, q) array_like
-            Gain of ``x_hat(k+1) = A x_hat(k) + gain (y(k) - C x_hat(k))``.
-
-        Returns
-        -------
-        StateSpace
-            ``(A - gain C, B - gain D, L, 0)``.
-
-        Raises
-        ------
-        DimensionError
-            If the gain does not fit.
+        The gain (n, q) is that of ``x_hat(k+1) = A x_hat(k) + gain (y(k) - C x_hat(k))``; one of
+        another size raises a DimensionError.
 
         Examples
         --------
@@ -127,11 +115,6 @@ class EstimationProblem(LinearSystem):
 
         The columns of ``[B; D]`` are divided by their norms, so that the disturbances of
         the generalised plant act with identity weights.
-
-        Returns
-        -------
-        EstimationProblem
-            The same states, measurements and signals.
 
         Examples
         --------
@@ -213,22 +196,9 @@ class EstimationProblem(LinearSystem):
         """Add the past innovations of a filter as states, for filters that weight them.
 
         The true values of the new states are zero, so z is the same signal. A filter that feeds
-        its innovations into them, with gain 1, estimates ``L x + taps [nu(k); nu(k-1); ...]``.
-
-        Parameters
-        ----------
-        taps : (l, T q) array_like
-            Weights of the innovations, the newest first.
-
-        Returns
-        -------
-        EstimationProblem
-            The same kind of problem, with T q more states.
-
-        Raises
-        ------
-        DimensionError
-            If the taps do not fit.
+        its innovations into them, with gain 1, estimates ``L x + taps [nu(k); nu(k-1); ...]``. The
+        taps are (l, T q), the newest first, and add T q states; taps that do not fit raise a
+        DimensionError.
 
         Examples
         --------
@@ -256,37 +226,13 @@ class EstimationProblem(LinearSystem):
         )
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from all known signals: here from y(k), as :meth:`controller`.
-
-        Parameters
-        ----------
-        gain_predictor : (n, q) array_like
-            Predictor gain.
-
-        Returns
-        -------
-        Controller
-            In new-state form.
-        """
+        """Estimator of z from all known signals: here from y(k), as :meth:`controller`."""
         return self.controller(gain_predictor)
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.
 
-        Parameters
-        ----------
-        gain_predictor : (n, q) array_like
-            Predictor gain.
-
-        Returns
-        -------
-        Controller
-            The filter, in new-state form.
-
-        Raises
-        ------
-        DimensionError
-            If the gain does not fit.
+        The predictor gain is (n, q); one of another size raises a DimensionError.
 
         Examples
         --------

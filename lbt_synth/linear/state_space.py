@@ -84,22 +84,9 @@ class StateSpace(LinearSystem):
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:
-        """Take a StateSpace, a discrete control.StateSpace, or a tuple (A, B, C, D).
+        """Take a StateSpace, a discrete ``control.StateSpace``, or a tuple (A, B, C, D).
 
-        Parameters
-        ----------
-        system : StateSpace, control.StateSpace or tuple
-            The system.
-
-        Returns
-        -------
-        StateSpace
-            The same system.
-
-        Raises
-        ------
-        ProblemError
-            If it is none of these, or a continuous-time system.
+        Anything else, and a system in continuous time, raises a ProblemError.
 
         Examples
         --------
@@ -129,11 +116,6 @@ class StateSpace(LinearSystem):
     def to_control(self) -> Any:
         """Return the system as a ``control.StateSpace`` with its sampling period.
 
-        Returns
-        -------
-        control.StateSpace
-            The same matrices.
-
         Examples
         --------
         >>> import lbt_synth as lbt
@@ -148,13 +130,9 @@ class StateSpace(LinearSystem):
         )
 
     def balanced(self) -> StateSpace:
-        """Scale the states by powers of two so that the system is balanced.
+        """Scale the states by powers of two, which leaves the input-output map as it is.
 
-        Returns
-        -------
-        StateSpace
-            The same input-output map; rows and columns of ``[[A, B], [C, 0]]`` are of
-            similar size, state by state.
+        Rows and columns of ``[[A, B], [C, 0]]`` are then of similar size, state by state.
 
         Examples
         --------

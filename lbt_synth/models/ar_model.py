@@ -79,22 +79,10 @@ class ARModel:
         return self.driving_rms_nm * float(np.sqrt(variance_ratios(self.coefficients)))
 
     def psd(self, frequency_hz: Any) -> FloatArray:
-        """One-sided power spectrum [nm^2/Hz] at frequencies up to Nyquist.
+        """One-sided power spectrum [nm^2/Hz] at frequencies [Hz] up to Nyquist, of their shape.
 
-        Parameters
-        ----------
-        frequency_hz : array_like
-            Frequencies [Hz].
-
-        Returns
-        -------
-        ndarray
-            ``2 s^2 / (f_s |1 - a1 z^-1 - a2 z^-2 - ...|^2)``.
-
-        Raises
-        ------
-        ProblemError
-            If a frequency is not finite.
+        It is ``2 s^2 / (f_s |1 - a1 z^-1 - a2 z^-2 - ...|^2)``; a frequency that is not finite
+        raises a ProblemError.
 
         Examples
         --------

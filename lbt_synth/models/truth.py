@@ -103,23 +103,7 @@ class Truth:
         return not isinstance(self.turbulence, tuple)
 
     def turbulence_per_mode(self, modes: int) -> tuple[Spectrum | None, ...]:
-        """Return the turbulence of each mode.
-
-        Parameters
-        ----------
-        modes : int
-            Number of modes n of the loop.
-
-        Returns
-        -------
-        tuple of Spectrum or None
-            Of each mode.
-
-        Raises
-        ------
-        DimensionError
-            If there are spectra for another number of modes.
-        """
+        """Return each mode's spectrum, or None; another number of modes is a DimensionError."""
         if not isinstance(self.turbulence, tuple):
             return (self.turbulence,) * modes  # type: ignore[return-value]
         if len(self.turbulence) != modes:
@@ -130,22 +114,9 @@ class Truth:
         return self.turbulence
 
     def turbulence_groups(self, modes: int) -> tuple[tuple[Spectrum, tuple[int, ...]], ...]:
-        """Return the different spectra, each with the modes that have it.
+        """Return the different spectra, each with the modes that have it; other modes have none.
 
-        Parameters
-        ----------
-        modes : int
-            Number of modes n of the loop.
-
-        Returns
-        -------
-        tuple of (Spectrum, tuple of int)
-            Modes without turbulence are left out; equal AR models are one spectrum.
-
-        Raises
-        ------
-        DimensionError
-            If there are spectra for another number of modes.
+        Equal AR models are one spectrum. Spectra for another number of modes are a DimensionError.
         """
         found: dict[object, tuple[Spectrum, list[int]]] = {}
         for mode, spectrum in enumerate(self.turbulence_per_mode(modes)):
@@ -156,20 +127,7 @@ class Truth:
     def noise_per_measurement(self, measurements: int) -> FloatArray:
         """Return the standard deviation of the noise on each measurement, (q,) [nm].
 
-        Parameters
-        ----------
-        measurements : int
-            Number of measurements q of the loop.
-
-        Returns
-        -------
-        (q,) ndarray
-            Of each measurement.
-
-        Raises
-        ------
-        DimensionError
-            If there are deviations for another number of measurements.
+        Deviations for another number of measurements are a DimensionError.
         """
         if np.ndim(self.noise_nm) and np.size(self.noise_nm) != measurements:
             raise DimensionError(

@@ -90,25 +90,15 @@ class EndToEndSetup:
         return leaks
 
     def controller(self, filter: Any, *, tip_tilt_gain: float | None = None) -> MixedController:  # noqa: A002
-        """Return the mixed controller with a filter for tip and tilt.
+        """Return the mixed controller for :func:`run_end_to_end`, with a filter for tip and tilt.
 
         Parameters
         ----------
         filter : Design, Controller, object with ``step(y)`` and ``reset()``, or None
             Controller of tip and tilt, two measurements and two commands; None for
-            integrators, as classical control has them.
+            integrators, as classical control has them. One of another loop is refused.
         tip_tilt_gain : float, optional
             Integrator gain of tip and tilt where there is no filter.
-
-        Returns
-        -------
-        MixedController
-            For the modal measurements of :func:`run_end_to_end`.
-
-        Raises
-        ------
-        ProblemError
-            If the filter is of another loop.
         """
         hardware = getattr(filter, "hardware", None)
         mine = self.system.hardware

@@ -146,16 +146,8 @@ class EndToEndSystem:
     def screen_pixels(self, frames: int) -> int:
         """Return the side of a square phase screen that does not repeat within some frames.
 
-        Parameters
-        ----------
-        frames : int
-            Frames to be run.
-
-        Returns
-        -------
-        int
-            A power of two. The screen is also at least six outer scales long, because it is
-            periodic and holds nothing slower.
+        It is a power of two, and at least six outer scales, because the screen is periodic and
+        holds nothing slower.
         """
         travelled = frames / self.frame_rate_hz * self.wind_speed_m_s
         length = max(travelled + 2 * self.diameter_m, 6 * self.outer_scale_m)

@@ -113,8 +113,9 @@ def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, I
 
     E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77, 767 (2004),
     doi:10.1080/00207170410001714988. After j steps the iterate holds 2^j steps of the Riccati
-    recursion; the convergence is quadratic. G need not be semidefinite. Return X, nan where the iteration did not converge, and the steps
-    made (N,). An equation leaves the stack as soon as it has converged or diverged.
+    recursion; the convergence is quadratic. G need not be semidefinite. Return X, nan where the
+    iteration did not converge, and the steps made (N,). An equation leaves the stack as soon as it
+    has converged or diverged.
 
     Examples
     --------

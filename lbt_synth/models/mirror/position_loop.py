@@ -218,13 +218,10 @@ class PositionLoop:
         return float((gain + self.feed_forward * stiffness) / (gain + stiffness))
 
     def closed_loop(self) -> StateSpace:
-        """Return the local loop from command to position, at its own rate.
+        """Return the local loop from command to position, at its own rate, before calibration.
 
-        Returns
-        -------
-        StateSpace
-            States: position, velocity [positions per sample], last position, and the
-            accelerations under way; before calibration.
+        Its states are position, velocity [positions per sample], last position, and the
+        accelerations under way.
         """
         end = self._motion(1.0)
         n = 3 + self.delay_samples
@@ -240,38 +237,18 @@ class PositionLoop:
         return StateSpace(A=A, B=B, C=C, D=np.zeros((1, 1)), dt_s=1 / self.sampling_hz)
 
     def position_integral(self, samples: float) -> FloatArray:
-        """Integral of the position over a part of a sample, in samples.
+        """Integral of the position over a part of a sample, 0 to 1, in samples.
 
-        Parameters
-        ----------
-        samples : float
-            The part, 0 to 1.
-
-        Returns
-        -------
-        (n + 1,) ndarray
-            Row over the states at its beginning and the command.
+        It is a row (n + 1,) over the states at the sample's beginning and the command.
         """
         return np.asarray(self._motion(samples)[2])
 
     def step_response(self, tolerance: float = 0.1) -> StepResponse:
         """Compute the response from rest to a unit step of the command.
 
-        Parameters
-        ----------
-        tolerance : float, optional
-            Half width of the band around the final position.
-
-        Returns
-        -------
-        StepResponse
-            Eight exact points per sample, until the mode has decayed to 1e-6, with rise,
-            overshoot and settling time.
-
-        Raises
-        ------
-        ProblemError
-            If the tolerance is not in (0, 1), or the mode hardly decays.
+        ``tolerance`` is the half width of the band, in (0, 1), around the final position. The
+        response has eight exact points per sample, until the mode has decayed to 1e-6. A mode that
+        hardly decays raises a ProblemError.
         """
         band = number(tolerance, "tolerance", above=0, below=1)
         loop = self.closed_loop()

@@ -35,25 +35,11 @@ class FullStatePlant(EstimationProblem):
     hardware: LoopHardware
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
-        """Return the controller from y(k) to u(k), the known input included.
+        """Return the controller from y(k) to u(k), the known input included, in new-state form.
 
         ``u(k) = N^+ L x_hat(k+1 | k)``; the past command u(k-1) is therefore
-        ``N^+ L x_hat(k | k-1)`` and needs no state of its own.
-
-        Parameters
-        ----------
-        gain_predictor : (n, q) array_like
-            Predictor gain over the full state.
-
-        Returns
-        -------
-        Controller
-            In new-state form.
-
-        Raises
-        ------
-        DimensionError
-            If the gain does not fit.
+        ``N^+ L x_hat(k | k-1)`` and needs no state of its own. The predictor gain is over the full
+        state, (n, q).
         """
         gain = self._checked_gain(gain_predictor)
         to_command = self.hardware.projector @ self.L
@@ -62,22 +48,9 @@ class FullStatePlant(EstimationProblem):
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s)
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from y(k) and the command u(k-1), whatever gave that command.
+        """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
 
-        Parameters
-        ----------
-        gain_predictor : (n, q) array_like
-            Predictor gain over the full state.
-
-        Returns
-        -------
-        Controller
-            From ``[y(k), u(k-1)]`` to the estimate, in new-state form.
-
-        Raises
-        ------
-        DimensionError
-            If the gain does not fit.
+        The predictor gain is over the full state, (n, q).
         """
         gain = self._checked_gain(gain_predictor)
         B = np.hstack([gain, self.B_known - gain @ self.D_known])
@@ -85,23 +58,7 @@ class FullStatePlant(EstimationProblem):
         return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
 
     def ahead(self, frames: int) -> EstimationProblem:
-        """Refuse any horizon but one; the reduced plant has the others.
-
-        Parameters
-        ----------
-        frames : int
-            Frames from the newest measurement to the estimate.
-
-        Returns
-        -------
-        FullStatePlant
-            This plant, for 1.
-
-        Raises
-        ------
-        ProblemError
-            For any other horizon.
-        """
+        """Refuse any horizon but one; the reduced plant has the others."""
         if frames != 1:
             raise ProblemError(
                 f"a plant with its commands as states has a horizon of 1; got {frames!r}. "
@@ -112,20 +69,7 @@ class FullStatePlant(EstimationProblem):
     def with_memory(self, taps: FloatArray) -> EstimationProblem:
         """Return the plant with past innovations as states, which no command reaches.
 
-        Parameters
-        ----------
-        taps : (l, T q) array_like
-            Weights of the innovations, the newest first.
-
-        Returns
-        -------
-        FullStatePlant
-            With T q more states.
-
-        Raises
-        ------
-        DimensionError
-            If the taps do not fit.
+        The taps (l, T q) weight the innovations, the newest first.
         """
         bare = EstimationProblem(A=self.A, B=self.B, C=self.C, D=self.D, L=self.L)
         longer = bare.with_memory(taps)
@@ -139,12 +83,8 @@ class FullStatePlant(EstimationProblem):
     def generalised(self) -> tuple[FloatArray, FloatArray]:
         """Matrices of the H-infinity filter's generalised plant (eq. 8, errata 2 and 7).
 
-        Returns
-        -------
-        plant : (n + l + q, n + p + l) ndarray
-            Maps ``[x(k), w(k), z_hat(k)]`` to ``[x(k+1), z_hat(k) - z(k), y(k)]``.
-        known : (n + l + q, m) ndarray
-            The columns of the known input u(k-1).
+        The first (n + l + q, n + p + l) maps ``[x(k), w(k), z_hat(k)]`` to
+        ``[x(k+1), z_hat(k) - z(k), y(k)]``; the second holds the columns of the known input u(k-1).
         """
         n, p = self.B.shape
         outputs, q = self.L.shape[0], self.C.shape[0]

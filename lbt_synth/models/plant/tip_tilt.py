@@ -55,11 +55,6 @@ class TipTiltPlant(EstimationProblem):
     def full(self) -> FullStatePlant:
         """Return the same plant with the mirror's states, which are past commands if it settles.
 
-        Returns
-        -------
-        FullStatePlant
-            For the paper's case, delay 2 and AR1, of order 2p + 2n + m.
-
         Examples
         --------
         >>> import lbt_synth as lbt
@@ -68,7 +63,7 @@ class TipTiltPlant(EstimationProblem):
         >>> plant = lbt.tip_tilt_plant(
         ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
         ... )
-        >>> plant.full().A.shape  # 2 p + 2 n + m = 2 + 4 + 2
+        >>> plant.full().A.shape  # 2 p + 2 n + m = 2 + 4 + 2, the paper's case
         (8, 8)
         """
         hw = self.hardware
@@ -94,45 +89,19 @@ class TipTiltPlant(EstimationProblem):
         )
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
-        """Return the controller from y(k) to u(k), the known input included.
+        """Return the controller from y(k) to u(k), the known input included, in new-state form.
 
-        Parameters
-        ----------
-        gain_predictor : (n, q) array_like
-            Predictor gain over the reduced state.
-
-        Returns
-        -------
-        Controller
-            In new-state form: the reduced estimator, and the mirror's states.
-
-        Raises
-        ------
-        DimensionError
-            If the gain does not fit.
+        Its states are those of the reduced estimator, to which the gain (n, q) belongs, and the
+        mirror's.
         """
         full = self.full()
         return full.controller(self._padded(gain_predictor, full))
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from y(k) and the command u(k-1), whatever gave that command.
+        """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
 
-        The known input is removed exactly, so the estimation error does not depend on it.
-
-        Parameters
-        ----------
-        gain_predictor : (n, q) array_like
-            Predictor gain over the reduced state.
-
-        Returns
-        -------
-        Controller
-            From ``[y(k), u(k-1)]`` to the estimate, in new-state form.
-
-        Raises
-        ------
-        DimensionError
-            If the gain does not fit.
+        The known input is removed exactly, so the estimation error does not depend on it. The
+        predictor gain is over the reduced state, (n, q).
         """
         full = self.full()
         return full.estimator(self._padded(gain_predictor, full))
@@ -140,22 +109,9 @@ class TipTiltPlant(EstimationProblem):
     def ahead(self, frames: int) -> TipTiltPlant:
         """Plant of the estimate of ``z(k + frames)`` from y up to k: a loop of another delay.
 
-        A prediction that reaches one frame further serves a loop that is one frame later.
-
-        Parameters
-        ----------
-        frames : int
-            Frames from the newest measurement to the estimate; 1 is this plant.
-
-        Returns
-        -------
-        TipTiltPlant
-            The plant with a delay of ``delay_frames + frames - 1``.
-
-        Raises
-        ------
-        ProblemError
-            If ``frames`` is no integer, or that delay is less than one frame.
+        A prediction that reaches one frame further serves a loop that is one frame later, so the
+        plant returned has a delay of ``delay_frames + frames - 1``. A delay below one frame, or
+        ``frames`` that are no integer, raise a ProblemError.
 
         Examples
         --------
@@ -181,15 +137,7 @@ class TipTiltPlant(EstimationProblem):
     def parts(self) -> PlantParts:
         """Return what the plant was assembled from.
 
-        Returns
-        -------
-        PlantParts
-            Loop, turbulence, vibrations and noise.
-
-        Raises
-        ------
-        ProblemError
-            If the plant holds the memory of a mixed filter.
+        A plant that holds the memory of a mixed filter raises a ProblemError.
         """
         q = self.hardware.n_measurements
         parts = PlantParts(

@@ -87,26 +87,11 @@ class Atmosphere:
         return 0.0 if self.outer_scale_m is None else self.diameter_m / self.outer_scale_m
 
     def psd(self, frequency_hz: Any) -> FloatArray:
-        """One-sided temporal power spectrum of one axis [nm^2/Hz].
+        """One-sided temporal power spectrum of one axis [nm^2/Hz] at frequencies [Hz].
 
-        The mean over wind directions: the two axes have the same spectrum and
-        are taken as independent. Its integral over frequency is
-        ``tilt_rms_nm**2``.
-
-        Parameters
-        ----------
-        frequency_hz : array_like
-            Frequencies [Hz], at least 0.
-
-        Returns
-        -------
-        ndarray
-            Spectrum at each frequency [nm^2/Hz].
-
-        Raises
-        ------
-        ProblemError
-            If a frequency is negative or not finite.
+        The mean over wind directions: the two axes have the same spectrum and are taken as
+        independent. Its integral over frequency is ``tilt_rms_nm**2``. A frequency that is negative
+        or not finite raises a ProblemError.
 
         Examples
         --------

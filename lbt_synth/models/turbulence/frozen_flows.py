@@ -113,22 +113,9 @@ class FrozenFlows:
         return np.asarray(np.sqrt(self._strength * variances[which.reshape(-1)]))
 
     def psd(self, frequency_hz: Any) -> FloatArray:
-        """One-sided temporal power spectra of one axis [nm^2/Hz].
+        """One-sided temporal power spectra (p, f) of one axis [nm^2/Hz] at frequencies (f,) [Hz].
 
-        Parameters
-        ----------
-        frequency_hz : (f,) array_like
-            Frequencies [Hz], above 0.
-
-        Returns
-        -------
-        (p, f) ndarray
-            Spectrum of each loop.
-
-        Raises
-        ------
-        ProblemError
-            If a frequency is not a finite number above 0.
+        A frequency that is not a finite number above 0 raises a ProblemError.
         """
         frequency = real_array(frequency_hz, "frequency_hz")
         if frequency.ndim != 1 or np.any(frequency <= 0):

@@ -85,22 +85,9 @@ class ModalTurbulence:
 
     @classmethod
     def of(cls, models: ARModel | Sequence[ARModel]) -> ModalTurbulence:
-        """Return the processes of single models, of any orders.
+        """Return the processes of single models, one per mode, of any orders.
 
-        Parameters
-        ----------
-        models : ARModel or sequence of ARModel
-            One model per mode.
-
-        Returns
-        -------
-        ModalTurbulence
-            The same processes.
-
-        Raises
-        ------
-        ProblemError
-            If there is none, one is no ARModel, or their frame rates differ.
+        No model at all, anything but an ARModel, and different frame rates raise a ProblemError.
 
         Examples
         --------
@@ -146,23 +133,7 @@ class ModalTurbulence:
         return frozen_copy(self.driving_rms_nm * np.sqrt(variance_ratios(self.coefficients)))
 
     def model(self, mode: int) -> ARModel:
-        """Return the process of one mode.
-
-        Parameters
-        ----------
-        mode : int
-            The mode, from 0.
-
-        Returns
-        -------
-        ARModel
-            Its process.
-
-        Raises
-        ------
-        ProblemError
-            If there is no such mode.
-        """
+        """Return the process of one mode, from 0; any other is a ProblemError."""
         i = integer(mode, "mode", at_least=0, at_most=self.n_modes - 1)
         return ARModel(
             coefficients=self.coefficients[i],
@@ -171,23 +142,7 @@ class ModalTurbulence:
         )
 
     def psd(self, frequency_hz: Any) -> FloatArray:
-        """One-sided power spectra [nm^2/Hz] at frequencies up to Nyquist, (n, f).
-
-        Parameters
-        ----------
-        frequency_hz : (f,) array_like
-            Frequencies [Hz].
-
-        Returns
-        -------
-        (n, f) ndarray
-            One spectrum per mode, each as :meth:`ARModel.psd`.
-
-        Raises
-        ------
-        ProblemError
-            If a frequency is not finite.
-        """
+        """One-sided power spectra (n, f) [nm^2/Hz] at frequencies (f,) [Hz] up to Nyquist."""
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         return densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)
 

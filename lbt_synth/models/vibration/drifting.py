@@ -75,44 +75,12 @@ class DriftingVibration:
         return float(np.sqrt(2) * self.rms_nm)
 
     def frequency_hz_at(self, time_s: Any) -> FloatArray:
-        """Return the frequency at times [Hz]; the drift begins at time 0.
-
-        Parameters
-        ----------
-        time_s : array_like
-            Times [s], negative ones before the drift.
-
-        Returns
-        -------
-        ndarray
-            Frequencies [Hz], of the shape of the times.
-
-        Raises
-        ------
-        ProblemError
-            If a time is not finite.
-        """
+        """Return the frequency [Hz] at finite times [s]; the drift begins at time 0."""
         moved = np.clip(real_array(time_s, "time_s") / self.duration_s, 0.0, 1.0)
         return np.asarray(self.start_hz + (self.end_hz - self.start_hz) * moved)
 
     def turns_at(self, time_s: Any) -> FloatArray:
-        """Return the integral of the frequency from time 0 [turns].
-
-        Parameters
-        ----------
-        time_s : array_like
-            Times [s].
-
-        Returns
-        -------
-        ndarray
-            Phases over 2 pi, negative before time 0.
-
-        Raises
-        ------
-        ProblemError
-            If a time is not finite.
-        """
+        """Return the phase over 2 pi at finite times [s]: the frequency's integral from time 0."""
         t = real_array(time_s, "time_s")
         inside = np.clip(t, 0.0, self.duration_s)
         rise = (self.end_hz - self.start_hz) / self.duration_s
@@ -138,12 +106,8 @@ class DriftingVibration:
 
         Returns
         -------
-        a1 : (frames,) ndarray
-            First coefficient in each frame.
-        a2 : float
-            Second coefficient.
-        driving_rms_nm : (frames,) ndarray
-            Standard deviation s of the driving noise in each frame [nm].
+        a1, a2, driving_rms_nm : (frames,) ndarray, float, (frames,) ndarray
+            Coefficients, and the standard deviation s of the driving noise [nm], in each frame.
 
         Raises
         ------

@@ -59,22 +59,9 @@ class Vibration:
         set_fields(self, direction=unit_direction(self.direction))
 
     def ar_model(self, frame_rate_hz: float) -> ARModel:
-        """Return the AR2 process sampled at a frame rate.
+        """Return the AR2 process of this rms, sampled at a frame rate [Hz].
 
-        Parameters
-        ----------
-        frame_rate_hz : float
-            Sampling frequency [Hz].
-
-        Returns
-        -------
-        ARModel
-            Process with this vibration's rms.
-
-        Raises
-        ------
-        ProblemError
-            If the line is not below the Nyquist frequency.
+        A line that is not below the Nyquist frequency raises a ProblemError.
 
         Examples
         --------
@@ -90,26 +77,10 @@ class Vibration:
         return ARModel(coefficients=a, driving_rms_nm=float(driving), frame_rate_hz=rate)
 
     def retuned(self, frequency_hz: float, *, frame_rate_hz: float, hold: str = "rms") -> Vibration:
-        """Return this vibration at another frequency.
+        """Return this vibration at another frequency [Hz], for a loop of a frame rate [Hz].
 
-        Parameters
-        ----------
-        frequency_hz : float
-            New frequency [Hz].
-        frame_rate_hz : float
-            Sampling frequency [Hz].
-        hold : {"rms", "driving"}, optional
-            What stays: the rms of the vibration, or that of its driving noise.
-
-        Returns
-        -------
-        Vibration
-            The vibration at its new frequency.
-
-        Raises
-        ------
-        ProblemError
-            If a value is out of its range.
+        ``hold`` says what stays: the rms of the vibration, "rms", or that of its driving noise,
+        "driving". A value out of its range raises a ProblemError.
 
         Examples
         --------
@@ -127,25 +98,11 @@ class Vibration:
         return replace(moved, rms_nm=self.rms_nm * ratio)
 
     def at_frequency(self, frequency_hz: float) -> Vibration:
-        """Return this vibration at another frequency, with the same rms and the same decay.
+        """Return this vibration at another frequency [Hz], with the same rms and the same decay.
 
-        The decay rate is damping times frequency, so the coefficient a2 of the AR2 process
-        stays the same.
-
-        Parameters
-        ----------
-        frequency_hz : float
-            New frequency [Hz].
-
-        Returns
-        -------
-        Vibration
-            The vibration at its new frequency.
-
-        Raises
-        ------
-        ProblemError
-            If the frequency is not above the decay rate, so that nothing oscillates.
+        The decay rate is damping times frequency, so the coefficient a2 of the AR2 process stays
+        the same. A frequency that is not above the decay rate raises a ProblemError: nothing
+        oscillates.
 
         Examples
         --------
