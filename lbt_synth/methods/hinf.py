@@ -30,7 +30,7 @@ def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign:
 METHOD = filter_method(
     name="hinf",
     title="H-infinity filter",
-    label=r"H$_\infty$",
+    label="H∞",
     options=HinfOptions,
     build=_build,
     exclusive=BOUNDS,

@@ -6,14 +6,10 @@ import difflib
 import pkgutil
 from functools import cache
 from importlib import import_module, metadata
-from typing import TYPE_CHECKING
 
 from lbt_synth import methods as folder
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.method import Method
-
-if TYPE_CHECKING:
-    from lbt_synth.design.result import Design
 
 
 @cache
@@ -150,12 +146,12 @@ def design_title(name: str) -> str:
         return name
 
 
-def design_label(design: Design) -> str:
-    """Return what figures call a design: the label of its method, else its method's name."""
+def design_label(name: str) -> str:
+    """Return what figures call a design with a name in ``Design.method``, else the name."""
     try:
-        return method_of_design(design.method).label
+        return method_of_design(name).label
     except ProblemError:
-        return design.method
+        return name
 
 
 def record_methods() -> list[str]:

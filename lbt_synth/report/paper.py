@@ -59,7 +59,7 @@ def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) ->
         name: [(row.model_hz - VIBRATION_HZ, getattr(row, name)) for row in TABLE_III]
         for name in (kalman_design.method, hinf_design.method)
     }
-    filters = {design_label(design): design for design in (kalman_design, hinf_design)}
+    filters = {design_label(design.method): design for design in (kalman_design, hinf_design)}
     for name, figure in (
         ("robustness", robustness_figure(rows, published)),
         ("sigma", sigma_figure(filters, unit_weights=True)),

@@ -51,8 +51,8 @@ def test_methods_by_name(leaky):
 
 
 def test_labels(leaky, config):
-    assert design_label(config.design("leaky", leak_per_s=1.0)) == "leaky"
-    assert design_label(config.design("kalman")) == "Kalman"
+    assert design_label(config.design("leaky", leak_per_s=1.0).method) == "leaky"
+    assert design_label(config.design("kalman").method) == "Kalman"
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Panel
 from lbt_synth.report.charts.matplotlib_charts import draw_figure
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
-from lbt_synth.report.figures.style import METHOD_LABELS
 from lbt_synth.studies import EndToEndEntry
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
     y = Axis(label="Strehl ratio at 2.2 µm", unit="%", low=0, high=100)
     panels = [
         Panel(
-            title=METHOD_LABELS.get(method, method),
+            title=design_label(method),
             x=FREQUENCY_ERROR if len(methods) < 3 else Axis(label="frequency error", unit="Hz"),
             y=y,
             marks=_method_curves([e for e in rows if e.method == method]),

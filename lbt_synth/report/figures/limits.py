@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Panel, Rule
 from lbt_synth.report.charts.matplotlib_charts import draw_figure
 from lbt_synth.report.figures.loop import stable_curve
-from lbt_synth.report.figures.style import METHOD_LABELS
 from lbt_synth.studies import LimitStudy
 from lbt_synth.validation import FloatArray
 
@@ -63,14 +63,14 @@ def limits_figure(study: LimitStudy, *, axes: Axes | Sequence[Axes] | None = Non
     word = "frequency of the true vibration" if single else "shift of the true vibrations"
     x = Axis(label=word, unit="Hz")
     shifted = study.shift_hz + (study.frequency_hz or 0.0)
-    return draw_figure([limits_panel(study, x, shifted, METHOD_LABELS)], axes=axes)
+    return draw_figure([limits_panel(study, x, shifted, design_label)], axes=axes)
 
 
 def limits_panel(
-    study: LimitStudy, x: Axis, places: FloatArray, labels: Mapping[str, str]
+    study: LimitStudy, x: Axis, places: FloatArray, label: Callable[[str], str]
 ) -> Panel:
     """Return the residual of each design, and the limits, over places on an axis."""
-    names = [labels.get(row.design, row.design) for row in study.rows]
+    names = [label(row.design) for row in study.rows]
     marks: list[Curve | Rule] = [
         stable_curve(name, names, places, curve if row.stable else None)
         for name, row, curve in zip(names, study.rows, study.residual_nm, strict=True)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Panel
 from lbt_synth.report.charts.matplotlib_charts import draw_figure
-from lbt_synth.report.figures.style import METHOD_LABELS
 from lbt_synth.studies import RobustnessRow
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def robustness_figure(
     curves = []
     for look, method in enumerate(dict.fromkeys(row.method for row in rows)):
         own = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
-        label = METHOD_LABELS.get(method, method)
+        label = design_label(method)
         stable = [r for r in own if r.stable]
         unstable = np.array([r.error_hz for r in own if not r.stable])
         if stable:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
-METHOD_LABELS = {"kalman": "Kalman", "hinf": "H∞"}
 
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
