@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any, TypeAlias
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.certificate_table import certificate_table, check_records
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage import rows
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.storage.tables import Table
-from lbt_synth.validation import FloatArray
-
-Data: TypeAlias = dict[str, Any]
 
 _SMALL_MODULUS = 0.3
 
@@ -29,23 +24,17 @@ class DesignFacts:
     """What every design has."""
 
     method: str = column("method")
-    solver: str = column("route")
+    route: str = column("route")
     n_states: int = column("states of the controller")
 
 
 @table_row
 class LoopFacts:
-    """The loop that a design is for, and its margins."""
+    """The loop that a design is for."""
 
     frame_rate_hz: float = column("frame rate", unit="Hz")
     delay_frames: float = column("total delay", unit="frames")
     settling_ms: float | None = column("settling time of the mirror, to 10 %", unit="ms")
-    modulus: float = column("modulus margin")
-    gain_low: float = column("stable sensor gains, from")
-    gain_high: float = column("stable sensor gains, to")
-    phase_deg: float = column("phase margin", unit="deg")
-    delay_margin: float = column("delay margin", unit="frames")
-    crossover_hz: float = column("highest crossover", unit="Hz")
 
 
 def describe_design(design: Design, *, matrices: bool = False) -> Report:
@@ -53,86 +42,56 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
     described = method_of_design(design.method).describe(design)
     said = DesignFacts(
         method=design.method,
-        solver=f"{design.solver.route} ({design.solver.status})",
+        route=f"{design.solver.route} ({design.solver.status})",
         n_states=design.controller.n_states,
     )
-    data: Data = {
-        "method": design.method,
-        "solver": asdict(design.solver),
-        "n_states": design.controller.n_states,
-        "poles": [complex(p) for p in design.poles],
-        "controller_spectral_radius": design.controller.to_statespace().spectral_radius,
-        "checks": check_records(design.certificate.checks),
-        **rows.json_record(described.facts),
-        **{t.key: [rows.json_record(row) for row in t.rows] for t in described.tables},
-    }
-    facts, notes = [said, described.facts], [*described.notes]
-    if design.hardware is not None:
-        loop, loop_data = _describe_loop(design, design.hardware)
-        facts.append(loop)
-        data |= loop_data
-        notes = _loop_notes(design, design.hardware, data) + notes
-    table = rows.fact_table("Design", *facts)
     report = Report(
-        data=data,
-        tables=[
-            _table_text(table if design.hardware is not None else _without_units(table)),
-            *(_table_text(rows.row_table(t.title, t.rows)) for t in described.tables),
-            certificate_table(design.certificate),
-        ],
-        notes=notes,
+        data={
+            "solver": asdict(design.solver),
+            "poles": [complex(p) for p in design.poles],
+            "controller_spectral_radius": design.controller.to_statespace().spectral_radius,
+        }
     )
+    if design.hardware is None:
+        report.add_facts("Design", said, described.facts)
+        report.tables[0] = _without_units(report.tables[0])
+    else:
+        _add_loop(report, design, design.hardware, said, described.facts)
+    report.notes += described.notes
+    for table in described.tables:
+        report.add_rows(table.key, table.title, table.rows)
+    report.add_rows("checks", "Certificate", design.certificate.checks)
     if matrices:
-        _add_matrices(report, design, described.matrices)
+        named = {name: getattr(design.controller, name) for name in "ABCD"}
+        named |= described.matrices
+        report.data["matrices"] = named
+        with np.printoptions(precision=8, linewidth=160, suppress=False):
+            report.notes += [f"{name} =\n{value}" for name, value in named.items()]
     return report
-
-
-def _table_text(table: Table) -> TableText:
-    return TableText(title=table.caption, headings=table.headings, rows=table.rows)
 
 
 def _without_units(table: Table) -> Table:
     """Return the facts of a bare estimation problem, whose signals have no units."""
-    return Table(
-        caption=table.caption,
-        headings=table.headings,
-        rows=tuple((*row[:2], "") for row in table.rows),
-        words=table.words,
-    )
+    return replace(table, rows=tuple((*row[:2], "") for row in table.rows))
 
 
-def _add_matrices(report: Report, design: Design, more: Mapping[str, FloatArray]) -> None:
-    matrices = {name: getattr(design.controller, name) for name in "ABCD"} | dict(more)
-    report.data["matrices"] = matrices
-    with np.printoptions(precision=8, linewidth=160, suppress=False):
-        report.notes += [f"{name} =\n{value}" for name, value in matrices.items()]
-
-
-def _describe_loop(design: Design, hardware: LoopHardware) -> tuple[LoopFacts, Data]:
+def _add_loop(report: Report, design: Design, hardware: LoopHardware, *facts: Any) -> None:
+    """Add the facts of a design with those of its loop, and what to note of it."""
     margins = loop_margins(close_loop(hardware, design.controller))
-    settling_s, data = None, {}
+    settling_s = None
     if hardware.mirror is not None:
         settling_s = hardware.mirror.step_response().settling_s
-        data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
-    facts = LoopFacts(
-        frame_rate_hz=hardware.frame_rate_hz,
-        delay_frames=hardware.delay_frames,
-        settling_ms=None if settling_s is None else 1e3 * settling_s,
-        modulus=margins.modulus,
-        gain_low=margins.gain_low,
-        gain_high=margins.gain_high,
-        phase_deg=margins.phase_deg,
-        delay_margin=margins.delay_frames,
-        crossover_hz=margins.crossover_hz,
+        report.data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
+    loop = fill_row(
+        LoopFacts, hardware, settling_ms=None if settling_s is None else 1e3 * settling_s
     )
-    return facts, data | {
-        "frame_rate_hz": hardware.frame_rate_hz,
-        "delay_frames": hardware.delay_frames,
-        "margins": asdict(margins),
-    }
+    report.add_facts("Design", *facts, loop)
+    report.tables[0] = rows.fact_table("Design", *facts, loop, margins)
+    report.data["margins"] = rows.json_record(margins)
+    report.notes += _loop_notes(design, hardware, report.data)
 
 
-def _loop_notes(design: Design, hardware: LoopHardware, data: Data) -> list[str]:
+def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:
     notes = []
     modulus, alone = data["margins"]["modulus"], data["controller_spectral_radius"]
     if hardware.mirror is not None and not design.knows_mirror:

@@ -6,17 +6,30 @@ import math
 from argparse import Namespace
 from pathlib import Path
 
-from lbt_synth.cli.frame_cost import cost_facts, cost_record
-from lbt_synth.cli.output import Facts, Report, fact_table
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.interop import Exported, export_c, export_iir, export_mat, frame_cost
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
 
 _SINGLE_SUFFICES = 1e-3  # of the largest command
 _C_OPTIONS = ("precision", "name")
+
+
+@table_row
+class ExportFacts:
+    """What was exported, and how far it is from the controller."""
+
+    method: str = column("method")
+    n_states: int = column("states of the controller")
+    measurements: int = column("measurements")
+    commands: int = column("commands")
+    error: float = column("difference from the controller", unit="of the largest command")
+    error_single: float = column("  in single precision", unit="of the largest command")
+    stable_single: bool = column("  stable in single precision")
 
 
 def run(arguments: Namespace) -> Report:
@@ -31,40 +44,23 @@ def run(arguments: Namespace) -> Report:
     with show_spinner("exporting", quiet=arguments.json):
         written = _export_as(arguments, design, digest)
     cost = frame_cost(design)
-    stable_single = math.isfinite(written.error_single)
-    facts: Facts = [
-        ("method", design.method, ""),
-        ("states of the controller", design.controller.n_states, ""),
-        ("measurements", design.controller.B.shape[1], ""),
-        ("commands", len(design.controller.C), ""),
-    ]
-    if arguments.format == "c":
-        facts += cost_facts(cost)
-    facts += [
-        ("difference from the controller", written.error, "of the largest command"),
-        (
-            "  in single precision",
-            written.error_single if stable_single else "unstable",
-            "of the largest command",
-        ),
-    ]
-    return Report(
-        data={
-            "gain": arguments.gain,
-            "gain_digest": digest,
-            "format": arguments.format,
-            "files": [str(file) for file in written.files],
-            "error": written.error,
-            "error_single": written.error_single,
-            "stable_single": stable_single,
-            "frame_cost": cost_record(cost),
-        },
-        tables=[fact_table("Export", facts)],
-        notes=[
-            *_precision_notes(arguments, written),
-            *(f"written: {file}" for file in written.files),
-        ],
+    report = Report(
+        data={"gain": arguments.gain, "gain_digest": digest, "format": arguments.format}
     )
+    facts = fill_row(
+        ExportFacts,
+        written,
+        design,
+        measurements=design.controller.B.shape[1],
+        commands=len(design.controller.C),
+        n_states=design.controller.n_states,
+        stable_single=math.isfinite(written.error_single),
+    )
+    report.data |= {"frame_cost": json_record(cost), **json_record(facts)}
+    report.tables.append(fact_table("Export", facts, *([cost] if arguments.format == "c" else [])))
+    report.notes += _precision_notes(arguments, written)
+    report.note_files(written.files)
+    return report
 
 
 def _export_as(arguments: Namespace, design: Design, digest: str) -> Exported:

@@ -6,7 +6,6 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
-from lbt_synth.cli.certificate_table import check_records
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
@@ -110,7 +109,7 @@ def _design_record(one: DesignAssessment) -> dict[str, Any]:
     """Return what JSON says of a design beside its row."""
     good = good_range(one)
     return {
-        "checks": check_records(one.checks),
+        "checks": [json_record(check) for check in one.checks],
         "good_errors_hz": None if good is None else [good.low_hz, good.high_hz],
         "margins": None if one.margins is None else asdict(one.margins),
         "stable_sensor_gains": one.sensor_gains,

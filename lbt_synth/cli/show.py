@@ -5,10 +5,10 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli.design_description import describe_design
-from lbt_synth.cli.frame_cost import cost_facts, cost_record
-from lbt_synth.cli.output import Report, fact_table
+from lbt_synth.cli.output import Report
 from lbt_synth.files import load_gain
 from lbt_synth.interop import frame_cost
+from lbt_synth.storage.rows import fact_table, json_record
 
 
 def run(arguments: Namespace) -> Report:
@@ -16,6 +16,6 @@ def run(arguments: Namespace) -> Report:
     design = load_gain(arguments.gain)
     report = describe_design(design, matrices=arguments.matrices)
     cost = frame_cost(design)
-    report.data |= {"file": arguments.gain, "frame_cost": cost_record(cost)}
-    report.tables.append(fact_table("Cost per frame, as exported to C", cost_facts(cost)))
+    report.data |= {"file": arguments.gain, "frame_cost": json_record(cost)}
+    report.tables.append(fact_table("Cost per frame, as exported to C", cost))
     return report

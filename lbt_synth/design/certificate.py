@@ -22,7 +22,8 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, frozen_copy, number
+from lbt_synth.storage.rows import column
+from lbt_synth.validation import FloatArray, frozen_copy, number, set_fields
 
 GAIN_TOLERANCE = 1e-6
 NORM_TOLERANCE = 1e-6
@@ -44,17 +45,18 @@ class Check:
         What was computed, and what it must stay below.
     computed_by : str
         How the value was computed.
+    passed : bool
+        Whether the value is below its limit; NaN is not.
     """
 
-    name: str
-    value: float
-    limit: float
-    computed_by: str
+    name: str = column("check")
+    value: float = column("value")
+    limit: float = column("limit")
+    computed_by: str = column("computed by")
+    passed: bool = column("passed", init=False)
 
-    @property
-    def passed(self) -> bool:
-        """Whether the value is below its limit; NaN is not."""
-        return bool(self.value < self.limit)
+    def __post_init__(self) -> None:
+        set_fields(self, passed=bool(self.value < self.limit))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -24,6 +24,7 @@ from lbt_synth.validation import FloatArray, frozen_copy
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
+_CHECK = ("name", "value", "limit", "computed_by")
 _PROBLEMS: dict[str, type[EstimationProblem]] = {
     "problem": EstimationProblem,
     "plant": TipTiltPlant,
@@ -142,7 +143,7 @@ def _pack_certificate(certificate: Certificate) -> Meta:
     return {
         "gamma": None if math.isnan(certificate.gamma) else certificate.gamma,
         "rms_per_output": certificate.rms_per_output.tolist(),
-        "checks": [asdict(check) for check in certificate.checks],
+        "checks": [{name: getattr(check, name) for name in _CHECK} for check in certificate.checks],
     }
 
 

@@ -2,36 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller
-from lbt_synth.validation import FloatArray
+from lbt_synth.storage.rows import column, table_row
+from lbt_synth.validation import FloatArray, set_fields
 
 _SMALL = 256  # up to so many entries of [[A, B], [C, D]], every term is written out
 _LONGEST = 4096  # terms that are written out at most
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class FrameCost:
-    """Arithmetic and memory of one frame of a controller.
-
-    Attributes
-    ----------
-    form : str
-        "straight line" where the exported source writes each non-zero term out, "loops" where
-        it multiplies by whole matrices.
-    multiplications, additions : int
-        Per frame of the exported source; factors of 1 and -1 are no multiplications.
-    coefficients : int
-        Numbers that the exported source stores.
-    states : int
-        Numbers that it keeps from one frame to the next.
-    dense_multiplications, dense_additions, dense_coefficients : int
-        The same for products with the whole matrices A, B, C, D.
+    """Arithmetic and memory of one frame of a controller, as exported and with whole matrices.
 
     Examples
     --------
@@ -42,34 +27,34 @@ class FrameCost:
     (2, 16, 8)
     """
 
-    form: str
-    multiplications: int
-    additions: int
-    coefficients: int
-    states: int
-    dense_multiplications: int
-    dense_additions: int
-    dense_coefficients: int
+    form: str = column(
+        "form of the exported source",
+        help='"straight line" where each non-zero term is written out, "loops" where the source '
+        "multiplies by whole matrices",
+    )
+    multiplications: int = column(
+        "multiplications per frame",
+        help="Of the exported source; factors of 1 and -1 are no multiplications",
+    )
+    dense_multiplications: int = column("  with whole matrices", help="The same of A, B, C, D")
+    additions: int = column("additions per frame", help="Of the exported source")
+    dense_additions: int = column("  with whole matrices", help="The same of A, B, C, D")
+    coefficients: int = column(help="Numbers that the exported source stores")
+    dense_coefficients: int = column(help="Numbers of the whole matrices")
+    states: int = column(help="Numbers that it keeps from one frame to the next")
+    coefficient_bytes_double: int = column("coefficients, double", unit="bytes", init=False)
+    coefficient_bytes_single: int = column("coefficients, single", unit="bytes", init=False)
+    state_bytes_double: int = column("state, double", unit="bytes", init=False)
+    state_bytes_single: int = column("state, single", unit="bytes", init=False)
 
-    @property
-    def coefficient_bytes_double(self) -> int:
-        """Bytes of the coefficients in double precision."""
-        return 8 * self.coefficients
-
-    @property
-    def coefficient_bytes_single(self) -> int:
-        """Bytes of the coefficients in single precision."""
-        return 4 * self.coefficients
-
-    @property
-    def state_bytes_double(self) -> int:
-        """Bytes of the state in double precision."""
-        return 8 * self.states
-
-    @property
-    def state_bytes_single(self) -> int:
-        """Bytes of the state in single precision."""
-        return 4 * self.states
+    def __post_init__(self) -> None:
+        set_fields(
+            self,
+            coefficient_bytes_double=8 * self.coefficients,
+            coefficient_bytes_single=4 * self.coefficients,
+            state_bytes_double=8 * self.states,
+            state_bytes_single=4 * self.states,
+        )
 
 
 def frame_cost(design: Design | Controller) -> FrameCost:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import brentq
 
@@ -12,37 +10,41 @@ from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, spectral_radii
 from lbt_synth.models import LoopHardware
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
 _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
 _WIDEST = 1e4
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class LoopMargins:
-    """Margins of a stable loop; each measurement is broken in turn, the others closed.
+    """Margins of a stable loop; each measurement is broken in turn, the others closed."""
 
-    Attributes
-    ----------
-    modulus : float
-        Least distance of the loop from instability, ``1 / ||(I + loop)^-1||_inf``.
-    gain_low, gain_high : float
-        Interval of factors on the loop gain that keep it stable (0 or inf at open ends).
-    phase_deg : float
-        Least phase lag that destabilises [deg]; inf without a crossover.
-    delay_s, delay_frames : float
-        Least further delay that destabilises [s], [frames]; inf without a crossover.
-    crossover_hz : float
-        Highest frequency at which a loop's gain crosses one [Hz]; 0 without any.
-    """
-
-    modulus: float
-    gain_low: float
-    gain_high: float
-    phase_deg: float
-    delay_s: float
-    delay_frames: float
-    crossover_hz: float
+    modulus: float = column(
+        "modulus margin",
+        help="Least distance of the loop from instability, ``1 / ||(I + loop)^-1||_inf``",
+    )
+    gain_low: float = column(
+        "stable sensor gains, from", help="Least factor on the loop gain that keeps it stable"
+    )
+    gain_high: float = column(
+        "stable sensor gains, to", help="Largest factor on the loop gain; inf at an open end"
+    )
+    phase_deg: float = column(
+        "phase margin",
+        unit="deg",
+        help="Least phase lag that destabilises; inf without a crossover",
+    )
+    delay_s: float = column(unit="s", help="Least further delay that destabilises")
+    delay_frames: float = column(
+        "delay margin", unit="frames", help="The same; inf without a crossover"
+    )
+    crossover_hz: float = column(
+        "highest crossover",
+        unit="Hz",
+        help="Highest frequency at which a loop's gain crosses one; 0 without any",
+    )
 
 
 def loop_margins(loop: ClosedLoop) -> LoopMargins:

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from lbt_synth.methods.method import Description, Method
 from lbt_synth.methods.section import Section
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, fill_row, table_row
 
 if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
@@ -73,12 +73,7 @@ def limit_facts(design: EstimatorDesign) -> dict[str, Any]:
 def _describe_filter(design: FilterDesign) -> Description:
     """Describe a filter."""
     return Description(
-        facts=FilterFacts(
-            rms=design.rms,
-            gamma=design.gamma,
-            **limit_facts(design),
-            **{name: getattr(design, name) for name in _CLAIMS},
-        ),
+        facts=fill_row(FilterFacts, design, **limit_facts(design)),
         matrices={"gain_predictor": design.gain_predictor, "gain_filter": design.gain_filter},
     )
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from lbt_synth.methods.filters import limit_facts
 from lbt_synth.methods.method import Description, DesignInputs, Method
 from lbt_synth.methods.section import Section
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import frozen_copy, number
 
 if TYPE_CHECKING:
@@ -85,14 +85,7 @@ def _unpack(record: DesignRecord) -> LqgDesign:
 
 
 def _describe(design: LqgDesign) -> Description:
-    return Description(
-        facts=LqgFacts(
-            rms=design.rms,
-            gamma=design.gamma,
-            **limit_facts(design),
-            command_weight=design.command_weight,
-        )
-    )
+    return Description(facts=fill_row(LqgFacts, design, **limit_facts(design)))
 
 
 METHOD = Method(

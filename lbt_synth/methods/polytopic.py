@@ -10,7 +10,7 @@ from pydantic import Field
 from lbt_synth.methods.filters import Horizon, limit_facts
 from lbt_synth.methods.method import Description, DesignInputs, Method
 from lbt_synth.methods.section import Section
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, number
 
 if TYPE_CHECKING:
@@ -89,18 +89,10 @@ def _unpack(record: DesignRecord) -> PolytopicDesign:
 
 
 def _describe(design: PolytopicDesign) -> Description:
+    ratio = design.bound_guaranteed / design.worst_achieved
+    own = {**limit_facts(design), "guaranteed_over_found": ratio}
     return Description(
-        facts=PolytopicFacts(
-            rms=design.rms,
-            gamma=design.gamma,
-            **limit_facts(design),
-            half_width_hz=design.half_width_hz,
-            low_hz=design.interval.low_hz,
-            high_hz=design.interval.high_hz,
-            norm=design.norm,
-            **{name: getattr(design, name) for name in _SIZES},
-            guaranteed_over_found=design.bound_guaranteed / design.worst_achieved,
-        ),
+        facts=fill_row(PolytopicFacts, design, design.interval, **own),
         matrices={f"predictor_{name}": getattr(design.predictor, name) for name in "ABC"},
     )
 

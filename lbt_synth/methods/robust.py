@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.methods.method import Description, DesignInputs, Method, RowTable
 from lbt_synth.methods.section import Count, NonNegative, Positive, Section
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:
@@ -294,14 +294,7 @@ def _describe(design: ShapedDesign) -> Description:
     demands = [DemandRow(demand=label, mode=m + 1) for m, label in design.demand_labels()]
     terms = [TermRow(term=text, mode=m + 1, rms_nm=rms) for m, text, rms in design.terms_nm()]
     return Description(
-        facts=RobustFacts(
-            states_per_mode=design.states_per_mode,
-            loss=design.loss,
-            limit_nm=limit_nm,
-            above_limit_percent=above,
-            objective_nm=design.objective_nm,
-            long_objective_nm=design.long_objective_nm,
-        ),
+        facts=fill_row(RobustFacts, design, limit_nm=limit_nm, above_limit_percent=above),
         tables=(
             RowTable(key="demands", title="Demands", rows=demands),
             RowTable(key="terms", title="Residual of each term", rows=terms),
