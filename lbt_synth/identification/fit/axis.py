@@ -27,7 +27,7 @@ from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.stretches import checked_stretches
 from lbt_synth.validation import FloatArray, number, real_array, require_instance
 
-GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
+_GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
 _POOR_GAIN = 0.1  # relative error from which a note says so
 _APART = 3.0  # standard errors
 _LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0
@@ -116,13 +116,11 @@ def identify_axis(
     y = real_array(measurement, "measurement")
     if y.ndim != 1:
         raise DimensionError(f"measurement must be a series (frames,); got shape {y.shape}.")
-    c = None
-    if correction is not None:
-        c = real_array(correction, "correction")
-        if c.shape != y.shape:
-            raise DimensionError(
-                f"correction must have shape {y.shape} like measurement; got {c.shape}."
-            )
+    c = None if correction is None else real_array(correction, "correction")
+    if c is not None and c.shape != y.shape:
+        raise DimensionError(
+            f"correction must have shape {y.shape} like measurement; got {c.shape}."
+        )
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
     longest = max(stop - begin for begin, stop in pieces)
@@ -160,7 +158,7 @@ def identify_axis(
     if not data.closed:
         return describe_axis(search, model, None, "1: of an open loop it has no meaning")
     error = _gain_error(search, model)
-    if error <= GAIN_ERROR:
+    if error <= _GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
         return describe_axis(search, model, error, f"found in the closed loop's data{poor}")
     search = replace(search, gain=assumed)
@@ -244,16 +242,14 @@ def identify_spectrum(
     if np.any(density <= 0):
         raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density):.6g}.")
     if averages is None:
-        many = estimate_averages(density) or 1.0
-    else:
-        many = number(averages, "averages", above=0)
+        averages = estimate_averages(density) or 1.0
     zero = np.zeros_like(f)
     data = LoopPeriodogram(
         frequency_hz=f,
         measured=density,
         crossed=zero,
         corrected=zero,
-        count=np.full(f.size, many),
+        count=np.full(f.size, number(averages, "averages", above=0)),
         frame_rate_hz=rate,
         resolution_hz=float(np.median(steps)),
     )
@@ -285,12 +281,10 @@ def estimate_averages(density: FloatArray) -> float | None:
 
 def _gain_error(search: Search, model: FittedModel) -> float:
     """Return the standard error of the logarithm of the gain, infinite where it is unknown."""
-    errors = standard_errors(model.spectrum, parameter_covariance(model))
-    error = errors.log_gain or float("inf")
-    narrow = model.spectrum.drop_wide(WIDE_DAMPING)
-    if error <= GAIN_ERROR and narrow != model.spectrum:
-        # such a model may stand for another gain
-        away = gain_ambiguity(search, model)
-        if away > _APART * error:
-            return away
-    return error
+    spectrum = model.spectrum
+    error = standard_errors(spectrum, parameter_covariance(model)).log_gain or float("inf")
+    if error > _GAIN_ERROR or spectrum.drop_wide(WIDE_DAMPING) == spectrum:
+        return error
+    # a model with wide resonances may stand for another gain
+    away = gain_ambiguity(search, model)
+    return away if away > _APART * error else error

@@ -10,32 +10,20 @@ Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.identification.fit.fitting import (
-    STARTING_CORNER_HZ,
-    Search,
-    add_evidence,
-    centre_line,
-    cost,
-    drop_roll_off,
-    fit,
-    likeliest,
-    prune,
-    refit,
-)
-from lbt_synth.identification.fit.line_candidates import (
-    Candidate,
-    find_candidates,
-    measure_excess,
-    smooth_background,
-)
+from lbt_synth.identification.fit import fitting
+from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.parameters import Kind, SpectrumModel
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import FittedModel, density, minimise
+from lbt_synth.validation import FloatArray
 
+_WIDEST = 0.3  # band, of its frequency
 _STARTING_GAINS = (0.35, 0.6, 1.0)
 _STARTING_FREQUENCIES_HZ = (0.5, 5.0)  # of the turbulence
 _STARTING_DAMPING = 0.55
@@ -46,9 +34,19 @@ _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """An excess of power in a band."""
+
+    frequency_hz: float  # where it is highest
+    half_width_hz: float  # at half height
+    variance_nm2: float  # of a resonance of that height and width
+    gain: float  # log-likelihood that a model with the mean of the band would add
+
+
 def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
     """Find the model of one axis."""
-    return add_evidence(search, _find_components(search, start))
+    return fitting.add_evidence(search, _find_components(search, start))
 
 
 def gain_ambiguity(search: Search, best: FittedModel) -> float:
@@ -57,7 +55,7 @@ def gain_ambiguity(search: Search, best: FittedModel) -> float:
     Wide resonances can stand for what a wrong gain leaves. Models are searched for at other
     gains, which are then set free.
     """
-    least, gain = cost(search, best), best.spectrum.log_gain
+    least, gain = fitting.cost(search, best), best.spectrum.log_gain
     away = 0.0
     for trial in _STARTING_GAINS:
         if abs(float(np.log(trial)) - gain) < _SAME_GAIN:
@@ -66,8 +64,8 @@ def gain_ambiguity(search: Search, best: FittedModel) -> float:
             other = _find_components(replace(search, gain=trial), None, rounds=_FEW_ROUNDS)
         except NumericalError:
             continue
-        made = fit(search, other.spectrum)
-        if made is not None and cost(search, made) < least + search.price:
+        made = fitting.fit(search, other.spectrum)
+        if made is not None and fitting.cost(search, made) < least + search.price:
             away = max(away, abs(made.spectrum.log_gain - gain))
     return away
 
@@ -76,21 +74,44 @@ def _find_components(
     search: Search, start: SpectrumModel | None, *, rounds: int = _MOST_ROUNDS
 ) -> FittedModel:
     """Find the model: add components, move them, prune them."""
-    model = None if start is None else refit(search, start)
+    model = None if start is None else fitting.refit(search, start)
     if model is None:
         gains = _STARTING_GAINS if search.finds_gain else (search.gain or 1.0,)
-        model = likeliest(_begin(search, gain) for gain in gains)
+        model = fitting.likeliest(_begin(search, gain) for gain in gains)
     if model is None:
         raise NumericalError(
             "the likelihood of the spectrum is not finite. Check the units of the series."
         )
-    model = _add_announced(search, prune(search, model))
+    model = _add_announced(search, fitting.prune(search, model))
     for _ in range(rounds):
-        better = _extend(search, model) or _move_line(search, model)
+        better = _improve(search, model)
         if better is None:
             break
         model = better
-    return _restore_turbulence(search, prune(search, drop_roll_off(search, model)))
+    return _restore_turbulence(search, fitting.prune(search, fitting.drop_roll_off(search, model)))
+
+
+def _improve(search: Search, model: FittedModel) -> FittedModel | None:
+    """Return the first model that is clearly better; None if none is."""
+    for trial, least in _trials(search, model.spectrum):
+        made = fitting.fit(search, trial)
+        if made is not None:
+            made = fitting.prune(search, made)
+            if fitting.cost(search, made) < fitting.cost(search, model) - least:
+                return made
+    return None
+
+
+def _trials(search: Search, spectrum: SpectrumModel) -> Iterator[tuple[SpectrumModel, float]]:
+    """Yield models with new components or other places of lines, and what each must save."""
+    found = _find_excesses(search, spectrum)
+    found = [c for c in found if c.gain > 0.25 * found[0].gain]
+    while found:
+        yield _add_candidates(search, spectrum, found), 0.0
+        found = found[: len(found) // 2]
+    for i, component in enumerate(spectrum.components):
+        if component.kind == "line":
+            yield from ((trial, 1.0) for trial in _line_moves(search, spectrum, i))
 
 
 def _begin(search: Search, gain: float) -> FittedModel | None:
@@ -100,26 +121,26 @@ def _begin(search: Search, gain: float) -> FittedModel | None:
         return None
     found = _find_excesses(search, ground.spectrum)
     clear = [c for c in found if c.gain > max(2 * search.price, 0.02 * found[0].gain)]
-    return fit(search, _add_candidates(search, ground.spectrum, clear))
+    return fitting.fit(search, _add_candidates(search, ground.spectrum, clear))
 
 
 def _fit_background(search: Search, gain: float) -> FittedModel | None:
     """Fit turbulence and noise to medians over bands, which lines hardly touch."""
     data = search.data
-    f, d, weight = smooth_background(data.power(gain), data.frequency_hz, data.count)
+    f, d, weight = _smooth_background(data.power(gain), data.frequency_hz, data.count)
     zero = np.zeros_like(f)
     smooth = replace(data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight)
     white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
     slow = max(float(np.trapezoid(d, f)) - white, 0.1 * white)
     known = replace(search, gain=gain)
     ground = SpectrumModel(
-        float(np.log(gain)), float(np.log(white)), known.log_angle(STARTING_CORNER_HZ), ()
+        float(np.log(gain)), float(np.log(white)), known.log_angle(fitting.STARTING_CORNER_HZ), ()
     )
     starts = [
         ground.add(known.component("turbulence", hz, _STARTING_DAMPING, slow))
         for hz in _STARTING_FREQUENCIES_HZ
     ]
-    return likeliest(minimise(smooth, start, known.priors(start)) for start in starts)
+    return fitting.likeliest(minimise(smooth, start, known.priors(start)) for start in starts)
 
 
 def _add_candidates(
@@ -133,7 +154,7 @@ def _add_candidates(
         kind: Kind = "line" if line else "slow"
         whole = whole.add(search.component(kind, c.frequency_hz, ratio, c.variance_nm2))
     for i in range(len(spectrum.components), len(whole.components)):
-        whole = centre_line(search, whole, i)
+        whole = fitting.centre_line(search, whole, i)
     return whole
 
 
@@ -148,20 +169,16 @@ def _add_announced(search: Search, model: FittedModel) -> FittedModel:
     seen = density(search.data, spectrum)
     for f, error in search.announced:
         known = (search.log_angle(f), max(error, 0.1 * step) / f)
-        near = [
-            (i, c)
-            for i, c in enumerate(model.spectrum.components)
-            if c.kind == "line" and abs(search.place(c)[0] - f) < 3 * max(error, step)
-        ]
-        if near:
-            i, line = near[0]
-            spectrum = spectrum.exchange(i, replace(line, announced=known))
-        else:
-            level = float(np.interp(f, search.data.frequency_hz, seen))
-            line = search.component("line", f, 0.01, level * max(0.01 * f, step))
-            spectrum = spectrum.add(replace(line, announced=known))
-    made = fit(search, spectrum)
-    return model if made is None else prune(search, made)
+        level = float(np.interp(f, search.data.frequency_hz, seen))
+        line = search.component("line", f, 0.01, level * max(0.01 * f, step))
+        place = len(spectrum.components)
+        for i, c in enumerate(model.spectrum.components):
+            if c.kind == "line" and abs(search.place(c)[0] - f) < 3 * max(error, step):
+                place, line = i, spectrum.components[i]
+                break
+        spectrum = spectrum.exchange(place, replace(line, announced=known))
+    made = fitting.fit(search, spectrum)
+    return model if made is None else fitting.prune(search, made)
 
 
 def _find_excesses(search: Search, spectrum: SpectrumModel) -> list[Candidate]:
@@ -177,51 +194,18 @@ def _find_excesses(search: Search, spectrum: SpectrumModel) -> list[Candidate]:
     return found
 
 
-def _extend(search: Search, model: FittedModel) -> FittedModel | None:
-    """Return the model with the best candidates, those that pay; None if none does."""
-    found = _find_excesses(search, model.spectrum)
-    found = [c for c in found if c.gain > 0.25 * found[0].gain]
-    while found:
-        better = _improve(search, model, _add_candidates(search, model.spectrum, found), 0)
-        if better is not None:
-            return better
-        found = found[: len(found) // 2]
-    return None
-
-
-def _move_line(search: Search, model: FittedModel) -> FittedModel | None:
-    """Return the model with a line moved, or split in two; None if none is better."""
-    for i, component in enumerate(model.spectrum.components):
-        for trial in _line_moves(search, model.spectrum, i) if component.kind == "line" else ():
-            better = _improve(search, model, trial, 1)
-            if better is not None:
-                return better
-    return None
-
-
-def _improve(
-    search: Search, model: FittedModel, trial: SpectrumModel, least: float
-) -> FittedModel | None:
-    """Fit and prune a model; None if it costs not less than another by more than ``least``."""
-    made = fit(search, trial)
-    if made is None:
-        return None
-    made = prune(search, made)
-    return made if cost(search, made) < cost(search, model) - least else None
-
-
 def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[SpectrumModel]:
     """Yield other beginnings for a line: elsewhere in its band, or as two lines."""
     data, line, step = search.data, spectrum.components[i], search.data.step_hz
     centre, half = search.place(line)
-    centred = centre_line(search, spectrum, i)
+    centred = fitting.centre_line(search, spectrum, i)
     moved_by = centred.components[i].log_frequency - line.log_frequency
     if abs(moved_by) * centre > 0.4 * step:
         yield centred
     reach = max(10 * half, 20 * step)
     start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
     rest = density(data, spectrum.exchange(i))
-    seen = measure_excess(data, data.power(spectrum.gain), rest, int(start), int(stop))
+    seen = _measure_excess(data, data.power(spectrum.gain), rest, int(start), int(stop))
     if abs(seen.frequency_hz - centre) > 0.5 * half + step:
         ratio = min(seen.half_width_hz / seen.frequency_hz, 0.5)
         again = search.component("line", seen.frequency_hz, ratio, seen.variance_nm2)
@@ -240,7 +224,89 @@ def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
     slow = [i for i, c in enumerate(others, 1) if c.frequency < lowest]
     if first.frequency < lowest or not slow or spectrum.rolls_off or first.damping_ratio > 0.98:
         return model
-    made = fit(search, spectrum.promote(spectrum.strongest(slow), first.convert("line")))
-    if made is not None and cost(search, made) < cost(search, model) + search.price:
+    made = fitting.fit(search, spectrum.promote(spectrum.strongest(slow), first.convert("line")))
+    if made is not None and fitting.cost(search, made) < fitting.cost(search, model) + search.price:
         return made
     return model
+
+
+def find_candidates(
+    data: LoopPeriodogram, power: FloatArray, model: FloatArray, *, least: float, most: int
+) -> list[Candidate]:
+    """Find the bands with the most significant excess of power over a model.
+
+    Bands of 1, 2, 4, ... bins are tried everywhere, at steps of a quarter of their width. A band of
+    n values with the mean ratio R of power to model would gain ``n (R - 1 - log R)``.
+    """
+    f, step = data.frequency_hz, data.step_hz
+    ratio = np.cumsum(np.append(0.0, power / model))
+    weight = np.cumsum(np.append(0.0, data.count))
+    found: list[tuple[float, int, int]] = []
+    width = 1
+    while width * step < _WIDEST * f[-1] and width < f.size:
+        starts = np.arange(0, f.size - width + 1, max(1, width // 4))
+        widest = np.maximum(_WIDEST * f[starts + width // 2], 4 * step)
+        starts = starts[width * step <= widest]
+        mean = np.maximum((ratio[starts + width] - ratio[starts]) / width, 1)
+        gain = (weight[starts + width] - weight[starts]) * (mean - 1 - np.log(mean))
+        best = np.argsort(gain)[::-1][: 8 * most]
+        best = best[gain[best] > least]
+        found += [(float(gain[i]), int(starts[i]), int(starts[i]) + width) for i in best]
+        width *= 2
+    apart: list[tuple[float, int, int]] = []
+    for worth, start, stop in sorted(found, reverse=True):
+        reach = max(3, stop - start)
+        if all(start >= b + reach or stop <= a - reach for _, a, b in apart):
+            apart.append((worth, start, stop))
+    return [
+        _measure_excess(data, power, model, start, stop, worth)
+        for worth, start, stop in apart[:most]
+    ]
+
+
+def _measure_excess(
+    data: LoopPeriodogram,
+    power: FloatArray,
+    model: FloatArray,
+    start: int,
+    stop: int,
+    gain: float = 0.0,
+) -> Candidate:
+    """Measure place, half width and variance of the highest excess between two bins."""
+    excess = power[start:stop] - model[start:stop]
+    count = max(1, (stop - start) // 2).bit_length()
+    each = [(2**k, np.convolve(excess, np.ones(2**k) / 2**k, mode="same")) for k in range(count)]
+    # the smoothing at which the peak is highest over its scatter, which falls with its root
+    _, smooth = max(each, key=lambda one: float(np.max(one[1])) * np.sqrt(one[0]))
+    peak = int(np.argmax(smooth))
+    low_enough = np.flatnonzero(smooth <= 0.5 * smooth[peak])
+    low = low_enough[low_enough <= peak].max(initial=0)
+    high = low_enough[low_enough >= peak].min(initial=smooth.size - 1)
+    half = max(0.5 * float(high - low - 1), 0.5) * data.step_hz
+    height = max(float(smooth[peak]), float(np.min(model[start:stop])))
+    return Candidate(
+        frequency_hz=float(data.frequency_hz[start + peak]),
+        half_width_hz=half,
+        variance_nm2=np.pi * half * height,
+        gain=gain,
+    )
+
+
+def _smooth_background(
+    power: FloatArray, frequency_hz: FloatArray, count: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a background without its lines: frequencies, medians over bands, weights, (b,)."""
+    from scipy.special import gammaincinv
+
+    low, high = frequency_hz[0], frequency_hz[-1]
+    edges = np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80))
+    edges = np.unique(np.append(edges, frequency_hz.size))
+    shape = max(float(np.median(count)), 0.5)
+    to_mean = shape / float(gammaincinv(shape, 0.5))
+    bands = [(slice(a, b), to_mean if b - a > 2 else 1.0) for a, b in pairwise(edges)]
+    rows = [
+        (np.mean(frequency_hz[band]), np.median(power[band]) * factor, np.sum(count[band]))
+        for band, factor in bands
+    ]
+    f, d, w = np.array(rows).T
+    return f, d, w

@@ -14,14 +14,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.identification.fit.taper import tukey
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 _FLOOR = 1e-12  # of the mean density: below, there is nothing but rounding
-LONGEST_SEGMENT = 1 << 16
+_LONGEST_SEGMENT = 1 << 16
 SHORTEST_SEGMENT = 256
 
 
@@ -65,18 +66,9 @@ class LoopPeriodogram:
     def merge(self, starts: IntArray) -> LoopPeriodogram:
         """Return the means over groups of neighbours that begin at these indices."""
         size = np.diff(np.append(starts, len(self.frequency_hz)))
-
-        def mean(values: FloatArray) -> FloatArray:
-            return np.asarray(np.add.reduceat(values, starts) / size)
-
-        return replace(
-            self,
-            frequency_hz=mean(self.frequency_hz),
-            measured=mean(self.measured),
-            crossed=mean(self.crossed),
-            corrected=mean(self.corrected),
-            count=np.add.reduceat(self.count, starts),
-        )
+        names = ("frequency_hz", "measured", "crossed", "corrected")
+        means: Any = {name: np.add.reduceat(getattr(self, name), starts) / size for name in names}
+        return replace(self, **means, count=np.add.reduceat(self.count, starts))
 
 
 def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:
@@ -101,32 +93,28 @@ def loop_periodogram(
     length = _segment_length([stop - start for start, stop in stretches])
     starts: list[int] = []
     for start, stop in stretches:
-        many = (stop - start) // length
-        if many:
-            spare = stop - start - many * length
-            starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
-    rows = np.array(starts)[:, None] + np.arange(length)[None, :]
+        many, spare = divmod(stop - start, length)
+        starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
+    rows = np.array(starts)[:, None] + np.arange(length)
     taper = tukey(length - 1)
     size = int(next_fast_len(length - 1, real=True))
     frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
     scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
 
-    def transform(series: FloatArray) -> FloatArray:
+    def transform(series: FloatArray) -> ComplexArray:
         tapered = taper * np.diff(series[rows], axis=1)
         return np.asarray(rfft(tapered, size, axis=1)[:, 1 : (size + 1) // 2])
 
     y = transform(measurement)
-    c = None if correction is None else transform(correction)
-    zero = np.zeros(frequency.size)
+    c = np.zeros_like(y) if correction is None else transform(correction)
     measured = scale * np.mean(np.abs(y) ** 2, axis=0)
-    measured += _FLOOR * np.mean(measured)
     # neighbours of a padded or tapered transform are not independent
     independent = len(starts) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
     return LoopPeriodogram(
         frequency_hz=frequency,
-        measured=measured,
-        crossed=zero if c is None else scale * np.mean((y * c.conj()).real, axis=0),
-        corrected=zero if c is None else scale * np.mean(np.abs(c) ** 2, axis=0),
+        measured=measured + _FLOOR * np.mean(measured),
+        crossed=scale * np.mean((y * c.conj()).real, axis=0),
+        corrected=scale * np.mean(np.abs(c) ** 2, axis=0),
         count=np.full(frequency.size, independent),
         frame_rate_hz=frame_rate_hz,
         resolution_hz=frame_rate_hz / length,
@@ -136,16 +124,9 @@ def loop_periodogram(
 
 def _segment_length(lengths: list[int]) -> int:
     """Return the length of segments that uses most frames, the longest of equal ones."""
-    candidates = sorted(
-        {length // part for length in lengths for part in range(1, 9)} | {LONGEST_SEGMENT}
-    )
-    candidates = [c for c in candidates if SHORTEST_SEGMENT <= c <= LONGEST_SEGMENT]
-    if not candidates:
-        return max(lengths)
-    used = [sum(length // c * c for length in lengths) for c in candidates]
-    most = max(used)
+    parts = {length // part for length in lengths for part in range(1, 9)}
+    c = np.array(sorted(p for p in parts | {_LONGEST_SEGMENT} if p >= SHORTEST_SEGMENT))
+    c = c[c <= _LONGEST_SEGMENT]
+    used = np.sum(np.array(lengths)[:, None] // c * c, axis=0)
     # a tenth of the data is a fair price for a resolution twice as fine
-    worth = [
-        u / most + 0.1 * np.log2(c / LONGEST_SEGMENT) for u, c in zip(used, candidates, strict=True)
-    ]
-    return candidates[int(np.argmax(worth))]
+    return int(c[np.argmax(used / np.max(used) + 0.1 * np.log2(c / _LONGEST_SEGMENT))])

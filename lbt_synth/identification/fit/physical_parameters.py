@@ -55,7 +55,7 @@ def describe_axis(
     density, _, _ = densities(data, spectrum)
     fitted = density.sum(axis=0)
     lines = [
-        _describe_line(search, model, i, covariance, density)
+        _describe_line(search, model, i, errors, covariance, density)
         for i in range(1, len(spectrum.components))
     ]
     background = fitted.copy()
@@ -66,7 +66,7 @@ def describe_axis(
     noise = max(float(np.exp(spectrum.log_noise / 2)), _LEAST_NOISE * innovation)
     return IdentifiedAxis(
         turbulence=_turbulence_process(spectrum, rate),
-        turbulence_fit=_describe_turbulence(spectrum, covariance, rate),
+        turbulence_fit=_describe_turbulence(spectrum, errors, covariance, rate),
         parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
@@ -86,11 +86,16 @@ def describe_axis(
 
 
 def _describe_line(
-    search: Search, model: FittedModel, i: int, covariance: FloatArray, density: FloatArray
+    search: Search,
+    model: FittedModel,
+    i: int,
+    errors: SpectrumModel,
+    covariance: FloatArray,
+    density: FloatArray,
 ) -> IdentifiedLine:
     """Return the resonance of component i, given the ``density`` (1 + parts, f) of each part."""
     data, spectrum = search.data, model.spectrum
-    line, error = spectrum.components[i], standard_errors(spectrum, covariance).components[i]
+    line, error = spectrum.components[i], errors.components[i]
     frequency = line.frequency / data.angle_s
     damping = line.damping_ratio
     damping_error = damping * line.damping_slope * error.damping
@@ -100,9 +105,7 @@ def _describe_line(
         damping = damping_error = finest
     rms = float(np.exp(line.log_power / 2 - spectrum.log_gain))
     by_gain = spectrum.unpack(covariance[GAIN])  # covariances with the gain
-    variance = (
-        by_gain.log_gain - by_gain.components[i].log_power + error.log_power**2 / 4
-    )  # of the logarithm of the rms
+    variance = by_gain.log_gain - by_gain.components[i].log_power + error.log_power**2 / 4
     own = float(np.interp(frequency, data.frequency_hz, density[1 + i]))
     rest = float(np.interp(frequency, data.frequency_hz, density.sum(axis=0))) - own
     narrow = damping < WIDE_DAMPING and own > rest
@@ -136,30 +139,25 @@ def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
 
 
 def _describe_turbulence(
-    spectrum: SpectrumModel, covariance: FloatArray, rate: float
+    spectrum: SpectrumModel, errors: SpectrumModel, covariance: FloatArray, rate: float
 ) -> IdentifiedTurbulence:
     """Return the parameters of the turbulence; the error of its rms is by differences."""
-    alone = spectrum.keep(lambda _: False)
-    theta = alone.pack()
-    covariance = covariance[: theta.size, : theta.size]
+    theta = spectrum.pack()
 
-    def log_rms(change: FloatArray) -> float:
-        return float(np.log(_turbulence_process(alone.unpack(theta + change), rate).rms_nm))
+    def rms(change: FloatArray) -> float:
+        return _turbulence_process(spectrum.unpack(theta + change), rate).rms_nm
 
     steps = _DIFFERENCE * np.eye(theta.size)
-    slope = np.array([log_rms(step) - log_rms(-step) for step in steps]) / (2 * _DIFFERENCE)
-    errors = standard_errors(alone, covariance)
-    turbulence, error = spectrum.components[0], errors.components[0]
-    rms = _turbulence_process(spectrum, rate).rms_nm
-    frequency = turbulence.frequency * rate / (2 * np.pi)
-    corner = float(np.exp(spectrum.log_corner)) * rate / (2 * np.pi) if spectrum.rolls_off else None
+    slope = np.log([rms(step) / rms(-step) for step in steps]) / (2 * _DIFFERENCE)
+    turbulence, error, to_hz = spectrum.components[0], errors.components[0], rate / (2 * np.pi)
+    corner = float(np.exp(spectrum.log_corner)) * to_hz if spectrum.rolls_off else None
     return IdentifiedTurbulence(
-        frequency_hz=frequency,
-        frequency_error_hz=frequency * error.log_frequency,
+        frequency_hz=turbulence.frequency * to_hz,
+        frequency_error_hz=turbulence.frequency * to_hz * error.log_frequency,
         damping=turbulence.damping_ratio,
         damping_error=turbulence.damping_ratio * turbulence.damping_slope * error.damping,
         corner_hz=corner,
         corner_error_hz=None if corner is None else corner * errors.log_corner,
-        rms_nm=rms,
-        rms_error_nm=rms * float(np.sqrt(slope @ covariance @ slope)),
+        rms_nm=rms(np.zeros(theta.size)),
+        rms_error_nm=rms(np.zeros(theta.size)) * float(np.sqrt(slope @ covariance @ slope)),
     )

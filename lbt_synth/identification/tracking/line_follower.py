@@ -109,27 +109,25 @@ class LineFollower:
         shared = (directions @ directions.T) ** 2
         found = list(self._lines)
         for group in self._groups(shared):
-            width_bins = _WIDTH if len(group) == 1 else _WIDTH_BESIDE
+            width_hz = (_WIDTH if len(group) == 1 else _WIDTH_BESIDE) * rate / frames
             searches = []
             for i in group:
                 line = self._lines[i]
                 bins = np.abs(grid - line.frequency_hz) <= self._span_hz
                 if np.count_nonzero(bins) < _LEAST_BINS:
                     return None
-                searches.append(
-                    _LineSearch(
-                        line=line,
-                        frequency_hz=grid[bins],
-                        power=powers[bins, i],
-                        rest=self._background(group, i, grid[bins]),
-                        width_hz=max(line.damping * line.frequency_hz, width_bins * rate / frames),
-                        bin_hz=rate / frames,
-                        frame_rate_hz=rate,
-                    )
+                search = _LineSearch(
+                    line=line,
+                    frequency_hz=grid[bins],
+                    power=powers[bins, i],
+                    rest=self._background(group, i, grid[bins]),
+                    width_hz=max(line.damping * line.frequency_hz, width_hz),
+                    bin_hz=rate / frames,
+                    frame_rate_hz=rate,
                 )
+                searches.append(search)
             if len(group) == 1:
-                alone = _fit_line(searches[0])
-                frequencies = None if alone is None else [alone]
+                frequencies = _fit_alone(searches[0])
             else:
                 frequencies = _fit_neighbours(searches, shared[np.ix_(group, group)])
             if frequencies is None:
@@ -204,11 +202,11 @@ class _LineSearch:
         return float(np.sum(np.log(model) + self.power / model))
 
 
-def _fit_line(search: _LineSearch) -> float | None:
+def _fit_alone(search: _LineSearch) -> list[float] | None:
     """Return the frequency of a line without neighbours [Hz]; None if it is not there."""
     highest = float(search.frequency_hz[np.argmax(search.power / search.rest)])
     found = _fit_peak(search, search.rest, _Peak(highest, 0.0))
-    return found.frequency_hz if found and _is_there(search, search.rest, found) else None
+    return [found.frequency_hz] if found and _is_there(search, search.rest, found) else None
 
 
 def _fit_neighbours(searches: Sequence[_LineSearch], shared: FloatArray) -> list[float] | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -81,6 +82,16 @@ class TrackingUpdate:
 
 class _KeepFilterError(Exception):
     """The reason why the running filter is kept."""
+
+
+@contextmanager
+def _keeping_filter_if(step: str) -> Iterator[None]:
+    """Keep the running filter if a step fails, whatever stops it: the loop goes on."""
+    try:
+        yield
+    except Exception as error:
+        reason = f"the {step} failed: {type(error).__name__}: {error}"
+        raise _KeepFilterError(reason) from error
 
 
 class TrackingController(SwitchedController):
@@ -198,18 +209,7 @@ class TrackingController(SwitchedController):
             reset()
 
     def step(self, y: ArrayLike) -> FloatArray:
-        """Take measurements and return the command, as the base class does; update if it is time.
-
-        Parameters
-        ----------
-        y : (q,) array_like
-            Measurements y(k); where one of them is not finite the command is held.
-
-        Returns
-        -------
-        (m,) ndarray
-            The command u(k).
-        """
+        """Return the command as :meth:`SwitchedController.step` does, and update if it is time."""
         command = super().step(y)
         if self.frames >= self._window and (self.frames - self._window) % self._every == 0:
             self._update(self.frames / self._rate)
@@ -223,7 +223,9 @@ class TrackingController(SwitchedController):
         try:
             found = self._identify_window()
             clock.append(time.perf_counter())
-            designed = self._design_filter(self._extrapolate_lines(found, time_s))
+            plant = self._extrapolate_lines(found, time_s)
+            with _keeping_filter_if("design"):
+                designed = self._make_design(plant)
             clock.append(time.perf_counter())
             self.switch(designed)
         except _KeepFilterError as kept:
@@ -252,10 +254,8 @@ class TrackingController(SwitchedController):
     def _identify_window(self) -> TipTiltPlant:
         """Return the plant of the last window."""
         window = self._clean_window()
-        try:
+        with _keeping_filter_if("fit"):
             found = self._identify(*window)
-        except Exception as error:  # whatever stops a fit, the loop goes on
-            raise _KeepFilterError(f"the fit failed: {type(error).__name__}: {error}") from error
         if found is None:
             raise _KeepFilterError("the fit found no plant")
         if not isinstance(found, TipTiltPlant):
@@ -283,35 +283,21 @@ class TrackingController(SwitchedController):
             measurements = bridge_frames(measurements + seen, wrong) - seen
         return measurements, corrections
 
-    def _design_filter(self, plant: TipTiltPlant) -> FilterDesign:
-        """Return the certified filter of a plant."""
-        try:
-            return self._make_design(plant)
-        except Exception as error:  # as above
-            raise _KeepFilterError(f"the design failed: {type(error).__name__}: {error}") from error
-
     def _extrapolate_lines(self, found: TipTiltPlant, time_s: float) -> TipTiltPlant:
         """Return the plant with its lines as expected halfway to the next update."""
         if not self._extrapolate or not found.vibrations:
             return found
         middle_s = time_s - self._window_s / 2
+        recent_s, ahead_s = middle_s - self._trend_s, time_s + self._update_s / 2
         tracks = match_tracks(self._tracks, found.vibrations)
+        lines = []
         for track, line in zip(tracks, found.vibrations, strict=True):
-            track.add(middle_s, line.frequency_hz, since_s=middle_s - self._trend_s)
-        kept = {id(track) for track in tracks}
-        recent = middle_s - self._trend_s
-        self._tracks = tracks + [
-            old for old in self._tracks if id(old) not in kept and old.time_s[-1] >= recent
-        ]
-        overlap = self._window_s / self._update_s
-        ahead_s = time_s + self._update_s / 2
-        return with_vibrations(
-            found,
-            [
-                _move_line(line, track.frequency_at(ahead_s, overlap=overlap), self._rate)
-                for line, track in zip(found.vibrations, tracks, strict=True)
-            ],
-        )
+            track.add(middle_s, line.frequency_hz, since_s=recent_s)
+            expected = track.frequency_at(ahead_s, overlap=self._window_s / self._update_s)
+            lines.append(_move_line(line, expected, self._rate))
+        every = dict.fromkeys([*tracks, *self._tracks])
+        self._tracks = [track for track in every if track.time_s[-1] >= recent_s]
+        return with_vibrations(found, lines)
 
 
 def _move_line(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:

@@ -63,7 +63,9 @@ def test_modes_of_many():
     assert (seen.diameter_m, seen.source) == (8.0, "night")
     assert lbt.identification.record_from_telemetry(many, modes=[3]).axes == 1
     for bad in ((0, 0), (5,), (0, 1, 2), ()):
-        with pytest.raises(lbt.errors.ProblemError, match="modes must be one or two different numbers below 5"):
+        with pytest.raises(
+            lbt.errors.ProblemError, match="modes must be one or two different numbers below 5"
+        ):
             lbt.identification.record_from_telemetry(many, modes=bad)
 
 

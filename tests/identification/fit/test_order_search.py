@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lbt_synth.identification.fit.line_candidates import find_candidates
+from lbt_synth.identification.fit.order_search import find_candidates
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 
 RATE = 1000.0
