@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -100,7 +100,15 @@ def shape(
             "hardware must be a LoopHardware, such as plant.hardware; got "
             f"{type(hardware).__name__}."
         )
-    specifications = _specification_per_mode(specification, hardware.modes)
+    given: Any = specification
+    given = tuple(given) if isinstance(given, list | tuple) else (given,) * hardware.modes
+    for spec in given:
+        require_instance(spec, Specification)
+    if len(given) != hardware.modes:
+        raise ProblemError(
+            f"give one specification, or one for each of {hardware.modes} modes; got {len(given)}."
+        )
+    specifications: tuple[Specification, ...] = given
     size = integer(functions, "functions", at_least=1, at_most=_MOST_FUNCTIONS)
     common = number(pole, "pole", at_least=0, below=1)
     tolerance = number(loss, "loss", at_least=0)
@@ -137,20 +145,6 @@ def shape(
         long_functions=size,
     )
     return with_certificate(design, "Try more functions, or looser demands.")
-
-
-def _specification_per_mode(
-    specification: Specification | Sequence[Specification], modes: int
-) -> tuple[Specification, ...]:
-    given: Any = specification
-    given = tuple(given) if isinstance(given, list | tuple) else (given,) * modes
-    for spec in given:
-        require_instance(spec, Specification)
-    if len(given) != modes:
-        raise ProblemError(
-            f"give one specification, or one for each of {modes} modes; got {len(given)}."
-        )
-    return cast(tuple[Specification, ...], given)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -212,11 +206,8 @@ class ShapedDesign(Design):
 
     def demand_labels(self) -> tuple[tuple[int, str], ...]:
         """Demands in words: mode, demand."""
-        return tuple(
-            (mode, demand.label)
-            for mode, spec in enumerate(self.specifications)
-            for demand in spec.demands
-        )
+        specs = enumerate(self.specifications)
+        return tuple((mode, demand.label) for mode, spec in specs for demand in spec.demands)
 
     def __repr__(self) -> str:
         """Return one line: what it is, not its matrices."""
@@ -247,9 +238,7 @@ class ShapedDesign(Design):
         whole = controller_from_parameters(hardware, self.parameters)
         difference = controller_difference(self.controller, whole)
         checks += [
-            Check(
-                "controller against its parameters", difference, _SAME, "matrices assembled again"
-            ),
+            Check("controller against its parameters", difference, _SAME, "assembled again"),
             certify_loop(hardware, self.controller),
         ]
         if checks[-1].passed:
@@ -304,15 +293,9 @@ def controller_from_parameters(
     hardware: LoopHardware, parameters: tuple[Controller, ...]
 ) -> Controller:
     """Join the Youla parameters of all modes in the controller of the whole loop."""
-    back = np.linalg.pinv(hardware.sensor)
+    back, out = np.linalg.pinv(hardware.sensor), hardware.projector
     A, B, C, D = (block_diag(*(getattr(p, name) for p in parameters)) for name in "ABCD")
-    whole = Controller(
-        A=A,
-        B=B @ back,
-        C=hardware.projector @ C,
-        D=hardware.projector @ D @ back,
-        dt_s=hardware.dt_s,
-    )
+    whole = Controller(A=A, B=B @ back, C=out @ C, D=out @ D @ back, dt_s=hardware.dt_s)
     return youla_controller(hardware, whole)
 
 

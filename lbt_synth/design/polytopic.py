@@ -15,12 +15,7 @@ from lbt_synth.design.certificate import (
     certify_loop,
     controller_difference,
 )
-from lbt_synth.design.result import (
-    UNCERTIFIED,
-    EstimatorDesign,
-    SolverReport,
-    with_certificate,
-)
+from lbt_synth.design.result import UNCERTIFIED, EstimatorDesign, SolverReport, with_certificate
 from lbt_synth.design.worst_case import bound_worst_error, error_size, search_worst_error
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.riccati.filtering import kalman_riccati
@@ -100,9 +95,8 @@ class PolytopicDesign(EstimatorDesign):
     def recertify(self) -> Certificate:
         """Compute the certificate again from the matrices."""
         interval, norm, predictor = self.interval, self.norm, self.predictor
-        certificate = certify_error(
-            self.error_system(), stability="spectral radius of plant and filter"
-        )
+        stability = "spectral radius of plant and filter"
+        certificate = certify_error(self.error_system(), stability=stability)
         if not certificate.passed:
             return certificate
         bound, worst, limit = self.bound_guaranteed, self.worst_achieved, NORM_TOLERANCE

@@ -108,7 +108,6 @@ def robust(
             terms = tuple(replace(term, sensor_gain=g) for g in gains for term in (air, *lines))
             by_mode[key] = Specification(objective=Total(terms=terms), demands=(*fixed, *further))
         specifications.append(by_mode[key])
-    design = shape(
-        plant.hardware, specifications, functions=functions, pole=pole, states=states, loss=loss
-    )
+    path = plant.hardware
+    design = shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)
     return replace(design, method="robust")

@@ -12,7 +12,7 @@ import heapq
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import fminbound
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
@@ -49,10 +49,8 @@ def search_worst_error(
     sizes = np.array([value for value, _ in found])
     for i in np.argsort(sizes)[-3:]:
         around = grid[max(i - 1, 0)], grid[min(i + 1, _GRID - 1)]
-        refined = minimize_scalar(
-            lambda f: -size(float(f)), bounds=around, method="bounded", options={"xatol": 1e-7}
-        )
-        found.append((-float(refined.fun), float(refined.x)))
+        x, least, *_ = fminbound(lambda f: -size(float(f)), *around, xtol=1e-7, full_output=True)
+        found.append((-float(least), float(x)))
     return max(found)
 
 

@@ -23,6 +23,19 @@ from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.validation import FloatArray
 
 
+def spectral_radii(A: FloatArray) -> FloatArray:
+    """Largest modulus of the eigenvalues of each matrix of a stack, (N,)."""
+    return np.asarray(np.abs(np.linalg.eigvals(A)).max(axis=-1))
+
+
+class LoopVariances(NamedTuple):
+    """What the loops of a block leave, with what tells how far it can be trusted."""
+
+    variances: FloatArray  # (N, w), of each mode's residual
+    residuals: FloatArray  # (N,), relative, of the Lyapunov equations
+    rounding: FloatArray  # (N,), what it may have done to the variances, relative
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopBlock:
     """Closed loops of one bank, from ``[phi_tot, noise]`` to ``[phi_res, u]``."""
@@ -32,6 +45,54 @@ class LoopBlock:
     B: FloatArray  # (N, s, 2 w)
     C: FloatArray  # (N, 2 w, s)
     D: FloatArray  # (N, 2 w, 2 w)
+
+    @property
+    def width(self) -> int:
+        """Number of modes w of each loop."""
+        return int(self.modes.shape[1])
+
+    @property
+    def spectral_radii(self) -> FloatArray:
+        """Spectral radius of each loop, (N,)."""
+        return spectral_radii(self.A)
+
+    def variances(
+        self, turbulence: ModalTurbulence, lines: Lines, noise_nm: FloatArray
+    ) -> LoopVariances:
+        """Exact variances under models and white noise: Lyapunov equations of loops and models.
+
+        The variances are small differences where a process is nearly a random walk.
+        """
+        count, w = self.modes.shape
+        n = self.A.shape[-1]
+        models, drives, rows = disturbances(turbulence, lines, self.modes.ravel())
+        k, p = drives.shape[1:]
+        models, drives = models.reshape(count, w, k, k), drives.reshape(count, w, k, p)
+        rows = rows.reshape(count, w, 1, k)
+        A = np.zeros((count, n + w * k, n + w * k))
+        B = np.zeros((count, n + w * k, w + w * p))
+        C, D = np.zeros((count, w, n + w * k)), np.zeros((count, w, w + w * p))
+        noise = noise_nm[self.modes][:, None, :]
+        A[:, :n, :n], C[..., :n] = self.A, self.C[:, :w]
+        B[:, :n, :w], D[..., :w] = self.B[..., w:] * noise, self.D[:, :w, w:] * noise
+        for i in range(w):
+            x, v = slice(n + i * k, n + (i + 1) * k), slice(w + i * p, w + (i + 1) * p)
+            A[:, :n, x] = self.B[..., i : i + 1] @ rows[:, i]
+            C[..., x] = self.D[:, :w, i : i + 1] @ rows[:, i]
+            A[:, x, x], B[:, x, v] = models[:, i], drives[:, i]
+        P, residuals = stationary_covariances(A, B @ transpose(B))
+        output = C @ P @ transpose(C) + D @ transpose(D)
+        variances = np.diagonal(output, axis1=-2, axis2=-1).copy()
+        sizes = np.abs(C) @ np.abs(P) @ np.abs(transpose(C))
+        sizes = np.diagonal(sizes, axis1=-2, axis2=-1) + np.sum(D**2, axis=-1)
+        small = np.finfo(float).tiny  # no disturbance: 0, and nothing is lost
+        rounding = np.finfo(float).eps * np.max(sizes / np.maximum(variances, small), axis=-1)
+        return LoopVariances(variances, residuals, np.asarray(rounding))
+
+    def phase_system(self, outputs: int) -> BatchedSystems:
+        """Return the systems from the phase to the first outputs, the residual first."""
+        w = self.width
+        return BatchedSystems(self.A, self.B[..., :w], self.C[:, :outputs], self.D[:, :outputs, :w])
 
 
 def close_bank(bank: Bank, sensor_gain: FloatArray, mirror: Response) -> LoopBlock:
@@ -52,65 +113,11 @@ def close_bank(bank: Bank, sensor_gain: FloatArray, mirror: Response) -> LoopBlo
     return LoopBlock(bank.modes, A0 + factor * A1, B, C, D[:, part])
 
 
-def spectral_radii(A: FloatArray) -> FloatArray:
-    """Largest modulus of the eigenvalues of each matrix of a stack, (N,)."""
-    return np.asarray(np.abs(np.linalg.eigvals(A)).max(axis=-1))
-
-
-class LoopVariances(NamedTuple):
-    """What the loops of a block leave, with what tells how far it can be trusted."""
-
-    variances: FloatArray  # (N, w), of each mode's residual
-    residuals: FloatArray  # (N,), relative, of the Lyapunov equations
-    rounding: FloatArray  # (N,), what it may have done to the variances, relative
-
-
-def block_variances(
-    block: LoopBlock, turbulence: ModalTurbulence, lines: Lines, noise_nm: FloatArray
-) -> LoopVariances:
-    """Exact variances under models and white noise: Lyapunov equations of loops and models.
-
-    The variances are small differences where a process is nearly a random walk.
-    """
-    count, w = block.modes.shape
-    n = block.A.shape[-1]
-    models, drives, rows = disturbances(turbulence, lines, block.modes.ravel())
-    k, p = drives.shape[1:]
-    models, drives = models.reshape(count, w, k, k), drives.reshape(count, w, k, p)
-    rows = rows.reshape(count, w, 1, k)
-    A = np.zeros((count, n + w * k, n + w * k))
-    B = np.zeros((count, n + w * k, w + w * p))
-    C, D = np.zeros((count, w, n + w * k)), np.zeros((count, w, w + w * p))
-    noise = noise_nm[block.modes][:, None, :]
-    A[:, :n, :n], C[..., :n] = block.A, block.C[:, :w]
-    B[:, :n, :w], D[..., :w] = block.B[..., w:] * noise, block.D[:, :w, w:] * noise
-    for i in range(w):
-        x, v = slice(n + i * k, n + (i + 1) * k), slice(w + i * p, w + (i + 1) * p)
-        A[:, :n, x] = block.B[..., i : i + 1] @ rows[:, i]
-        C[..., x] = block.D[:, :w, i : i + 1] @ rows[:, i]
-        A[:, x, x], B[:, x, v] = models[:, i], drives[:, i]
-    P, residuals = stationary_covariances(A, B @ transpose(B))
-    output = C @ P @ transpose(C) + D @ transpose(D)
-    variances = np.diagonal(output, axis1=-2, axis2=-1).copy()
-    sizes = np.abs(C) @ np.abs(P) @ np.abs(transpose(C))
-    sizes = np.diagonal(sizes, axis1=-2, axis2=-1) + np.sum(D**2, axis=-1)
-    small = np.finfo(float).tiny  # no disturbance: 0, and nothing is lost
-    rounding = np.finfo(float).eps * np.max(sizes / np.maximum(variances, small), axis=-1)
-    return LoopVariances(variances, residuals, np.asarray(rounding))
-
-
-def phase_system(block: LoopBlock, outputs: int) -> BatchedSystems:
-    """Return the systems of a block from the phase to its first outputs, the residual first."""
-    w = block.modes.shape[1]
-    return BatchedSystems(block.A, block.B[..., :w], block.C[:, :outputs], block.D[:, :outputs, :w])
-
-
 def filter_phase(
     blocks: tuple[LoopBlock, ...],
     systems: tuple[BatchedSystems, ...],
     total: FloatArray,
     scaled: FloatArray,
-    *,
     with_commands: bool,
 ) -> tuple[FloatArray, FloatArray | None]:
     """Return the residuals of all modes, and the commands on request.
@@ -127,9 +134,9 @@ def filter_phase(
             return only, None
     series = [np.empty(total.shape) for _ in range(2 if with_commands else 1)]
     for block, system in zip(blocks, systems, strict=True):
-        w = block.modes.shape[1]
+        w = block.width
         if with_commands:
-            system = phase_system(block, 2 * w)
+            system = block.phase_system(2 * w)
         out = system.filter(_effective_phase(block, total, scaled))[:, 1:]
         for i in range(w):
             which = _index(block.modes[:, i])

@@ -5,7 +5,7 @@ The certificate goes by other means than the Riccati equation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,16 +19,11 @@ from lbt_synth.design.certificate import (
     Check,
 )
 from lbt_synth.design.modal.banks import Bank, RunningBanks
-from lbt_synth.design.modal.closed_loops import (
-    LoopBlock,
-    LoopVariances,
-    block_variances,
-    close_bank,
-    spectral_radii,
-)
+from lbt_synth.design.modal.closed_loops import LoopBlock, LoopVariances, close_bank, spectral_radii
 from lbt_synth.design.modal.plants import (
     Lines,
     PlantBatch,
+    Vibrations,
     as_modal_turbulence,
     lines_per_mode,
     number_per_mode,
@@ -40,7 +35,7 @@ from lbt_synth.linear import Controller, DareSolution, solve_dare
 from lbt_synth.linear.batched import frobenius_norms, transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
+from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray, frozen_copy, integer, read_only
 
 _STABLE = 1 - STABILITY_MARGIN
@@ -180,7 +175,7 @@ def modal_filters(
     turbulence: ModalTurbulence | Sequence[ARModel],
     *,
     noise_nm: Any,
-    vibrations: Mapping[int, Vibration | Sequence[Vibration]] | None = None,
+    vibrations: Vibrations | None = None,
     delay_frames: float = 2.0,
     sensor_gain: Any = 1.0,
     mirror: PositionLoop | None = None,
@@ -254,7 +249,7 @@ def modal_filters(
         gains = np.array(transpose(solution.gain_feedback))
         matrices = batch.controllers(gains, response)
         block = close_bank(Bank(modes[:, None], *matrices), gain, response)
-        left = block_variances(block, air, lines, noise)
+        left = block.variances(air, lines, noise)
         found = batch_errors(batch, gains, solution, (block, left), applied=applied)
         errors[:, modes], estimation_nm2[modes] = found
         states[modes], residual_nm2[modes] = batch.A.shape[-1], left.variances[:, 0]
@@ -329,7 +324,7 @@ def batch_errors(
     last = np.abs(left.variances[:, 0] - lyapunov) / lyapunov if applied else left.rounding
     rows = (
         spectral_radii(A),
-        spectral_radii(block.A),
+        block.spectral_radii,
         solution.residuals,
         residuals,
         np.abs(lyapunov - riccati) / riccati,

@@ -8,7 +8,7 @@ the grid's points the residual, times its distance from the stability limit, is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,21 +17,14 @@ from numpy.polynomial.polynomial import polyadd, polyval
 from scipy.special import comb
 
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
-from lbt_synth.design.modal.plants import lines_per_mode, number_per_mode
+from lbt_synth.design.modal.plants import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import distinct_edges, pole_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.models import (
-    ARModel,
-    LoopHardware,
-    ModalTurbulence,
-    PositionLoop,
-    Spectrum,
-    Vibration,
-)
+from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Spectrum
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, number, read_only
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, read_only
 
 Density = Callable[[FloatArray], FloatArray]
 
@@ -84,7 +77,7 @@ def modal_gains(
     *,
     noise_nm: Any,
     frame_rate_hz: float,
-    vibrations: Mapping[int, Vibration | Sequence[Vibration]] | None = None,
+    vibrations: Vibrations | None = None,
     delay_frames: float = 2.0,
     sensor_gain: Any = 1.0,
     margin: float = 0.001,
@@ -235,9 +228,8 @@ def find_gains(
     # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
     path_taps = np.append(0.0, taps)
     poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
-    edges = distinct_edges(
-        np.concatenate([[0.0], np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), own_edges])
-    )
+    grid = [np.zeros(1), np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), own_edges]
+    edges = distinct_edges(np.concatenate(grid))
     last: tuple[FloatArray, FloatArray] | None = None
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
@@ -268,9 +260,9 @@ def find_gains(
     allowed = highest / gain
     gains = np.minimum(best / gain, allowed)
     return ModalGains(
-        gains=frozen_copy(gains),
-        rms_nm=frozen_copy(np.sqrt(variance)),
-        limit=frozen_copy(allowed),
+        gains=read_only(gains),
+        rms_nm=read_only(np.sqrt(variance)),
+        limit=read_only(allowed),
         limited=read_only(gains > allowed * (1 - 1e-6)),
         noise_nm=noise,
         delay_frames=path.delay_frames,
@@ -283,9 +275,8 @@ def _checked(spectra: FloatArray, differenced: bool) -> FloatArray:
     sound = np.isfinite(spectra) & ((spectra >= 0) | differenced)
     wrong = np.flatnonzero(~sound.all(axis=1))
     if wrong.size:
-        raise ProblemError(
-            f"every spectrum must be finite and at least 0; that of mode {wrong[0]} is not."
-        )
+        which = f"that of mode {wrong[0]} is not"
+        raise ProblemError(f"every spectrum must be finite and at least 0; {which}.")
     return spectra
 
 

@@ -5,24 +5,22 @@ The frames are those of :class:`LoopHardware` with a unit sensor and mirror.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.design.certificate import RESIDUAL_TOLERANCE, VARIANCE_TOLERANCE
-from lbt_synth.design.modal.closed_loops import (
-    LoopBlock,
-    block_variances,
-    close_bank,
-    filter_phase,
-    phase_system,
-    spectral_radii,
-)
+from lbt_synth.design.modal.closed_loops import LoopBlock, close_bank, filter_phase
 from lbt_synth.design.modal.filters import ModalFilters
 from lbt_synth.design.modal.mixed_controller import MixedController
-from lbt_synth.design.modal.plants import as_modal_turbulence, lines_per_mode, number_per_mode
+from lbt_synth.design.modal.plants import (
+    Vibrations,
+    as_modal_turbulence,
+    lines_per_mode,
+    number_per_mode,
+)
 from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import (
     DimensionError,
@@ -33,16 +31,8 @@ from lbt_synth.errors import (
 )
 from lbt_synth.linear.block_filtering import BatchedSystems
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Vibration
-from lbt_synth.validation import (
-    FloatArray,
-    float_array,
-    frozen_copy,
-    integer,
-    number,
-    read_only,
-    real_array,
-)
+from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop
+from lbt_synth.validation import FloatArray, float_array, integer, number, read_only, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,7 +118,7 @@ class ModalLoop:
         turbulence: ModalTurbulence | Sequence[ARModel],
         *,
         noise_nm: Any,
-        vibrations: Mapping[int, Vibration | Sequence[Vibration]] | None = None,
+        vibrations: Vibrations | None = None,
     ) -> FloatArray:
         """Exact stationary residual of each mode, by Lyapunov equations.
 
@@ -167,7 +157,7 @@ class ModalLoop:
         lines = lines_per_mode(vibrations, self.n_modes)
         out = np.zeros(self.n_modes)
         for block in self.blocks:
-            left = block_variances(block, air, lines, noise)
+            left = block.variances(air, lines, noise)
             for what, error, limit in (
                 ("the residual of the Lyapunov equation", left.residuals, RESIDUAL_TOLERANCE),
                 ("rounding of the variance", left.rounding, VARIANCE_TOLERANCE),
@@ -182,7 +172,7 @@ class ModalLoop:
                         residual=float(np.max(error)),
                     )
             out[block.modes] = np.sqrt(np.maximum(left.variances, 0))
-        return frozen_copy(out)
+        return read_only(out)
 
     def run(
         self, total_nm: Any, noise_nm: Any, *, settle_frames: int = 0, all_series: bool = False
@@ -233,14 +223,12 @@ class ModalLoop:
         frames = total.shape[1]
         settle = integer(settle_frames, "settle_frames", at_least=0)
         if not settle < frames:
-            raise ProblemError(
-                f"there must be more frames than settle_frames; got {frames} and {settle}."
-            )
+            got = f"{frames} and {settle}"
+            raise ProblemError(f"there must be more frames than settle_frames; got {got}.")
         scaled = noise if np.all(self.sensor_gain == 1) else noise / self.sensor_gain[:, None]
         with np.errstate(all="ignore"):  # what is not finite is refused below
-            residual, commands = filter_phase(
-                self.blocks, self.systems, total, scaled, with_commands=all_series
-            )
+            systems = self.systems
+            residual, commands = filter_phase(self.blocks, systems, total, scaled, all_series)
         measurements = noise.copy() if all_series else None
         if measurements is not None:
             measurements[:, 1:] += self.sensor_gain[:, None] * residual[:, :-1]
@@ -254,7 +242,7 @@ class ModalLoop:
             name: None if each is None else read_only(each)[:, settle:]
             for name, each in named.items()
         }
-        return ModalRun(**series, rms_nm=frozen_copy(rms))
+        return ModalRun(**series, rms_nm=read_only(rms))
 
 
 def modal_loop(
@@ -324,15 +312,15 @@ def modal_loop(
     blocks = tuple(close_bank(bank, gain, response) for bank in controller.banks())
     radii = np.zeros(n)
     for block in blocks:
-        radii[block.modes] = spectral_radii(block.A)[:, None]
+        radii[block.modes] = block.spectral_radii[:, None]
     return ModalLoop(
         delay_frames=hardware.delay_frames,
         frame_rate_hz=rate,
         mirror=hardware.mirror,
         sensor_gain=gain,
-        spectral_radii=frozen_copy(radii),
+        spectral_radii=read_only(radii),
         blocks=blocks,
-        systems=tuple(phase_system(block, block.modes.shape[1]) for block in blocks),
+        systems=tuple(block.phase_system(block.width) for block in blocks),
     )
 
 

@@ -82,9 +82,7 @@ class MixedController:
     def __post_init__(self) -> None:
         gains = real_array(self.gains, "gains")
         if gains.ndim != 1 or gains.size == 0:
-            raise DimensionError(
-                f"gains must be a list, one number per mode; got shape {gains.shape}."
-            )
+            raise DimensionError(f"gains must be a list, one per mode; got shape {gains.shape}.")
         n = gains.size
         self.gains = number_per_mode(gains, "gains", n, zero=True)
         self.leak = number_per_mode(self.leak, "leak", n, zero=True, at_most=1)
@@ -191,11 +189,9 @@ class MixedController:
         ProblemError
             If y or the commands of the filter are no real numbers.
         """
-        measured = float_array(y, "y")
-        if measured.shape != (self.n_measurements,):
-            raise DimensionError(
-                f"y must have shape ({self.n_measurements},); got {measured.shape}."
-            )
+        measured, shape = float_array(y, "y"), (self.n_measurements,)
+        if measured.shape != shape:
+            raise DimensionError(f"y must have shape {shape}; got {measured.shape}.")
         if self.reconstructor is not None:
             measured = self.reconstructor.matrix @ measured
         if not np.isfinite(measured).all():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.models.vibration.resonance import sampled_lines
 from lbt_synth.validation import FloatArray, frozen_copy, integer, real_array
 
-Lines = tuple[tuple[Vibration, ...], ...]
+Lines: TypeAlias = tuple[tuple[Vibration, ...], ...]
+Vibrations: TypeAlias = Mapping[int, Vibration | Sequence[Vibration]]  # of some modes
 
 
 def number_per_mode(
@@ -24,9 +25,8 @@ def number_per_mode(
     """Return one positive number per mode, (n,), from one for all or one each."""
     given = real_array(value, name)
     if given.shape not in ((), (modes,)):
-        raise DimensionError(
-            f"{name} must be one number, or one per mode ({modes}); got shape {given.shape}."
-        )
+        got = f"shape {given.shape}"
+        raise DimensionError(f"{name} must be one number, or one per mode ({modes}); got {got}.")
     low, high = float(np.min(given, initial=np.inf)), float(np.max(given, initial=-np.inf))
     if low < 0 or (low == 0 and not zero) or high > at_most:
         bounds = f"{'at least' if zero else 'above'} 0"
@@ -46,9 +46,7 @@ def as_modal_turbulence(
     return air
 
 
-def lines_per_mode(
-    vibrations: Mapping[int, Vibration | Sequence[Vibration]] | None, modes: int
-) -> Lines:
+def lines_per_mode(vibrations: Vibrations | None, modes: int) -> Lines:
     """Return the vibrations of each mode, from a mapping of some modes."""
     lines: list[tuple[Vibration, ...]] = [()] * modes
     vibrations = {} if vibrations is None else vibrations

@@ -107,9 +107,7 @@ def reconstructor(
     D = matrix(interaction_matrix, "interaction_matrix")
     q, n = D.shape
     if q == 0 or n == 0:
-        raise DimensionError(
-            f"interaction_matrix must have at least one row and one column; got {D.shape}."
-        )
+        raise DimensionError(f"interaction_matrix must have rows and columns; got {D.shape}.")
     size = np.linalg.norm(D, axis=0)
     invisible = np.flatnonzero(size <= q * np.finfo(float).eps * size.max())
     if invisible.size:
@@ -223,9 +221,8 @@ def project_out(
     size, before = np.linalg.norm(left, axis=0), np.linalg.norm(rest, axis=0)
     gone = others[size <= _EMPTY * before]
     if gone.size:
-        raise ProblemError(
-            f"nothing is left of {name_modes(gone)} without the removed ones. Leave them out."
-        )
+        names = name_modes(gone)
+        raise ProblemError(f"nothing is left of {names} without the removed ones. Leave them out.")
     overlap = np.abs(base.T @ left) / np.outer(np.linalg.norm(base, axis=0), size)
     if overlap.size and overlap.max() > 1e-6:
         raise NumericalError(
@@ -237,15 +234,13 @@ def project_out(
     return frozen_copy(out)
 
 
-def mode_indices(indices: Any, name: str, modes: int) -> np.ndarray:
+def mode_indices(indices: Any, name: str, n: int) -> np.ndarray:
     """Return different mode numbers from 0 to n - 1 as an integer array."""
     if isinstance(indices, str | bytes) or not np.iterable(indices):
         raise ProblemError(f"{name} must be a list of mode numbers; got {indices!r}.")
     out = [integer(index, name, at_least=0) for index in indices]
-    if len(set(out)) != len(out) or any(index >= modes for index in out):
-        raise ProblemError(
-            f"{name} must be different mode numbers from 0 to {modes - 1}; got {out}."
-        )
+    if len(set(out)) != len(out) or any(index >= n for index in out):
+        raise ProblemError(f"{name} must be different mode numbers from 0 to {n - 1}; got {out}.")
     return np.array(out, dtype=np.intp)
 
 

@@ -125,9 +125,8 @@ def modal_gains_from_telemetry(
             f"mirror; got {frames}. Record more, or shorten segment_frames."
         )
     open_loop = y[:, first:] / gain[:, None] + past_corrections(taps, u.T)[first:].T
-    frequency, power = welch(
-        np.diff(open_loop, axis=1), fs=rate, nperseg=segment, axis=1, detrend=False
-    )
+    steps = np.diff(open_loop, axis=1)
+    frequency, power = welch(steps, fs=rate, nperseg=segment, axis=1, detrend=False)
     power[:, 0] *= 2  # one-sided as the others
     if segment % 2 == 0:
         power[:, -1] *= 2
@@ -144,9 +143,7 @@ def modal_gains_from_telemetry(
 
     def density(wanted: FloatArray) -> FloatArray:
         left = np.clip(np.searchsorted(frequency, wanted) - 1, 0, frequency.size - 2)
-        part = np.clip(
-            (wanted - frequency[left]) / (frequency[left + 1] - frequency[left]), 0.0, 1.0
-        )
+        part = np.clip((wanted - frequency[left]) / np.diff(frequency)[left], 0.0, 1.0)
         return np.asarray(table[:, left] * (1 - part) + table[:, left + 1] * part)
 
     edges = 2 * frequency / rate

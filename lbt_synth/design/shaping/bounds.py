@@ -12,13 +12,7 @@ import numpy as np
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import (
-    BAND_LEVEL_SETS,
-    LEVEL_SETS,
-    ROOM,
-    Band,
-    discs,
-)
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, discs
 from lbt_synth.design.shaping.frequency_grid import Grid, spectrum_edges
 from lbt_synth.design.shaping.objectives import ResidualVariance
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
@@ -159,10 +153,8 @@ class Attenuation(Band):
     @property
     def label(self) -> str:
         """What a message calls it."""
-        return (
-            f"attenuation to {self.at_most:g} in {self.band_text} "
-            f"at sensor gain {self.sensor_gain:g}"
-        )
+        band, gain = self.band_text, self.sensor_gain
+        return f"attenuation to {self.at_most:g} in {band} at sensor gain {gain:g}"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
@@ -180,7 +172,7 @@ class Attenuation(Band):
         """Check the real loop."""
         name = f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}"
         peak = self.peak(loop.at(self.sensor_gain).rejection())
-        return (Check(name, peak, self.at_most, BAND_LEVEL_SETS),)
+        return (self.check(name, peak, self.at_most),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -52,9 +52,8 @@ class Basis:
 
     def parameter(self, coefficients: FloatArray) -> Controller:
         """Return the filter ``sum of c_i Phi_i`` in new-state form."""
-        return Controller(
-            A=self.A, B=self.B, C=coefficients[None, :], D=np.zeros((1, 1)), dt_s=self.dt_s
-        )
+        C = coefficients[None, :]
+        return Controller(A=self.A, B=self.B, C=C, D=np.zeros((1, 1)), dt_s=self.dt_s)
 
 
 def orthonormal_basis(poles: ComplexArray, *, dt_s: float) -> Basis:
@@ -71,9 +70,7 @@ def orthonormal_basis(poles: ComplexArray, *, dt_s: float) -> Basis:
     given = np.atleast_1d(np.asarray(poles, dtype=np.complex128))
     radius = float(np.max(np.abs(given)))
     if not radius < 1:
-        raise ProblemError(
-            f"the poles of a basis must lie inside the unit circle; got a modulus of {radius:.9g}."
-        )
+        raise ProblemError(f"poles must lie inside the unit circle; got a modulus of {radius:.9g}.")
     tiny = 1e-13
     chosen = sorted((p for p in given if p.imag >= -tiny), key=abs)
     A, B = np.zeros((0, 0)), np.zeros((0, 1))

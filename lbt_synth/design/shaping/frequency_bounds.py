@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.design.certificate import Check
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.convex_functions import Discs
 from lbt_synth.linear.norms import band_norm
@@ -13,7 +14,6 @@ from lbt_synth.validation import ComplexArray, FloatArray, number, set_fields
 
 ROOM = 1e-3  # part of a bound that the programme leaves for what lies between its points
 LEVEL_SETS = "level sets, all frequencies"
-BAND_LEVEL_SETS = "level sets, all of the band"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +41,10 @@ class Band:
     def peak(self, system: StateSpace) -> float:
         """Return an upper bound of a system's largest gain in the band, by level sets."""
         return band_norm(system, self.low_hz, self.high_hz).upper
+
+    def check(self, name: str, peak: float, limit: float) -> Check:
+        """Return the check of a peak in the band."""
+        return Check(name, peak, limit, "level sets, all of the band")
 
 
 def discs(frequency_hz: FloatArray, rows: ComplexArray, centre: float, radius: float) -> Discs:

@@ -74,10 +74,8 @@ def fine_frequencies(channel: Channel, count: int) -> FloatArray:
     centres, widths = np.abs(np.angle(poles)) / (2 * np.pi), (1 - np.abs(poles)) / (2 * np.pi)
     offsets = np.linspace(-3, 3, 13)
     near = (centres[:, None] + widths[:, None] * offsets).ravel()
-    return (
-        np.unique(np.clip(np.concatenate([even, low, near]), 0, 0.5))
-        * channel.hardware.frame_rate_hz
-    )
+    turns = np.unique(np.clip(np.concatenate([even, low, near]), 0, 0.5))
+    return turns * channel.hardware.frame_rate_hz
 
 
 def spectrum_edges(spectrum: Spectrum | None, nyquist_hz: float) -> FloatArray:

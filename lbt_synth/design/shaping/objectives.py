@@ -75,9 +75,8 @@ class ResidualVariance:
         density = np.zeros(f.size) if self.turbulence is None else self.turbulence.psd(f)
         size = np.sqrt(w * density)
         noise = self.noise_nm * np.sqrt(w / channel.nyquist_hz)
-        rows = np.stack(
-            [-size[:, None] * complementary, noise[:, None] * channel.noise_rows(f)], axis=1
-        )
+        noise_rows = noise[:, None] * channel.noise_rows(f)
+        rows = np.stack([-size[:, None] * complementary, noise_rows], axis=1)
         centres = np.stack([size, np.zeros(f.size)], axis=1).astype(np.complex128)
         return Fractions(
             frequency_hz=f,

@@ -130,12 +130,10 @@ class _Programme:
                 residual=float(self._excess.size),
             )
         self.solved += 1
-        constraints = _merged(self.groups)
-        c, self.status = minimize(
-            function, constraints, size=self.size, scale=self.scale, start=start
-        )
+        held = _merged(self.groups)
+        c, self.status = minimize(function, held, size=self.size, scale=self.scale, start=start)
         if c is None:
-            raise _infeasibility_error(self.specification, self.groups, self.size, self.status)
+            raise _infeasibility_error(self)
         return c
 
     def is_stable(self, c: FloatArray) -> bool:
@@ -153,19 +151,27 @@ class _Programme:
 
     def _find_excess(self, c: FloatArray) -> FloatArray:
         """Frequencies at which bounds, or the programme's own worst cases, are exceeded [Hz]."""
-        limits = tuple(
-            leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf
-            for leaf in leaf_fractions(self.function)
-        )
-        found = _peaks_above(self._fine, limits, c, 1 + ROOM / 2)
-        if found.size:
-            return found[:, 1]
+        leaves = leaf_fractions(self.function)
+        limits = [leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf for leaf in leaves]
+
+        def peaks(fine: tuple[Function, tuple[Constraint, ...]], level: float) -> FloatArray:
+            """Local peaks above a level of their limits, each between its neighbours, (k, 3)."""
+            bounds = [bound for bound in fine[1] if isinstance(bound, Discs | HalfPlanes)]
+            found = [_local_peaks(bound.frequency_hz, bound.use(c), level) for bound in bounds]
+            found += [
+                _local_peaks(leaf.frequency_hz, leaf.values(c), limit * level)
+                for leaf, limit in zip(leaf_fractions(fine[0]), limits, strict=True)
+                if leaf.worst
+            ]
+            return np.unique(np.concatenate([np.zeros((0, 3)), *found]), axis=0)
+
+        found = peaks(self._fine, 1 + ROOM / 2)
+        close = found if found.size else peaks(self._fine, _CLOSE)
+        if found.size or not close.size:
+            return close[:, 1]
         # between the neighbours of what comes close
-        close = _peaks_above(self._fine, limits, c, _CLOSE)
-        if not close.size:
-            return np.zeros(0)
         finer = self._between(np.unique(np.linspace(close[:, 0], close[:, 2], _BETWEEN)))
-        return _peaks_above(finer, limits, c, 1 + ROOM / 2)[:, 1]
+        return peaks(finer, 1 + ROOM / 2)[:, 1]
 
     def _between(self, points_hz: FloatArray) -> tuple[Function, tuple[Constraint, ...]]:
         """Return the objective and the constraints at other points."""
@@ -178,26 +184,6 @@ def _merged(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...
     return merge_constraints(tuple(constraint for group in groups for constraint in group))
 
 
-def _peaks_above(
-    fine: tuple[Function, tuple[Constraint, ...]],
-    limits: tuple[float, ...],
-    c: FloatArray,
-    level: float,
-) -> FloatArray:
-    """Local peaks above a level of their limits, each between its neighbours, (k, 3)."""
-    bounds = [
-        _local_peaks(constraint.frequency_hz, constraint.use(c), level)
-        for constraint in fine[1]
-        if isinstance(constraint, Discs | HalfPlanes)
-    ]
-    worst = [
-        _local_peaks(leaf.frequency_hz, leaf.values(c), limit * level)
-        for leaf, limit in zip(leaf_fractions(fine[0]), limits, strict=True)
-        if leaf.worst
-    ]
-    return np.unique(np.concatenate([np.zeros((0, 3)), *bounds, *worst]), axis=0)
-
-
 def _local_peaks(frequency_hz: FloatArray, values: FloatArray, limit: float) -> FloatArray:
     """Local peaks above a limit, with the frequencies before and after each, (k, 3)."""
     order = np.argsort(frequency_hz, kind="stable")
@@ -208,26 +194,23 @@ def _local_peaks(frequency_hz: FloatArray, values: FloatArray, limit: float) -> 
     return np.stack([f[before], f[at], f[after]], axis=1)
 
 
-def _infeasibility_error(
-    specification: Specification,
-    groups: tuple[tuple[Constraint, ...], ...],
-    size: int,
-    status: str,
-) -> InfeasibleError | NumericalError:
+def _infeasibility_error(programme: _Programme) -> InfeasibleError | NumericalError:
     """Error that names a smallest set of demands that cannot hold, and how far each is off."""
     from lbt_synth.linear.lmi.conic_program import minimize_relaxation
+
+    groups, size = programme.groups, programme.size
 
     def relaxations(chosen: list[int], relaxed: Container[int]) -> FloatArray:
         rigid = tuple(i not in relaxed for i in chosen)
         return minimize_relaxation(tuple(groups[i] for i in chosen), size=size, rigid=rigid)
 
-    labels = [demand.label for demand in specification.demands]
+    labels = [demand.label for demand in programme.specification.demands]
     core = list(range(len(groups)))
     if not groups or np.max(relaxations(core, core)) <= _RELAXED:
         return NumericalError(
-            f"the programme of the shaped loop ended as {status!r}; expected an optimum. Try "
-            "another number of functions.",
-            status=status,
+            f"the programme of the shaped loop ended as {programme.status!r}; expected an optimum. "
+            "Try another number of functions.",
+            status=programme.status,
         )
     for candidate in range(len(groups)):  # a demand without which the rest still clashes may go
         rest = [i for i in core if i != candidate]

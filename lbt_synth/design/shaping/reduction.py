@@ -75,11 +75,17 @@ def reduce_poles(
         fewer = drop_cheapest_pair(response, candidates[-1])
         candidates.append(fit_poles(response, fewer)[0])
 
-    def attempt(index: int) -> tuple[ModeSolution | None, float]:
-        found = _solve_with_poles(spec, long.sequence, candidates[index], response)
-        return found, np.inf if found is None else found.objective_nm / long.objective_nm - 1
+    def attempt(poles: ComplexArray) -> tuple[ModeSolution | None, float]:
+        """Solve with given poles, from the fit of the response; return the relative loss, too."""
+        channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
+        start = response.coefficients(channel.command_rows(long.sequence.grid.nodes_hz))
+        try:
+            found = solve_mode(spec, channel, start=start)
+        except (InfeasibleError, NumericalError):
+            return None, np.inf
+        return found, found.objective_nm / long.objective_nm - 1
 
-    accepted, loss = attempt(0)
+    accepted, loss = attempt(candidates[0])
     if accepted is None or loss > tolerance:
         best = f"the best lost {100 * loss:.3g} %" if np.isfinite(loss) else "none was feasible"
         raise InfeasibleError(
@@ -91,25 +97,12 @@ def reduce_poles(
     kept, failed = 0, len(candidates)
     while failed - kept > 1:  # fewer poles lose more: bisection
         middle = (kept + failed) // 2
-        found, loss = attempt(middle)
+        found, loss = attempt(candidates[middle])
         if found is not None and loss <= tolerance:
             kept, accepted = middle, found
         else:
             failed = middle
     return accepted
-
-
-def _solve_with_poles(
-    spec: Specification, long: SequenceSolution, poles: ComplexArray, response: WeightedResponse
-) -> ModeSolution | None:
-    """Solve the specification with given poles, from the fit of a response; None if it fails."""
-    hardware = long.channel.hardware
-    channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
-    start = response.coefficients(channel.command_rows(long.grid.nodes_hz))
-    try:
-        return solve_mode(spec, channel, start=start)
-    except (InfeasibleError, NumericalError):
-        return None
 
 
 def _response_to_fit(spec: Specification, long: SequenceSolution) -> WeightedResponse:

@@ -24,9 +24,8 @@ class SingleModeLoop:
     def at(self, sensor_gain: float) -> ClosedLoop:
         """Return the loop at a sensor gain."""
         if sensor_gain not in self._loops:
-            self._loops[sensor_gain] = close_loop(
-                self.hardware, self.controller, sensor_gain=sensor_gain
-            )
+            loop = close_loop(self.hardware, self.controller, sensor_gain=sensor_gain)
+            self._loops[sensor_gain] = loop
         return self._loops[sensor_gain]
 
     @property

@@ -8,14 +8,9 @@ from typing import Any, TypeAlias, get_args
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, CommandRms, ModulusMargin, NoisePeak
 from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.frequency_bounds import Band
 from lbt_synth.design.shaping.frequency_grid import Grid, first_grid
-from lbt_synth.design.shaping.objectives import (
-    ResidualVariance,
-    Term,
-    leaves,
-    require_term,
-    vibration_bands,
-)
+from lbt_synth.design.shaping.objectives import ResidualVariance, Term, leaves, require_term
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.design.shaping.uncertainty import DelayError, MirrorUncertainty, SensorGainRange
 from lbt_synth.errors import ProblemError
@@ -85,17 +80,20 @@ class Specification:
         set_fields(self, demands=tuple(demands))
 
     @property
+    def _parts(self) -> tuple[object, ...]:
+        return (*leaves(self.objective), *self.demands)
+
+    @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:
         """Bands of the objective and of the demands [Hz]."""
-        masks = [d for d in self.demands if isinstance(d, Attenuation | MirrorUncertainty)]
-        named = ((mask.low_hz, mask.high_hz) for mask in masks)
-        return tuple(dict.fromkeys([*vibration_bands(self.objective), *named]))
+        bands = [part for part in self._parts if isinstance(part, Band)]
+        return tuple(dict.fromkeys((band.low_hz, band.high_hz) for band in bands))
 
     @property
     def spectra(self) -> tuple[Spectrum, ...]:
         """Spectra of the objective and of the demands."""
-        parts = [*leaves(self.objective), *self.demands]
-        found = [p.turbulence for p in parts if isinstance(p, ResidualVariance | CommandRms)]
+        kinds = ResidualVariance | CommandRms
+        found = [part.turbulence for part in self._parts if isinstance(part, kinds)]
         return tuple(spectrum for spectrum in found if spectrum is not None)
 
     def require_fitting(self, hardware: LoopHardware) -> None:

@@ -9,13 +9,7 @@ from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import (
-    BAND_LEVEL_SETS,
-    LEVEL_SETS,
-    ROOM,
-    Band,
-    discs,
-)
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, discs
 from lbt_synth.design.shaping.frequency_grid import Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, append_taps
 from lbt_synth.errors import ProblemError
@@ -212,4 +206,4 @@ class MirrorUncertainty(Band):
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         name = f"|T| in {self.band_text} times the mirror's error"
-        return (Check(name, self.relative * self.peak(loop.complementary), 1.0, BAND_LEVEL_SETS),)
+        return (self.check(name, self.relative * self.peak(loop.complementary), 1.0),)

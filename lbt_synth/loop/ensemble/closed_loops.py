@@ -99,11 +99,8 @@ def _close_subloop(
 ) -> Iterator[LoopGroup]:
     """Close a subloop at all sensor gains and delays, by whole delay."""
     for rows, fraction, mirrors in _mirrors_by_delay(hardware, delay_frames):
-        sensor, influence = subloop.sensor, subloop.influence
-        ends = [
-            loop_matrices(*subloop.controllers(rows), mirror=m, sensor=sensor, influence=influence)
-            for m in mirrors
-        ]
+        parts = {"sensor": subloop.sensor, "influence": subloop.influence}
+        ends = [loop_matrices(*subloop.controllers(rows), mirror=m, **parts) for m in mirrors]
         share, gain = fraction[:, None, None], sensor_gains[rows][:, None, None]
         A0, A1, B, C0, C1, D = (
             one if one is two or not fraction.any() else one + share * (two - one)

@@ -14,6 +14,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.batched import transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
+from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops, LoopGroup
 from lbt_synth.loop.ensemble.loop_ensemble import EnsembleVibration, Turbulence, turbulence_rows
 from lbt_synth.loop.ensemble.spectral_covariances import spectral_covariances
@@ -26,14 +27,18 @@ _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 _AT_ONCE = 1024  # loops with vibrations
 
 
-def turbulence_and_noise_covariances(
+def turbulence_and_noise_nm2(
     loops: ClosedLoops, turbulence: list[tuple[Turbulence, tuple[int, ...]]], noise_nm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Covariances (p, n, n) of the residual from turbulence, and from noise (p, q).
 
     ``turbulence`` pairs each spectrum with its modes. Unstable loops have nan.
     """
-    n, stable = loops.hardware.modes, loops.stable
+    hardware, stable = loops.hardware, loops.stable
+    for spectrum, _ in turbulence:
+        if isinstance(spectrum, PROCESSES):
+            require_loop_rate(spectrum.frame_rate_hz, hardware)
+    n, rate = hardware.modes, hardware.frame_rate_hz
     turbulence_nm2, noise_nm2 = np.full((2, stable.size, n, n), np.nan)
     turbulence_nm2[stable], noise_nm2[stable] = 0.0, 0.0
     spectra = [pair for pair in turbulence if not isinstance(pair[0], PROCESSES)]
@@ -47,9 +52,7 @@ def turbulence_and_noise_covariances(
                     smooth.append((turbulence_rows(spectrum, batch.rows), places))
             at = (batch.rows[:, None, None], *np.ix_(own, own))
             noise = noise_nm[batch.rows][:, batch.subloop.measurements]
-            turbulence_nm2[at], noise_nm2[at] = spectral_covariances(
-                batch, smooth, noise, loops.hardware.frame_rate_hz
-            )
+            turbulence_nm2[at], noise_nm2[at] = spectral_covariances(batch, smooth, noise, rate)
     for spectrum, modes in turbulence:
         if not isinstance(spectrum, PROCESSES):
             continue
@@ -94,10 +97,8 @@ def vibration_residuals(
                     amplitudes_nm[rows[:, None], i, modes] = left[..., 0]
             for line in random:
                 numbers = line.frequency_hz[rows], line.damping[rows], line.rms_nm[rows]
-                coefficients, driving = sampled_lines(*numbers, rate)
-                process = ModalTurbulence(
-                    coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=rate
-                )
+                a, drive = sampled_lines(*numbers, rate)
+                process = ModalTurbulence(coefficients=a, driving_rms_nm=drive, frame_rate_hz=rate)
                 _add_process(random_nm2, rows, chosen, process, line.direction[rows])
     return random_nm2, amplitudes_nm
 

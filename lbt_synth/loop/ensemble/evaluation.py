@@ -10,23 +10,13 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear import Controller
-from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
+from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
-from lbt_synth.loop.ensemble.covariances import (
-    PROCESSES,
-    turbulence_and_noise_covariances,
-    vibration_residuals,
-)
+from lbt_synth.loop.ensemble.covariances import turbulence_and_noise_nm2, vibration_residuals
 from lbt_synth.loop.ensemble.loop_ensemble import LoopEnsemble, turbulence_rows
 from lbt_synth.loop.strehl import Imaging, jitter_spread_nm, jitter_strehls, widest_jitter_nm
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import (
-    BoolArray,
-    ComplexArray,
-    FloatArray,
-    read_only,
-    require_instance,
-)
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, read_only, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,18 +157,13 @@ def residuals_from_matrices(
 ) -> EnsembleResiduals:
     """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
     turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
-    for spectrum, _ in turbulence:
-        if isinstance(spectrum, PROCESSES):
-            require_loop_rate(spectrum.frame_rate_hz, hardware)
     # loops that differ only in their vibrations are closed once
     points, which = ensemble.distinct(hardware, apart=len(matrices[0]) > 1)
     gains, delays = ensemble.gains()[points], ensemble.delays(hardware)[points]
     loops = ClosedLoops.of(matrices, hardware, gains, delays)
-    turbulence_nm2, noise_nm2 = turbulence_and_noise_covariances(
-        loops,
-        [(turbulence_rows(spectrum, points), modes) for spectrum, modes in turbulence],
-        ensemble.noise(hardware)[points],
-    )
+    distinct = [(turbulence_rows(spectrum, points), modes) for spectrum, modes in turbulence]
+    noise_nm = ensemble.noise(hardware)[points]
+    turbulence_nm2, noise_nm2 = turbulence_and_noise_nm2(loops, distinct, noise_nm)
     random_nm2, amplitudes = vibration_residuals(loops, which, lines)
     return EnsembleResiduals(
         stable=read_only(loops.stable[which]),

@@ -64,9 +64,8 @@ class EnsembleVibration:
             value = real_array(getattr(self, name), name)
             if np.any(value <= 0) or np.any(value >= high):
                 allowed = "above 0" if high == np.inf else "between 0 and 1"
-                raise ProblemError(
-                    f"{name} must be {allowed}; got {value.min():.6g} to {value.max():.6g}."
-                )
+                got = f"{value.min():.6g} to {value.max():.6g}"
+                raise ProblemError(f"{name} must be {allowed}; got {got}.")
             set_fields(self, **{name: value})
         direction = real_array(self.direction, "direction")
         size = np.linalg.norm(np.atleast_1d(direction), axis=-1, keepdims=True)
@@ -181,9 +180,8 @@ class LoopEnsemble:
         q, given = hardware.n_measurements, np.asarray(self.noise_nm)
         given = given[:, None] if given.ndim == 1 else given
         if given.ndim == 2 and given.shape[1] not in (1, q):
-            raise DimensionError(
-                f"noise_nm must have one column per measurement ({q}); got {given.shape[1]}."
-            )
+            got = given.shape[1]
+            raise DimensionError(f"noise_nm must have one column per measurement ({q}); got {got}.")
         return np.broadcast_to(given, (self.loops, q))
 
     def groups(self, hardware: LoopHardware) -> list[tuple[Turbulence, tuple[int, ...]]]:
@@ -216,9 +214,8 @@ class LoopEnsemble:
         varying = [column for column in columns if np.ptp(column) > 0]
         if not varying:
             return rows[:1], np.zeros(self.loops, dtype=np.int64)
-        _, first, which = np.unique(
-            np.stack(varying, axis=1), axis=0, return_index=True, return_inverse=True
-        )
+        table = np.stack(varying, axis=1)
+        _, first, which = np.unique(table, axis=0, return_index=True, return_inverse=True)
         return (rows, rows) if first.size == self.loops else (first, which.reshape(-1))
 
     def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:

@@ -116,9 +116,8 @@ def least_worst_residual(
     """
     nyquist = hardware.frame_rate_hz / 2
     low, high = _checked_band(band_hz, nyquist)
-    line = SinusoidalVibration(
-        frequency_hz=high, rms_nm=rms_nm, direction=tuple(np.ravel(direction))
-    )
+    axis = tuple(np.ravel(direction))
+    line = SinusoidalVibration(frequency_hz=high, rms_nm=rms_nm, direction=axis)
     along = checked_direction(line, hardware)
     directions, modes = truth_modes(hardware, truth, (along,))
     own = int(np.argmax(np.abs(directions @ along)))
@@ -139,9 +138,8 @@ def _checked_band(band_hz: tuple[float, float], nyquist_hz: float) -> tuple[floa
     try:
         low, high = band_hz
     except (TypeError, ValueError) as error:
-        raise DimensionError(
-            f"band_hz must be two frequencies, the lowest and the highest; got {band_hz!r}."
-        ) from error
+        text = f"band_hz must be two frequencies, the lowest and the highest; got {band_hz!r}."
+        raise DimensionError(text) from error
     low = number(low, "band_hz[0]", above=0)
     high = number(high, "band_hz[1]", above=0)
     if not low < high < nyquist_hz:

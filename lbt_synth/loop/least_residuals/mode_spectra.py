@@ -153,10 +153,8 @@ def decoupled_modes(
     groups = {key: np.diag([float(own == key) for own in keys]) for key in kinds}
     matrices = [("the noise of the sensor", noise)]
     matrices += [("the turbulence", projector) for projector in groups.values()]
-    matrices += [
-        (f"the vibration at {line.frequency_hz:.6g} Hz", np.outer(along, along))
-        for along, line in vibrations
-    ]
+    for along, line in vibrations:
+        matrices.append((f"the vibration at {line.frequency_hz:.6g} Hz", np.outer(along, along)))
     matrices += [("the given direction", np.outer(along, along)) for along in directions]
     axes = _common_axes(matrices)
     parts = []

@@ -7,11 +7,7 @@ from typing import assert_never
 
 import numpy as np
 
-from lbt_synth.loop.least_residuals.mode_spectra import (
-    ModeSpectrum,
-    decoupled_modes,
-    plant_modes,
-)
+from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_modes, plant_modes
 from lbt_synth.loop.least_residuals.prediction import Prediction
 from lbt_synth.models import (
     FullStatePlant,

@@ -42,5 +42,8 @@ def test_what_is_no_simulation_is_refused(axis_plant):
         lbt.files.telemetry_from_simulation(run, 3)
     with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got Controller"):
         lbt.files.telemetry_from_simulation(run, path, design=design.controller)
-    with pytest.raises(lbt.errors.DimensionError, match="interaction_matrix must have 1 measurement to match measurements"):
+    with pytest.raises(
+        lbt.errors.DimensionError,
+        match="interaction_matrix must have 1 measurement to match measurements",
+    ):
         lbt.files.telemetry_from_simulation(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))
