@@ -131,28 +131,30 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
     for target in targets:
         _require_no_directory(target)
     staged: dict[Path, Path] = {}
-    older: dict[Path, bytes | None] = {}
     target = next(iter(targets))
-    try:
-        for target, content in targets.items():
-            staged[target] = _stage(target, content)
-        for target, temporary in staged.items():
-            # kept to undo the change if a later file fails; a single file needs no undoing
-            older[target] = target.read_bytes() if len(targets) > 1 and target.exists() else None
-            temporary.replace(target)
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        for temporary in staged.values():
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-        older.pop(target, None)  # this one was not replaced
-        for done, content_before in older.items():
-            with contextlib.suppress(OSError):
-                if content_before is None:
-                    done.unlink()
-                else:
-                    _stage(done, content_before).replace(done)
-        raise _output_error(target, error) from error
+    with contextlib.ExitStack() as undo:
+        try:
+            for target, content in targets.items():
+                staged[target] = _stage(target, content)
+                undo.callback(_restore, staged[target], None)
+            for target, temporary in staged.items():
+                # kept to undo the change if a later file fails; a single file needs no undoing
+                older = target.read_bytes() if len(targets) > 1 and target.exists() else None
+                temporary.replace(target)
+                undo.callback(_restore, target, older)
+        except (OSError, ValueError) as error:  # ValueError: a null character in the name
+            raise _output_error(target, error) from error
+        undo.pop_all()
     return tuple(targets)
+
+
+def _restore(target: Path, older: bytes | None) -> None:
+    """Give a file its older content again, or delete it."""
+    with contextlib.suppress(OSError):
+        if older is None:
+            target.unlink()
+        else:
+            _stage(target, older).replace(target)
 
 
 def _stage(target: Path, content: bytes) -> Path:
@@ -176,8 +178,7 @@ def _temporary_file(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
     except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+        _restore(temporary, None)
         raise
 
 

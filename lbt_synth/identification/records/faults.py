@@ -31,6 +31,20 @@ def runs(flags: BoolArray) -> IntArray:
     return np.column_stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)])
 
 
+def mark(stretches: IntArray, frames: int) -> BoolArray:
+    """Return which frames lie in one of some stretches (start, stop), (r, 2)."""
+    out = np.zeros(frames, dtype=np.bool_)
+    for start, stop in stretches:
+        out[start:stop] = True
+    return out
+
+
+def _neighbours(values: FloatArray | BoolArray) -> FloatArray:
+    """Return the larger of the two values beside each, 0 beyond the ends."""
+    padded = np.pad(values.astype(np.float64), 1)
+    return np.asarray(np.maximum(padded[:-2], padded[2:]))
+
+
 def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
     """Return (start, stop) of each run of one value, single values included, (r, 2)."""
     same = (series[1:] == series[:-1]) & good[1:] & good[:-1]
@@ -41,9 +55,8 @@ def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
 
 def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find frames of a value that is held for longer than chance or quantisation hold it."""
-    out = np.zeros(len(series), dtype=np.bool_)
     if not good.any():
-        return out
+        return np.zeros(len(series), dtype=np.bool_)
     each = equal_runs(series, good)
     lengths = each[:, 1] - each[:, 0]
     repeated = float(np.mean(lengths > 1))  # chance that a value is seen again
@@ -59,19 +72,14 @@ def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
         least = 1 + np.log(_RARE / len(series)) / np.log(repeated)
     else:
         least = 0.0
-    for start, stop in each[lengths >= max(least, _SHORTEST_RUN)]:
-        out[start:stop] = True
-    return out
+    return mark(each[lengths >= max(least, _SHORTEST_RUN)], len(series))
 
 
 def _is_quantised(values: FloatArray) -> bool:
     """Whether all values are whole multiples of a step that is not tiny."""
     steps = np.abs(np.diff(values))
-    steps = steps[steps > 0]
-    if steps.size == 0:
-        return False
-    step = float(steps.min())
-    if float(np.ptp(values)) > _QUANTISED * step:
+    step = float(np.min(steps[steps > 0], initial=np.inf))
+    if not 0 < float(np.ptp(values)) <= _QUANTISED * step:
         return False
     counts = steps / step
     return bool(np.all(np.abs(counts - np.round(counts)) < 1e-3))
@@ -85,9 +93,7 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     """
     out = np.zeros(len(series), dtype=np.bool_)
     values = series[good]
-    if values.size <= _LEAST_AT_LIMIT:
-        return out
-    span = float(np.ptp(values))
+    span = float(np.ptp(values)) if values.size > _LEAST_AT_LIMIT else 0.0
     if span == 0:
         return out
     tolerance = _SAME_LEVEL * span
@@ -116,36 +122,29 @@ def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
     of the 256 frames around, whichever is larger: a burst of vibration is no outlier, and one
     value cannot raise the median. A strong sinusoid stays below its own scale.
     """
-    good = good.copy()
-    out = np.zeros(len(series), dtype=np.bool_)
-    smallest = _resolution(series, good)
+    good, out = good.copy(), np.zeros(len(series), dtype=np.bool_)
+    steps = np.abs(np.diff(series))[good[1:] & good[:-1]]
+    rising = steps[steps > 0]
+    smallest = float(rising.min()) / 2 if rising.size else 0.0
     for _ in range(_PASSES):
         bend, valid = _second_difference(series, good)
         if not valid.any():
             break
         size = np.abs(bend)
         scale = np.maximum(_local_scale(size, valid), smallest)
-        beside = np.maximum(np.append(size[1:], 0.0), np.append(0.0, size[:-1]))
-        found = valid & (size > _OUTLIER * scale) & (size >= 0.9 * beside)
+        found = valid & (size > _OUTLIER * scale) & (size >= 0.9 * _neighbours(size))
         if not found.any():
             break
         # a frame at an edge has no second difference: it may be the one that bends its neighbour
-        near = np.append(found[1:], False) | np.append(False, found[:-1])
-        found |= good & ~valid & near
+        found |= good & ~valid & (_neighbours(found) > 0)
         out |= found
         good &= ~found
     if out.any():  # frames between outliers that are too few to be judged
-        beside = np.append(out[1:], False) | np.append(False, out[:-1])
-        for start, stop in runs(good):
-            if stop - start < 3 and beside[start:stop].any():
-                out[start:stop] = True
+        beside = _neighbours(out) > 0
+        left = runs(good)
+        few = np.array([b - a < 3 and beside[a:b].any() for a, b in left], dtype=np.bool_)
+        out |= mark(left[few], len(series))
     return out
-
-
-def _resolution(series: FloatArray, good: BoolArray) -> float:
-    steps = np.abs(np.diff(series))[good[1:] & good[:-1]]
-    steps = steps[steps > 0]
-    return float(steps.min()) / 2 if steps.size else 0.0
 
 
 def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray, BoolArray]:
@@ -170,8 +169,7 @@ def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
     local = np.full(blocks, whole)
     if enough.any():
         local[enough] = np.maximum(whole, _MAD * np.nanmedian(table[enough], axis=1))
-    wide = np.maximum(local, np.maximum(np.append(local[1:], 0), np.append(0, local[:-1])))
-    return np.asarray(np.repeat(wide, _BLOCK)[:frames])
+    return np.repeat(np.maximum(local, _neighbours(local)), _BLOCK)[:frames]
 
 
 def fill(series: FloatArray, good: BoolArray) -> FloatArray:

@@ -15,6 +15,7 @@ from lbt_synth.identification.records.faults import (
     find_outliers,
     find_saturated,
     find_stuck,
+    mark,
     runs,
 )
 from lbt_synth.identification.records.health import Finding, RecordHealth, finding_in, merge_notes
@@ -234,19 +235,16 @@ _COMMANDED: Finders = (("saturated", _find_clipped),)
 
 def _report_held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> None:
     """Report where the loop was open, and where its commands stood still."""
-    is_open = _mark_long(runs(np.all(commands == 0, axis=1) & good), len(commands))
+    frames, is_zero = len(commands), np.all(commands == 0, axis=1)
+    is_open = mark(_longest(runs(is_zero & good)), frames)
     _report(findings, "loop open", "commands", None, is_open, spoils=False)
     for axis, column in enumerate(commands.T):
-        held = _mark_long(equal_runs(column, good), len(commands))
+        held = mark(_longest(equal_runs(column, good)), frames)
         _report(findings, "held", "commands", axis, held & ~is_open, spoils=False)
 
 
-def _mark_long(stretches: IntArray, frames: int) -> BoolArray:
-    """Return the frames of the stretches (start, stop) that are long for commands."""
-    out = np.zeros(frames, dtype=np.bool_)
-    for start, stop in stretches[stretches[:, 1] - stretches[:, 0] >= _OPEN_FRAMES]:
-        out[start:stop] = True
-    return out
+def _longest(stretches: IntArray) -> IntArray:
+    return stretches[stretches[:, 1] - stretches[:, 0] >= _OPEN_FRAMES]
 
 
 def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
