@@ -141,10 +141,7 @@ def design_from_record(
         )
     require_length(record)
 
-    def step() -> None:
-        if progress is not None:
-            progress(1)
-
+    step = progress or (lambda _: None)
     found: dict[str, Any] = {
         "sensor_gain": sensor_gain,
         "assumed_gain": assumed_gain,
@@ -153,7 +150,7 @@ def design_from_record(
     }
     fit, test = split_halves(record.stretches(), record.frames)
     half = identify(record, stretches=fit, **found)
-    step()
+    step(1)
     plant = half.plant()
     request = design_request(chosen, {})
 
@@ -173,10 +170,10 @@ def design_from_record(
         imaging=Imaging() if imaging is None else imaging,
         taps=taps,
     )
-    step()
+    step(1)
     model = identify(record, start=half, **found)
     design = design_for(model)
-    step()
+    step(1)
     return RecordedDesign(
         model=model,
         design=design,

@@ -250,33 +250,27 @@ def accelerometer_lines(
         length = int(min(longest, max((len(z) - 1) / _AVERAGES, _SHORTEST_SEGMENT)))
     else:
         length = integer(segment_frames, "segment_frames", at_least=_SHORTEST_SEGMENT)
-    a, z = (_whole_segments(series, good, length) for series in (a, z))
-    count = len(z) // length
+    sensors, series = a.shape[1], _whole_segments(np.hstack([a, z]), good, length)
+    count = len(series) // length
     if count < _FEWEST_AVERAGES:
         raise ProblemError(
             f"coherence needs at least {_FEWEST_AVERAGES} segments of {length} usable frames; got "
             f"{count}. Record more, or shorten segment_frames."
         )
-    window = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
-    welch: dict[str, Any] = {
-        "fs": rate,
-        "window": window,
-        "nperseg": length,
-        "noverlap": 0,
-        "axis": 0,
-    }
-    frequency, cross = csd(a[:, :, None], z[:, None, :], **welch)  # (f, sensors, axes)
-    power_a, power_z = (csd(series, series, **welch)[1].real for series in (a, z))
-    both = power_a[:, :, None] * power_z[:, None, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        coherence = np.where(both > 0, np.abs(cross) ** 2 / both, 0.0)
+    window: Any = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+    pair = series[:, :, None], series[:, None, :]
+    frequency, cross = csd(*pair, fs=rate, window=window, nperseg=length, noverlap=0, axis=0)
+    power = np.diagonal(cross, axis1=1, axis2=2).real
+    power_a, power_z = power[:, :sensors, None], power[:, None, sensors:]
+    cross = cross[:, :sensors, sensors:]  # (f, sensors, axes)
+    coherence = np.abs(cross) ** 2 / np.maximum(power_a * power_z, np.finfo(np.float64).tiny)
     inside = (frequency >= max(lowest_hz, rate / length)) & (frequency < rate / 2)
     tried = max(int(np.sum(inside)) * coherence.shape[1] * coherence.shape[2], 1)
     threshold = 1 - (chance / tried) ** (1 / (count - 1))
     significant = inside & np.any(coherence > threshold, axis=(1, 2))
     # power of the phase (not of its difference) that goes with a sensor
     steps = 4 * np.sin(np.pi * frequency / rate) ** 2
-    shared = np.max(coherence * power_z[:, None, :], axis=(1, 2)) / np.where(inside, steps, 1.0)
+    shared = np.max(coherence * power_z, axis=(1, 2)) / np.where(inside, steps, 1.0)
     source = f"accelerometers: coherence over {count} segments, false alarm {chance:g}"
     return _find_lines(frequency, np.where(inside, shared, 0.0), significant, source)
 
@@ -301,20 +295,16 @@ def _find_lines(
     frequency: FloatArray, power: FloatArray, significant: BoolArray, source: str
 ) -> tuple[LinePrior, ...]:
     """Return the local maxima among the significant bins, each with a dip to the next."""
-    from scipy.signal import find_peaks, peak_prominences
+    from scipy.signal import find_peaks
 
-    width = frequency[1]
     seen = np.where(significant, power, 0.0)
-    at, _ = find_peaks(seen)
-    if not at.size:
-        return ()
-    prominence = peak_prominences(seen, at)[0]
+    at, peaks = find_peaks(seen, prominence=0)
     out = []
-    for k in at[prominence >= _DIP * seen[at]]:
+    for k in at[peaks["prominences"] >= _DIP * seen[at]]:
         around = np.arange(k - 1, k + 2)
         weight = power[around]
         centre = float(weight @ frequency[around] / weight.sum())
         spread = float(np.sqrt(weight @ (frequency[around] - centre) ** 2 / weight.sum()))
-        error = max(width / np.sqrt(12), spread / 2)
+        error = max(frequency[1] / np.sqrt(12), spread / 2)
         out.append(LinePrior(frequency_hz=centre, frequency_error_hz=error, source=source))
     return tuple(out)
