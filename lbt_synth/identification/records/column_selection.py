@@ -62,10 +62,10 @@ def select_series(
     }
     if kind == "closed_loop":
         _require_same_axes(chosen)
-    notes += [f"{each.replace('_', ' ')}: {_join_names(own)}" for each, own in chosen.items()]
+    notes += [f"{each.replace('_', ' ')}: {join_names(own)}" for each, own in chosen.items()]
     used = {id(column.values) for own in chosen.values() for column in own}
     if left := [column for column in there if id(column.values) not in used]:
-        notes.append(f"not used: {_join_names(left)}")
+        notes.append(f"not used: {join_names(left)}")
     if kind == "open_loop" and "commands" in found:
         notes.append("commands were left out: the record is of an open loop")
     return Series(kind=kind, role=role, columns=chosen)
@@ -116,7 +116,7 @@ def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
             raise ProblemError(f"{len(hits)} columns are named {wanted!r}; choose by numbers.")
         hits = hits or [each for each in columns if each.name.lower().startswith(f"{name}[")]
         if not hits:
-            raise ProblemError(f"there is no column {wanted!r}; got {_join_names(columns)}.")
+            raise ProblemError(f"there is no column {wanted!r}; got {join_names(columns)}.")
         return hits
     number = integer(wanted, "a number of columns", at_least=0)
     if number >= len(columns):
@@ -134,7 +134,7 @@ def _assign_by_kind(columns: Sequence[Column], kind: str | None, notes: list[str
     for number, each in enumerate(columns):
         if rises(each.values):
             raise ProblemError(
-                f"column {number} ({_join_names([each])}) rises from row to row, as a clock "
+                f"column {number} ({join_names([each])}) rises from row to row, as a clock "
                 f"does: choose by columns={{'times': {number}, 'open_loop': ...}}, by names or "
                 "numbers from 0."
             )
@@ -168,7 +168,7 @@ def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> 
     known = {each.axis for each in found if each.axis is not None and of_axes}
     if len(found) > 1 and len(known) < len(found):
         raise ProblemError(
-            f"{_join_names(found)} are all named as {role}"
+            f"{join_names(found)} are all named as {role}"
             f"{', and not each of an axis of its own' if of_axes else ''}; choose by "
             f"columns={{'{role}': ...}} (--columns {role}=...)."
         )
@@ -204,13 +204,14 @@ def _require_same_axes(chosen: Roles) -> None:
     if None in (*mine, *theirs) or len(mine) != len(theirs) or mine == theirs or from_one:
         return
     raise ProblemError(
-        f"measurements and commands must be of the same axes; got {_join_names(y)} with "
-        f"{_join_names(u)}. Choose by columns={{'measurements': ..., 'commands': ...}} if they do "
+        f"measurements and commands must be of the same axes; got {join_names(y)} with "
+        f"{join_names(u)}. Choose by columns={{'measurements': ..., 'commands': ...}} if they do "
         "belong together."
     )
 
 
-def _join_names(columns: Sequence[Column]) -> str:
+def join_names(columns: Sequence[Column]) -> str:
+    """Return the names of columns in one text."""
     return ", ".join(each.name or "a column without a name" for each in columns)
 
 
@@ -218,6 +219,6 @@ def _how_to_choose(columns: Sequence[Column], *roles: str) -> str:
     wanted = ", ".join(f"'{role}': ..." for role in roles)
     options = " ".join(f"{role}=..." for role in roles)
     return (
-        f"; got {_join_names(columns)}. Choose by columns={{{wanted}}} (--columns {options}), by "
+        f"; got {join_names(columns)}. Choose by columns={{{wanted}}} (--columns {options}), by "
         "names or numbers from 0."
     )

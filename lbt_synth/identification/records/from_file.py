@@ -9,43 +9,27 @@ from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
 
-import numpy as np
-
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_telemetry
-from lbt_synth.identification.records.column_selection import KINDS, Series, select_series
-from lbt_synth.identification.records.columns import Column
+from lbt_synth.identification.records.column_selection import KINDS, select_series
 from lbt_synth.identification.records.commands_file import join_commands
 from lbt_synth.identification.records.contents import (
     FITS,
-    Contents,
     name_in_errors,
     parse_contents,
     read_contents,
     read_record_bytes,
 )
-from lbt_synth.identification.records.from_arrays import loop_record
+from lbt_synth.identification.records.from_series import build_record
 from lbt_synth.identification.records.from_telemetry import record_from_telemetry
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
-from lbt_synth.identification.records.units import (
-    density_unit,
-    hz_per,
-    nm_per,
-    same_unit,
-    seconds_per,
-)
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.fits import has_card
-from lbt_synth.validation import FloatArray, choice, number
+from lbt_synth.validation import choice
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of our own telemetry, and of the AOT standard
 _TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
-_RATES_HZ = (5.0, 1e5)  # plausible for times without a unit
-_WHICH_UNITS = {
-    "density": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
-    "measurements": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
-}
 
 
 def load_record(
@@ -128,8 +112,18 @@ def load_record(
     if kind is not None:
         choice(kind, "kind", KINDS)
     content = read_record_bytes(source)
-    if _is_telemetry(source, content):
-        with name_in_errors(source):
+    given: dict[str, Any] = {
+        "frame_rate_hz": frame_rate_hz,
+        "delay_frames": delay_frames,
+        "unit": unit,
+        "command_unit": command_unit,
+        "diameter_m": diameter_m,
+        "obstruction": obstruction,
+        "mirror": mirror,
+        "source": str(source),
+    }
+    with name_in_errors(source):
+        if _is_telemetry(source, content):
             if kind not in (None, "closed_loop") or columns is not None or commands is not None:
                 raise ProblemError(
                     "telemetry holds measurements and commands: kind must be closed_loop, and "
@@ -137,44 +131,13 @@ def load_record(
                 )
             if averages is not None:
                 raise ProblemError("this is telemetry, and averages are of a spectrum.")
-            return record_from_telemetry(
-                load_telemetry(source),
-                modes=None if axes is None else tuple(axes),
-                frame_rate_hz=frame_rate_hz,
-                delay_frames=delay_frames,
-                mirror=mirror,
-                unit=unit,
-                command_unit=command_unit,
-                diameter_m=diameter_m,
-                obstruction=obstruction,
-                source=str(source),
-            )
-    contents = parse_contents(source, content)
-    with name_in_errors(source):
+            return record_from_telemetry(load_telemetry(source), modes=axes, **given)
+        contents = parse_contents(source, content)
         if commands is not None:
             other = Path(commands)
             join_commands(contents, read_contents(other), other)
         series = select_series(contents, kind=kind, axes=axes, columns=columns)
-        facts = {
-            "frame_rate_hz": _find_fact(contents, "frame_rate_hz", frame_rate_hz, may_differ=False),
-            "diameter_m": _find_fact(contents, "diameter_m", diameter_m),
-            "source": str(source),
-        }
-        if series.kind == "spectrum":
-            facts["averages"] = _find_fact(contents, "averages", averages)
-            return _build_spectrum_record(series, contents, unit, **facts)
-        if averages is not None:
-            raise ProblemError(f"averages are of a spectrum; the record is of kind {series.kind}.")
-        return _build_loop_record(
-            series,
-            contents,
-            unit,
-            command_unit,
-            mirror=mirror,
-            delay_frames=_find_fact(contents, "delay_frames", delay_frames),
-            obstruction=_find_fact(contents, "obstruction", obstruction),
-            **facts,
-        )
+        return build_record(series, contents, averages=averages, **given)
 
 
 def _is_telemetry(path: Path, content: bytes) -> bool:
@@ -187,133 +150,3 @@ def _is_telemetry(path: Path, content: bytes) -> bool:
     except (BadZipFile, OSError, ValueError):
         return False  # parse_contents says so
     return names >= _TELEMETRY_ARRAYS
-
-
-def _find_fact(contents: Contents, name: str, given: Any, *, may_differ: bool = True) -> Any:
-    """Return what was given, or what the file has; refuse two values of a file."""
-    places = contents.facts.get(name, {})
-    own = {where: number(value, f"{where} ({name})") for where, value in places.items()}
-    if given is None:
-        if len(set(own.values())) > 1:
-            found = ", ".join(f"{value:.9g} by {where}" for where, value in own.items())
-            raise ProblemError(f"the file gives {name} twice: {found}. Choose one in the call.")
-        for where, value in own.items():
-            contents.notes.append(f"{name} {value:.9g}, by {where}")
-            return int(value) if name == "averages" else value
-        return None
-    wanted = number(given, name)
-    for where, value in own.items():
-        if abs(value - wanted) > 1e-6 * wanted:
-            if not may_differ:
-                raise ProblemError(
-                    f"{name} must be that of the file, {value:.9g} by {where}; got {wanted:.9g}."
-                )
-            contents.notes.append(
-                f"{name} {wanted:.9g} was given; the file has {value:.9g} by {where}"
-            )
-    return given
-
-
-def _find_unit(
-    chosen: Sequence[Column], given: str | None, contents: Contents, what: str, option: str = "unit"
-) -> str:
-    """Return the unit of some columns by their names or headers, the file, or the call."""
-    facts = contents.facts.get(option, contents.facts.get("unit", {}))
-    of_file = list(dict.fromkeys(map(str, facts.values())))
-    found = {each.unit or (of_file[0] if of_file else "") for each in chosen}
-    if len(found) > 1 or len(of_file) > 1:
-        raise ProblemError(
-            f"the {what} must all have the same unit; got "
-            f"{', '.join(sorted(found.union(of_file)))}."
-        )
-    (own,) = found
-    if not own and given is None:
-        raise ProblemError(
-            f"the file does not tell the unit of the {what}; give {option} "
-            f"({_WHICH_UNITS.get(what, _WHICH_UNITS['measurements'])})."
-        )
-    if own and given is not None and not same_unit(own, given):
-        raise ProblemError(f"{option} must be that of the file, {own!r}; got {given!r}.")
-    return own or str(given)
-
-
-def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
-    sizes = {len(each.values) for each in chosen}
-    if len(sizes) > 1:
-        raise ProblemError(
-            f"{' and '.join(each.name for each in chosen)} must be equally long; got "
-            f"{' and '.join(map(str, sorted(sizes)))} rows."
-        )
-    return np.column_stack([each.values for each in chosen])
-
-
-def _build_loop_record(
-    series: Series, contents: Contents, unit: str | None, command_unit: str | None, **facts: Any
-) -> LoopRecord:
-    y, u = series.columns[series.role], series.columns.get("commands")
-    (clock,) = series.columns.get("times", [None])
-    (counter,) = series.columns.get("frame_numbers", [None])
-    y_unit, u_unit = _find_unit(y, unit, contents, "measurements"), None
-    if u is not None:
-        u_unit = _find_unit(u, command_unit or unit, contents, "commands", "command_unit")
-    times = None if clock is None else seconds_per(clock.unit) * clock.values
-    if clock is not None and not clock.unit:
-        contents.notes.append(f"{clock.name} was taken for seconds")
-    record = loop_record(
-        _stack_columns(y),
-        None if u is None else _stack_columns(u),
-        unit=y_unit,
-        command_unit=u_unit,
-        times_s=times,
-        frame_numbers=None if counter is None else counter.values,
-        notes=contents.notes,
-        **facts,
-    )
-    low, high = _RATES_HZ
-    plausible = facts["frame_rate_hz"] is not None or low <= record.frame_rate_hz <= high
-    if clock is not None and not clock.unit and not plausible:
-        raise ProblemError(
-            f"the frame rate would be {record.frame_rate_hz:.6g} Hz with "
-            f"{clock.name or 'the times'} in seconds, and their unit is not given; name it, as in "
-            "time_ms, or give frame_rate_hz."
-        )
-    return record
-
-
-def _build_spectrum_record(
-    series: Series, contents: Contents, unit: str | None, *, diameter_m: float | None, **facts: Any
-) -> SpectrumRecord:
-    densities, (frequency,) = series.columns[series.role], series.columns["frequency"]
-    text = _find_unit(densities, unit, contents, "density")
-    parted = density_unit(text)
-    if parted is None:
-        raise ProblemError(
-            f"the unit of a density is a square over Hz (nm^2/Hz, mas^2/Hz), or a length or angle "
-            f"over sqrt(Hz) (nm/sqrt(Hz)); got {text!r}."
-        )
-    name, power = parted
-    if series.role == "amplitude" and power == 2:
-        raise ProblemError(
-            f"{densities[0].name} is named as an amplitude, but has the unit {text!r} of a power; "
-            "choose by columns={'density': ...}."
-        )
-    if not frequency.unit:
-        contents.notes.append("frequencies were taken for Hz")
-    table = _stack_columns([frequency, *densities])
-    complete = np.all(np.isfinite(table), axis=1)
-    if not complete.all():
-        contents.notes.append(f"{int(np.sum(~complete))} rows with gaps were left out")
-    table = table[complete]
-    scaled = nm_per(name, diameter_m=diameter_m) ** power * table[:, 1:]
-    if power == 1:
-        if np.any(scaled < 0):
-            raise ProblemError("an amplitude density must be at least 0; got a negative one.")
-        contents.notes.append("amplitude densities were squared")
-        scaled = scaled**2
-    return SpectrumRecord(
-        frequency_hz=hz_per(frequency.unit) * table[:, 0],
-        density_nm2_hz=scaled,
-        diameter_m=diameter_m,
-        notes=tuple(dict.fromkeys(contents.notes)),
-        **facts,
-    )

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import cast
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry
-from lbt_synth.identification.records.column_selection import choose_axes
-from lbt_synth.identification.records.from_arrays import loop_record
+from lbt_synth.identification.records.column_selection import Series, choose_axes
+from lbt_synth.identification.records.columns import Column
+from lbt_synth.identification.records.contents import Contents
+from lbt_synth.identification.records.from_series import build_record
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.units import unit_name
 from lbt_synth.models import PositionLoop
-from lbt_synth.validation import FloatArray, number, require_instance
+from lbt_synth.validation import FloatArray, require_instance
 
+_FACTS = ("frame_rate_hz", "delay_frames", "diameter_m", "obstruction")
 _FOREIGN = "timing"  # key of metadata in telemetry of other programs
 _CONDITION = 1e8
-_SAME_RATE = 1e-6
 
 
 def record_from_telemetry(
@@ -89,53 +91,61 @@ def record_from_telemetry(
     True
     """
     require_instance(telemetry, Telemetry)
-    notes: list[str] = []
-    if frame_rate_hz is not None:
-        rate, own = number(frame_rate_hz, "frame_rate_hz", above=0), telemetry.frame_rate_hz
-        if abs(rate / own - 1) > _SAME_RATE:
-            raise ProblemError(
-                f"frame_rate_hz must be that of the telemetry, {own:.9g} Hz; got {rate:.9g} Hz."
-            )
-    chosen = choose_axes(modes, "modes", telemetry.modes, "modes")
-    y, y_unit = _modal_measurements(telemetry, unit, notes)
-    u, u_unit = _modal_commands(telemetry, command_unit or unit, notes)
-    facts: dict[str, Any] = {
-        "delay_frames": delay_frames,
-        "diameter_m": diameter_m,
-        "obstruction": obstruction,
-        "mirror": mirror,
-    }
-    for name, given in facts.items():
-        there = getattr(telemetry, name)
-        if given is None:
-            facts[name] = there
-        elif name != "mirror" and there not in (None, given):
-            notes.append(f"{name} {given:g} was given; the telemetry has {there:g}")
-    if max(telemetry.modes, y.shape[1], telemetry.commands.shape[1]) > len(chosen):
-        notes.append(f"axes are modes {', '.join(map(str, chosen))} of {telemetry.modes}")
-    if _FOREIGN in telemetry.metadata:
-        notes.append(
+    n, is_foreign = telemetry.modes, _FOREIGN in telemetry.metadata
+    chosen = choose_axes(modes, "modes", n, "modes")
+    facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
+    contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
+    columns: dict[str, list[Column]] = {}
+    for role, series, matrix, word, own in (
+        (
+            "measurements",
+            telemetry.measurements,
+            _inverse_response(telemetry),
+            "the inverse of the interaction matrix",
+            telemetry.measurement_unit,
+        ),
+        (
+            "commands",
+            telemetry.commands,
+            _influence(telemetry),
+            "the influence matrix",
+            telemetry.command_unit,
+        ),
+    ):
+        known, said = unit_name(own), f"in {own!r}"
+        if matrix is not None:
+            series, said = series @ matrix.T, f"behind {word}"
+            known = "nm" if known or not is_foreign else None  # our own modes are in nm
+            contents.notes.append(f"{role}: {word} times what was recorded")
+        columns[role] = [
+            Column(name=f"mode {k} {said}", values=series[:, k], unit=known) for k in chosen
+        ]
+    if telemetry.times_s is not None:
+        columns["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
+    if max(n, telemetry.measurements.shape[1], telemetry.commands.shape[1]) > len(chosen):
+        contents.notes.append(f"axes are modes {', '.join(map(str, chosen))} of {n}")
+    if is_foreign:
+        contents.notes.append(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
-    return loop_record(
-        y[:, chosen],
-        u[:, chosen],
-        frame_rate_hz=telemetry.frame_rate_hz,
-        times_s=telemetry.times_s,
-        unit=y_unit,
-        command_unit=u_unit,
+    record = build_record(
+        Series(kind="closed_loop", role="measurements", columns=columns),
+        contents,
+        frame_rate_hz=frame_rate_hz,
+        delay_frames=delay_frames,
+        mirror=telemetry.mirror if mirror is None else mirror,
+        unit=unit,
+        command_unit=command_unit,
+        diameter_m=diameter_m,
+        obstruction=obstruction,
         source=(telemetry.name or "telemetry") if source is None else source,
-        notes=notes,
-        **facts,
     )
+    return cast(LoopRecord, record)
 
 
-def _modal_measurements(
-    seen: Telemetry, unit: str | None, notes: list[str]
-) -> tuple[FloatArray, str]:
-    """Return the measurements of all modes, and their unit."""
-    y, n, q = seen.measurements, seen.modes, seen.measurements.shape[1]
-    response = seen.interaction_matrix
+def _inverse_response(seen: Telemetry) -> FloatArray | None:
+    """Return the matrix from measurements to modes, None for the identity."""
+    n, q, response = seen.modes, seen.measurements.shape[1], seen.interaction_matrix
     if seen.slopes is not None and response is not None:
         response = None if seen.reconstructor is None else seen.reconstructor @ response
     if (response is None and q != n) or (response is not None and q > n > 2):
@@ -145,48 +155,22 @@ def _modal_measurements(
             "Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R, ...)."
         )
     if response is None or np.array_equal(response, np.eye(n)):
-        return y, _choose_unit(seen.measurement_unit, unit, "measurements")
+        return None
     if q < n or np.linalg.cond(response) > _CONDITION:
         raise ProblemError(
             f"the interaction matrix {response.shape} has no inverse: the {q} measurements do not "
             f"tell {n} modes apart. Give telemetry of tip and tilt alone."
         )
-    notes.append("measurements: the inverse of the interaction matrix times what was recorded")
-    own = _unit_of_modes(seen, seen.measurement_unit)
-    return y @ np.linalg.pinv(response).T, _choose_unit(
-        own, unit, "modes behind the interaction matrix"
-    )
+    return np.asarray(np.linalg.pinv(response), dtype=np.float64)
 
 
-def _modal_commands(seen: Telemetry, unit: str | None, notes: list[str]) -> tuple[FloatArray, str]:
-    """Return the commands of all modes, and their unit."""
-    u, n, m, influence = seen.commands, seen.modes, seen.commands.shape[1], seen.influence_matrix
+def _influence(seen: Telemetry) -> FloatArray | None:
+    """Return the matrix from commands to modes, None for the identity."""
+    n, m, influence = seen.modes, seen.commands.shape[1], seen.influence_matrix
     if influence is None and m != n:
         raise ProblemError(
             f"this telemetry has {m} commands of {n} modes, and no influence matrix; give it "
             "to Telemetry(influence_matrix=...), (modes, commands)."
         )
-    if influence is None or np.array_equal(influence, np.eye(n)):
-        return u, _choose_unit(seen.command_unit, unit, "commands")
-    notes.append("commands: the influence matrix times what was recorded")
-    own = _unit_of_modes(seen, seen.command_unit)
-    return u @ influence.T, _choose_unit(own, unit, "modes behind the influence matrix")
-
-
-def _unit_of_modes(seen: Telemetry, unit: str) -> str:
-    """Return the unit of the modes behind a matrix: nm in our own telemetry, and of lengths."""
-    return "nm" if unit_name(unit) or _FOREIGN not in seen.metadata else ""
-
-
-def _choose_unit(own: str, given: str | None, what: str) -> str:
-    """Return the unit of the telemetry, or the one that was given; refuse a contradiction."""
-    known = unit_name(own)
-    if given is None:
-        if known is None:
-            raise ProblemError(
-                f"the unit of the {what} is {own!r}, which is none of tip and tilt; give unit."
-            )
-        return known
-    if known is not None and unit_name(given) not in (None, known):
-        raise ProblemError(f"unit must be that of the {what}, {known}; got {given!r}.")
-    return given
+    is_identity = influence is None or np.array_equal(influence, np.eye(n))
+    return None if is_identity else influence

@@ -83,7 +83,7 @@ def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
     mine = csv(tmp_path / "y.csv", ("unit = mas", "diameter_m = 8.0"), y=y)
     slow = csv(tmp_path / "u.csv", ("frame_rate_hz = 250", "delay_frames = 2"), u_nm=u)
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"must be that of the file, 250 by .* in u\.csv"
+        lbt.errors.ProblemError, match=r"must be that of .* in u\.csv, 250; got 500"
     ):
         lbt.load_record(mine, commands=slow, frame_rate_hz=RATE)
     seen = lbt.load_record(mine, commands=slow)
@@ -91,7 +91,9 @@ def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
     assert np.allclose(seen.measurements[:, 0], lbt.models.nm_per_mas(8.0) * y)
     assert np.allclose(seen.commands[:, 0], u)
     silent = csv(tmp_path / "v.csv", u=u)
-    with pytest.raises(lbt.errors.ProblemError, match="unit of the commands; give command_unit"):
+    with pytest.raises(
+        lbt.errors.ProblemError, match="nothing tells the unit of u; give command_unit"
+    ):
         lbt.load_record(mine, commands=silent, frame_rate_hz=RATE)
     seen = lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="um")
     assert np.allclose(seen.commands[:, 0], 1e3 * u)

@@ -113,10 +113,14 @@ def test_slopes_with_their_modes_and_without():
 @pytest.mark.parametrize(
     ("telemetry_changes", "options", "words"),
     [
-        ({}, {"frame_rate_hz": 999}, "frame_rate_hz must be that of the telemetry, 1000 Hz"),
-        ({}, {"unit": "mas"}, "unit must be that of the measurements, nm"),
-        ({"measurement_unit": "pixel"}, {}, "unit of the measurements is 'pixel'.*give unit"),
-        ({"command_unit": "V"}, {}, "unit of the commands is 'V'"),
+        ({}, {"frame_rate_hz": 999}, "frame_rate_hz must be that of the telemetry, 1000; got 999"),
+        ({}, {"unit": "mas"}, "unit must be that of the data, 'nm'; got 'mas'"),
+        (
+            {"measurement_unit": "pixel"},
+            {},
+            "the unit of mode 0 in 'pixel', mode 1 in 'pixel'; give unit",
+        ),
+        ({"command_unit": "V"}, {}, "the unit of mode 0 in 'V', mode 1 in 'V'; give command_unit"),
         (
             {"commands": np.ones((60, 3)), "interaction_matrix": np.eye(2)},
             {},
