@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from lbt_synth.errors import FileError
 from lbt_synth.storage.array_file import digest, error_reason
 from lbt_synth.validation import FloatArray
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,10 +55,11 @@ class FileKind:
             )
         return arrays, meta
 
-    def rebuild(self, build: Callable[[], T], source: Path) -> T:
-        """Build what a file holds; what does not fit together is the file's fault."""
+    @contextmanager
+    def rebuilding(self, source: Path) -> Iterator[None]:
+        """Build what a file holds in the block; what does not fit is the file's fault."""
         try:
-            return build()
+            yield
         except FileError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:

@@ -125,4 +125,5 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
                 f"{source} is damaged: {name} holds values that are not finite.", path=source
             )
     record = DesignRecord({name: frozen_copy(array) for name, array in arrays.items()}, meta)
-    return _KIND.rebuild(lambda: unpack_design(record), source), str(meta["digest"])
+    with _KIND.rebuilding(source):
+        return unpack_design(record), str(meta["digest"])

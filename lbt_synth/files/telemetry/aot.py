@@ -31,6 +31,10 @@ _OWN_FIELDS = (
     *("seed", "name", "controller_name", "controller_digest", "metadata"),
     *("integrator_gains", "psf_pixel_mas"),
 )
+_OF_SUBAPERTURES = {
+    *("measurements", "control_matrix"),
+    *("measurements_to_modes", "modes_to_measurements"),
+}
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
 _RAD_PER_MAS = np.pi / 180 / 3600e3
 _FOREIGN = "that of another program: the AOT standard does not say which exposure a row is of"
@@ -88,20 +92,13 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     clock = aotpy.Time("Frames", frame_numbers=list(map(float, range(seen.frames))))
     if seen.times_s is not None:
         clock.timestamps = seen.times_s.tolist()
-    units = _units(seen)  # of the series, which have a clock
-    images: dict[str, Any] = {}
+    units = _units(seen)
+    images = {}
     for name, data in _arrays(seen).items():
-        text, timed = name.upper().replace("_", " "), name in units
-        images[name] = (
-            data
-            if data is None
-            else aotpy.Image(
-                text,
-                data.astype(precision if timed else np.float64),
-                unit=units.get(name) or None,
-                time=clock if timed else None,
-            )
-        )
+        # series have a clock, and the precision that was chosen
+        kind, time = (precision, clock) if name in units else ("float64", None)
+        text, unit = name.upper().replace("_", " "), units.get(name) or None
+        images[name] = aotpy.Image(text, data.astype(kind), unit=unit, time=time)
     sensor = aotpy.Pyramid(
         "Pyramid",
         source=star,
@@ -109,12 +106,14 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         n_valid_subapertures=seen.sensed.shape[1] // seen.subaperture_axes,
         n_sides=4,
         measurements=images.pop("measurements"),
-        optical_gain=images.pop("optical_gain"),
+        optical_gain=images.pop("optical_gain", None),
     )
-    cameras, picture = [], images.pop("psf")
-    if picture is not None:
+    cameras = []
+    if seen.psf is not None:
         pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
-        detector = aotpy.Detector("Camera detector", pixel_intensities=picture, pixel_scale=pixel)
+        detector = aotpy.Detector(
+            "Camera detector", pixel_intensities=images.pop("psf"), pixel_scale=pixel
+        )
         camera = aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))
         cameras.append(camera)
     if m == 2:
@@ -157,38 +156,38 @@ def _units(seen: Telemetry) -> dict[str, str]:
     }
 
 
-def _arrays(seen: Telemetry) -> dict[str, FloatArray | None]:
-    """Return series, matrices, images and time filters, by aotpy's names."""
-    out: dict[str, FloatArray | None] = dict.fromkeys(
-        ("residual_commands", "control_matrix", "time_filter_num", "time_filter_den")
-    )
+def _arrays(seen: Telemetry) -> dict[str, FloatArray]:
+    """Return the series, matrices, images and time filters that there are, by aotpy's names."""
     metres, axes = 1e-9 if seen.command_unit == "nm" else 1.0, seen.subaperture_axes
-    back, response = seen.reconstructor, seen.interaction_matrix
-    if (filters := _filters(seen)) is not None:
-        out["residual_commands"] = metres * seen.measurements @ filters.matrix.T
-        out["time_filter_num"], out["time_filter_den"] = filters.numerators, filters.denominators
-        if seen.slopes is None:
-            out["control_matrix"] = _by_subaperture(filters.matrix, axes)
-        elif back is not None:
-            out["control_matrix"] = _by_subaperture(filters.matrix @ back, axes)
-    return out | {
+    back, response, filters = seen.reconstructor, seen.interaction_matrix, _filters(seen)
+    arrays: dict[str, Any] = {
         "commands": metres * seen.commands,
-        "measurements": _by_subaperture(seen.sensed, axes),
+        "measurements": seen.sensed,
         "modal_coefficients": None if seen.slopes is None else seen.measurements,
-        "optical_gain": None if seen.sensor_gain is None else np.array([seen.sensor_gain]),
+        "optical_gain": None if seen.sensor_gain is None else [seen.sensor_gain],
         "modes": seen.mode_maps,
-        "measurements_to_modes": None if back is None else _by_subaperture(back, axes),
-        "modes_to_measurements": (  # (s_v, d, n)
-            None if response is None else _by_subaperture(response.T, axes).transpose(2, 1, 0)
-        ),
+        "measurements_to_modes": back,
+        "modes_to_measurements": None if response is None else response.T,
         "commands_to_modes": seen.influence_matrix,
-        "psf": None if seen.psf is None else seen.psf[None],
+        "psf": None if seen.psf is None else [seen.psf],
     }
-
-
-def _by_subaperture(matrix: FloatArray, axes: int) -> FloatArray:
-    """Reshape (rows, s) to (rows, d, s_v), d values from each of s_v subapertures."""
-    return matrix.reshape(len(matrix), axes, -1)
+    if filters is not None:
+        control: FloatArray | None = filters.matrix
+        if seen.slopes is not None:
+            control = None if back is None else filters.matrix @ back
+        arrays |= {
+            "residual_commands": metres * seen.measurements @ filters.matrix.T,
+            "control_matrix": control,
+            "time_filter_num": filters.numerators,
+            "time_filter_den": filters.denominators,
+        }
+    out = {name: np.asarray(data) for name, data in arrays.items() if data is not None}
+    for name in _OF_SUBAPERTURES & out.keys():
+        # (rows, s) to (rows, d, s_v), d values from each of s_v subapertures
+        out[name] = out[name].reshape(len(out[name]), axes, -1)
+    if response is not None:  # (s_v, d, n)
+        out["modes_to_measurements"] = out["modes_to_measurements"].transpose(2, 1, 0)
+    return out
 
 
 def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:

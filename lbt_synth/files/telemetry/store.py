@@ -152,9 +152,8 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     source = Path(path)
     if source.suffix.lower() not in (".fits", ".npz"):
         raise TelemetryError(f"telemetry must end in {_ENDINGS}; got {source.name!r}.", path=source)
-    content = read_bytes(source, TelemetryError)
-    is_fits = source.suffix.lower() == ".fits"
-    if is_fits and aot.is_aot(content):
-        return _KIND.rebuild(lambda: aot.from_bytes(content, source), source)
-    arrays, meta = _KIND.decode(content, read_fits if is_fits else read_npz, source)
-    return _KIND.rebuild(lambda: unpack(arrays, meta), source)
+    content, is_fits = read_bytes(source, TelemetryError), source.suffix.lower() == ".fits"
+    with _KIND.rebuilding(source):
+        if is_fits and aot.is_aot(content):
+            return aot.from_bytes(content, source)
+        return unpack(*_KIND.decode(content, read_fits if is_fits else read_npz, source))

@@ -1,17 +1,13 @@
-"""The clock of a record: its rows on a regular grid, by times or frame counters."""
+"""The clock of a record: its rows on a regular grid of frames, by times or frame counters."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.records.frame_grid import (
-    fit_rate,
-    frames_from_times,
-    require_few_holes,
-)
 from lbt_synth.validation import FloatArray, IntArray, number, real_array
 
 _MOST_APART = 5e-3  # by which a stated rate may differ from that of the times at all
@@ -20,6 +16,17 @@ _SAME_FRAMES = 3.0  # by which it may differ over the record, if that is more
 _SAID_FRAMES = 0.5  # over the record, beyond which a difference is noted
 _MOST_UNEVEN = 0.1  # of the steps, longer than a frame, if the times give the rate
 _FEW_ROWS = 20  # too few for that share
+_MOST_HOLES = 9  # missing frames over those that are there
+_CLEAR = 0.3  # of a frame, by which a step may differ from a whole number of frames
+_LEAST_GAP = 0.1  # of a frame, between the latest and the earliest row of a frame
+_COARSE = 0.02  # of a frame: times in smaller steps count as exact
+_WHOLE = 0.02  # of a step, by which times may differ from whole ones
+_EXACT = 0.05  # of a frame over the record, below which quantum and period are one
+_ABOVE = 1.05  # quantum over period above which different frames have equal times
+_FEW = 3  # odd steps that show an order
+_DENOMINATOR = 100_000
+_BLOCKS = 16  # of rows, whose mean distance from the grid is compared
+_SEARCH = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,7 +35,6 @@ class Clock:
 
     frame_rate_hz: float
     frame_of_row: IntArray  # (rows,), from 0, never falling; equal for rows of the same time
-    frames: int  # from the first row to the last
     notes: tuple[str, ...] = ()
 
 
@@ -48,8 +54,8 @@ def build_clock(
         frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
     if times is not None and rows > 1:
         if frame_numbers is None:
-            frame, notes = frames_from_times(times, rate)
-        found = fit_rate(times, frame)
+            frame, notes = _frames_from_times(times, rate)
+        found = _fit_rate(times, frame)
         if rate is None:
             rate = found
             notes.append(f"frame rate {rate:.9g} Hz, from the times")
@@ -64,9 +70,7 @@ def build_clock(
             notes += _compare_rates(rate, found, times, frame)
     if rate is None:
         raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
-    frames = int(frame[-1]) + 1
-    require_few_holes(frames, rows)
-    return Clock(frame_rate_hz=rate, frame_of_row=frame, frames=frames, notes=tuple(notes))
+    return Clock(frame_rate_hz=rate, frame_of_row=frame, notes=tuple(notes))
 
 
 def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:
@@ -114,5 +118,182 @@ def _frames_from_counter(numbers: FloatArray) -> IntArray:
             "frame_numbers must mostly rise by 1 per row; got a median step of "
             f"{np.median(steps):.6g}. A record of every second frame is one of half the rate."
         )
-    require_few_holes(float(numbers[-1]) - float(numbers[0]) + 1, len(numbers))
+    _require_few_holes(float(numbers[-1]) - float(numbers[0]) + 1, len(numbers))
     return np.asarray(numbers - numbers[0], dtype=np.int64)
+
+
+def _frames_from_times(times: FloatArray, rate: float | None) -> tuple[IntArray, list[str]]:
+    """Return the frame of each row, from 0, and notes.
+
+    Rounded to a quantum q, the times of frames without a hole stay within ``q rate`` of a
+    straight line; a missing frame leaves it by 1. Rows are laid on the grid where only one of
+    the two explains them.
+    """
+    steps = np.diff(times)
+    rising = steps[steps > 0]
+    if rising.size == 0:
+        raise ProblemError("times_s must rise; all rows have the same time.")
+    period = float(np.median(rising)) if rate is None else 1 / rate
+    _require_few_holes(float(times[-1] - times[0]) / period + 1, len(times))
+    if rising.size == len(steps) and np.ptp(steps) < 2 * _CLEAR * float(np.median(steps)):
+        # no frame is missing, whatever the rate is: that is compared afterwards
+        return np.arange(len(times)), []
+    quantum = _quantum(times, steps)
+    if rate is None:
+        return _lay_by_steps(times, steps, period, quantum), []
+    return _lay_by_rate(times, steps, rate, quantum)
+
+
+def _require_few_holes(frames: float, rows: int) -> None:
+    """Refuse a record that would be nearly all holes."""
+    if frames > (1 + _MOST_HOLES) * rows:
+        raise ProblemError(
+            f"{frames - rows:.15g} of {frames:.15g} frames would be missing between the first row "
+            "and the last; cut the record where it was interrupted."
+        )
+
+
+def _quantum(times: FloatArray, steps: FloatArray) -> float:
+    """Return the quantum of which all steps in time are multiples; 0 if there is none."""
+    noise = 8 * float(np.spacing(np.max(np.abs(times))))
+    levels = np.unique(steps)
+    levels = np.concatenate([levels[:1], levels[1:][np.diff(levels) > noise]])
+    gaps = np.concatenate([levels[levels > noise], np.diff(levels)])
+    least = float(np.min(gaps[gaps > noise], initial=np.inf))
+    if not np.isfinite(least):
+        return 0.0
+    counts = np.round(steps / least)
+    if np.any(np.abs(steps / least - counts) > _WHOLE + noise / least) or not counts.sum():
+        return 0.0
+    return float(times[-1] - times[0]) / float(counts.sum())
+
+
+def _grid_distance(times: FloatArray, rate: float) -> FloatArray:
+    """Return how far complete rows are from a grid, (rows,) [frames]."""
+    return np.asarray((times - times[0]) * rate - np.arange(len(times)))
+
+
+def _closest_rate(times: FloatArray) -> tuple[float, float]:
+    """Return the rate whose grid complete rows are closest to, and their spread [frames]."""
+    rate = _fit_rate(times, np.arange(len(times)))
+    ends = rate * (1 - 2 / len(times)), rate * (1 + 2 / len(times))
+    for _ in range(_SEARCH):  # the spread is convex in the rate
+        low, high = (ends[i] + (ends[1 - i] - ends[i]) / 3 for i in range(2))
+        better = np.ptp(_grid_distance(times, low)) < np.ptp(_grid_distance(times, high))
+        ends = (ends[0], high) if better else (low, ends[1])
+    rate = sum(ends) / 2
+    return rate, float(np.ptp(_grid_distance(times, rate)))
+
+
+def _lay_by_steps(times: FloatArray, steps: FloatArray, period: float, quantum: float) -> IntArray:
+    """Lay rows by the steps in time, for an unknown rate."""
+    counts = np.round(steps / period)
+    if np.any(np.abs(steps / period - counts) >= _CLEAR):
+        k = int(np.argmax(np.abs(steps / period - counts)))
+        raise ProblemError(
+            f"times_s lie on no regular grid of {1 / period:.6g} Hz; row {k + 1} comes "
+            f"{steps[k] / period:.3g} frames after the one before. Give frame_rate_hz, a counter "
+            "of frames, or leave the times away."
+        )
+    if quantum > _COARSE * period and int(np.sum(counts != 1)) >= _FEW:
+        rate, spread = _closest_rate(times)
+        if spread <= quantum * rate + _WHOLE + _slack(times, rate):
+            raise ProblemError(
+                f"the steps in time, whole multiples of {quantum:.6g} s, are those of missing or "
+                f"repeated frames at {1 / period:.6g} Hz, or of no such frame at {rate:.6g} Hz: "
+                "the times may be rounded. Give frame_rate_hz."
+            )
+    return np.asarray(np.concatenate([[0], np.cumsum(counts)]), dtype=np.int64)
+
+
+def _slack(times: FloatArray, rate: float) -> float:
+    return 1e-6 + 16 * rate * float(np.spacing(np.max(np.abs(times))))
+
+
+def _lay_by_rate(
+    times: FloatArray, steps: FloatArray, rate: float, quantum: float
+) -> tuple[IntArray, list[str]]:
+    """Lay rows on the grid of a known rate."""
+    rows, slack = len(times), _slack(times, rate)
+    step = quantum * rate  # frames
+    placed, gap, second = _part_in_widest_gap(times, steps, rate)
+    coarse = step > _COARSE and abs(1 - step) * rows > _EXACT
+    if coarse:
+        complete = _is_complete(_grid_distance(times, rate), step, slack)
+        if not complete and gap < _LEAST_GAP:  # a rate that is stated with few digits
+            found, spread = _closest_rate(times)
+            complete = abs(found / rate - 1) * rows < 0.5 and spread <= step + slack
+        if complete:
+            alone = step >= _ABOVE or placed is None or np.array_equal(placed, np.arange(rows))
+            if alone and not _may_hide_frame(_grid_distance(times, rate), step, slack):
+                return np.arange(rows), [f"times are rounded to {quantum:.6g} s"]
+            raise ProblemError(
+                f"times_s in steps of {quantum:.6g} s cannot tell rounding from missing or "
+                f"repeated frames at {rate:.9g} Hz in {rows} rows. Give a counter of frames, or "
+                "leave the times away."
+            )
+        # the frames begin in the gap that rounding leaves: another one that wide would do, too
+        if placed is None or second >= 1 - step + _finest_distance(step) - slack:
+            raise ProblemError(
+                f"times_s in steps of {quantum:.6g} s leave the grid of {rate:.9g} Hz by up to "
+                f"{np.ptp(_grid_distance(times, rate)):.3g} frames, and cannot tell which frames "
+                "are missing or repeated. Give a counter of frames, or cut the record there."
+            )
+    if placed is not None:
+        return placed, []
+    return _lay_by_steps(times, steps, 1 / rate, 0.0), []
+
+
+def _is_complete(apart: FloatArray, step: float, slack: float) -> bool:
+    """Whether rounding alone explains how far the rows are from the grid."""
+    spread = float(np.ptp(apart))
+    if spread <= step - _finest_distance(step) + slack:
+        return True
+    # ties may be rounded up and down: then both ends are reached, and nothing moves
+    if spread > step + slack or len(apart) < 4 * _BLOCKS:
+        return False
+    means = [float(block.mean()) for block in np.array_split(apart, _BLOCKS)]
+    return max(means) - min(means) < 0.5
+
+
+def _finest_distance(step: float) -> float:
+    """Return the quantum of the distances from the grid; rounding reaches one end only."""
+    part = Fraction(step).limit_denominator(_DENOMINATOR)
+    return 1 / part.denominator if abs(float(part) - step) < 1e-9 else 0.0
+
+
+def _may_hide_frame(apart: FloatArray, step: float, slack: float) -> bool:
+    """Whether rounding may hide a missing frame, the ends of the record aside."""
+    high, low = np.maximum.accumulate, np.minimum.accumulate
+    top = np.maximum(high(apart)[:-1], high(apart[::-1])[::-1][1:] - 1)
+    bottom = np.minimum(low(apart)[:-1], low(apart[::-1])[::-1][1:] - 1)
+    end = 1 + len(apart) // _BLOCKS
+    hidden = (top - bottom)[end:-end] <= step - _finest_distance(step) + slack
+    return bool(hidden.any())
+
+
+def _part_in_widest_gap(
+    times: FloatArray, steps: FloatArray, rate: float
+) -> tuple[IntArray | None, float, float]:
+    """Return frames that begin in the widest gap (None if it is narrow), and the two widest."""
+    grid = (times - times[0]) * rate
+    parts = np.sort(grid - np.floor(grid))
+    gaps = np.diff(np.append(parts, parts[0] + 1))
+    k = int(np.argmax(gaps))
+    gap = float(gaps[k])
+    second = float(np.max(np.delete(gaps, k), initial=0.0))
+    if gap < _LEAST_GAP:
+        return None, gap, second
+    frame = np.floor(grid - (parts[k] + gap / 2))
+    if np.any(np.diff(frame)[steps > 0] <= 0):
+        return None, gap, second
+    return np.asarray(frame - frame[0], dtype=np.int64), gap, second
+
+
+def _fit_rate(times: FloatArray, frame: IntArray) -> float:
+    """Return the rate by a straight line through times and frames, to nine digits."""
+    t, n = times - times.mean(), frame - frame.mean()
+    slope = float(n @ t)
+    if not slope > 0:
+        raise ProblemError("times_s must rise; all rows have the same time.")
+    return float(f"{float(n @ n) / slope:.9g}")

@@ -1,7 +1,8 @@
-"""What a file of series holds: columns and facts of FITS, NPY, NPZ and CSV."""
+"""What a file of series holds: columns and facts of FITS, NPY, NPZ and text tables."""
 
 from __future__ import annotations
 
+import csv
 import io
 import re
 import warnings
@@ -10,21 +11,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from zipfile import is_zipfile
 
 import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.errors import FileError, LbtSynthError, ProblemError, TelemetryError
 from lbt_synth.identification.records.columns import Column, parse_column, recognise_fact
-from lbt_synth.identification.records.csv_file import read_csv
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.atomic_files import read_bytes, require_ending
+from lbt_synth.validation import FloatArray
 
 FITS = (".fits", ".fit", ".fts")
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
 _SUFFIXES = {"frame_rate_hz": "hz", "delay_frames": "frames?", "diameter_m": "m"}  # of numbers
+_GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
+_DELIMITERS = (";", "\t", ",", "|")  # else blanks
+_LOOKED_AT = 20  # rows, to find decimal commas
 _DELAY_CARD = "DELAY"
 _IN_FRAMES = ("[frame]", "[frames]")  # the unit of a card, where the FITS standard has it
 
@@ -96,7 +99,7 @@ def read_contents(path: Path) -> Contents:
 def parse_contents(path: Path, content: bytes) -> Contents:
     """Return what the content of a file holds."""
     ending, out = path.suffix.lower(), Contents()
-    read = {**dict.fromkeys(FITS, _read_fits), ".npy": _read_npy, ".npz": _read_npz}
+    read = {**dict.fromkeys(FITS, _read_fits), ".npy": _read_numpy, ".npz": _read_numpy}
     with name_in_errors(path):
         try:
             read.get(ending, _read_text)(out, content)
@@ -154,18 +157,13 @@ def _add_table(out: Contents, unit: Any) -> None:
         out.add_array(card.name, data, card.unit)
 
 
-def _read_npy(out: Contents, content: bytes) -> None:
-    if not content.startswith(b"\x93NUMPY"):
-        raise ValueError("it does not begin as an NPY file does; it is damaged, or another kind")
-    _add_named(out, "", np.asarray(np.load(io.BytesIO(content), allow_pickle=False)))
-
-
-def _read_npz(out: Contents, content: bytes) -> None:
-    if not is_zipfile(io.BytesIO(content)):
-        raise ValueError("it is no ZIP archive; it is damaged, or of another kind")
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        for name in archive.files:
-            _add_named(out, name, np.asarray(archive[name]))
+def _read_numpy(out: Contents, content: bytes) -> None:
+    if not content.startswith((b"\x93NUMPY", b"PK\x03\x04")):
+        raise ValueError("it begins as neither an NPY file nor a ZIP archive does")
+    with io.BytesIO(content) as stream:
+        arrays = np.load(stream, allow_pickle=False)
+        for name in getattr(arrays, "files", [""]):
+            _add_named(out, name, np.asarray(arrays[name] if name else arrays))
 
 
 def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
@@ -188,15 +186,76 @@ def _read_text(out: Contents, content: bytes) -> None:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise TelemetryError("it is no text in UTF-8.") from error
-    table = read_csv(text)
-    out.notes += table.notes
-    out.columns = [parse_column(n, v) for n, v in zip(table.names, table.values.T, strict=True)]
-    for line in table.comments:  # such as frame_rate_hz = 1000
-        match = re.match(r"^\s*([A-Za-z][\w .\-]*?)\s*[:=]\s*(\S.*?)\s*$", line)
-        if match is None or (fact := recognise_fact(match[1])) is None:
-            continue
-        where = f"the comment {match[1].strip()}"
+    rows: list[tuple[int, str]] = []  # number of each line, from 1, and its text
+    above = ""  # the last comment before the table, which may have the names
+    for number, raw in enumerate(text.splitlines(), start=1):
+        line = raw.strip("\r\n ")
+        if line.lstrip().startswith("#"):
+            comment = line.lstrip().lstrip("#").strip()
+            above = above if rows else comment
+            _add_comment(out, comment)
+        elif line:
+            rows.append((number, line))
+    if not rows:
+        raise TelemetryError("it has no rows.")
+    sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
+    names = _split_cells(rows[0][1], sign)
+    sample = "".join(line for _, line in rows[1:_LOOKED_AT])
+    if sign in (";", "\t") and "," in sample and "." not in sample:
+        out.notes.append("commas were taken for decimal points")
+        rows = [(number, line.replace(",", ".")) for number, line in rows]
+    if None in map(_parse_number, _split_cells(rows[0][1], sign)):
+        rows = rows[1:]
+    else:
+        cells = _split_cells(above, sign)
+        numbers = [cell for cell in cells if not cell or _parse_number(cell) is not None]
+        names = [""] * len(names) if numbers or len(cells) != len(names) else cells
+    if not rows:
+        raise TelemetryError("it has a heading and no rows.")
+    table = _parse_rows(rows, sign, len(names))
+    out.columns = [parse_column(name, column) for name, column in zip(names, table.T, strict=True)]
+
+
+def _add_comment(out: Contents, comment: str) -> None:
+    """Add the fact of a comment such as frame_rate_hz = 1000."""
+    match = re.match(r"^([A-Za-z][\w .\-]*?)\s*[:=]\s*(\S.*)$", comment)
+    if match is not None and (fact := recognise_fact(match[1])) is not None:
         if fact == "unit" and " " in match[2]:
-            out.notes.append(f"{where} was not taken for a unit: {match[2]!r}")
+            out.notes.append(f"the comment {match[1]} was not taken for a unit: {match[2]!r}")
         else:
-            out.add_fact(fact, match[2], where)
+            out.add_fact(fact, match[2], f"the comment {match[1]}")
+
+
+def _split_cells(line: str, sign: str | None) -> list[str]:
+    cells = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
+    return [cell.strip().strip('"') for cell in cells]
+
+
+def _parse_number(cell: str) -> float | None:
+    word = cell.lower()
+    try:
+        return float("nan" if word in _GAPS else word)
+    except ValueError:
+        return None
+
+
+def _parse_rows(rows: list[tuple[int, str]], sign: str | None, width: int) -> FloatArray:
+    try:  # the quick way, which knows no gaps
+        lines = [line for _, line in rows]
+        out = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
+        if out.shape == (len(rows), width):
+            return out
+    except ValueError:
+        pass
+    out = np.empty((len(rows), width))
+    for i, (number, line) in enumerate(rows):
+        cells = _split_cells(line, sign)
+        if len(cells) != width:
+            raise TelemetryError(f"line {number} must have {width} cells; got {len(cells)}.")
+        for j, cell in enumerate(cells):
+            if (value := _parse_number(cell)) is None:
+                raise TelemetryError(
+                    f"cell {j + 1} of line {number} must be a number; got {cell!r}."
+                )
+            out[i, j] = value
+    return out

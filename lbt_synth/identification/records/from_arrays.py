@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError
-from lbt_synth.identification.records.clock import Clock, build_clock
+from lbt_synth.identification.records.clock import build_clock
 from lbt_synth.identification.records.faults import (
     equal_runs,
     fill,
@@ -123,10 +123,10 @@ def loop_record(
     )
     findings, said = list[Finding](), [*notes, *clock.notes]
     rows = y if u is None else np.hstack([y, u])
-    rows, there = _lay_on_grid(rows, clock, findings, said)
-    axes = y.shape[1]
+    rows, there = _lay_on_grid(rows, clock.frame_of_row, findings, said)
+    axes, frames = y.shape[1], len(rows)
     y, measured = _judge_series(rows[:, :axes], there, "measurements", _MEASURED, findings)
-    commanded = np.ones(clock.frames, dtype=np.bool_)
+    commanded = np.ones(frames, dtype=np.bool_)
     if u is not None:
         u, commanded = _judge_series(rows[:, axes:], there, "commands", _COMMANDED, findings)
         _report_held(u, commanded, findings)
@@ -139,7 +139,7 @@ def loop_record(
         mirror=mirror,
         usable=measured,
         health=RecordHealth(
-            frames=clock.frames,
+            frames=frames,
             usable=int(np.sum(measured)),
             findings=tuple(findings),
             notes=merge_notes(said),
@@ -171,21 +171,20 @@ def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
 
 
 def _lay_on_grid(
-    rows: FloatArray, clock: Clock, findings: list[Finding], said: list[str]
+    rows: FloatArray, frame: IntArray, findings: list[Finding], said: list[str]
 ) -> tuple[FloatArray, BoolArray]:
     """Return the first row of each frame, NaN without one, and the frames whose rows agree."""
-    frame = clock.frame_of_row
     is_first = np.diff(frame, prepend=-1) > 0
     first = np.flatnonzero(is_first)
     earlier = rows[first[np.cumsum(is_first) - 1]]
     differs = ~np.all((rows == earlier) | (np.isnan(rows) & np.isnan(earlier)), axis=1)
-    there, torn = np.zeros((2, clock.frames), dtype=np.bool_)
+    there, torn = np.zeros((2, frame[-1] + 1), dtype=np.bool_)
     there[frame], torn[frame[differs]] = True, True
     _report(findings, "missing", "frames", None, ~there)
     _report(findings, "repeated", "frames", None, torn)
     if again := len(rows) - len(first):
         said.append(f"{again} rows of a time that had been recorded already were left out")
-    out = np.full((clock.frames, rows.shape[1]), np.nan)
+    out = np.full((len(there), rows.shape[1]), np.nan)
     out[frame[first]] = rows[first]
     return out, there & ~torn
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from astropy.io import fits
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from support.record_files import csv, hdus, image
 
 import lbt_synth as lbt
+from lbt_synth.identification.records.contents import parse_contents
 
 RATE = 500.0
 
@@ -159,9 +164,50 @@ def test_facts_in_arrays_and_texts(tmp_path, series):
 
 
 def test_broken_archives_do_not_speak_of_pickles(tmp_path):
-    for name, words in (("a.npz", "no ZIP archive"), ("a.npy", "does not begin as an NPY")):
+    neither = "it begins as neither an NPY file nor a ZIP archive does"
+    for name in ("a.npz", "a.npy"):
         for content in (b"", b"PK", b"garbage"):
             (tmp_path / name).write_bytes(content)
-            with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
+            with pytest.raises(lbt.errors.TelemetryError, match=neither) as caught:
                 lbt.load_record(tmp_path / name)
             assert "pickle" not in str(caught.value)
+
+
+def table_of(text):
+    """Names of the columns of a text table, its values, and notes."""
+    found = parse_contents(Path("a.csv"), text.encode())
+    values = np.column_stack([column.values for column in found.columns])
+    return [column.name for column in found.columns], values, found.notes
+
+
+def test_gaps_and_comments_of_text_tables():
+    names, values, _ = table_of("# mode: closed\ntime_s, y_nm\n0.000, 3.5\n0.001, \n")
+    assert names == ["time_s", "y_nm"]
+    assert np.array_equal(values, [[0.0, 3.5], [0.001, np.nan]], equal_nan=True)
+
+
+@settings(max_examples=40)
+@given(
+    rows=st.lists(
+        st.tuples(*[st.one_of(st.none(), st.floats(allow_nan=False, allow_infinity=False))] * 3),
+        min_size=1,
+        max_size=8,
+    ),
+    sign=st.sampled_from([",", ";", "\t", "|"]),
+    heading=st.booleans(),
+)
+def test_any_table_comes_back(rows, sign, heading):
+    head = [sign.join(["alpha", "beta", "gamma"])] if heading else []
+    lines = [sign.join("" if v is None else repr(v) for v in row) for row in rows]
+    names, values, _ = table_of("\n".join(head + lines))
+    expected = np.array([[np.nan if v is None else v for v in row] for row in rows])
+    assert np.array_equal(values, expected, equal_nan=True)
+    assert names == (["alpha", "beta", "gamma"] if heading else [""] * 3)
+
+
+def test_headings_in_comments_and_decimal_commas():
+    names, _, _ = table_of("# time_s y_nm\n0.0 1.5\n0.1 2.5\n")
+    assert names == ["time_s", "y_nm"]
+    _, values, notes = table_of("t_s;y_nm\n0,5;1,25\n1,0;-2\n")
+    assert values.tolist() == [[0.5, 1.25], [1.0, -2.0]]
+    assert notes == ["commas were taken for decimal points"]
