@@ -8,11 +8,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from lbt_synth.design.hinf import hinf, require_reachable
-from lbt_synth.design.result import FilterDesign, Gains, SolverReport, filter_design
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.linear import EstimationProblem, hinf_norm
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.linear.riccati.gamma import gamma_riccati
 from lbt_synth.validation import number
 
@@ -76,12 +76,12 @@ class CentralFilters:
         self.problem, self.least = problem, least
         self.start = kalman_riccati(problem)
 
-    def member(self, measure: Callable[[float, float], float]) -> Gains:
+    def member(self, measure: Callable[[float, float], float]) -> FilterDesign | FilterRiccati:
         """Return the filter at which a rising measure of norm and deviation is zero.
 
         Where the measure does not change its sign it is one end of the family.
         """
-        gains: dict[float, Gains] = {0.0: self.least}
+        gains: dict[float, FilterDesign | FilterRiccati] = {0.0: self.least}
         found = {0.0: measure(self.least.gamma, self.least.rms)}
 
         def value(decades: float) -> float:

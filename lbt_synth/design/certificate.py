@@ -30,6 +30,7 @@ NORM_TOLERANCE = 1e-6
 RESIDUAL_TOLERANCE = 1e-8
 INFEASIBLE_TOLERANCE = 1e-9
 VARIANCE_TOLERANCE = 1e-6
+LEVEL_SETS = "level sets on the symplectic pencil"
 _GRID = 513
 
 
@@ -161,26 +162,15 @@ def certify_filter(
     gain = np.asarray(gain_predictor)
     checks = list(certificate.checks)
     if gamma is not None:
-        checks.append(
-            Check(
-                name="norm of the estimation error",
-                value=norm.upper,
-                limit=gamma * (1 + NORM_TOLERANCE),
-                computed_by="level sets on the symplectic pencil",
-            )
-        )
+        limit = gamma * (1 + NORM_TOLERANCE)
+        checks.append(Check("norm of the estimation error", norm.upper, limit, LEVEL_SETS))
     if least_variance:
         innovation = problem.R + problem.C @ P @ problem.C.T
         optimal = np.linalg.solve(innovation, (problem.A @ P @ problem.C.T + problem.S).T).T
         size = float(np.linalg.norm(optimal, 2))
-        checks.append(
-            Check(
-                name="distance from the least-variance gain",
-                value=float(np.linalg.norm(gain - optimal, 2)) / size if size > 0 else 0.0,
-                limit=GAIN_TOLERANCE,
-                computed_by="gain recomputed from the Lyapunov covariance",
-            )
-        )
+        distance = float(np.linalg.norm(gain - optimal, 2)) / size if size > 0 else 0.0
+        how = "gain recomputed from the Lyapunov covariance"
+        checks.append(Check("distance from the least-variance gain", distance, GAIN_TOLERANCE, how))
     return replace(certificate, checks=tuple(checks))
 
 
@@ -205,21 +195,13 @@ def _examine_error(
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     highest = float(np.max(largest_singular_values(error, grid)))
+    equation = "residual of the Lyapunov equation", lyapunov_residual(error.A, drive, P)
+    above, how = highest / max(norm.upper, 1e-300) - 1, f"{_GRID} frequencies against level sets"
     checks = (
         stable,
-        Check(
-            name="residual of the Lyapunov equation",
-            value=lyapunov_residual(error.A, drive, P),
-            limit=RESIDUAL_TOLERANCE,
-            computed_by="relative, 1-norm",
-        ),
+        Check(*equation, RESIDUAL_TOLERANCE, "relative, 1-norm"),
         _adjoint_variance_check(error, float(variances.sum())),
-        Check(
-            name="singular values above the norm",
-            value=highest / max(norm.upper, 1e-300) - 1,
-            limit=NORM_TOLERANCE,
-            computed_by=f"{_GRID} frequencies against level sets",
-        ),
+        Check("singular values above the norm", above, NORM_TOLERANCE, how),
     )
     rms = frozen_copy(np.sqrt(np.maximum(variances, 0)))
     return Certificate(checks=checks, gamma=norm.value, rms_per_output=rms), norm, P
@@ -230,12 +212,9 @@ def _adjoint_variance_check(error: StateSpace, variance: float) -> Check:
     weight = stationary_covariance(error.A.T, error.C.T @ error.C)
     adjoint = float(np.trace(error.B.T @ weight @ error.B))
     size = max(abs(variance), abs(adjoint))
-    return Check(
-        name="variance, against its adjoint equation",
-        value=abs(variance - adjoint) / size if size > 0 else 0.0,
-        limit=VARIANCE_TOLERANCE,
-        computed_by="relative, two Lyapunov equations",
-    )
+    apart = abs(variance - adjoint) / size if size > 0 else 0.0
+    how = "relative, two Lyapunov equations"
+    return Check("variance, against its adjoint equation", apart, VARIANCE_TOLERANCE, how)
 
 
 def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
@@ -288,12 +267,9 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
         )
     claimed = number(level, "level", above=0)
     proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
-    return Check(
-        name="infeasible level over the level proved, less 1",
-        value=claimed / max(proved, 1e-300) - 1,
-        limit=INFEASIBLE_TOLERANCE,
-        computed_by="disturbances that no measurement shows",
-    )
+    above, how = claimed / max(proved, 1e-300) - 1, "disturbances that no measurement shows"
+    name = "infeasible level over the level proved, less 1"
+    return Check(name, above, INFEASIBLE_TOLERANCE, how)
 
 
 def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
@@ -331,7 +307,7 @@ def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
 
 
 def _stability_check(name: str, radius: float) -> Check:
-    return Check(name=name, value=radius, limit=1 - STABILITY_MARGIN, computed_by="eigenvalues")
+    return Check(name, radius, 1 - STABILITY_MARGIN, "eigenvalues")
 
 
 def controller_difference(one: Controller, other: Controller) -> float:

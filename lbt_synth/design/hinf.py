@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.kalman import error_scale
-from lbt_synth.design.result import FilterDesign, SolvedGains, SolverReport, filter_design
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_level
 from lbt_synth.linear.estimation_problem import require_problem
@@ -15,6 +16,11 @@ from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.linear.riccati.gamma import gamma_riccati, least_gamma
 from lbt_synth.linear.riccati.invisible_disturbance import worst_invisible_disturbance
 from lbt_synth.validation import FloatArray, choice, frozen_copy, number
+
+if TYPE_CHECKING:
+    from lbt_synth.linear.lmi.balanced_coordinates import LmiSolution
+
+SolvedGains: TypeAlias = "FilterRiccati | LmiSolution"
 
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9

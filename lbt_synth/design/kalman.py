@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from lbt_synth.design.result import FilterDesign, SolvedGains, SolverReport, filter_design
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
-from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.validation import choice
+
+if TYPE_CHECKING:
+    from lbt_synth.linear.lmi.balanced_coordinates import LmiSolution
 
 
 def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccati") -> FilterDesign:
@@ -51,7 +56,7 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     choice(route, "route", ("riccati", "sdp"))
     problem = problem.ahead(horizon)
     solution = kalman_riccati(problem)
-    gains: SolvedGains = solution
+    gains: FilterRiccati | LmiSolution = solution
     if route == "sdp":
         from lbt_synth.linear.lmi.filters import kalman_sdp
 

@@ -140,13 +140,9 @@ class LqgDesign(EstimatorDesign):
         rebuilt = lqg_controller(
             self.problem, self.gain_predictor, self.gain_state, self.gain_mirror
         )
+        apart = controller_difference(self.controller, rebuilt)
         checks += [
-            Check(
-                name="controller against its gains",
-                value=controller_difference(self.controller, rebuilt),
-                limit=_SAME,
-                computed_by="matrices assembled again",
-            ),
+            Check("controller against its gains", apart, _SAME, "matrices assembled again"),
             certify_loop(self.problem.hardware, self.controller),
         ]
         if checks[-1].passed:
@@ -172,12 +168,8 @@ class LqgDesign(EstimatorDesign):
             better = (core.D * row - entry @ X @ whole) / weight
             size = max(float(np.linalg.norm(better)), 1e-300)
             worst = max(worst, float(np.linalg.norm(law - better)) / size)
-        return Check(
-            name="distance from the least-cost regulator",
-            value=worst,
-            limit=GAIN_TOLERANCE,
-            computed_by="gains recomputed from a Lyapunov equation",
-        )
+        how = "gains recomputed from a Lyapunov equation"
+        return Check("distance from the least-cost regulator", worst, GAIN_TOLERANCE, how)
 
     def _cost_checks(self, rms: float) -> list[Check]:
         """Compare the cost of the real loop, by a Lyapunov equation, with the claimed one."""
@@ -187,15 +179,11 @@ class LqgDesign(EstimatorDesign):
             ("residual of the closed loop, against the error system", residual, rms**2),
             ("objective of the closed loop, against the one claimed", cost, self.objective_nm**2),
         )
-        return [
-            Check(
-                name=name,
-                value=abs(found / claimed - 1) if claimed > 0 else found,
-                limit=VARIANCE_TOLERANCE,
-                computed_by="relative, Lyapunov equation of the whole loop",
-            )
-            for name, found, claimed in pairs
-        ]
+        how, checks = "relative, Lyapunov equation of the whole loop", []
+        for name, found, claimed in pairs:
+            apart = abs(found / claimed - 1) if claimed > 0 else found
+            checks.append(Check(name, apart, VARIANCE_TOLERANCE, how))
+        return checks
 
 
 def lqg_controller(

@@ -11,7 +11,7 @@ import numpy as np
 from lbt_synth.design.central_filters import CentralFilters
 from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
-from lbt_synth.design.result import FilterDesign, Gains, SolverReport, filter_design
+from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import (
     EstimationProblem,
@@ -22,7 +22,7 @@ from lbt_synth.linear import (
     largest_singular_values,
 )
 from lbt_synth.linear.estimation_problem import require_problem
-from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ class _ImpulseResponse:
 
 def _complete_base(
     problem: EstimationProblem,
-    base: Gains,
+    base: FilterDesign | FilterRiccati,
     length: int,
     solve: Callable[[InnovationProgramme, FloatArray], _Answer],
 ) -> _ImpulseResponse:
@@ -204,7 +204,7 @@ def _complete_base(
 
 def _mixed_design(
     problem: EstimationProblem,
-    base: Gains,
+    base: FilterDesign | FilterRiccati,
     response: _ImpulseResponse,
     least: FilterDesign,
     *,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypedDict, TypeVar, Unpack
+from typing import Any, TypeVar
 
 import numpy as np
 
 from lbt_synth.design.certificate import (
     INFEASIBLE_TOLERANCE,
+    LEVEL_SETS,
     NORM_TOLERANCE,
     Certificate,
     Check,
@@ -250,40 +251,6 @@ def with_certificate(design: AnyDesign, hint: str) -> AnyDesign:
     return replace(design, certificate=design.recertify().require(hint))
 
 
-class Gains(Protocol):
-    """The two gains of a filter, as :class:`FilterDesign` has them."""
-
-    @property
-    def gain_predictor(self) -> FloatArray:
-        """Gain of the time-and-measurement update."""
-
-    @property
-    def gain_filter(self) -> FloatArray:
-        """Gain of the measurement update alone."""
-
-
-class SolvedGains(Gains, Protocol):
-    """Gains, with what the solver said."""
-
-    @property
-    def status(self) -> str:
-        """What the solver said."""
-
-    @property
-    def iterations(self) -> int:
-        """Iterations it took."""
-
-
-class FilterClaims(TypedDict, total=False):
-    """Bounds that a filter design was given, and claims about its problem."""
-
-    gamma_requested: float | None
-    rms_requested: float | None
-    gamma_least: float | None
-    gamma_infeasible: float | None
-    witness: Witness | None
-
-
 def certify_design(design: FilterDesign) -> Certificate:
     """Certify a filter, its claims, and its closed loop where its problem is a plant."""
     problem = design.problem
@@ -295,23 +262,13 @@ def certify_design(design: FilterDesign) -> Certificate:
     )
     checks = list(certificate.checks)
     if design.rms_requested is not None:
-        checks.append(
-            Check(
-                name="standard deviation of the estimation error",
-                value=certificate.rms,
-                limit=design.rms_requested * (1 + NORM_TOLERANCE),
-                computed_by="Lyapunov equation",
-            )
-        )
+        limit = design.rms_requested * (1 + NORM_TOLERANCE)
+        name = "standard deviation of the estimation error"
+        checks.append(Check(name, certificate.rms, limit, "Lyapunov equation"))
     if design.gamma_infeasible is not None:
-        checks.append(
-            Check(
-                name="infeasible level over the norm achieved, less 1",
-                value=design.gamma_infeasible / certificate.gamma - 1,
-                limit=INFEASIBLE_TOLERANCE,
-                computed_by="level sets on the symplectic pencil",
-            )
-        )
+        name = "infeasible level over the norm achieved, less 1"
+        value = design.gamma_infeasible / certificate.gamma - 1
+        checks.append(Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS))
         # a claim without a witness is not believed
         proof = design.witness or Witness(
             states=np.zeros((problem.n_states, 1)),
@@ -330,7 +287,7 @@ def filter_design(
     *,
     method: str,
     solver: SolverReport,
-    **claims: Unpack[FilterClaims],
+    **claims: Any,
 ) -> FilterDesign:
     """Make a design and certify it; raise CertificateError if it fails."""
     design = FilterDesign(
