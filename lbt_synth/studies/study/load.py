@@ -150,7 +150,7 @@ def _read_designs(study: Study, directory: str | os.PathLike[str] | None) -> dic
     if directory is None or (manifest := read_manifest(Path(directory))) is None:
         return {}
     require_same_study(manifest, study.digest, Path(directory))
-    return {name: read_design(Path(directory), name, manifest) for name in manifest["designs"]}
+    return {name: read_design(Path(directory), name, manifest) for name in manifest.designs}
 
 
 def _designed_controller(study: Study, name: str, stored: Design | None) -> StudyController:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,10 @@ from lbt_synth.storage.atomic_files import open_atomically, write_atomically
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.parquet import read_parquet, write_parquet
-from lbt_synth.studies.study.store import FAILED, Part, read_blocks, read_part
+from lbt_synth.studies.study.store import FAILED, Part, read_part
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
-_BLOCK_ROWS = 65_536
 _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 
 
@@ -34,23 +33,23 @@ def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
     A CSV table has 12 digits for parameters and 9 for results; a Parquet table has all digits.
     """
     path = results_path(folder, study)
+    blocks = ((part.start, _part_rows(study, part)) for part in parts)
     with open_atomically(path) as stream:
         if study.settings.results == "parquet":
-            write_parquet(stream, study.columns, _table_blocks(study, parts))
+            write_parquet(stream, study.columns, blocks)
             return path
         stream.write((",".join(study.columns) + "\n").encode())
         formats = [_PARAMETER] * len(study.parameters) + [_RESULT] * len(study.result_columns)
         line = ",".join(["%d", *formats])
-        for start, values in _table_blocks(study, parts):
+        for start, values in blocks:
             rows = enumerate(values.tolist(), start)
             stream.write("".join([f"{line % (row, *cells)}\n" for row, cells in rows]).encode())
     return path
 
 
-def _table_blocks(study: Study, parts: Sequence[Part]) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the first row, and parameters and results side by side."""
-    for start, results in read_blocks(list(parts), study, _BLOCK_ROWS):
-        yield start, np.hstack([study.values(start, start + len(results)), results])
+def _part_rows(study: Study, part: Part) -> FloatArray:
+    """Return parameters and results of a part side by side."""
+    return np.hstack([study.values(part.start, part.stop), read_part(part, study)[0]])
 
 
 def write_failures(folder: Path, failures: Sequence[Failure]) -> Path:
@@ -68,11 +67,9 @@ def read_failures(folder: Path) -> list[tuple[int, str, str]]:
 def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict[str, FloatArray]:
     """Return all columns (n,), from the parts if there are any, else from the table of results."""
     if parts:
-        rows = np.concatenate([np.arange(part.start, part.stop) for part in parts])
-        values = np.vstack([study.values(part.start, part.stop) for part in parts])
-        results = np.vstack([read_part(part, study)[0] for part in parts])
-        stacked = [rows.astype(np.float64), *values.T, *results.T]
-        return dict(zip(study.columns, stacked, strict=True))
+        rows = np.vstack([_part_rows(study, part) for part in parts])
+        first = np.arange(study.samples, dtype=np.float64)
+        return dict(zip(study.columns, (first, *rows.T), strict=True))
     path = results_path(folder, study)
     if study.settings.results == "parquet":
         found = read_parquet(path)

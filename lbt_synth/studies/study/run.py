@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import lbt_synth
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.worker_processes import exclusive_lock
@@ -30,10 +29,12 @@ from lbt_synth.studies.study.store import (
     PAGE,
     PARTS,
     PRINT,
+    Manifest,
     Part,
     file_digest,
     list_parts,
     missing_rows,
+    new_manifest,
     read_design,
     read_manifest,
     read_part,
@@ -42,7 +43,6 @@ from lbt_synth.studies.study.store import (
     require_same_study,
     require_unchanged,
     write_designs,
-    write_manifest,
     write_part,
 )
 from lbt_synth.studies.study.study import Study
@@ -176,26 +176,22 @@ def run_study(
         require_parquet()
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
+    computed, computing_s = 0, 0.0
     with exclusive_lock(folder, "study"):
         remove_unfinished_files(folder, [path.name for path in output_paths(folder, study)])
         manifest = _begin(folder, study)
-        tables = (results_path(folder, study), folder / FAILED)
-        finished = bool(manifest["finished"]) and all(path.exists() for path in tables)
-        if finished:
-            require_unchanged(folder, manifest)
-        parts = _usable_parts(folder, study)
-        if finished and not manifest["retry"]:
+        if manifest.finished:
             remove_parts(folder)  # a run was killed while it removed them
-            parts = []
-        computed, computing_s = 0, 0.0
-        if not finished or manifest["retry"]:
-            if manifest["finished"]:  # not until its tables are written again
-                manifest = manifest | {"finished": False, "tables": {}}
-                write_manifest(folder, manifest)
+            if progress is not None:
+                progress(study.samples)
+            if whole is not None:
+                found, spent = read_results(folder, study), manifest.computing_seconds
+                whole(FinishedStudy(columns=found, computing_s=spent, new=False))
+        else:
             computed = _compute_missing(
                 study,
                 folder,
-                parts,
+                _usable_parts(folder, study),
                 executor=executor,
                 jobs=jobs,
                 workers=workers,
@@ -204,20 +200,14 @@ def run_study(
             )
             computing_s = time.perf_counter() - began
             manifest = _write_tables(folder, study, manifest, computed, began, whole)
-        else:
-            if progress is not None:
-                progress(study.samples)
-            if whole is not None:
-                found, spent = read_results(folder, study), manifest["computing_seconds"]
-                whole(FinishedStudy(columns=found, computing_s=spent, new=False))
     return StudyRun(
         directory=folder,
         results=results_path(folder, study),
         failed=folder / FAILED,
         samples=study.samples,
         computed=computed,
-        failures=manifest["failures"],
-        retry=manifest["retry"],
+        failures=manifest.failures,
+        retry=manifest.retry,
         computing_s=computing_s,
         seconds=time.perf_counter() - began,
     )
@@ -230,13 +220,19 @@ def output_paths(folder: Path, study: Study) -> list[Path]:
     return [folder / name for name in (MANIFEST, *tables, *designs)]
 
 
-def _begin(folder: Path, study: Study) -> dict[str, Any]:
+def _begin(folder: Path, study: Study) -> Manifest:
     """Return the manifest of a directory; begin the study if there is none."""
     manifest = read_manifest(folder)
     if manifest is not None:
         require_same_study(manifest, study.digest, folder)
-        for name in manifest["designs"]:
+        for name in manifest.designs:
             read_design(folder, name, manifest)
+        if manifest.finished:
+            written = results_path(folder, study).exists() and (folder / FAILED).exists()
+            if written:
+                require_unchanged(folder, manifest)
+            if manifest.retry or not written:
+                manifest = manifest.write(folder, finished=False, tables={})
     elif list_parts(folder):
         raise OutputError(
             f"{folder} holds parts of a study without its {MANIFEST}. Name another directory, or "
@@ -251,28 +247,10 @@ def _begin(folder: Path, study: Study) -> dict[str, Any]:
                     "another directory, or delete it.",
                     path=path,
                 )
-        manifest = {
-            "digest": study.digest,
-            "version": lbt_synth.__version__,
-            "source": str(study.source),
-            "samples": study.samples,
-            "evaluation": study.settings.evaluation,
-            "parameters": {p.name: p.distribution.text for p in study.parameters},
-            "controllers": {c.name: c.origin for c in study.controllers},
-            "designs": {},
-            "tables": {},
-            "settings": study.settings.model_dump(by_alias=True, exclude_none=True),
-            "finished": False,
-            "failures": 0,
-            "retry": 0,
-            "seconds": 0.0,
-            "computing_seconds": 0.0,
-        }
-        write_manifest(folder, manifest)
-    designs = {c.name for c in study.controllers if c.is_designed}
-    if set(manifest["designs"]) != designs:  # begun now, or killed before they were written
-        manifest = manifest | {"designs": write_designs(folder, study)}
-        write_manifest(folder, manifest)
+        manifest = new_manifest(study).write(folder)
+    if set(manifest.designs) != {c.name for c in study.controllers if c.is_designed}:
+        # begun now, or killed before they were written
+        manifest = manifest.write(folder, designs=write_designs(folder, study))
     return manifest
 
 
@@ -318,11 +296,11 @@ def _compute_missing(
 def _write_tables(
     folder: Path,
     study: Study,
-    manifest: dict[str, Any],
+    manifest: Manifest,
     computed: int,
     began: float,
     whole: Callable[[FinishedStudy], None] | None,
-) -> dict[str, Any]:
+) -> Manifest:
     """Write the results of all parts, then the manifest, then remove the parts."""
     parts = list_parts(folder)
     logs = [read_part(part, study)[1:] for part in parts]
@@ -333,17 +311,17 @@ def _write_tables(
         found = read_results(folder, study, parts)
         whole(FinishedStudy(columns=found, computing_s=spent, new=True))
     retry = sum(failure.retry for failure in failures)
-    manifest = manifest | {
-        "finished": True,
-        "tables": {path.name: file_digest(path) for path in tables},
-        "settings": study.settings.model_dump(by_alias=True, exclude_none=True),
-        "failures": len(failures),
-        "retry": retry,
-        "computed_last": computed,
-        "seconds": manifest["seconds"] + time.perf_counter() - began,
-        "computing_seconds": spent,
-    }
-    write_manifest(folder, manifest)
+    manifest = manifest.write(
+        folder,
+        finished=True,
+        tables={path.name: file_digest(path) for path in tables},
+        settings=study.settings.model_dump(by_alias=True, exclude_none=True),
+        failures=len(failures),
+        retry=retry,
+        computed_last=computed,
+        seconds=manifest.seconds + time.perf_counter() - began,
+        computing_seconds=spent,
+    )
     if not retry:  # else the parts are needed to try again
         remove_parts(folder)
     return manifest

@@ -10,13 +10,14 @@ import contextlib
 import hashlib
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import lbt_synth
 from lbt_synth.design import Design
@@ -29,21 +30,10 @@ from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
-SCHEMA, SCHEMA_VERSION = "lbt_synth study", 1
 MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
 _UNFINISHED = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # the temporary files of write_atomically
-_MANIFEST_KINDS: dict[str, type | tuple[type, ...]] = {
-    "digest": str,
-    "designs": dict,
-    "tables": dict,
-    "finished": bool,
-    "failures": int,
-    "retry": int,
-    "seconds": (int, float),
-    "computing_seconds": (int, float),
-}
 RowRange = tuple[int, int]
 
 
@@ -56,7 +46,62 @@ class Part:
     path: Path
 
 
-def read_manifest(folder: Path) -> dict[str, Any] | None:
+class Manifest(BaseModel):
+    """What the manifest in the directory of a study says."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="allow")
+
+    schema_: Literal["lbt_synth study"] = Field(alias="schema")
+    schema_version: Literal[1]
+    digest: str  # of the study
+    version: str = ""  # of the package that began it
+    source: str = ""
+    samples: int = 0
+    evaluation: str = ""
+    parameters: dict[str, str] = {}  # their distributions in words
+    controllers: dict[str, str] = {}  # their origins
+    designs: dict[str, str]  # digests of the gain files of the designs for the whole study
+    tables: dict[str, str]  # digests of the finished tables
+    settings: dict[str, Any] = {}
+    finished: bool
+    failures: int
+    retry: int  # failures that are tried again
+    computed_last: int = 0  # rows that the last run computed
+    seconds: float  # of all runs
+    computing_seconds: float  # of all batches, summed over processes
+
+    def write(self, folder: Path, **changes: Any) -> Manifest:
+        """Write the manifest with some changes, and return it."""
+        made = self.model_copy(update=changes)
+        text = json.dumps(made.model_dump(by_alias=True), indent=1)
+        write_atomically(folder / MANIFEST, text.encode() + b"\n")
+        return made
+
+
+def new_manifest(study: Study) -> Manifest:
+    """Return the manifest of a study that begins."""
+    return Manifest(
+        schema="lbt_synth study",
+        schema_version=1,
+        digest=study.digest,
+        version=lbt_synth.__version__,
+        source=str(study.source),
+        samples=study.samples,
+        evaluation=study.settings.evaluation,
+        parameters={p.name: p.distribution.text for p in study.parameters},
+        controllers={c.name: c.origin for c in study.controllers},
+        designs={},
+        tables={},
+        settings=study.settings.model_dump(by_alias=True, exclude_none=True),
+        finished=False,
+        failures=0,
+        retry=0,
+        seconds=0.0,
+        computing_seconds=0.0,
+    )
+
+
+def read_manifest(folder: Path) -> Manifest | None:
     """Return the manifest of a directory, None if it has none."""
     path = folder / MANIFEST
     try:
@@ -67,38 +112,33 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         raise OutputError(
             f"cannot read {path}: {error}. Name another directory.", path=path
         ) from error
-    if (
-        not isinstance(content, dict)
-        or content.get("schema") != SCHEMA
-        or content.get("schema_version") != SCHEMA_VERSION
-        or any(not isinstance(content.get(name), kind) for name, kind in _MANIFEST_KINDS.items())
-    ):
+    try:
+        return Manifest.model_validate(content)
+    except ValidationError as error:
         raise OutputError(
             f"{path} is no manifest of a study that this version reads. Name another directory.",
             path=path,
-        )
-    return content
+        ) from error
 
 
-def require_same_study(manifest: Mapping[str, Any], digest: str, folder: Path) -> None:
+def require_same_study(manifest: Manifest, digest: str, folder: Path) -> None:
     """Refuse a directory whose study has another digest."""
-    if manifest["digest"] == digest:
+    if manifest.digest == digest:
         return
-    version = manifest.get("version")
     why = (
-        f"was made by lbt_synth {version}; this is {lbt_synth.__version__}"
-        if version != lbt_synth.__version__
-        else f"is of another study: {manifest.get('source')} as it was, with its configuration and "
+        f"was made by lbt_synth {manifest.version}; this is {lbt_synth.__version__}"
+        if manifest.version != lbt_synth.__version__
+        else f"is of another study: {manifest.source} as it was, with its configuration and "
         "gain files"
     )
     raise OutputError(f"{folder} {why}. Name another directory, or delete it.", path=folder)
 
 
-def read_design(folder: Path, name: str, manifest: Mapping[str, Any]) -> Design:
+def read_design(folder: Path, name: str, manifest: Manifest) -> Design:
     """Return the design that a study wrote for a controller."""
     path = folder / f"{name}.fits"
     design, digest = load_with_digest(path)
-    if digest != manifest["designs"][name]:
+    if digest != manifest.designs[name]:
         raise OutputError(
             f"{path} is not the design that the study was begun with. Put that back, or name "
             "another directory.",
@@ -111,16 +151,10 @@ def write_designs(folder: Path, study: Study) -> dict[str, str]:
     """Write the designs for the whole study, and return the digests of their files."""
     digests = {}
     for controller in study.controllers:
-        if controller.request is not None and controller.design is not None:
+        if controller.is_designed and controller.design is not None:
             path = save_gain(folder / f"{controller.name}.fits", controller.design)
             digests[controller.name] = load_with_digest(path)[1]
     return digests
-
-
-def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the manifest."""
-    text = json.dumps({"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **content}, indent=1)
-    write_atomically(folder / MANIFEST, text.encode() + b"\n")
 
 
 def list_parts(folder: Path) -> list[Part]:
@@ -173,8 +207,8 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
         meta = json.loads(text)
         results = arrays["RESULTS"]
         failures = tuple(Failure(**failure) for failure in meta["failures"])
-        whole = meta["digest"] == array_file.digest(arrays, meta)
         seconds = float(meta["seconds"])
+        whole = meta["digest"] == array_file.digest(arrays, meta)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _damage_error(path) from error
     if not whole or results.shape != (part.stop - part.start, len(study.result_columns)):
@@ -188,23 +222,6 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
 
 def _damage_error(path: Path) -> OutputError:
     return OutputError(f"{path} is damaged. Delete it, and its rows are computed again.", path=path)
-
-
-def read_blocks(parts: list[Part], study: Study, size: int) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the first row and the results of blocks of so many rows, the last one shorter."""
-    held: list[FloatArray] = []
-    start, rows = 0, 0
-    for part in parts:
-        results = read_part(part, study)[0]
-        while rows + len(results) >= size:
-            count = size - rows
-            yield start, np.concatenate([*held, results[:count]])
-            held, results = [], results[count:]
-            start, rows = start + size, 0
-        held.append(results)
-        rows += len(results)
-    if rows:
-        yield start, np.concatenate(held)
 
 
 def remove_unfinished_files(folder: Path, names: Collection[str]) -> None:
@@ -226,9 +243,9 @@ def file_digest(path: Path) -> str:
         raise OutputError(f"cannot read {path}: {error.strerror}.", path=path) from error
 
 
-def require_unchanged(folder: Path, manifest: Mapping[str, Any]) -> None:
+def require_unchanged(folder: Path, manifest: Manifest) -> None:
     """Refuse tables of a finished study that were changed."""
-    for name, digest in manifest.get("tables", {}).items():
+    for name, digest in manifest.tables.items():
         path = folder / name
         if path.exists() and file_digest(path) != digest:
             raise OutputError(
