@@ -10,8 +10,6 @@ from .robustness import robustness as robustness
 from .robustness_map import RobustnessMap as RobustnessMap
 from .robustness_map import robustness_map as robustness_map
 from .study.batch_evaluation import evaluate_samples as evaluate_samples
-from .study.batch_result import BatchResult as BatchResult
-from .study.batch_result import Failure as Failure
 from .study.estimate import Estimate as Estimate
 from .study.estimate import estimate_study as estimate_study
 from .study.load import load_study as load_study
@@ -22,6 +20,8 @@ from .study.run import run_study as run_study
 from .study.statistics import ControllerStatistics as ControllerStatistics
 from .study.statistics import StudyStatistics as StudyStatistics
 from .study.statistics import study_statistics as study_statistics
+from .study.study import BatchResult as BatchResult
+from .study.study import Failure as Failure
 from .study.study import Study as Study
 from .study.summary import summary_tables as summary_tables
 from .study.variance_index import first_order_index as first_order_index

@@ -19,7 +19,6 @@ from lbt_synth.errors import CertificateError
 from lbt_synth.loop import EnsembleResiduals
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.studies.study import reference_evaluation as reference
-from lbt_synth.studies.study.batch_result import BatchResult
 from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.sample_designs import (
     design_for_samples,
@@ -30,6 +29,8 @@ from lbt_synth.studies.study.study import (
     DELAY_ERROR,
     EXACT_COLUMNS,
     NOISE_FACTOR,
+    RESIDUALS,
+    BatchResult,
     Study,
     StudyController,
 )
@@ -82,9 +83,8 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
         found = {name: np.full(len(values), np.nan) for name in EXACT_COLUMNS}
         for rows, residuals, strehl in _evaluate_groups(study, controller, values):
             found["strehl"][rows] = strehl
-            found["residual_nm"][rows] = residuals.rms_nm
-            for name in ("turbulence_nm", "vibration_nm", "noise_nm", "stable"):
-                found[name][rows] = getattr(residuals, name)
+            for name, part in {**RESIDUALS, "stable": "stable"}.items():
+                found[name][rows] = getattr(residuals, part)
             i = int(rows[rows.size // 2])
             numbers = {name: float(column[i]) for name, column in found.items()}
             _require_agreement(study, controller, values[i], start + i, numbers)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import pkgutil
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -15,7 +14,6 @@ import lbt_synth
 from lbt_synth.errors import MissingExtraError, ProblemError
 
 _TIMEOUT_S = 10
-_VERSION = "lbt_synth:__version__"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,19 +69,15 @@ def _silence_logging() -> Iterator[None]:
 
 def _require_versions(address: str, client: Any) -> None:
     """Refuse a scheduler or worker without this version, as both unpickle what they receive."""
-    try:
-        found = {"scheduler": client.run_on_scheduler(pkgutil.resolve_name, _VERSION)}
-    except ImportError as error:
-        found = {"scheduler": error}
-    # a function of the standard library exists on every worker
-    found |= client.run(pkgutil.resolve_name, _VERSION, on_error="return")
-    for name, version in found.items():
+    hosts = client.get_versions(packages=["lbt_synth"])
+    found = {"the scheduler": hosts["scheduler"]}
+    found |= {f"the worker {name}": host for name, host in hosts["workers"].items()}
+    for who, host in found.items():
+        version = host["packages"].get("lbt_synth")
         if version != lbt_synth.__version__:
-            text = f"has none ({version})" if isinstance(version, Exception) else f"has {version}"
-            who = "the scheduler" if name == "scheduler" else f"the worker {name}"
             raise ProblemError(
                 f"scheduler and workers must have lbt_synth {lbt_synth.__version__}, as here; "
-                f"{who} of {address} {text}. Start them from the same environment."
+                f"{who} of {address} has {version or 'none'}. Start them from the same environment."
             )
 
 

@@ -31,7 +31,9 @@ class ControllerSamples:
         return self.evaluated & ~self.unstable
 
 
-def read_column(columns: Mapping[str, Any], name: str, size: int | None = None) -> FloatArray:
+def read_column(
+    columns: Mapping[str, Any], name: str, size: int | None = None, *, finite: bool = False
+) -> FloatArray:
     """Return a column of the results, of the given length if there is one."""
     if name not in columns:
         raise ProblemError(
@@ -42,6 +44,8 @@ def read_column(columns: Mapping[str, Any], name: str, size: int | None = None) 
     if out.ndim != 1 or (size is not None and len(out) != size):
         demand = "be 1-D" if size is None else f"have {size} rows, as the others"
         raise DimensionError(f"column {name!r} must {demand}; got shape {out.shape}.")
+    if finite:
+        _refuse_where(~np.isfinite(out), out, NonFiniteError, f"column {name!r} must be finite")
     return out
 
 
@@ -64,46 +68,40 @@ def read_controller_samples(
     """
     stable_column = read_column(columns, f"{controller}.stable", size)
     size = len(stable_column)
-    evaluated = ~np.isnan(stable_column)
-    unstable = stable_column == 0
+    evaluated, unstable = ~np.isnan(stable_column), stable_column == 0
     stable = stable_column == 1
-    odd = evaluated & ~unstable & ~stable
-    if np.any(odd):
-        row = int(np.argmax(odd))
-        raise ProblemError(
-            f"column '{controller}.stable' must be 1, 0 or nan; got {stable_column[row]:g} "
-            f"at index {row}."
+    demand = f"column '{controller}.stable' must be 1, 0 or nan"
+    _refuse_where(evaluated & ~unstable & ~stable, stable_column, ProblemError, demand)
+    found = {}
+    for name, most, range_ in (
+        ("strehl", 1 + 1e-9, "within [0, 1]"),
+        ("residual_nm", np.inf, "at least 0"),
+    ):
+        found[name] = values = read_column(columns, f"{controller}.{name}", size)
+        demand = (
+            f"column '{controller}.{name}' must be finite and {range_} where the loop is stable"
         )
-    strehl = read_column(columns, f"{controller}.strehl", size)
-    residual = read_column(columns, f"{controller}.residual_nm", size)
-    _require_range(controller, "strehl", strehl, stable, "within [0, 1]", most=1 + 1e-9)
-    _require_range(controller, "residual_nm", residual, stable, "at least 0", most=np.inf)
-    parts = {
-        part: read_column(columns, f"{controller}.{part}_nm", size)
-        for part in PARTS
-        if f"{controller}.{part}_nm" in columns
-    }
+        _refuse_where(stable & ~np.isfinite(values), values, NonFiniteError, demand)
+        outside = ~((values >= 0) & (values <= most))
+        _refuse_where(stable & outside, values, ProblemError, demand)
     return ControllerSamples(
         controller=controller,
-        strehl=np.where(stable, strehl, np.where(evaluated, 0.0, np.nan)),
-        residual_nm=np.where(stable, residual, np.where(evaluated, np.inf, np.nan)),
+        strehl=np.where(stable, found["strehl"], np.where(evaluated, 0.0, np.nan)),
+        residual_nm=np.where(stable, found["residual_nm"], np.where(evaluated, np.inf, np.nan)),
         evaluated=evaluated,
         unstable=unstable,
-        parts_nm=parts,
+        parts_nm={
+            part: read_column(columns, name, size)
+            for part in PARTS
+            if (name := f"{controller}.{part}_nm") in columns
+        },
     )
 
 
-def _require_range(
-    controller: str, name: str, values: FloatArray, where: BoolArray, demand: str, *, most: float
+def _refuse_where(
+    wrong: BoolArray, values: FloatArray, error: type[ProblemError], demand: str
 ) -> None:
-    """Refuse values of stable loops that are not finite, or out of range."""
-    for wrong, error in (
-        (where & ~np.isfinite(values), NonFiniteError),
-        (where & ~((values >= 0) & (values <= most)), ProblemError),
-    ):
-        if np.any(wrong):
-            row = int(np.argmax(wrong))
-            raise error(
-                f"column '{controller}.{name}' must be finite and {demand} where the loop is "
-                f"stable; got {values[row]:g} at index {row}. Check the file of the results."
-            )
+    """Refuse a column with wrong values, and show the first."""
+    if np.any(wrong):
+        row = int(np.argmax(wrong))
+        raise error(f"{demand}; got {values[row]:g} at index {row}. Check the file of the results.")

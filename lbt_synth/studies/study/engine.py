@@ -20,10 +20,9 @@ import numpy as np
 from lbt_synth.errors import LbtSynthError, NumericalError
 from lbt_synth.storage.worker_processes import WorkerPool, limit_threads
 from lbt_synth.studies.study.batch_queue import BatchQueue
-from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.cluster import is_death_of_workers
 from lbt_synth.studies.study.store import RowRange
-from lbt_synth.studies.study.study import Study
+from lbt_synth.studies.study.study import BatchResult, Failure, Study
 from lbt_synth.validation import FloatArray
 
 Evaluate = Callable[[Study, FloatArray, int], BatchResult]

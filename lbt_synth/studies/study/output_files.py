@@ -13,10 +13,9 @@ import numpy as np
 from lbt_synth.errors import OutputError
 from lbt_synth.storage.atomic_files import open_atomically, write_atomically
 from lbt_synth.storage.tables import csv_bytes
-from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.parquet import read_parquet, write_parquet
 from lbt_synth.studies.study.store import FAILED, Part, read_part
-from lbt_synth.studies.study.study import Study
+from lbt_synth.studies.study.study import Failure, Study
 from lbt_synth.validation import FloatArray
 
 _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,8 @@ from lbt_synth.design import Design
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, simulate, strehl
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
-from lbt_synth.studies.study.batch_result import BatchResult, Failure
 from lbt_synth.studies.study.sample import Sample, make_sample
-from lbt_synth.studies.study.study import Study, StudyController
+from lbt_synth.studies.study.study import RESIDUALS, BatchResult, Failure, Study, StudyController
 from lbt_synth.validation import FloatArray
 
 
@@ -56,40 +56,40 @@ def evaluate_row(
     study: Study, values: FloatArray, row: int
 ) -> tuple[dict[str, float], tuple[Failure, ...]]:
     """Evaluate one sample, and return its results by column and its failures."""
-    try:
-        sample = make_sample(study, values)
-    except EXPECTED_ERRORS as error:
-        return {}, tuple(_failure(row, c, error) for c in study.controllers)
+    failures: list[Failure] = []
     loops: dict[str, ClosedLoop] = {}
-    failures = []
-    for controller in study.controllers:
-        try:
-            loops[controller.name] = close_sample_loop(
-                sample, design_for_sample(controller, sample)
-            )
-        except EXPECTED_ERRORS as error:
-            failures.append(_failure(row, controller, error))
-    settle = _settle_frames(study, loops)
     out: dict[str, float] = {}
-    for controller in study.controllers:
-        name = controller.name
-        if name not in loops:
-            continue
-        loop = loops[name]
-        if not loop.is_stable:
-            out[f"{name}.stable"] = 0.0
-            continue
-        try:
-            if study.settings.evaluation == "exact":
-                found = _evaluate_exactly(loop, sample)
-            else:
-                found = _simulate(loop, sample, seed=study.simulation_seed(row), settle=settle)
-        except EXPECTED_ERRORS as error:
-            failures.append(_failure(row, controller, error))
-            continue
-        out |= {f"{name}.{column}": value for column, value in found.items()}
-        out[f"{name}.stable"] = 1.0
+    with _note_failure(failures, row, study.controllers):
+        sample = make_sample(study, values)
+        for controller in study.controllers:
+            with _note_failure(failures, row, [controller]):
+                design = design_for_sample(controller, sample)
+                loops[controller.name] = close_sample_loop(sample, design)
+        settle = _settle_frames(study, loops)
+        for controller in study.controllers:
+            if (loop := loops.get(controller.name)) is None:
+                continue
+            with _note_failure(failures, row, [controller]):
+                found = {"stable": float(loop.is_stable)}
+                if loop.is_stable and study.settings.evaluation == "exact":
+                    found |= _evaluate_exactly(loop, sample)
+                elif loop.is_stable:
+                    seed = study.simulation_seed(row)
+                    found |= _simulate(loop, sample, seed=seed, settle=settle)
+                out |= {f"{controller.name}.{column}": value for column, value in found.items()}
     return out, tuple(failures)
+
+
+@contextmanager
+def _note_failure(
+    failures: list[Failure], row: int, controllers: Sequence[StudyController]
+) -> Iterator[None]:
+    """Note an error that fails controllers on a sample, and not the study."""
+    try:
+        yield
+    except EXPECTED_ERRORS as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        failures += [Failure(row=row, controller=each.name, error=text) for each in controllers]
 
 
 def design_for_sample(controller: StudyController, sample: Sample) -> Design:
@@ -109,14 +109,9 @@ def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
     """Return the exact residual of a stable loop by origin, and its Strehl ratio."""
     budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
     spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
-    return {
-        # 0 beyond the widest jitter that is integrated, as in EnsembleResiduals.strehl
-        "strehl": strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0,
-        "residual_nm": budget.rms_nm,
-        "turbulence_nm": budget.turbulence_nm,
-        "vibration_nm": budget.vibration_nm,
-        "noise_nm": budget.noise_nm,
-    }
+    # 0 beyond the widest jitter that is integrated, as in EnsembleResiduals.strehl
+    ratio = strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0
+    return {"strehl": ratio} | {name: getattr(budget, part) for name, part in RESIDUALS.items()}
 
 
 def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
@@ -141,8 +136,3 @@ def _settle_frames(study: Study, loops: Mapping[str, ClosedLoop]) -> int:
     """Return the frames to drop, the same for all controllers: they meet the same disturbances."""
     needed = [settling_frames(loop.spectral_radius) for loop in loops.values() if loop.is_stable]
     return max([study.config.settings.simulation.settle_frames, *needed])
-
-
-def _failure(row: int, controller: StudyController, error: Exception) -> Failure:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return Failure(row=row, controller=controller.name, error=text)

@@ -17,7 +17,6 @@ from lbt_synth.config.schema import Ar2Section, FileSection
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.storage.atomic_files import refuse_replacing
-from lbt_synth.studies.study.batch_result import Failure
 from lbt_synth.studies.study.output_files import read_row
 from lbt_synth.studies.study.reference_evaluation import (
     design_for_sample,
@@ -30,7 +29,7 @@ from lbt_synth.studies.study.store import (
     require_same_study,
     require_unchanged,
 )
-from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Failure, Study
 from lbt_synth.validation import integer
 
 _NOISELESS = (

@@ -26,27 +26,21 @@ def is_kalman_for_sample(controller: StudyController) -> bool:
 def has_independent_axes(config: Config) -> bool:
     """Whether the Kalman filter of a configuration separates into one per axis."""
     hardware, settings = config.hardware, config.settings
-    diagonal = all(
-        matrix.shape[0] == matrix.shape[1] and not np.any(matrix - np.diag(np.diag(matrix)))
-        for matrix in (hardware.sensor, hardware.influence)
+    return (
+        settings.sensor.matrix is None
+        and np.array_equal(hardware.influence, np.eye(hardware.modes))
+        and all(np.count_nonzero(line.direction) == 1 for line in config.plant.vibrations)
+        and all(section.spread_hz is None for section in settings.model.vibrations or ())
     )
-    sections = settings.model.vibrations or ()
-    aligned = all(np.count_nonzero(line.direction) == 1 for line in config.plant.vibrations)
-    plain = all(section.spread_hz is None for section in sections)
-    unit = np.array_equal(hardware.influence, np.eye(hardware.modes))
-    return diagonal and unit and aligned and plain and settings.sensor.matrix is None
 
 
 def design_for_samples(samples: Samples) -> tuple[FloatArray, ...]:
     """Design a Kalman filter for each sample, and return their textbook matrices."""
-    axes = assumed_axes(samples)
-    designs: list[ModalFilters] = []
-    for axis in axes:
-        like_first = designs and axis.equals(axes[0])
-        designs.append(
-            designs[0] if like_first else _design_axis(axis, samples.config.hardware.mirror)
-        )
-    return _combine_axes(designs)
+    first, *others = assumed_axes(samples)
+    mirror = samples.config.hardware.mirror
+    design = _design_axis(first, mirror)
+    same = (design if axis.equals(first) else _design_axis(axis, mirror) for axis in others)
+    return _combine_axes([design, *same])
 
 
 def _design_axis(axis: AssumedAxis, mirror: PositionLoop | None) -> ModalFilters:

@@ -5,9 +5,7 @@ A seed fixes every point, whichever are requested with it.
 
 from __future__ import annotations
 
-import inspect
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -36,7 +34,7 @@ def unit_points(
         return _hypercube(samples, dimensions, seed)[start:stop]
     from scipy.stats import qmc
 
-    engine = qmc.Sobol(dimensions, scramble=True, **_generator(seed))
+    engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
     if start > 0:
         engine.fast_forward(start)
         return np.asarray(engine.random(stop - start))
@@ -48,14 +46,7 @@ def unit_points(
 def _hypercube(samples: int, dimensions: int, seed: int) -> FloatArray:
     from scipy.stats import qmc
 
-    points = np.asarray(qmc.LatinHypercube(dimensions, **_generator(seed)).random(samples))
+    engine = qmc.LatinHypercube(dimensions, seed=np.random.default_rng(seed))
+    points = np.asarray(engine.random(samples))
     points.setflags(write=False)
     return points
-
-
-def _generator(seed: int) -> dict[str, Any]:
-    """Return a generator under the argument name of the installed SciPy."""
-    from scipy.stats import qmc
-
-    name = "rng" if "rng" in inspect.signature(qmc.Sobol.__init__).parameters else "seed"
-    return {name: np.random.default_rng(seed)}

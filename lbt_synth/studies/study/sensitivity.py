@@ -1,4 +1,4 @@
-"""Sensitivity of each controller's Strehl ratio to each parameter."""
+"""Sensitivity of each controller's Strehl ratio to each parameter, and its curve."""
 
 from __future__ import annotations
 
@@ -7,16 +7,49 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.studies.study.conditional_curve import ConditionalCurve, conditional_curve
+from lbt_synth.studies.study.comparison import mean_and_error
 from lbt_synth.studies.study.controller_samples import ControllerSamples
 from lbt_synth.studies.study.variance_index import (
     FEWEST,
     NO_INDEX,
     VarianceIndex,
     first_order_index,
+    group_starts,
+    is_list,
     value_starts,
 )
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.validation import BoolArray, FloatArray, IntArray, frozen_copy
+
+_GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # samples, and groups if there are fewer
+_MOST_GROUPS = 32
+_MIDDLE = 0.05, 0.95
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ConditionalCurve:
+    """Strehl ratio in k groups of one parameter, whatever the others are; all arrays (k,)."""
+
+    parameter: FloatArray  # its median in each group, or the values of a list
+    low_edge: FloatArray  # its least value in each group
+    high_edge: FloatArray  # its greatest value in each group
+    mean: FloatArray  # Strehl ratio
+    mean_error: FloatArray  # standard error of the mean
+    low: FloatArray  # 10th percentile of the Strehl ratio
+    high: FloatArray  # 90th percentile
+    unstable: FloatArray  # part of the loops that are unstable
+    samples: FloatArray  # number in each group
+    discrete: bool  # whether the groups are the values of a list
+
+    def swing(self) -> tuple[float, float]:
+        """Return greatest less least mean over the middle 90 % of samples, and its error."""
+        end = np.cumsum(self.samples)
+        centre = (end - self.samples / 2) / end[-1]
+        inside = self.discrete | ((centre >= _MIDDLE[0]) & (centre <= _MIDDLE[1]))
+        places = np.flatnonzero(inside)
+        top = places[np.argmax(self.mean[places])]
+        bottom = places[np.argmin(self.mean[places])]
+        error = np.hypot(self.mean_error[top], self.mean_error[bottom])
+        return float(self.mean[top] - self.mean[bottom]), float(error)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,11 +57,11 @@ class ParameterSensitivity:
     """How a controller's Strehl ratio depends on one parameter."""
 
     parameter: str  # its name
-    index: VarianceIndex  # part of the variance that it explains by itself
-    spearman: float  # rank correlation, in [-1, 1]; nan if either is constant
-    swing: float  # see ConditionalCurve.swing; nan for a constant
-    swing_error: float  # its standard error
-    curve: ConditionalCurve | None  # None for a constant
+    index: VarianceIndex = NO_INDEX  # part of the variance that it explains by itself
+    spearman: float = np.nan  # rank correlation, in [-1, 1]; nan if either is constant
+    swing: float = np.nan  # see ConditionalCurve.swing; nan for a constant
+    swing_error: float = np.nan  # its standard error
+    curve: ConditionalCurve | None = None  # None for a constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,6 +77,10 @@ class ControllerSensitivity:
         """The parameters that vary, by falling index."""
         varying = [each for each in self.parameters if np.isfinite(each.index.value)]
         return tuple(sorted(varying, key=lambda each: -each.index.value))
+
+    def find(self, name: str) -> ParameterSensitivity:
+        """Return the sensitivity to one parameter."""
+        return next(each for each in self.parameters if each.parameter == name)
 
     @property
     def sum(self) -> float:
@@ -67,44 +104,39 @@ def sensitivities(
     controllers: Sequence[ControllerSamples], parameters: Mapping[str, FloatArray]
 ) -> tuple[ControllerSensitivity, ...]:
     """Return the sensitivity of each controller's Strehl ratio to each parameter, (n,) each."""
-    ranks = [_ranks(each) for each in controllers]
-    found: list[list[ParameterSensitivity]] = [[] for _ in controllers]
-    for name, values in parameters.items():
-        order = np.argsort(values, kind="stable")  # ties in the order of the samples
-        for place, each in enumerate(controllers):
-            found[place].append(_sensitivity(name, values, each, order, ranks[place]))
-    return tuple(
-        ControllerSensitivity(
-            controller=each.controller,
-            samples=int(np.count_nonzero(each.evaluated)),
-            parameters=tuple(found[place]),
+    # ties in the order of the samples
+    orders = {name: np.argsort(values, kind="stable") for name, values in parameters.items()}
+    found = []
+    for each in controllers:
+        ranks = _rank(each)
+        sensitivity = tuple(
+            _sensitivity(name, values, each, orders[name], ranks)
+            for name, values in parameters.items()
         )
-        for place, each in enumerate(controllers)
-    )
+        samples = int(np.count_nonzero(each.evaluated))
+        found.append(
+            ControllerSensitivity(
+                controller=each.controller, samples=samples, parameters=sensitivity
+            )
+        )
+    return tuple(found)
 
 
 def _sensitivity(
-    name: str,
-    values: FloatArray,
-    controller: ControllerSamples,
-    order: IntArray,
-    ranks: FloatArray,
+    name: str, values: FloatArray, each: ControllerSamples, order: IntArray, ranks: FloatArray
 ) -> ParameterSensitivity:
     """Return the sensitivity to one parameter, given the order of its values."""
-    if not controller.evaluated.all():
-        order = order[controller.evaluated[order]]
-    ordered = values[order]
-    index, curve = NO_INDEX, None
-    spearman = swing = error = np.nan
-    if len(ordered) >= FEWEST and ordered[0] < ordered[-1]:
-        strehl = controller.strehl[order]
-        index = first_order_index(ordered, strehl)
-        spearman = _correlation(_ranks_in_order(ordered), ranks[order])
-        curve = conditional_curve(ordered, strehl, controller.unstable[order])
-        swing, error = curve.swing()
+    order = order[each.evaluated[order]]
+    ordered, strehl = values[order], each.strehl[order]
+    if len(ordered) < FEWEST or ordered[0] == ordered[-1]:
+        return ParameterSensitivity(parameter=name)
+    curve = conditional_curve(ordered, strehl, each.unstable[order])
+    swing, error = curve.swing()
+    with np.errstate(invalid="ignore"):  # nan if the Strehl ratio is constant
+        spearman = float(np.corrcoef(_rank_ordered(ordered), ranks[order])[0, 1])
     return ParameterSensitivity(
         parameter=name,
-        index=index,
+        index=first_order_index(ordered, strehl),
         spearman=spearman,
         swing=swing,
         swing_error=error,
@@ -112,26 +144,59 @@ def _sensitivity(
     )
 
 
-def _ranks(controller: ControllerSamples) -> FloatArray:
+def conditional_curve(
+    ordered: FloatArray, strehl: FloatArray, unstable: BoolArray
+) -> ConditionalCurve:
+    """Return the Strehl ratio (n,) in groups of a parameter, given in rising order (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.studies.study.sensitivity import conditional_curve
+    >>> gains = np.repeat([0.5, 1.0], 100)
+    >>> curve = conditional_curve(gains, 0.8 * gains, gains < 0)
+    >>> curve.mean, round(curve.swing()[0], 6)
+    (array([0.4, 0.8]), 0.4)
+    """
+    n = len(ordered)
+    discrete = is_list(ordered)
+    if discrete:
+        starts = value_starts(ordered)
+    else:
+        groups = next((k for limit, k in _GROUPS if n < limit), _MOST_GROUPS)
+        starts = group_starts(n, groups)
+    rows = []
+    for first, last in zip(starts, np.append(starts[1:], n), strict=True):
+        inside, here = ordered[first:last], strehl[first:last]
+        low, high = np.percentile(here, (10, 90))
+        mean, error = mean_and_error(here)
+        rows.append(
+            {
+                "parameter": (inside[(len(inside) - 1) // 2] + inside[len(inside) // 2]) / 2,
+                "low_edge": inside[0],
+                "high_edge": inside[-1],
+                "mean": mean,
+                "mean_error": error,
+                "low": low,
+                "high": high,
+                "unstable": np.mean(unstable[first:last]),
+                "samples": last - first,
+            }
+        )
+    columns = {name: frozen_copy([row[name] for row in rows]) for name in rows[0]}
+    return ConditionalCurve(**columns, discrete=discrete)
+
+
+def _rank(each: ControllerSamples) -> FloatArray:
     """Return the ranks of the Strehl ratio, their mean for ties; nan where it failed."""
     from scipy.stats import rankdata
 
-    ranks = np.full(len(controller.strehl), np.nan)
-    ranks[controller.evaluated] = rankdata(controller.strehl[controller.evaluated])
-    return ranks
+    return np.asarray(rankdata(each.strehl, nan_policy="omit"))
 
 
-def _ranks_in_order(ordered: FloatArray) -> FloatArray:
+def _rank_ordered(ordered: FloatArray) -> FloatArray:
     """Return the ranks of values that are in order."""
     starts = value_starts(ordered)
     counts = np.diff(np.append(starts, len(ordered)))
     ranks: FloatArray = np.repeat(starts + (counts + 1) / 2, counts)
     return ranks
-
-
-def _correlation(first: FloatArray, second: FloatArray) -> float:
-    """Return Spearman's correlation, given ranks."""
-    middle = (len(first) + 1) / 2  # the mean of ranks
-    first, second = first - middle, second - middle
-    size = float(first @ first) * float(second @ second)
-    return float(first @ second) / float(np.sqrt(size)) if size > 0 else np.nan

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import NonFiniteError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.studies.study.comparison import Comparison, Loss, compare, losses, mean_and_error
 from lbt_synth.studies.study.controller_samples import (
     ControllerSamples,
@@ -18,11 +18,21 @@ from lbt_synth.studies.study.controller_samples import (
 )
 from lbt_synth.studies.study.percentiles import Percentile, Share, percentiles, share
 from lbt_synth.studies.study.sensitivity import ControllerSensitivity, sensitivities
-from lbt_synth.studies.study.worst_samples import WorstRow, worst_rows
 from lbt_synth.validation import FloatArray, IntArray, integer, number
 
 PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
 LEVELS = (0.3, 0.5, 0.7, 0.8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorstRow:
+    """One controller on one sample."""
+
+    row: int  # of the sample in the study
+    stable: bool
+    strehl: float  # 0 if unstable
+    residual_nm: float  # [nm rms]; inf if unstable
+    parameters: dict[str, float]  # of the sample
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,8 +160,9 @@ def study_statistics(
     >>> only.worst[0].row, only.worst[0].stable
     (180, False)
     """
-    _require_names(parameters, "parameters")
-    _require_names(controllers, "controllers")
+    for names, what in ((parameters, "parameters"), (controllers, "controllers")):
+        if isinstance(names, str) or len(set(names)) != len(names):
+            raise ProblemError(f"{what} must be a list of different names; got {names!r}.")
     if not controllers:
         raise ProblemError("controllers must name one at least; got none.")
     levels = [number(level, "levels", at_least=0, at_most=1) for level in levels]
@@ -160,13 +171,15 @@ def study_statistics(
     if not size:
         raise ProblemError("the results must have at least one sample; got none.")
     found = [read_controller_samples(columns, name, size) for name in controllers]
-    values = {name: _finite(columns, name, size) for name in parameters}
-    rows = _row_numbers(columns, size)
+    values = {name: read_column(columns, name, size, finite=True) for name in parameters}
+    rows = np.arange(size)
+    if "row" in columns:
+        rows = read_column(columns, "row", size, finite=True).astype(np.int64)
     return StudyStatistics(
         samples=size,
         parameters=tuple(parameters),
         controllers=tuple(
-            _controller_statistics(each, loss, levels, worst_rows(each, rows, values, count=worst))
+            _controller_statistics(each, loss, levels, _worst_rows(each, rows, values, count=worst))
             for each, loss in zip(found, losses(found), strict=True)
         ),
         comparisons=tuple(compare(first, second) for first, second in combinations(found, 2)),
@@ -201,21 +214,27 @@ def _controller_statistics(
     )
 
 
-def _require_names(names: Sequence[str], what: str) -> None:
-    if isinstance(names, str) or len(set(names)) != len(names):
-        raise ProblemError(f"{what} must be a list of different names; got {names!r}.")
-
-
-def _finite(columns: Mapping[str, Any], name: str, size: int) -> FloatArray:
-    values = read_column(columns, name, size)
-    wrong = ~np.isfinite(values)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise NonFiniteError(f"column {name!r} must be finite; got {values[row]} at index {row}.")
-    return values
-
-
-def _row_numbers(columns: Mapping[str, Any], size: int) -> IntArray:
-    if "row" not in columns:
-        return np.arange(size)
-    return _finite(columns, "row", size).astype(np.int64)
+def _worst_rows(
+    controller: ControllerSamples,
+    rows: IntArray,
+    parameters: Mapping[str, FloatArray],
+    *,
+    count: int,
+) -> tuple[WorstRow, ...]:
+    """Return the samples of least Strehl ratio, the unstable ones first; arrays are (n,)."""
+    indices = np.flatnonzero(controller.evaluated)
+    key = np.where(controller.unstable, -1.0, controller.strehl)[indices]
+    if 0 < count < len(indices):  # sort no more than those up to the last one wanted
+        least = key <= np.partition(key, count - 1)[count - 1]
+        indices, key = indices[least], key[least]
+    order = np.lexsort((rows[indices], key))[:count]
+    return tuple(
+        WorstRow(
+            row=int(rows[i]),
+            stable=not controller.unstable[i],
+            strehl=float(controller.strehl[i]),
+            residual_nm=float(controller.residual_nm[i]),
+            parameters={name: float(values[i]) for name, values in parameters.items()},
+        )
+        for i in indices[order]
+    )

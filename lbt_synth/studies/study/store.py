@@ -26,8 +26,7 @@ from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import write_atomically
-from lbt_synth.studies.study.batch_result import BatchResult, Failure
-from lbt_synth.studies.study.study import Study
+from lbt_synth.studies.study.study import BatchResult, Failure, Study
 from lbt_synth.validation import FloatArray
 
 MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"

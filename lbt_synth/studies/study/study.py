@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +21,13 @@ from lbt_synth.validation import FloatArray, integer
 DELAY_ERROR = "error.delay_frames"
 NOISE_FACTOR = "error.noise_factor"
 ERRORS = (DELAY_ERROR, NOISE_FACTOR)
-EXACT_COLUMNS = ("strehl", "residual_nm", "turbulence_nm", "vibration_nm", "noise_nm", "stable")
+RESIDUALS = {  # columns, and the attributes of budgets with their values
+    "residual_nm": "rms_nm",
+    "turbulence_nm": "turbulence_nm",
+    "vibration_nm": "vibration_nm",
+    "noise_nm": "noise_nm",
+}
+EXACT_COLUMNS = ("strehl", *RESIDUALS, "stable")
 SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
 
 
@@ -158,3 +164,45 @@ class Study:
     def parameters_by_name(self, values: Sequence[float] | FloatArray) -> dict[str, float]:
         """Return a row of :meth:`values` as a dictionary."""
         return dict(zip(self.parameter_names, np.asarray(values).tolist(), strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """A controller without a result on a sample.
+
+    Attributes
+    ----------
+    row : int
+        The sample, from 0.
+    controller : str
+        Name of the controller.
+    error : str
+        What went wrong.
+    retry : bool
+        Whether it is tried again when the study is started again: its process died, which need
+        not be the sample's fault.
+    """
+
+    row: int
+    controller: str
+    error: str
+    retry: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BatchResult:
+    """Results of consecutive samples.
+
+    Attributes
+    ----------
+    start : int
+        Row of the first sample.
+    columns : mapping of str to (b,) ndarray
+        Results by column, one of ``Study.result_columns``; nan without a result.
+    failures : tuple of Failure
+        In the order of their rows.
+    """
+
+    start: int
+    columns: Mapping[str, FloatArray]
+    failures: tuple[Failure, ...] = ()

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from lbt_synth.storage.rows import cell_text
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies.study.percentiles import Percentile, Share
-from lbt_synth.studies.study.sensitivity import ParameterSensitivity
+from lbt_synth.studies.study.sensitivity import ControllerSensitivity
 from lbt_synth.studies.study.statistics import ControllerStatistics, StudyStatistics
 
-Row = tuple[str | Cell, ...]
+_Row = tuple[str, Callable[[Any], str | Cell] | None]  # a label, and the text of a controller
 
 
 def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
@@ -56,30 +59,30 @@ def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
 
 def strehl_table(statistics: StudyStatistics) -> Table:
     """Strehl ratio of each controller: mean, percentiles, parts of the samples."""
-    found = statistics.controllers
-    first = found[0]
-    return Table(
-        caption="Strehl ratio over the samples, with 95 % intervals for independent samples",
-        headings=("of the Strehl ratio [%]", *(c.controller for c in found)),
-        rows=(
-            (
-                "mean ± standard error",
-                *(with_error(c.mean, c.mean_error, scale=100, digits=2) for c in found),
-            ),
+    first = statistics.controllers[0]
+    return _table_by_controller(
+        "Strehl ratio over the samples, with 95 % intervals for independent samples",
+        "of the Strehl ratio [%]",
+        statistics.controllers,
+        (
+            ("mean ± standard error", lambda c: _with_error(c.mean, c.mean_error, digits=2)),
             *(
-                (ordinal(each.percent), *(_percentile(c.strehl[i]) for c in found))
+                (ordinal(each.percent), lambda c, i=i: _interval(c.strehl[i]))
                 for i, each in enumerate(first.strehl)
             ),
-            ("part of the samples [%]",),
+            ("part of the samples [%]", None),
             *(
-                (f"above {100 * level:g} %", *(_share(c.above[level]) for c in found))
+                (f"above {100 * level:g} %", lambda c, level=level: _interval(c.above[level]))
                 for level in first.above
             ),
-            ("unstable, counted as 0", *(_unstable(c.unstable) for c in found)),
-            ("best of all controllers", *(_share(c.loss.best) for c in found)),
-            ("samples",),
-            ("evaluated", *(str(c.samples) for c in found)),
-            ("failed", *(_bad_if(c.failed, str(c.failed)) for c in found)),
+            (
+                "unstable, counted as 0",
+                lambda c: _bad_if(c.unstable.count, _interval(c.unstable, digits=2)),
+            ),
+            ("best of all controllers", lambda c: _interval(c.loss.best)),
+            ("samples", None),
+            ("evaluated", lambda c: str(c.samples)),
+            ("failed", lambda c: _bad_if(c.failed, str(c.failed))),
         ),
     )
 
@@ -87,26 +90,28 @@ def strehl_table(statistics: StudyStatistics) -> Table:
 def residual_table(statistics: StudyStatistics) -> Table:
     """Residual of each controller, and the medians of its parts."""
     found = statistics.controllers
-    rows: list[Row] = [
-        (ordinal(each.percent), *(nanometres(c.residual_nm[i].value) for c in found))
-        for i, each in enumerate(found[0].residual_nm)
-    ]
     parts = dict.fromkeys(part for c in found for part in c.parts_nm)
-    if parts:
-        rows.append(("median over the stable loops",))
-        rows.extend(
-            (f"of {part}", *(nanometres(c.parts_nm.get(part, np.nan)) for c in found))
-            for part in parts
-        )
-    return Table(
-        caption="Residual of tip and tilt over the samples",
-        headings=("residual [nm rms]", *(c.controller for c in found)),
-        rows=tuple(rows),
+    return _table_by_controller(
+        "Residual of tip and tilt over the samples",
+        "residual [nm rms]",
+        found,
+        (
+            *(
+                (ordinal(each.percent), lambda c, i=i: _nanometres(c.residual_nm[i].value))
+                for i, each in enumerate(found[0].residual_nm)
+            ),
+            *([("median over the stable loops", None)] if parts else []),
+            *(
+                (f"of {part}", lambda c, part=part: _nanometres(c.parts_nm.get(part, np.nan)))
+                for part in parts
+            ),
+        ),
     )
 
 
 def comparison_table(statistics: StudyStatistics) -> Table:
     """Compare controllers with each other on the same samples."""
+    percents = (5, 50, 95)
     return Table(
         caption="Strehl ratio on the same samples: first less second [points]",
         headings=(
@@ -114,17 +119,19 @@ def comparison_table(statistics: StudyStatistics) -> Table:
             "first better [%]",
             "equal [%]",
             "mean",
-            "5th percentile",
-            "median",
-            "95th percentile",
+            *("median" if each == 50 else ordinal(each) for each in percents),
         ),
         rows=tuple(
             (
                 f"{pair.first} less {pair.second}",
                 percent(pair.better.value),
                 percent(pair.equal.value),
-                with_error(pair.mean, pair.mean_error, scale=100, digits=2),
-                *(_points(d) for d in pair.difference if d.percent in (5, 50, 95)),
+                _with_error(pair.mean, pair.mean_error, digits=2),
+                *(
+                    cell_text(100 * each.value, "+.1f")
+                    for each in pair.difference
+                    if each.percent in percents
+                ),
             )
             for pair in statistics.comparisons
         ),
@@ -135,30 +142,27 @@ def sensitivity_table(
     statistics: StudyStatistics, *, names: Mapping[str, str] | None = None
 ) -> Table:
     """First-order indices of the parameters, one column per controller."""
-    found = statistics.sensitivities
-    rows = _by_parameter(statistics, _index, names)
-    if rows:
-        rows += [
-            ("all of them",),
-            ("sum", *(with_error(s.sum, s.sum_error, scale=100, digits=1) for s in found)),
-            (
-                "only together (interactions)",
-                *(with_error(s.interactions, s.sum_error, scale=100, digits=1) for s in found),
-            ),
-        ]
-    return Table(
-        caption="Variance of the Strehl ratio that one parameter explains by itself [%]",
-        headings=("parameter", *(s.controller for s in found)),
-        rows=tuple(rows),
+    indices = list(_rows_by_parameter(statistics, _index_text, names))
+    totals: list[_Row] = [
+        ("all of them", None),
+        ("sum", lambda s: _with_error(s.sum, s.sum_error)),
+        ("only together (interactions)", lambda s: _with_error(s.interactions, s.sum_error)),
+    ]
+    return _table_by_controller(
+        "Variance of the Strehl ratio that one parameter explains by itself [%]",
+        "parameter",
+        statistics.sensitivities,
+        [*indices, *totals] if indices else [],
     )
 
 
 def swing_table(statistics: StudyStatistics, *, names: Mapping[str, str] | None = None) -> Table:
     """How far the mean Strehl ratio moves over each parameter, and in which direction."""
-    return Table(
-        caption="Points of Strehl ratio over the middle 90 % of a parameter (rank correlation)",
-        headings=("parameter", *(s.controller for s in statistics.sensitivities)),
-        rows=tuple(_by_parameter(statistics, _swing, names)),
+    return _table_by_controller(
+        "Points of Strehl ratio over the middle 90 % of a parameter (rank correlation)",
+        "parameter",
+        statistics.sensitivities,
+        _rows_by_parameter(statistics, _swing_text, names),
     )
 
 
@@ -185,12 +189,9 @@ def worst_table(
 
 def varying_parameters(statistics: StudyStatistics) -> tuple[str, ...]:
     """Return the parameters with an index for any controller, by falling greatest index."""
-    greatest: dict[str, float] = {}
-    for one in statistics.sensitivities:
-        for each in one.ranked:
-            value = each.index.value
-            greatest[each.parameter] = max(greatest.get(each.parameter, -np.inf), value)
-    return tuple(sorted(greatest, key=lambda name: -greatest[name]))
+    found = [each for one in statistics.sensitivities for each in one.ranked]
+    found.sort(key=lambda each: -each.index.value)
+    return tuple(dict.fromkeys(each.parameter for each in found))
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
@@ -209,31 +210,15 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     for name in names:
         keys = name.split(".")
         for count in range(1, len(keys) + 1):
-            short = ".".join(keys[-count:])
-            if sum(other == short or other.endswith(f".{short}") for other in names) == 1:
+            out[name] = ".".join(keys[-count:])
+            if sum(f".{other}".endswith(f".{out[name]}") for other in names) == 1:
                 break
-        out[name] = short
     return out
 
 
 def percent(value: float, digits: int = 1) -> str:
     """Return a part as a percentage, a dash if it is nan."""
-    return "-" if np.isnan(value) else _number(100 * value, digits)
-
-
-def with_error(value: float, error: float, *, scale: float = 1.0, digits: int = 3) -> str:
-    """Return a number with its standard error, a dash if it is nan."""
-    if np.isnan(value):
-        return "-"
-    text = _number(scale * value, digits)
-    return text if np.isnan(error) else f"{text} ± {_number(scale * error, digits)}"
-
-
-def nanometres(value: float) -> str:
-    """Return a residual: "unstable" if it is infinite, a dash if it is nan."""
-    if np.isnan(value):
-        return "-"
-    return _number(value, 1) if np.isfinite(value) else "unstable"
+    return cell_text(100 * value, f".{digits}f")
 
 
 def ordinal(percentile: float) -> str:
@@ -250,62 +235,61 @@ def ordinal(percentile: float) -> str:
     return f"{percentile:g}{'th' if teens or percentile % 1 else suffix} percentile"
 
 
-def _number(value: float, digits: int) -> str:
-    return f"{round(value, digits) + 0.0:.{digits}f}"
+def _table_by_controller(
+    caption: str,
+    heading: str,
+    found: Sequence[ControllerStatistics | ControllerSensitivity],
+    rows: Iterable[_Row],
+) -> Table:
+    """Return a table with a column per controller; a row without texts is a heading."""
+    headings = (heading, *(each.controller for each in found))
+    lines = tuple((label, *(map(text, found) if text else ())) for label, text in rows)
+    return Table(caption=caption, headings=headings, rows=lines)
 
 
-def _range(text: str, low: float, high: float, digits: int) -> str:
-    """Return a value and the limits of its interval that there are [percent]."""
-    if np.isnan(low) and np.isnan(high):
+def _rows_by_parameter(
+    statistics: StudyStatistics,
+    text: Callable[[str, ControllerSensitivity], str],
+    names: Mapping[str, str] | None,
+) -> Iterator[_Row]:
+    """Yield a row per varying parameter."""
+    for name in varying_parameters(statistics):
+        yield (names or {}).get(name, name), partial(text, name)
+
+
+def _index_text(name: str, one: ControllerSensitivity) -> str:
+    index = one.find(name).index
+    return _with_error(index.value, index.error)
+
+
+def _swing_text(name: str, one: ControllerSensitivity) -> str:
+    found = one.find(name)
+    if np.isnan(found.swing):
+        return "-"
+    return f"{_with_error(found.swing, found.swing_error)} ({cell_text(found.spearman, '+.2f')})"
+
+
+def _with_error(value: float, error: float, digits: int = 1) -> str:
+    """Return a part with its standard error as percentages, a dash if it is nan."""
+    text = percent(value, digits)
+    return text if text == "-" or np.isnan(error) else f"{text} ± {percent(error, digits)}"
+
+
+def _nanometres(value: float) -> str:
+    """Return a residual: "unstable" if it is infinite, a dash if it is nan."""
+    return "unstable" if np.isinf(value) else cell_text(value, ".1f")
+
+
+def _interval(found: Percentile | Share, digits: int = 1) -> str:
+    """Return a percentage and the limits of its interval that there are."""
+    text, low, high = (percent(each, digits) for each in (found.value, found.low, found.high))
+    if low == high == "-":
         return text
-    if np.isnan(low):
-        return f"{text} (to {percent(high, digits)})"
-    if np.isnan(high):
-        return f"{text} (from {percent(low, digits)})"
-    return f"{text} ({percent(low, digits)} to {percent(high, digits)})"
-
-
-def _percentile(found: Percentile) -> str:
-    return _range(percent(found.value), found.low, found.high, 1)
-
-
-def _share(part: Share, digits: int = 1) -> str:
-    return _range(percent(part.value, digits), part.low, part.high, digits)
-
-
-def _unstable(part: Share) -> str | Cell:
-    return _bad_if(part.count, _share(part, 2))
+    if "-" in (low, high):
+        return f"{text} (to {high})" if low == "-" else f"{text} (from {low})"
+    return f"{text} ({low} to {high})"
 
 
 def _bad_if(count: int, text: str) -> str | Cell:
     """Return a text, marked as bad if it counts any."""
     return Cell(text=text, tone="bad") if count else text
-
-
-def _points(difference: Percentile) -> str:
-    value = round(100 * difference.value, 1) + 0.0
-    return "-" if np.isnan(value) else f"{value:+.1f}"
-
-
-def _by_parameter(
-    statistics: StudyStatistics,
-    text: Callable[[ParameterSensitivity], str],
-    names: Mapping[str, str] | None,
-) -> list[Row]:
-    """Return a row per varying parameter, with a column per controller."""
-    found = [{p.parameter: p for p in one.parameters} for one in statistics.sensitivities]
-    return [
-        ((names or {}).get(name, name), *(text(by_name[name]) for by_name in found))
-        for name in varying_parameters(statistics)
-    ]
-
-
-def _index(one: ParameterSensitivity) -> str:
-    return with_error(one.index.value, one.index.error, scale=100, digits=1)
-
-
-def _swing(one: ParameterSensitivity) -> str:
-    if np.isnan(one.swing):
-        return "-"
-    sign = "-" if np.isnan(one.spearman) else f"{one.spearman:+.2f}"
-    return f"{with_error(one.swing, one.swing_error, scale=100, digits=1)} ({sign})"

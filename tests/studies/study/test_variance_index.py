@@ -10,7 +10,7 @@ from scipy import stats
 from support.study_results import draw_points
 
 import lbt_synth as lbt
-from lbt_synth.studies.study.conditional_curve import conditional_curve
+from lbt_synth.studies.study.sensitivity import conditional_curve
 
 
 def index(parameter, result):
