@@ -18,6 +18,7 @@ from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, strehl_panel
 from lbt_synth.report.figures.robustness_map import map_panels
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
+from lbt_synth.report.page.words import chart
 from lbt_synth.validation import FloatArray
 
 _PANELS = 6  # of one chart that has a panel per design: they fit a sheet
@@ -32,36 +33,19 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
     if norms:
         curves = [stable_curve(name, names, f, values) for name, values in norms.items()]
         peaks = [f"{name} {number_text(float(np.max(n)), 3)} nm" for name, n in norms.items()]
+        panel = frequency_panel("disturbances to error", "nm", curves, lines)
+        charts.append(chart("sigma", [panel], peaks=listing_text(peaks)))
+    if report.stable:
+        responses = {one.name: (f, one.rejection, one.noise_transfer) for one in report.assessments}
         charts.append(
-            Chart(
-                key="sigma",
-                title="Estimation error of the design models",
-                caption="Largest singular value from the disturbances that each design assumes "
-                "(of unit size) to the error of its estimate; of an LQG, to its residual. The "
-                "peak is the H-infinity norm, the area under the square the variance. Designs "
-                "that estimate nothing, such as integrators and shaped controllers, have none.",
-                alt="Curves over frequency, one per design that estimates. Peaks on this grid: "
-                f"{listing_text(peaks)}.",
-                panels=(frequency_panel("disturbances to error", "nm", curves, lines),),
+            chart(
+                "loop",
+                loop_panels(responses, lines, names),
+                gain=number_text(report.real_gain),
+                rejection=_largest_text(report, "rejection"),
+                noise=_largest_text(report, "noise_transfer"),
             )
         )
-    if not report.stable:
-        return charts
-    responses = {one.name: (f, one.rejection, one.noise_transfer) for one in report.assessments}
-    charts.append(
-        Chart(
-            key="loop",
-            title="Rejection and noise of the closed loops",
-            caption="Largest singular value at the real sensor gain of "
-            f"{number_text(report.real_gain)}: from the phase to "
-            "the residual (above; below 1 a disturbance is reduced) and from the measurement noise "
-            "to the residual (below). With several axes it is that of the worst one.",
-            alt="Two panels over frequency, one curve per design. "
-            f"Largest rejection: {_largest_text(report, 'rejection')}. "
-            f"Largest noise transfer: {_largest_text(report, 'noise_transfer')}.",
-            panels=loop_panels(responses, lines, names),
-        )
-    )
     return charts
 
 
@@ -77,17 +61,9 @@ def robustness_charts(report: DesignReport) -> list[Chart]:
         return [_sensor_gain_chart(report)]
     charts = [_strehl_chart(report), _residual_chart(report)] if report.stable else []
     maps = {one.name: one.map for one in report.assessments}
-    chart = Chart(
-        key="map",
-        title="Strehl ratio over frequency error and sensor gain",
-        caption="One scale of colours for all designs; lines at round values. Sensor gains "
-        "are relative to the sensor matrix of the configuration. Hatched: the loop is "
-        "unstable there.",
-        alt=f"One map per design. {_map_texts(report)}",
-        panels=map_panels(maps, real_gain=report.real_gain),
-        columns=count_columns(len(maps)),
-    )
-    return [*charts, *_split_by_sheets(chart)]
+    panels = map_panels(maps, real_gain=report.real_gain)
+    found = chart("map", panels, columns=count_columns(len(maps)), ranges=_map_texts(report))
+    return [*charts, *_split_by_sheets(found)]
 
 
 def _strehl_chart(report: DesignReport) -> Chart:
@@ -107,15 +83,9 @@ def _strehl_chart(report: DesignReport) -> Chart:
         )
         for one in report.assessments
     ]
-    return Chart(
-        key="robustness",
-        title="Strehl ratio over the frequency error",
-        caption="Exact long-exposure Strehl ratio with every true vibration moved below the "
-        "frequency that the design believes by the error, its rms kept, at the real sensor gain of "
-        f"{number_text(report.real_gain)}.",
-        alt=f"One curve per design. {listing_text(ends)}.",
-        panels=(strehl_panel(curves, max(0.0, 10 * np.floor((least - 5) / 10))),),
-    )
+    panel = strehl_panel(curves, max(0.0, 10 * np.floor((least - 5) / 10)))
+    gain = number_text(report.real_gain)
+    return chart("robustness", [panel], gain=gain, ends=listing_text(ends))
 
 
 def _residual_chart(report: DesignReport) -> Chart:
@@ -123,15 +93,11 @@ def _residual_chart(report: DesignReport) -> Chart:
     panel = limits_panel(study, FREQUENCY_ERROR, -study.shift_hz + 0.0, str)
     limits = [f"{rule.name} {fixed_text(rule.at, 1)} nm" for rule in panel.select(Rule)]
     worst = [f"{row.design} {fixed_text(row.worst_nm, 1)} nm" for row in study.rows if row.stable]
-    return Chart(
-        key="limits",
-        title="Residual over the frequency error, beside the limits",
-        caption="Exact residual. The lines are what no linear controller goes below: one that is "
-        "given the frequency, and one that has to serve the whole range. Where a limit cannot be "
-        "computed it is not drawn.",
-        alt=f"One curve per design. Worst residuals: {listing_text(worst)}."
-        + (f" Limits: {listing_text(limits)}." if limits else ""),
-        panels=(panel,),
+    return chart(
+        "limits",
+        [panel],
+        worst=listing_text(worst),
+        limits=f" Limits: {listing_text(limits)}." if limits else "",
     )
 
 
@@ -163,14 +129,7 @@ def _sensor_gain_chart(report: DesignReport) -> Chart:
         marks=(*marks, Rule(name="real sensor gain", at=report.real_gain, dash=3)),
         height_in=2.5,
     )
-    return Chart(
-        key="sensor-gain",
-        title="Strehl ratio over the sensor gain",
-        caption="Exact long-exposure Strehl ratio. Sensor gains are relative to the sensor matrix "
-        "of the configuration. Curves end where the loop becomes unstable.",
-        alt=f"One curve per design. {_map_texts(report)}",
-        panels=(panel,),
-    )
+    return chart("sensor-gain", [panel], ranges=_map_texts(report))
 
 
 def pole_and_step_charts(report: DesignReport) -> list[Chart]:
@@ -211,18 +170,9 @@ def pole_and_step_charts(report: DesignReport) -> list[Chart]:
         for one in report.assessments
     )
     radii = [f"{one.name} {number_text(one.spectral_radius, 6)}" for one in report.assessments]
-    chart = Chart(
-        key="poles",
-        title="Poles",
-        caption="Poles of the closed loop (crosses) at the real sensor gain and of the "
-        "controller by itself (circles). The loop is stable if all crosses lie inside the "
-        "unit circle; near 1 they are slow, near the circle lightly damped.",
-        alt="One complex plane per design, with the unit circle. Largest modulus of the "
-        f"closed loop's poles: {listing_text(radii)}.",
-        panels=panels,
-        columns=count_columns(len(panels)),
-    )
-    return [*_split_by_sheets(chart), *([_step_chart(report)] if report.stable else [])]
+    columns = count_columns(len(panels))
+    found = chart("poles", panels, columns=columns, radii=listing_text(radii))
+    return [*_split_by_sheets(found), *([_step_chart(report)] if report.stable else [])]
 
 
 def _step_chart(report: DesignReport) -> Chart:
@@ -242,19 +192,15 @@ def _step_chart(report: DesignReport) -> Chart:
             ),
         )
 
-    return Chart(
-        key="step",
-        title="Step response",
-        caption=f"The disturbance of the first axis steps by {STEP_NM:g} nm; nothing else moves, "
-        "and there is no noise. Residual (above) and command (below) in frames of "
-        f"{number_text(1e3 / report.config.hardware.frame_rate_hz)} ms. A controller with a model "
-        "of a vibration rings at its frequency.",
-        alt="Two panels over time, one curve per design. Largest residual from the sixth frame on: "
-        f"{listing_text(peaks)}.",
-        panels=(
+    return chart(
+        "step",
+        (
             panel("residual", lambda run: run.step_residual_nm),
             panel("command", lambda run: run.step_command_nm),
         ),
+        step=f"{STEP_NM:g}",
+        frame=number_text(1e3 / report.config.hardware.frame_rate_hz),
+        peaks=listing_text(peaks),
     )
 
 
@@ -277,33 +223,16 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
             Curve(name="residual, exact", x=f, y=run.exact_nm2_hz, look=1, width=1.4),
         )
         spectra.append(spectra_panel(curves, title=name))
-    first = Chart(
-        key="series",
-        title="Simulated residual",
-        caption=f"First {duration} s of the first run, first axis; the same turbulence, vibrations "
-        "and noise for all designs.",
-        alt="One panel per design, all of the same scale, over time. Residuals over all runs: "
-        f"{listing_text(left)}.",
-        panels=tuple(series),
-    )
-    second = Chart(
-        key="spectra",
-        title="Spectra, simulated and exact",
-        caption="Welch's method over all runs, with a Hann window; sums over the axes. The exact "
-        "spectrum is that of the transfer functions, a sinusoid as the same window shows it.",
-        alt="One panel per design: the spectrum before the correction, and that of the residual "
-        "twice, simulated and exact, which lie on each other.",
-        panels=tuple(spectra),
-        columns=count_columns(len(spectra)),
-    )
+    first = chart("series", series, duration=duration, residuals=listing_text(left))
+    second = chart("spectra", spectra, columns=count_columns(len(spectra)))
     return [*_split_by_sheets(first), *_split_by_sheets(second)]
 
 
-def _split_by_sheets(chart: Chart) -> Iterator[Chart]:
+def _split_by_sheets(found: Chart) -> Iterator[Chart]:
     """Split a chart into charts that each fit a sheet of paper."""
-    for start in range(0, len(chart.panels), _PANELS):
-        part = replace(chart, panels=chart.panels[start : start + _PANELS])
+    for start in range(0, len(found.panels), _PANELS):
+        part = replace(found, panels=found.panels[start : start + _PANELS])
         if start:
-            key, title = f"{chart.key}-{start // _PANELS + 1}", f"{chart.title} (continued)"
+            key, title = f"{found.key}-{start // _PANELS + 1}", f"{found.title} (continued)"
             part = replace(part, key=key, title=title)
         yield part

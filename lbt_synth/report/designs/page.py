@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
+
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
@@ -20,6 +22,7 @@ from lbt_synth.report.designs.verdict import verdict
 from lbt_synth.report.number_text import listing_text, number_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.page.words import paragraph
 from lbt_synth.report.provenance import (
     creator_name,
     files_table,
@@ -116,10 +119,11 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
     blocks: list[Block] = []
     for one in report.assessments:
         if not one.stable:
-            text = (
-                f"{one.name} is UNSTABLE in the loop of this configuration: its largest pole has a "
-                f"modulus of {number_text(one.spectral_radius, 6)} at a sensor gain of "
-                f"{number_text(report.real_gain)}. It must not be used here."
+            text = paragraph(
+                "unstable",
+                name=one.name,
+                radius=number_text(one.spectral_radius, 6),
+                gain=number_text(report.real_gain),
             )
             blocks.append(Notice(text=text, tone="bad"))
         if not one.certified:
@@ -150,17 +154,17 @@ def _situation_text(report: DesignReport) -> str:
         f"{number_text(line.rms_nm)} nm rms at {number_text(line.frequency_hz)} Hz"
         for line in stationary_vibrations(truth.vibrations)
     ]
-    noise = listing_text([number_text(float(v), 3) for v in _noise_levels(report)])
-    axes = "1 axis" if hardware.modes == 1 else f"{hardware.modes} axes"
-    turbulence = report.config.settings.true_turbulence.replace("_", " ")
-    return (
-        f"The loop: {axes} at {number_text(hardware.frame_rate_hz)} Hz, a delay of "
-        f"{number_text(hardware.delay_frames)} frames, a mirror "
-        f"{'that settles at once' if hardware.mirror is None else 'with dynamics'}. What it "
-        f"meets: turbulence ({turbulence}), {listing_text(lines) or 'no vibration'}, {noise} nm of "
-        f"noise per frame and measurement, a real sensor gain of {number_text(report.real_gain)}. "
-        "Residuals and Strehl ratios are exact, by Lyapunov equations and integrals over transfer "
-        "functions, unless they are called simulated."
+    noise = truth.noise_per_measurement(hardware.n_measurements)
+    return paragraph(
+        "situation",
+        axes="1 axis" if hardware.modes == 1 else f"{hardware.modes} axes",
+        rate=number_text(hardware.frame_rate_hz),
+        delay=number_text(hardware.delay_frames),
+        mirror="that settles at once" if hardware.mirror is None else "with dynamics",
+        turbulence=report.config.settings.true_turbulence.replace("_", " "),
+        lines=listing_text(lines) or "no vibration",
+        noise=listing_text([number_text(float(value), 3) for value in np.unique(noise)]),
+        gain=number_text(report.real_gain),
     )
 
 
@@ -175,11 +179,6 @@ def _transfer_blocks(report: DesignReport) -> list[Block]:
     ]
 
 
-def _noise_levels(report: DesignReport) -> list[float]:
-    noise = report.config.truth.noise_per_measurement(report.config.hardware.n_measurements)
-    return sorted({float(value) for value in noise})
-
-
 def _simulation_blocks(report: DesignReport) -> list[Block]:
     settings = report.config.settings.simulation
     charts = simulation_charts(report)
@@ -192,13 +191,7 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
 
 
 def _certificate_blocks(report: DesignReport) -> list[Block]:
-    blocks: list[Block] = [
-        Paragraph(
-            text="Every check was recomputed from the matrices of the gain file, by other means "
-            "than the solver that made the design. They hold for the loop that the design was made "
-            "for, at the sensor gain that it assumes."
-        )
-    ]
+    blocks: list[Block] = [Paragraph(text=paragraph("certificates"))]
     for one in report.assessments:
         missing = f"{one.name}: not computed: {one.certificate_error}"
         blocks.append(

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.loop import BandLimit, ResidualLimit
 from lbt_synth.report.designs.assessment import DesignAssessment
 from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.number_text import DASH, MINUS, fixed_text, interval_text, number_text
+from lbt_synth.report.designs.verdict import good_range
+from lbt_synth.report.number_text import (
+    DASH,
+    MINUS,
+    fixed_text,
+    interval_text,
+    number_text,
+    signed_text,
+)
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies import LimitRow
 
 Value = Callable[[DesignAssessment, LimitRow], str | Cell]
+_one_decimal = partial(fixed_text, decimals=1)
+_two_decimals = partial(fixed_text, decimals=2)
+_three_digits = partial(number_text, digits=3)
 
 
 def summary_table(report: DesignReport) -> Table:
@@ -28,16 +41,16 @@ def summary_table(report: DesignReport) -> Table:
             "achieved gamma, H-infinity norm of the error in its own model [nm]",
             lambda one, _: number_text(one.gamma, 5),
         ),
-        ("error in its own model [nm rms]", lambda one, _: fixed_text(one.estimation_rms, 1)),
+        ("error in its own model [nm rms]", lambda one, _: _one_decimal(one.estimation_rms)),
         ("certificate, recomputed", lambda one, _: _certificate_cell(one)),
         "In the loop of the configuration",
         ("closed loop", lambda one, _: _stability_cell(one)),
         ("largest modulus of its poles", lambda one, _: number_text(one.spectral_radius, 6)),
-        ("residual, exact [nm rms]", lambda one, _: fixed_text(one.residual_nm, 1)),
-        ("of that turbulence [nm rms]", lambda one, _: _part_text(one, "turbulence_nm")),
-        ("of that vibration [nm rms]", lambda one, _: _part_text(one, "vibration_nm")),
-        ("of that noise [nm rms]", lambda one, _: _part_text(one, "noise_nm")),
-        ("Strehl ratio, exact [%]", lambda one, _: fixed_text(100 * one.strehl, 2)),
+        ("residual, exact [nm rms]", lambda one, _: _one_decimal(one.residual_nm)),
+        ("of that turbulence [nm rms]", _part("budget", "turbulence_nm", _one_decimal)),
+        ("of that vibration [nm rms]", _part("budget", "vibration_nm", _one_decimal)),
+        ("of that noise [nm rms]", _part("budget", "noise_nm", _one_decimal)),
+        ("Strehl ratio, exact [%]", lambda one, _: _two_decimals(100 * one.strehl)),
         ("Strehl ratio, simulated [%]", lambda one, _: _simulated_text(report, one)),
     ]
     above = _limit_rows(report.limits.limit, ", frequency known", "above_limit_percent")
@@ -47,22 +60,23 @@ def summary_table(report: DesignReport) -> Table:
         ends = interval_text(float(report.errors_hz[0]), float(report.errors_hz[-1]))
         rows += [
             f"Over frequency errors of {ends} Hz",
-            ("worst residual [nm rms]", lambda _, row: fixed_text(row.worst_nm, 1)),
-            ("worst Strehl ratio [%]", lambda one, _: fixed_text(_worst_percent(one), 2)),
+            ("worst residual [nm rms]", lambda _, row: _one_decimal(row.worst_nm)),
+            ("worst Strehl ratio [%]", lambda one, _: _two_decimals(_worst_percent(one))),
+            ("within 10 % of its best Strehl ratio [Hz]", lambda one, _: _good_text(one)),
             *_limit_rows(report.limits.band, " for this range", "above_band_limit_percent"),
         ]
     rows += [
         "Margins at the real sensor gain",
-        ("modulus margin", lambda one, _: _margin_text(one, "modulus", 3)),
+        ("modulus margin", _part("margins", "modulus", _three_digits)),
         ("gain margin, factors", lambda one, _: _gain_margin_text(one)),
-        ("phase margin [deg]", lambda one, _: _margin_text(one, "phase_deg", 3)),
-        ("delay margin [frames]", lambda one, _: _margin_text(one, "delay_frames", 3)),
-        ("highest crossover [Hz]", lambda one, _: _margin_text(one, "crossover_hz", 3)),
+        ("phase margin [deg]", _part("margins", "phase_deg", _three_digits)),
+        ("delay margin [frames]", _part("margins", "delay_frames", _three_digits)),
+        ("highest crossover [Hz]", _part("margins", "crossover_hz", _three_digits)),
         ("stable real sensor gains", lambda one, _: _stable_gains_text(one)),
     ]
     return Table(
         caption=f"Summary at a real sensor gain of {number_text(report.real_gain)}",
-        headings=("quantity", *(one.name for one in report.assessments)),
+        headings=("quantity", *report.names),
         rows=tuple(
             (entry,)
             if isinstance(entry, str)
@@ -70,6 +84,16 @@ def summary_table(report: DesignReport) -> Table:
             for entry in rows
         ),
     )
+
+
+def _part(part: str, name: str, text: Callable[[float], str]) -> Value:
+    """Return what prints a number of the budget or the margins, which unstable loops lack."""
+
+    def value(one: DesignAssessment, _: Any) -> str:
+        found = getattr(one, part)
+        return DASH if found is None else text(getattr(found, name))
+
+    return value
 
 
 def _limit_rows(
@@ -123,24 +147,21 @@ def _stability_cell(one: DesignAssessment) -> Cell:
     return Cell(text="stable", tone="good") if one.stable else Cell(text="UNSTABLE", tone="bad")
 
 
-def _part_text(one: DesignAssessment, name: str) -> str:
-    return DASH if one.budget is None else fixed_text(getattr(one.budget, name), 1)
-
-
 def _simulated_text(report: DesignReport, one: DesignAssessment) -> str:
     run = report.simulations.get(one.name)
     if run is None:
         return DASH
-    scatter = "" if np.isnan(run.scatter) else f" ± {fixed_text(100 * run.scatter, 2)}"
-    return f"{fixed_text(100 * run.strehl, 2)}{scatter}"
+    scatter = "" if np.isnan(run.scatter) else f" ± {_two_decimals(100 * run.scatter)}"
+    return f"{_two_decimals(100 * run.strehl)}{scatter}"
 
 
 def _worst_percent(one: DesignAssessment) -> float:
     return 100 * float(np.min(one.curve.strehl)) if one.stable else float("nan")
 
 
-def _margin_text(one: DesignAssessment, name: str, digits: int) -> str:
-    return DASH if one.margins is None else number_text(getattr(one.margins, name), digits)
+def _good_text(one: DesignAssessment) -> str:
+    found = good_range(one)
+    return DASH if found is None else f"{signed_text(found.low_hz)} to {signed_text(found.high_hz)}"
 
 
 def _gain_margin_text(one: DesignAssessment) -> str:

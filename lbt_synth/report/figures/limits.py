@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Panel, Rule
@@ -71,8 +73,9 @@ def limits_panel(
 ) -> Panel:
     """Return the residual of each design, and the limits, over places on an axis."""
     names = [label(row.design) for row in study.rows]
+    order = np.argsort(places)
     marks: list[Curve | Rule] = [
-        stable_curve(name, names, places, curve if row.stable else None)
+        stable_curve(name, names, places[order], curve[order] if row.stable else None)
         for name, row, curve in zip(names, study.rows, study.residual_nm, strict=True)
     ]
     if study.limit is not None and study.limit.rms_nm > 0:

@@ -8,6 +8,7 @@ import numpy as np
 
 from lbt_synth.report.charts.description import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
 from lbt_synth.report.number_text import listing_text
+from lbt_synth.report.page.words import chart
 from lbt_synth.studies import StudyStatistics
 from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
 from lbt_synth.studies.study.comparison import sample_losses
@@ -18,207 +19,148 @@ from lbt_synth.validation import FloatArray
 
 _UNSTABLE_PANELS = 4
 _HIGH = 40.0  # Strehl ratio [%] above which the axis need not start at 0
+Names = Mapping[str, str]  # what each parameter is called
 
 
-def distribution_chart(found: Sequence[ControllerSamples]) -> Chart | None:
+def distribution_chart(found: Sequence[ControllerSamples]) -> list[Chart]:
     """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
-    curves = []
-    most = 1.0
+    plain, tail, medians = [], [], []
+    top, most = 0.0, 1.0
     for look, each in enumerate(found):
         values = each.strehl[each.evaluated]
         if not values.size:
+            medians.append(f"{each.controller} has none")
             continue
-        most = min(most, 1 / values.size)
+        medians.append(f"{each.controller} has a median of {100 * np.median(values):.1f} %")
         level, part = cumulative_points(values)
         # from nothing just below the first value
-        x, y = np.concatenate((level[:1], level)), np.concatenate(([0.0], part))
-        curves.append((look, each.controller, 100 * x, 100 * y))
-    if not curves:
-        return None
-    top = max(float(x[-1]) for _, _, x, _ in curves)
+        x, y = 100 * np.append(level[:1], level), 100 * np.append(0.0, part)
+        top, most = max(top, float(x[-1])), min(most, 1 / values.size)
+        plain.append(_steps(each.controller, x, y, look))
+        tail.append(_steps(each.controller, x[1:], y[1:], look))
+    if not plain:
+        return []
     low = min(10.0, 10.0 ** np.floor(np.log10(100 * most)))
-    plain, tail = (
-        [
-            Curve(name=name, x=x[first:], y=y[first:], look=look, step="after", width=1.8)
-            for look, name, x, y in curves
-        ]
-        for first in (0, 1)
-    )
     across = Axis(label="Strehl ratio", unit="%", low=0, high=min(100.0, max(1.02 * top, 1.0)))
-    part_label = "samples at or below"
-    return Chart(
-        key="distribution",
-        title="Distribution of the Strehl ratio",
-        caption=(
-            "Part of the samples whose Strehl ratio is at or below the value on the axis; further "
-            "to the right is better. An unstable loop counts as 0: the height at 0 is the part "
-            "that is unstable. The second panel shows the same on a logarithmic scale, for the "
-            "rare bad nights."
+    label, half = "samples at or below", Rule(name="half of the samples", at=50, axis="y")
+    panels = (
+        Panel(
+            x=across,
+            y=Axis(label=label, unit="%", low=0, high=100),
+            marks=(half, *plain),
+            title="all samples",
         ),
-        alt="Cumulative distributions of the Strehl ratio: "
-        + "; ".join(_median_text(each) for each in found)
-        + ".",
-        panels=(
-            Panel(
-                x=across,
-                y=Axis(label=part_label, unit="%", low=0, high=100),
-                marks=(Rule(name="half of the samples", at=50, axis="y"), *plain),
-                title="all samples",
-            ),
-            Panel(
-                x=across,
-                y=Axis(label=part_label, unit="%", log=True, low=low, high=100),
-                marks=tuple(tail),
-                title="lower tail",
-            ),
+        Panel(
+            x=across,
+            y=Axis(label=label, unit="%", log=True, low=low, high=100),
+            marks=tuple(tail),
+            title="lower tail",
         ),
-        columns=2,
     )
+    return [chart("distribution", panels, columns=2, medians="; ".join(medians))]
 
 
-def loss_chart(found: Sequence[ControllerSamples]) -> Chart | None:
+def _steps(name: str, x: FloatArray, y: FloatArray, look: int) -> Curve:
+    return Curve(name=name, x=x, y=y, look=look, step="after", width=1.8)
+
+
+def loss_chart(found: Sequence[ControllerSamples]) -> list[Chart]:
     """How much each controller loses against the best of each sample, and how often."""
     losses = sample_losses(found)
     if len(found) < 2 or not losses[0].size:
-        return None
+        return []
     curves = []
     for look, (each, loss) in enumerate(zip(found, losses, strict=True)):
         level, part = cumulative_points(loss)
-        x, y = np.concatenate(([0.0], level)), np.concatenate(([1.0], 1 - part))
-        curves.append(
-            Curve(name=each.controller, x=100 * x, y=100 * y, look=look, step="after", width=1.8)
-        )
-    x_axis = Axis(label="loss of Strehl ratio", unit="points", low=0)
-    y_axis = Axis(label="samples that lose more", unit="%", low=0, high=100)
-    return Chart(
-        key="loss",
-        title="Loss against the best controller of each sample",
-        caption=(
-            "Part of the samples in which a controller has a Strehl ratio that is lower than that "
-            "of the best one of the same sample by more than the points on the axis; lower is "
-            "better. What a controller would gain if it could be changed with the conditions."
-        ),
-        alt="For each controller, the part of the samples over the loss of Strehl ratio.",
-        panels=(Panel(x=x_axis, y=y_axis, marks=tuple(curves)),),
+        x, y = np.append(0.0, level), np.append(1.0, 1 - part)
+        curves.append(_steps(each.controller, 100 * x, 100 * y, look))
+    panel = Panel(
+        x=Axis(label="loss of Strehl ratio", unit="points", low=0),
+        y=Axis(label="samples that lose more", unit="%", low=0, high=100),
+        marks=tuple(curves),
     )
+    return [chart("loss", [panel])]
 
 
-def parameter_chart(parameters: Mapping[str, FloatArray], names: Mapping[str, str]) -> Chart | None:
+def parameter_chart(parameters: Mapping[str, FloatArray], names: Names) -> list[Chart]:
     """Histograms of the parameters that vary."""
     panels = []
     for name, values in parameters.items():
         if np.ptp(values) == 0:
             continue
         listed = value_shares(values)
+        marks: tuple[Area | Curve, ...]
         if listed is not None:
             places, part = listed
             x, y = np.repeat(places, 3), np.zeros(3 * len(places))
             y[1::3] = 100 * part
             x[2::3] = np.nan  # the stems are not joined
-            panels.append(
-                _histogram_panel(
-                    names[name],
-                    Curve(name="", x=x, y=y, look=0, dash=0, width=5, hover=False),
-                    Curve(name="", x=places, y=100 * part, look=0, line=False, marker="circle"),
-                )
+            marks = (
+                Curve(name="", x=x, y=y, dash=0, width=5, hover=False),
+                Curve(name="", x=places, y=100 * part, line=False, marker="circle"),
             )
-            continue
-        edges, part = histogram(values)
-        x, y = np.repeat(edges, 2), np.concatenate(([0.0], np.repeat(100 * part, 2), [0.0]))
-        panels.append(
-            _histogram_panel(
-                names[name],
-                Area(name="", x=x, low=np.zeros_like(y), high=y, look=0),
-                Curve(name="", x=x, y=y, look=0, dash=0, hover=False),
+        else:
+            edges, part = histogram(values)
+            x, y = np.repeat(edges, 2), np.concatenate(([0.0], np.repeat(100 * part, 2), [0.0]))
+            marks = (
+                Area(name="", x=x, low=np.zeros_like(y), high=y),
+                Curve(name="", x=x, y=y, dash=0, hover=False),
             )
-        )
+        y_axis = Axis(label="samples", unit="%", low=0)
+        panels.append(Panel(x=Axis(label=names[name]), y=y_axis, marks=marks, height_in=1.7))
+    return _parameter_chart("parameters", panels, 3)
+
+
+def _parameter_chart(key: str, panels: Sequence[Panel], columns: int) -> list[Chart]:
+    """Return a chart of panels that have a parameter each, none if there is no panel."""
     if not panels:
-        return None
-    return Chart(
-        key="parameters",
-        title="Histograms of the parameters",
-        caption="Part of the samples in each bin of a parameter, or at each value of a list.",
-        alt="Histograms of " + ", ".join(panel.x.label for panel in panels) + ".",
-        panels=tuple(panels),
-        columns=min(len(panels), 3),
-    )
+        return []
+    listed = listing_text([panel.x.label for panel in panels])
+    return [chart(key, panels, columns=min(len(panels), columns), names=listed)]
 
 
-def _histogram_panel(name: str, *marks: Area | Curve) -> Panel:
-    return Panel(
-        x=Axis(label=name), y=Axis(label="samples", unit="%", low=0), marks=marks, height_in=1.7
-    )
-
-
-def sensitivity_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Chart | None:
+def sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     """First-order indices as bars, one series per controller."""
     varying = varying_parameters(statistics)
     if not varying:
-        return None
-    bars = []
+        return []
+    bars, strongest = [], []
     for look, one in enumerate(statistics.sensitivities):
-        by_name = {each.parameter: each.index for each in one.parameters}
-        value = 100 * np.array([by_name[name].value for name in varying])
-        error = 200 * np.array([by_name[name].error for name in varying])
-        bars.append(
-            Bars(
-                name=one.controller,
-                values=np.maximum(value, 0),
-                low=np.maximum(value - error, 0),
-                high=np.maximum(value + error, 0),
-                look=look,
-            )
-        )
-    return Chart(
-        key="sensitivity",
-        title="Indices of first order",
-        caption=(
-            "Part of the variance of the Strehl ratio that each parameter explains by itself, with "
-            "two standard errors. What is missing to 100 % is due to parameters that act together."
-        ),
-        alt="Bars: " + "; ".join(_strongest_text(statistics, i) for i in range(len(bars))) + ".",
-        panels=(
-            Panel(
-                x=Axis(label="variance explained by itself", unit="%", low=0),
-                y=Axis(label=""),
-                marks=tuple(bars),
-                categories=tuple(names[name] for name in varying),
-            ),
-        ),
+        index = {each.parameter: each.index for each in one.parameters}
+        value = 100 * np.array([index[name].value for name in varying])
+        error = 200 * np.array([index[name].error for name in varying])
+        shown, low, high = np.maximum((value, value - error, value + error), 0)
+        bars.append(Bars(name=one.controller, values=shown, low=low, high=high, look=look))
+        first = one.ranked[:1]
+        strongest += [
+            f"{one.controller} depends most on {each.parameter}, {100 * each.index.value:.0f} %"
+            for each in first
+        ] or [f"{one.controller} has none"]
+    panel = Panel(
+        x=Axis(label="variance explained by itself", unit="%", low=0),
+        y=Axis(label=""),
+        marks=tuple(bars),
+        categories=tuple(names[name] for name in varying),
     )
+    return [chart("sensitivity", [panel], strongest="; ".join(strongest))]
 
 
-def conditional_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Chart | None:
+def conditional_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     """Mean and 10th percentile of the Strehl ratio over each parameter."""
     panels = []
     for name in varying_parameters(statistics):
         marks: list[Curve] = []
         least = 100.0
         for look, controller, curve in _conditional_curves(statistics, name):
-            marks += _mean_and_low(controller, curve, look)
-            least = min(least, 100 * float(np.min(curve.low)))
-        panels.append(
-            Panel(
-                x=Axis(label=names[name]),
-                y=Axis(label="Strehl ratio", unit="%", low=0 if least < _HIGH else None),
-                marks=tuple(marks),
-            )
-        )
-    if not panels:
-        return None
-    return Chart(
-        key="curves",
-        title="Strehl ratio over each parameter",
-        caption=(
-            "Mean over the samples of each group of a parameter, all others as they come "
-            "(with markers), and the 10th percentile (thin, without): one night in ten is below it."
-        ),
-        alt="Mean and 10th percentile of the Strehl ratio over "
-        + listing_text([panel.x.label for panel in panels])
-        + ".",
-        panels=tuple(panels),
-        columns=min(len(panels), 2),
-    )
+            x, mean, low = curve.parameter, 100 * curve.mean, 100 * curve.low
+            marks += [
+                Curve(name=controller, x=x, y=mean, look=look, marker="own", width=1.8),
+                Curve(name="", x=x, y=low, look=look, width=0.9, hover=False),
+            ]
+            least = min(least, float(np.min(low)))
+        y = Axis(label="Strehl ratio", unit="%", low=0 if least < _HIGH else None)
+        panels.append(Panel(x=Axis(label=names[name]), y=y, marks=tuple(marks)))
+    return _parameter_chart("curves", panels, 2)
 
 
 def _conditional_curves(
@@ -231,15 +173,7 @@ def _conditional_curves(
             yield look, one.controller, curve
 
 
-def _mean_and_low(name: str, curve: ConditionalCurve, look: int) -> list[Curve]:
-    x = curve.parameter
-    return [
-        Curve(name=name, x=x, y=100 * curve.mean, look=look, marker="own", width=1.8),
-        Curve(name="", x=x, y=100 * curve.low, look=look, width=0.9, hover=False),
-    ]
-
-
-def unstable_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Chart | None:
+def unstable_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     """Part of the loops that are unstable, over the parameters that it changes most with."""
     panels = []
     for name in varying_parameters(statistics):
@@ -250,32 +184,18 @@ def unstable_chart(statistics: StudyStatistics, names: Mapping[str, str]) -> Cha
                 marks.append(Curve(name=controller, x=x, y=y, look=look, marker="own", width=1.8))
                 span = max(span, float(np.ptp(curve.unstable)))
         axis = Axis(label="unstable", unit="%", low=0)
-        panels.append((span, Panel(x=Axis(label=names[name]), y=axis, marks=tuple(marks))))
-    most = sorted((pair for pair in panels if pair[1].marks), key=lambda pair: -pair[0])
-    shown = tuple(panel for _, panel in most[:_UNSTABLE_PANELS])
-    if not shown:
-        return None
-    listed = listing_text([panel.x.label for panel in shown])
-    return Chart(
-        key="unstable",
-        title="Where loops are unstable",
-        caption=(
-            "Part of the loops that are unstable in each group of a parameter, all others as they "
-            f"come, over the parameters that it changes most with: {listed}. Controllers that are "
-            "stable in every sample are not drawn."
-        ),
-        alt=f"Part of the loops that are unstable over {listed}.",
-        panels=shown,
-        columns=min(len(shown), 2),
-    )
+        if marks:
+            panels.append((span, Panel(x=Axis(label=names[name]), y=axis, marks=tuple(marks))))
+    most = sorted(panels, key=lambda pair: -pair[0])[:_UNSTABLE_PANELS]
+    return _parameter_chart("unstable", [panel for _, panel in most], 2)
 
 
 def map_charts(
     statistics: StudyStatistics,
     found: Sequence[ControllerSamples],
     parameters: Mapping[str, FloatArray],
-    names: Mapping[str, str],
-) -> tuple[Chart, ...]:
+    names: Names,
+) -> list[Chart]:
     """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
     charts = []
     for place, (one, each) in enumerate(zip(statistics.sensitivities, found, strict=True)):
@@ -295,38 +215,19 @@ def map_charts(
             high=5 * np.floor(high / 5) + 5,
             blank="no sample",
         )
+        x, y = names[first], names[second]
         charts.append(
-            Chart(
-                key=f"map-{place + 1}",
-                title=f"{each.controller}: Strehl ratio over {names[first]} and {names[second]}",
-                caption=(
-                    f"Mean of the Strehl ratio of {each.controller} in each cell, all other "
-                    "parameters as they come; unstable loops count as 0. These two parameters have "
-                    "its greatest indices; the outermost cells hold what is beyond. The scale of "
-                    "colours is its own."
-                ),
-                alt=(
-                    f"Map of the mean Strehl ratio of {each.controller} over {first} and {second}: "
-                    f"from {low:.1f} to {high:.1f} %."
-                ),
-                panels=(
-                    Panel(x=Axis(label=names[first]), y=Axis(label=names[second]), marks=(mark,)),
-                ),
+            chart(
+                f"map-{place + 1}",
+                [Panel(x=Axis(label=x), y=Axis(label=y), marks=(mark,))],
+                words="study-map",
+                controller=each.controller,
+                x=x,
+                y=y,
+                x_path=first,
+                y_path=second,
+                low=f"{low:.1f}",
+                high=f"{high:.1f}",
             )
         )
-    return tuple(charts)
-
-
-def _median_text(each: ControllerSamples) -> str:
-    values = each.strehl[each.evaluated]
-    if not values.size:
-        return f"{each.controller} has none"
-    return f"{each.controller} has a median of {100 * np.median(values):.1f} %"
-
-
-def _strongest_text(statistics: StudyStatistics, place: int) -> str:
-    one = statistics.sensitivities[place]
-    if not one.ranked:
-        return f"{one.controller} has none"
-    first = one.ranked[0]
-    return f"{one.controller} depends most on {first.parameter}, {100 * first.index.value:.0f} %"
+    return charts

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Section
+from lbt_synth.report.page.words import paragraph
 from lbt_synth.report.provenance import files_table, versions_table
 from lbt_synth.report.study.charts import (
     conditional_chart,
@@ -45,10 +46,7 @@ def summary_section(
     failed = [each for each in statistics.controllers if each.failed]
     warnings = []
     if statistics.samples < info.samples:
-        warnings.append(
-            f"The study is not complete: {statistics.samples} of {info.samples} samples have "
-            "results. What follows is of these alone."
-        )
+        warnings.append(paragraph("incomplete", done=statistics.samples, samples=info.samples))
     if unstable:
         parts = ", ".join(
             f"{each.controller} in {each.unstable.count} of {each.samples} "
@@ -64,9 +62,7 @@ def summary_section(
         text = "Every controller is stable in every sample, and none failed."
         blocks.append(Notice(text=text, tone="good"))
     blocks += [Paragraph(text=_verdict_text(statistics.controllers)), strehl_table(statistics)]
-    chart = distribution_chart(found)
-    blocks += [chart] if chart is not None else []
-    return Section(key="summary", title="Summary", blocks=tuple(blocks))
+    return Section(key="summary", title="Summary", blocks=(*blocks, *distribution_chart(found)))
 
 
 def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
@@ -74,24 +70,22 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     with_data = [each for each in controllers if each.samples]
     if not with_data:
         return "No controller was evaluated on any sample."
-    mean = max(with_data, key=lambda each: each.mean)
-    low = max(with_data, key=lambda each: each.strehl[1].value)
-    half = max(with_data, key=lambda each: each.strehl[3].value)
-    text = (
-        f"Highest mean Strehl ratio: {mean.controller}, {percent(mean.mean)} %. "
-        f"Highest median: {half.controller}, {percent(half.strehl[3].value)} %. "
-        f"Highest 5th percentile, which 19 of 20 samples exceed: {low.controller}, "
-        f"{percent(low.strehl[1].value)} %."
+
+    def leader(value: Callable[[ControllerStatistics], float]) -> str:
+        best = max(with_data, key=value)
+        return f"{best.controller}, {percent(value(best))} %"
+
+    text = paragraph(
+        "leaders",
+        mean=leader(lambda each: each.mean),
+        median=leader(lambda each: each.strehl[3].value),
+        low=leader(lambda each: each.strehl[1].value),
     )
-    if len(with_data) > 1:
-        loss = min(with_data, key=lambda each: each.loss.loss[1].value)
-        if np.isfinite(loss.loss.loss[1].value):
-            text += (
-                f" Least regret: {loss.controller} is within "
-                f"{percent(loss.loss.loss[1].value)} points of the best controller of the sample "
-                "in 95 % of the samples."
-            )
-    return text
+    least = min(with_data, key=lambda each: each.loss.loss[1].value)
+    loss = least.loss.loss[1].value
+    if len(with_data) == 1 or not np.isfinite(loss):
+        return text
+    return f"{text} {paragraph('regret', name=least.controller, loss=percent(loss))}"
 
 
 def samples_section(
@@ -114,16 +108,9 @@ def samples_section(
         rows=rows,
         words=(1, 2),
     )
-    chart = parameter_chart(values, names) if rows else None
-    return Section(
-        key="samples",
-        title="What was sampled",
-        blocks=(
-            Paragraph(text=f"{info.samples} samples, {info.sampling}; {info.evaluation}."),
-            table,
-            *([chart] if chart is not None else []),
-        ),
-    )
+    opening = f"{info.samples} samples, {info.sampling}; {info.evaluation}."
+    blocks = (Paragraph(text=opening), table, *(parameter_chart(values, names) if rows else ()))
+    return Section(key="samples", title="What was sampled", blocks=blocks)
 
 
 def _rounded_texts(values: FloatArray) -> list[str]:
@@ -176,17 +163,13 @@ def _count_cell(count: int) -> Cell:
 
 def comparison_section(statistics: StudyStatistics, found: Sequence[ControllerSamples]) -> Section:
     """Compare the controllers on the same samples."""
-    chart = loss_chart(found)
     table = comparison_table(statistics)
-    return Section(
-        key="comparison",
-        title="Comparison on the same samples",
-        blocks=(
-            *([table] if table.rows else []),
-            *([chart] if chart is not None else []),
-            residual_table(statistics),
-        ),
+    blocks: tuple[Block, ...] = (
+        *([table] if table.rows else []),
+        *loss_chart(found),
+        residual_table(statistics),
     )
+    return Section(key="comparison", title="Comparison on the same samples", blocks=blocks)
 
 
 def dependence_section(
@@ -197,24 +180,17 @@ def dependence_section(
 ) -> Section:
     """Show what the Strehl ratio depends on."""
     if not varying_parameters(statistics):
-        words = (
-            "No index: no parameter varies, the Strehl ratio is the same everywhere, or there are "
-            "fewer than 20 samples."
-        )
-        return Section(key="dependence", title="Dependence", blocks=(Notice(text=words),))
+        blocks: tuple[Block, ...] = (Notice(text=paragraph("no-index")),)
+        return Section(key="dependence", title="Dependence", blocks=blocks)
     blocks = (
-        sensitivity_chart(statistics, names),
+        *sensitivity_chart(statistics, names),
         sensitivity_table(statistics, names=names),
         swing_table(statistics, names=names),
-        conditional_chart(statistics, names),
-        unstable_chart(statistics, names),
+        *conditional_chart(statistics, names),
+        *unstable_chart(statistics, names),
         *map_charts(statistics, found, values, names),
     )
-    return Section(
-        key="dependence",
-        title="What the Strehl ratio depends on",
-        blocks=tuple(block for block in blocks if block is not None),
-    )
+    return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)
 
 
 def worst_section(
@@ -233,11 +209,7 @@ def worst_section(
             blocks.append(worst_table(each, shown, names=names))
             commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
     if most:
-        text = (
-            "Unstable loops first, then by the Strehl ratio; of the parameters, the "
-            f"{_PARAMETERS} with the greatest indices of the controller."
-        )
-        blocks.insert(0, Paragraph(text=text))
+        blocks.insert(0, Paragraph(text=paragraph("worst", count=_PARAMETERS)))
     if commands:
         caption = "Commands that replay the first of each table; any other row likewise"
         blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
@@ -246,32 +218,8 @@ def worst_section(
 
 def reading_section() -> Section:
     """Explain how the figures are to be read."""
-    return Section(
-        key="reading",
-        title="How to read the figures",
-        blocks=(
-            Paragraph(
-                text=(
-                    "An unstable loop counts as a Strehl ratio of 0 and an infinite residual. "
-                    "Evaluations that failed are left out and counted. Intervals hold the true "
-                    "value with a probability of 95 % for independent samples; for samples of a "
-                    "Sobol sequence or a Latin hypercube, which are more even, they are too wide. "
-                    "They tell how far the sampling is trusted, not how far the model is: if the "
-                    "parameters are distributed otherwise, so are the results."
-                )
-            ),
-            Paragraph(
-                text=(
-                    "The index of a parameter is the variance of the mean Strehl ratio given that "
-                    "parameter, over the whole variance. It does not say which way the Strehl "
-                    "ratio moves (the curves and the rank correlation do), and it leaves out what "
-                    "parameters do only together: what the indices lack to 100 %. An index near 0 "
-                    "with a large remainder does not make a parameter harmless. The sum means "
-                    "that only if the parameters were drawn independently of each other."
-                )
-            ),
-        ),
-    )
+    blocks = tuple(Paragraph(text=paragraph(name)) for name in ("intervals", "indices"))
+    return Section(key="reading", title="How to read the figures", blocks=blocks)
 
 
 def origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:

@@ -34,7 +34,9 @@ def test_an_unstable_loop_is_named_loudly(report, text):
     assert len(notices) == 2
     assert "wild is UNSTABLE in the loop of this configuration" in text
     assert "The certificate of wild fails: spectral radius of the closed loop" in text
-    assert "wild is UNSTABLE in this loop." in verdict(report)
+    assert "wild is UNSTABLE in this loop; the certificate of wild does NOT hold." in verdict(
+        report
+    )
     assert 'class="bad">UNSTABLE' in text
     assert text.count("wild: unstable") > 5
 
@@ -117,7 +119,7 @@ def test_nothing_stable_is_needed(config, designs):
     charts = design_page(report).charts
     assert [chart.key for chart in charts] == ["map", "poles"]  # none of them is empty
     honest = replace(report.assessments[0], checks=())
-    assert "passed; they are about the loops that the designs were made for" in verdict(
+    assert "passed, but they are about the loops that the designs were made for" in verdict(
         replace(report, assessments=(honest,))
     )
     assert "No loop is stable, so none was simulated." in text

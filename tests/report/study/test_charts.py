@@ -24,10 +24,10 @@ def test_the_size_does_not_grow_with_the_samples():
 def test_charts_show_the_numbers_of_the_columns():
     columns = results()
     found = [read_controller_samples(columns, name) for name in CONTROLLERS]
-    curves = {c.name: c for c in distribution_chart(found).panels[0].marks if hasattr(c, "x")}
+    curves = {c.name: c for c in distribution_chart(found)[0].panels[0].marks if hasattr(c, "x")}
     sharp = found[1].strehl
     assert curves["sharp"].y[1] == pytest.approx(100 * np.mean(sharp == 0))
-    loss = {c.name: c for c in loss_chart(found).panels[0].marks}
+    loss = {c.name: c for c in loss_chart(found)[0].panels[0].marks}
     whole = found[2].evaluated
     best = np.max([each.strehl[whole] for each in found], axis=0)
     at = np.searchsorted(loss["sharp"].x, 10, side="right") - 1
