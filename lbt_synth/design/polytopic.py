@@ -282,10 +282,8 @@ def _expected_error(
 ) -> tuple[FloatArray, float]:
     """Covariance and size of the Kalman error for a line as wide as the interval: a guess."""
     if plant.vibrations:
-        lines = [
-            replace(line, damping=max(line.damping, half_width_hz / (2 * line.frequency_hz)))
-            for line in plant.vibrations
-        ]
+        wide = [(line, half_width_hz / (2 * line.frequency_hz)) for line in plant.vibrations]
+        lines = [replace(line, damping=max(line.damping, width)) for line, width in wide]
         plant = with_vibrations(plant, lines)
     solution = kalman_riccati(plant)
     return solution.P, error_size(plant.error_system(solution.gain_predictor), norm)

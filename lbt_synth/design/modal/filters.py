@@ -127,12 +127,8 @@ class ModalFilters:
     @property
     def hardware(self) -> LoopHardware:
         """Loop that the filters are designed for, of one mode with a unit sensor."""
-        return LoopHardware(
-            frame_rate_hz=self.turbulence.frame_rate_hz,
-            delay_frames=self.delay_frames,
-            modes=1,
-            mirror=self.mirror,
-        )
+        rate, delay = self.turbulence.frame_rate_hz, self.delay_frames
+        return LoopHardware(frame_rate_hz=rate, delay_frames=delay, modes=1, mirror=self.mirror)
 
     def controller(self, mode: int) -> Controller:
         """Return the controller of one mode.
@@ -231,12 +227,10 @@ def modal_filters(
     ([135.9, 30.6], True)
     """
     air = as_modal_turbulence(turbulence)
-    n = air.n_modes
+    n, rate = air.n_modes, air.frame_rate_hz
     noise = number_per_mode(noise_nm, "noise_nm", n)
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
-    hardware = LoopHardware(
-        frame_rate_hz=air.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
-    )
+    hardware = LoopHardware(frame_rate_hz=rate, delay_frames=delay_frames, modes=1, mirror=mirror)
     lines = lines_per_mode(vibrations, n)
     delay, response = hardware.delay_frames, hardware.mirror_system.whole
     applied = mirror is None and delay >= 2 and delay == int(delay)

@@ -88,10 +88,10 @@ class MixedController:
         self.leak = number_per_mode(self.leak, "leak", n, zero=True, at_most=1)
         if self.reconstructor is not None:
             require_instance(self.reconstructor, Reconstructor)
-            if self.reconstructor.n_modes != n:
+            own = self.reconstructor.n_modes
+            if own != n:
                 raise DimensionError(
-                    "gains must be one per mode of the reconstructor, "
-                    f"{self.reconstructor.n_modes}; got {n}."
+                    f"gains must be one per mode of the reconstructor, {own}; got {n}."
                 )
         self._gain, self._leak = np.array(self.gains), np.array(self.leak)
         self._modes, self._running = np.zeros(0, dtype=np.intp), None

@@ -7,6 +7,7 @@ the real loop over all frequencies, which know nothing of the programme.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -256,3 +257,6 @@ class CommandRms:
         if self.turbulence is not None:
             density = density + self.turbulence.psd(f)
         return density * (4 * np.sin(np.pi * f * dt_s) ** 2 if self.rate else 1.0)
+
+
+Bound: TypeAlias = ModulusMargin | NoisePeak | Attenuation | CommandRms

@@ -78,13 +78,8 @@ class ResidualVariance:
         noise_rows = noise[:, None] * channel.noise_rows(f)
         rows = np.stack([-size[:, None] * complementary, noise_rows], axis=1)
         centres = np.stack([size, np.zeros(f.size)], axis=1).astype(np.complex128)
-        return Fractions(
-            frequency_hz=f,
-            rows=rows,
-            centres=centres,
-            steering=_steering(complementary, self.sensor_gain),
-            worst=False,
-        )
+        steering = _steering(complementary, self.sensor_gain)
+        return Fractions(frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=False)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the variance in the real loop, exactly."""
@@ -140,13 +135,10 @@ class VibrationBand(Band):
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""
         f = grid.within(self.low_hz, self.high_hz)
         complementary = channel.complementary_rows(f)
-        return Fractions(
-            frequency_hz=f,
-            rows=-self.rms_nm * complementary[:, None, :],
-            centres=np.full((f.size, 1), self.rms_nm, dtype=np.complex128),
-            steering=_steering(complementary, self.sensor_gain),
-            worst=True,
-        )
+        rows = -self.rms_nm * complementary[:, None, :]
+        centres = np.full((f.size, 1), self.rms_nm, dtype=np.complex128)
+        steering = _steering(complementary, self.sensor_gain)
+        return Fractions(frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=True)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets."""
@@ -181,11 +173,8 @@ class _CombinedTerms:
 
     def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the objective over a grid as a function of the coefficients [nm^2]."""
-        return CombinedFunction(
-            parts=tuple(term.function(channel, grid) for term in self.terms),
-            weights=self.factors,
-            worst=self.largest,
-        )
+        parts = tuple(term.function(channel, grid) for term in self.terms)
+        return CombinedFunction(parts=parts, weights=self.factors, worst=self.largest)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the objective of the real loop [nm^2]."""

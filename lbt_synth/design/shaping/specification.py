@@ -6,28 +6,20 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias, get_args
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.bounds import Attenuation, CommandRms, ModulusMargin, NoisePeak
+from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
 from lbt_synth.design.shaping.channel import Channel
 from lbt_synth.design.shaping.frequency_bounds import Band
 from lbt_synth.design.shaping.frequency_grid import Grid, first_grid
 from lbt_synth.design.shaping.objectives import ResidualVariance, Term, leaves, require_term
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
-from lbt_synth.design.shaping.uncertainty import DelayError, MirrorUncertainty, SensorGainRange
+from lbt_synth.design.shaping.uncertainty import SensorGainRange, Uncertainty
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, Function
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Spectrum
 from lbt_synth.validation import sequence, set_fields
 
-Demand: TypeAlias = (
-    ModulusMargin
-    | NoisePeak
-    | Attenuation
-    | SensorGainRange
-    | DelayError
-    | MirrorUncertainty
-    | CommandRms
-)
+Demand: TypeAlias = Bound | Uncertainty
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,10 +99,8 @@ class Specification:
         nyquist = hardware.frame_rate_hz / 2
         for low, high in self.bands_hz:
             if high > nyquist:
-                raise ProblemError(
-                    f"a band must lie below the Nyquist frequency {nyquist:.6g} Hz; got "
-                    f"{low:g} to {high:g} Hz."
-                )
+                nearest = f"the Nyquist frequency {nyquist:.6g} Hz"
+                raise ProblemError(f"a band must lie below {nearest}; got {low:g} to {high:g} Hz.")
         for spectrum in self.spectra:
             if isinstance(spectrum, ARModel):
                 require_loop_rate(spectrum.frame_rate_hz, hardware)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.polynomial.polynomial import polysub
@@ -207,3 +208,6 @@ class MirrorUncertainty(Band):
         """Check the real loop."""
         name = f"|T| in {self.band_text} times the mirror's error"
         return (self.check(name, self.relative * self.peak(loop.complementary), 1.0),)
+
+
+Uncertainty: TypeAlias = SensorGainRange | DelayError | MirrorUncertainty

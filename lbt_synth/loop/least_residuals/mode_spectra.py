@@ -21,7 +21,7 @@ _COUPLING = 1e-9  # relative size above which an off-diagonal entry counts as co
 _SAMPLES = 24  # frequencies at which the modes of a plant have to decouple
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class ModeSpectrum:
     """One decoupled mode: its disturbance and the white noise on its measurement."""
 
@@ -125,10 +125,9 @@ class ResponseSpectrum:
 
 def decoupled_modes(
     hardware: LoopHardware,
-    *,
     noise_nm2: FloatArray,
     turbulence: Sequence[Spectrum | None],
-    vibrations: Sequence[tuple[FloatArray, Vibration]] = (),
+    vibrations: Sequence[tuple[FloatArray, Vibration]],
     directions: Sequence[FloatArray] = (),
 ) -> tuple[FloatArray, list[ModeSpectrum]]:
     """Rotate the modes until disturbance and noise (q, q) are diagonal.
@@ -170,9 +169,7 @@ def _spectra_along(
 ) -> list[ModeSpectrum]:
     inner, rate = InnerFactor.of(hardware), hardware.frame_rate_hz
     return [
-        ModeSpectrum(
-            inner=inner, rate_hz=rate, parts=own, noise_nm2=max(float(axis @ noise @ axis), 0.0)
-        )
+        ModeSpectrum(inner, rate, own, max(float(axis @ noise @ axis), 0.0))
         for axis, own in zip(axes, parts, strict=True)
     ]
 

@@ -94,11 +94,7 @@ def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
     if isinstance(plant, FullStatePlant):
         return _residual_limit(*plant_modes(plant))
     lines = [(checked_direction(line, plant.hardware), line) for line in plant.vibrations]
-    return _residual_limit(
-        *decoupled_modes(
-            plant.hardware, noise_nm2=plant.R, turbulence=plant.turbulence, vibrations=lines
-        )
-    )
+    return _residual_limit(*decoupled_modes(plant.hardware, plant.R, plant.turbulence, lines))
 
 
 def truth_modes(
@@ -115,13 +111,8 @@ def truth_modes(
         elif not isinstance(vibration, SinusoidalVibration):
             assert_never(vibration)  # a random vibration of a new kind counts, too
     noise = np.diag((truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain) ** 2)
-    return decoupled_modes(
-        hardware,
-        noise_nm2=noise,
-        turbulence=truth.turbulence_per_mode(hardware.modes),
-        vibrations=lines,
-        directions=directions,
-    )
+    turbulence = truth.turbulence_per_mode(hardware.modes)
+    return decoupled_modes(hardware, noise, turbulence, lines, directions)
 
 
 def _residual_limit(directions: FloatArray, modes: list[ModeSpectrum]) -> ResidualLimit:
