@@ -135,9 +135,6 @@ def test_a_package_adds_a_method_by_its_entry_point(tmp_path):
     assert json.loads(done.stdout)["method"] == "leaky"
 
 
-NOT_YET = {"lbt_synth/report/figures/style.py", "lbt_synth/report/figures/tradeoff.py"}
-
-
 def test_no_other_file_names_a_method():
     """A method's name stands in its module, and in the design that it makes."""
     known = {"design", "methods"}
@@ -146,7 +143,7 @@ def test_no_other_file_names_a_method():
         for path in (ROOT / "lbt_synth").rglob("*.py")
         if path.relative_to(ROOT).parts[1] not in known and (found := method_names_in(path))
     }
-    assert set(named) <= NOT_YET
+    assert named == {}
 
 
 def method_names_in(path):

@@ -11,12 +11,15 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.report.charts.description import Area, Axis, Curve, Mark, Panel, Rule, Span
 from lbt_synth.report.charts.matplotlib_charts import draw_figure
 from lbt_synth.studies import TradeoffPoint
+from lbt_synth.studies.tradeoff import FAMILIES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_NAMES = {"mixed": "least variance at this norm", "central": "central H∞ filter of this norm"}
+_NAMES = dict(
+    zip(FAMILIES, ("least variance at this norm", "central H∞ filter of this norm"), strict=True)
+)
 
 
 def tradeoff_figure(
