@@ -8,6 +8,7 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
+from lbt_synth.cli.loop_inputs import given_options
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
@@ -98,8 +99,7 @@ def load_setup(arguments: Namespace) -> EndToEndSetup:
     setup = load_config(arguments.config).end_to_end
     if arguments.pixels is not None:
         setup = replace(setup, system=replace(setup.system, pixels=arguments.pixels))
-    given = {name: getattr(arguments, name) for name in ("frames", "settle_frames", "seed")}
-    return replace(setup, **{name: value for name, value in given.items() if value is not None})
+    return replace(setup, **given_options(arguments, "frames", "settle_frames", "seed"))
 
 
 def calibrate_setup(setup: EndToEndSetup, arguments: Namespace) -> Calibration:

@@ -1,9 +1,11 @@
-"""Designs and truths that several commands put into a loop."""
+"""What several commands put into a loop: options, designs and truths."""
 
 from __future__ import annotations
 
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
@@ -11,6 +13,11 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.models import Truth
 from lbt_synth.models.loop_hardware import loop_differences
+
+
+def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
+    """Return the options of those names that the command line gives."""
+    return {name: value for name in names if (value := getattr(arguments, name)) is not None}
 
 
 def load_designs(paths: list[str]) -> dict[str, Design]:

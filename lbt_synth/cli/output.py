@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from rich import table as rich_table
@@ -23,8 +23,6 @@ from lbt_synth.storage.tables import Table
 _WIDTH = 200  # where the output is no terminal
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
 
-Facts: TypeAlias = list[tuple[str, Any, str]]  # quantity, value, unit
-
 
 def text_table(caption: str, headings: Sequence[str], cells: Iterable[Sequence[Any]]) -> Table:
     """Return a table of values of any kind."""
@@ -34,21 +32,6 @@ def text_table(caption: str, headings: Sequence[str], cells: Iterable[Sequence[A
         rows=tuple(tuple(map(cell_text, row)) for row in cells),
         words=tuple(i for i, heading in enumerate(headings) if i and heading in _WORDS),
     )
-
-
-class TableText(Table):
-    """A table of values of any kind."""
-
-    def __init__(
-        self, *, title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]
-    ) -> None:
-        table = text_table(title, headings, rows)
-        super().__init__(caption=title, headings=table.headings, rows=table.rows, words=table.words)
-
-
-def fact_table(title: str, facts: Facts) -> Table:
-    """Make a table of facts: a quantity, its value, and its unit."""
-    return text_table(title, ("quantity", "value", "unit"), facts)
 
 
 @dataclass(kw_only=True)
@@ -83,15 +66,17 @@ class Report:
         self._add_units(found[0])
         self.tables.append(rows.row_table(caption, found, without=(*without, *hidden)))
 
-    def add_facts(self, caption: str, *facts: Any) -> None:
-        """Add the values of rows to the data, with their units, and as a table, one a line."""
+    def add_facts(self, caption: str, *facts: Any, key: str = "") -> None:
+        """Add the values of rows to the data, or under a key of it, and as a table, one a line."""
+        data = self.data.setdefault(key, {}) if key else self.data
         for row in facts:
-            self.data |= json_record(row)
+            data |= json_record(row)
             self._add_units(row)
         self.tables.append(rows.fact_table(caption, *facts))
 
     def _add_units(self, row: Any) -> None:
-        self.data["units"] = self.data.get("units", {}) | json_units(row)
+        if units := self.data.get("units", {}) | json_units(row):
+            self.data["units"] = units
 
     def note_written(self, path: str | os.PathLike[str], key: str = "file") -> None:
         """Add a file that was written to the data, and a line about it to the notes."""

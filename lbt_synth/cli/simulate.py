@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.loop_inputs import loop_difference_notes, truth_at_sensor_gain
-from lbt_synth.cli.output import Report, TableText
+from lbt_synth.cli.loop_inputs import given_options, loop_difference_notes, truth_at_sensor_gain
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
@@ -34,7 +34,30 @@ from lbt_synth.models import Truth
 from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.rows import (
+    column,
+    columns,
+    fill_row,
+    json_record,
+    json_units,
+    table_row,
+)
 from lbt_synth.validation import FloatArray
+
+
+@table_row
+class ExactAnswers:
+    """What the loop leaves without chance; a truth that drifts has no exact answer."""
+
+    strehl_exact: float | None = column("Strehl ratio", unit="%", scale=100, default=None)
+    residual_exact_nm: float | None = column("residual", unit="nm rms", default=None)
+    turbulence_nm: float | None = column("  turbulence", unit="nm rms", default=None)
+    vibration_nm: float | None = column("  vibration", unit="nm rms", default=None)
+    noise_nm: float | None = column("  noise", unit="nm rms", default=None)
+    limit_nm: float | None = column(
+        "least residual of any linear controller", unit="nm rms", default=None
+    )
+    above_limit_percent: float | None = column("  residual above it", unit="%", default=None)
 
 
 def run(arguments: Namespace) -> Report:
@@ -50,41 +73,49 @@ def run(arguments: Namespace) -> Report:
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
     _require_stable(loop, design, config.sensor_gain)
+    settings = config.settings.simulation
+    sizes = {"frames": settings.frames, "cases": settings.cases, "seed": settings.seed}
     # the same settling for all controllers, so that one seed is one weather
-    settle = max(config.settings.simulation.settle_frames, settling_frames(loop.spectral_radius))
+    settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
     with show_spinner("closing the loop", quiet=arguments.json):
         simulation = simulate(
             design.controller,
             truth,
             hardware=config.hardware,
-            **_run_size(arguments, config),
+            **sizes | given_options(arguments, *sizes),
             settle_frames=settle,
         )
         strehls = simulation.strehl(config.imaging)
+    exact = _exact_answers(loop, config, truth)
     command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
-    scatter = float(np.std(strehls, ddof=1)) if len(strehls) > 1 else float("nan")
-    exact = _exact_values(loop, config, truth)
-    frames = simulation.residual_nm.shape[1]
-    plural = "s" if len(strehls) > 1 else ""
+    cases, frames = simulation.residual_nm.shape[:2]
     report = Report(
         data={
             "strehl": strehls,
             "residual_nm": simulation.rms_nm,
-            **exact,
+            **json_record(exact),
             "command_rms": command_rms,
+            "units": json_units(exact) | {"residual_nm": "nm rms", "command_rms": "nm rms"},
             "frames": frames,
-            "cases": len(strehls),
+            "cases": cases,
             "seed": simulation.seed,
             "sensor_gain": config.sensor_gain * truth.sensor_gain,
         },
-        tables=[
-            TableText(
-                title=f"{design.method} in the loop: {len(strehls)} run{plural} of {frames} frames",
-                headings=("quantity", "simulated", "exact", "unit"),
-                rows=_quantities(simulation, strehls, command_rms, exact),
-            )
-        ],
-        notes=_simulation_notes(config, design, scatter, settle, drifts=truth.drifts),
+        notes=_simulation_notes(config, design, strehls, settle, drifts=truth.drifts),
+    )
+    simulated = {
+        "strehl_exact": 100 * float(np.mean(strehls)),
+        "residual_exact_nm": float(np.sqrt(np.mean(simulation.rms_nm**2))),
+    }
+    report.add_table(
+        f"{design.method} in the loop: {cases} run{'s' * (cases > 1)} of {frames} frames",
+        ("quantity", "simulated", "exact", "unit"),
+        [
+            (each.heading, simulated.get(each.name), each.text(exact), each.unit)
+            for each in columns(exact)
+            if each.name in simulated or getattr(exact, each.name) is not None
+        ]
+        + [("commands", command_rms, None, "nm rms")],
     )
     if arguments.output is not None:
         title = f"{design.method}: first run above, mean spectrum of all runs below"
@@ -98,65 +129,19 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def _run_size(arguments: Namespace, config: Config) -> dict[str, Any]:
-    """Return frames, cases and seed: those given, or those of the configuration."""
-    given = {name: getattr(arguments, name) for name in ("frames", "cases", "seed")}
-    settings = config.settings.simulation
-    return {n: getattr(settings, n) if value is None else value for n, value in given.items()}
-
-
-def _quantities(
-    simulation: Simulation,
-    strehls: FloatArray,
-    command_rms: float,
-    exact: dict[str, float | None],
-) -> list[tuple[str, float | None, float | None, str]]:
-    """Return each quantity simulated and exact, with its unit, unless neither is known."""
-    strehl_exact = exact["strehl_exact"]
-    residual = float(np.sqrt(np.mean(simulation.rms_nm**2)))
-    rows = [
-        (
-            "Strehl ratio",
-            100 * float(np.mean(strehls)),
-            None if strehl_exact is None else 100 * strehl_exact,
-            "%",
-        ),
-        ("residual", residual, exact["residual_exact_nm"], "nm rms"),
-        ("  turbulence", None, exact["turbulence_nm"], "nm rms"),
-        ("  vibration", None, exact["vibration_nm"], "nm rms"),
-        ("  noise", None, exact["noise_nm"], "nm rms"),
-        ("commands", command_rms, None, "nm rms"),
-        ("least residual of any linear controller", None, exact["limit_nm"], "nm rms"),
-        ("  residual above it", None, exact["above_limit_percent"], "%"),
-    ]
-    return [row for row in rows if row[1:3] != (None, None)]
-
-
-def _exact_values(loop: ClosedLoop, config: Config, truth: Truth) -> dict[str, float | None]:
-    """Return the exact answers, or None for each: a truth that drifts has none."""
-    names = (
-        "strehl_exact",
-        "residual_exact_nm",
-        "turbulence_nm",
-        "vibration_nm",
-        "noise_nm",
-        "limit_nm",
-        "above_limit_percent",
-    )
+def _exact_answers(loop: ClosedLoop, config: Config, truth: Truth) -> ExactAnswers:
     if truth.drifts:
-        return dict.fromkeys(names)
+        return ExactAnswers()
     budget = residual_budget(loop, truth)
     limit_nm = limit_or_nan(lambda: least_residual(config.hardware, truth))
-    values = (
-        strehl(budget, config.imaging),
-        budget.rms_nm,
-        budget.turbulence_nm,
-        budget.vibration_nm,
-        budget.noise_nm,
-        limit_nm,
-        round(above_percent(budget.rms_nm, limit_nm), 6) + 0.0,
+    return fill_row(
+        ExactAnswers,
+        budget,
+        strehl_exact=strehl(budget, config.imaging),
+        residual_exact_nm=budget.rms_nm,
+        limit_nm=limit_nm,
+        above_limit_percent=round(above_percent(budget.rms_nm, limit_nm), 6) + 0.0,
     )
-    return dict(zip(names, values, strict=True))
 
 
 def _require_stable(loop: ClosedLoop, design: Design, reference_gain: float) -> None:
@@ -192,13 +177,14 @@ def _require_stable(loop: ClosedLoop, design: Design, reference_gain: float) -> 
 
 
 def _simulation_notes(
-    config: Config, design: Design, scatter: float, settle: int, *, drifts: bool
+    config: Config, design: Design, strehls: FloatArray, settle: int, *, drifts: bool
 ) -> list[str]:
     notes = []
     if drifts:
         notes.append("note: a vibration drifts, so there is no exact answer beside the simulation.")
-    if not np.isnan(scatter):
-        notes.append(f"scatter of the Strehl ratio between runs: {100 * scatter:.2f} points")
+    if strehls.size > 1:
+        scatter = 100 * np.std(strehls, ddof=1)
+        notes.append(f"scatter of the Strehl ratio between runs: {scatter:.2f} points")
     usual = config.settings.simulation.settle_frames
     if settle > usual:
         notes.append(

@@ -7,17 +7,16 @@ import sys
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
-from lbt_synth.cli.output import Report, TableText, fact_table
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import write_study_page
 from lbt_synth.storage.atomic_files import refuse_replacing
-from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.studies import (
     Failure,
     Study,
@@ -55,45 +54,42 @@ def run(arguments: Namespace) -> Report:
 
 
 def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
-    files = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
-    study_run, statistics, new = _compute(loaded, folder, files, arguments)
-    report = Report(
-        data={
-            "samples": study_run.samples,
-            "computed": study_run.computed,
-            "failures": study_run.failures,
-            "retry": study_run.retry,
-            "computing_seconds": study_run.computing_s,
-            "seconds": study_run.seconds,
-            "files": [str(path) for path in (study_run.results, study_run.failed, *files)],
-        }
-    )
+    pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
+    found, statistics, new = _compute(loaded, folder, pages, arguments)
+    files = [found.results, found.failed, *pages]
     varying = [p.name for p in loaded.parameters if p.distribution.varies]
-    report.data["statistics"] = asdict(statistics)
-    report.tables = [_printed_table(table) for table in summary_tables(statistics)]
-    report.tables += [
-        _printed_table(worst_table(each, varying), rows=_WORST) for each in statistics.controllers
-    ]
-    report.notes.append(
-        f"{study_run.computed} of {study_run.samples} samples computed in "
-        f"{_duration(study_run.computing_s)}; with tables and page {_duration(study_run.seconds)}."
-        if new
-        else f"{folder} is finished: {study_run.samples} samples in {study_run.results.name}; none "
-        "computed."
-    )
-    report.notes += _sampling_notes(loaded)
-    if study_run.failures:
-        report.notes.append(
-            f"note: {study_run.failures} results failed, see {study_run.failed}."
-            + (
-                " Those that ended their process are tried again if it is started again."
-                if study_run.retry
-                else ""
-            )
+    worst = [worst_table(each, varying) for each in statistics.controllers]
+    done = f"{folder} is finished: {found.samples} samples in {found.results.name}; none computed."
+    if new:
+        done = (
+            f"{found.computed} of {found.samples} samples computed in "
+            f"{_duration(found.computing_s)}; with tables and page {_duration(found.seconds)}."
         )
-    words = "written" if new else "there"
-    report.notes += [f"{words}: {path}" for path in report.data["files"]]
-    return report
+    failed = f"note: {found.failures} results failed, see {found.failed}."
+    if found.retry:
+        failed += " Those that ended their process are tried again if it is started again."
+    return Report(
+        data={
+            "samples": found.samples,
+            "computed": found.computed,
+            "failures": found.failures,
+            "retry": found.retry,
+            "computing_seconds": found.computing_s,
+            "seconds": found.seconds,
+            "files": [str(path) for path in files],
+            "statistics": asdict(statistics),
+        },
+        tables=[
+            *summary_tables(statistics),
+            *(replace(table, rows=table.rows[:_WORST]) for table in worst),
+        ],
+        notes=[
+            done,
+            *_sampling_notes(loaded),
+            *([failed] if found.failures else []),
+            *(f"{'written' if new else 'there'}: {path}" for path in files),
+        ],
+    )
 
 
 def _compute(
@@ -164,18 +160,6 @@ def _summarise(loaded: Study, files: Sequence[Path], results: FinishedStudy) -> 
     return statistics
 
 
-def _printed_table(table: Table, rows: int | None = None) -> TableText:
-    cells = [
-        [cell.text if isinstance(cell, Cell) else cell for cell in row] for row in table.rows[:rows]
-    ]
-    width = len(table.headings)
-    return TableText(
-        title=table.caption,
-        headings=table.headings,
-        rows=[row + [""] * (width - len(row)) for row in cells],
-    )
-
-
 def _duration(seconds: float) -> str:
     if seconds < 100:
         return f"{seconds:.3g} s"
@@ -194,6 +178,21 @@ def _sampling_notes(loaded: Study) -> list[str]:
     ]
 
 
+@table_row
+class StudyFacts:
+    """What a study is, and what it would cost."""
+
+    samples: int = column("samples")
+    sampling: str = column("sampling")
+    seed: int = column("seed")
+    evaluation: str = column("evaluation")
+    workers: int = column()
+    measured_rows: int = column("samples measured in one process")
+    measured_s: float = column("  their time", unit="s", format=".3g")
+    seconds: float = column()  # said in a note, in words for long ones
+    disk_bytes: float = column("space on the disk, about", unit="MB", scale=1e-6, format=".3g")
+
+
 def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     with _engine(arguments) as (_, workers):
         count = workers or arguments.jobs
@@ -202,50 +201,19 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     where = f"{count} {'process' if count == 1 else 'processes'}"
     if workers is not None:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
-    settings = loaded.settings
-    return Report(
-        data={
-            "samples": loaded.samples,
-            "sampling": settings.sampling,
-            "evaluation": settings.evaluation,
-            "parameters": {p.name: p.distribution.text for p in loaded.parameters},
-            "controllers": {c.name: c.origin for c in loaded.controllers},
-            "workers": count,
-            **asdict(cost),
-        },
-        tables=[
-            fact_table(
-                f"Study {loaded.source}",
-                [
-                    ("samples", str(loaded.samples), ""),
-                    (
-                        "sampling",
-                        f"{settings.sampling.replace('_', ' ')}, seed {settings.seed}",
-                        "",
-                    ),
-                    ("evaluation", settings.evaluation, ""),
-                    (
-                        f"time of {cost.measured_rows} samples, measured in one process",
-                        f"{cost.measured_s:.3g}",
-                        "s",
-                    ),
-                    (f"time of the whole, on {where}", f"about {_duration(cost.seconds)}", ""),
-                    ("space on the disk", f"about {cost.disk_bytes / 1e6:.3g}", "MB"),
-                ],
-            ),
-            TableText(
-                title="Parameters",
-                headings=("parameter", "distribution"),
-                rows=[(p.name, p.distribution.text) for p in loaded.parameters],
-            ),
-            TableText(
-                title="Controllers",
-                headings=("controller", "what"),
-                rows=[(c.name, c.origin) for c in loaded.controllers],
-            ),
-        ],
-        notes=[*_sampling_notes(loaded), "nothing was written."],
-    )
+    parameters = {p.name: p.distribution.text for p in loaded.parameters}
+    controllers = {c.name: c.origin for c in loaded.controllers}
+    report = Report(data={"parameters": parameters, "controllers": controllers})
+    facts = fill_row(StudyFacts, cost, loaded.settings, samples=loaded.samples, workers=count)
+    report.add_facts(f"Study {loaded.source}", facts)
+    report.add_table("Parameters", ("parameter", "distribution"), parameters.items())
+    report.add_table("Controllers", ("controller", "what"), controllers.items())
+    report.notes += [
+        f"the whole takes about {_duration(cost.seconds)} on {where}.",
+        *_sampling_notes(loaded),
+        "nothing was written.",
+    ]
+    return report
 
 
 def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
@@ -253,35 +221,23 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         make_directory(folder)
     with show_spinner("replaying", quiet=arguments.json):
         replay = replay_row(loaded, folder, arguments.row)
-    data: dict[str, Any] = {
-        "row": replay.row,
-        "parameters": replay.parameters,
-        "stored": replay.stored,
-        "fresh": replay.fresh,
-        "failures": [asdict(failure) for failure in replay.failures],
-        "files": [str(path) for path in replay.files],
-    }
-    return Report(
-        data=data,
-        tables=[
-            TableText(
-                title=f"Row {replay.row}",
-                headings=("parameter", "value"),
-                rows=list(replay.parameters.items()),
-            ),
-            TableText(
-                title="Results",
-                headings=("result", "stored", "now"),
-                rows=[
-                    (name, replay.stored.get(name), replay.fresh.get(name))
-                    for name in loaded.result_columns
-                ],
-            ),
-        ],
+    stored, fresh = replay.stored, replay.fresh
+    report = Report(
+        data={
+            "row": replay.row,
+            "parameters": replay.parameters,
+            "stored": stored,
+            "fresh": fresh,
+            "failures": [asdict(failure) for failure in replay.failures],
+        },
         notes=[
-            *([] if replay.stored else ["note: the study has no result of this row yet."]),
+            *([] if stored else ["note: the study has no result of this row yet."]),
             *(f"failed: {failure.controller}: {failure.error}" for failure in replay.failures),
             *([f"note: {replay.unwritten}"] if replay.unwritten else []),
-            *(f"written: {path}" for path in replay.files),
         ],
     )
+    report.add_table(f"Row {replay.row}", ("parameter", "value"), replay.parameters.items())
+    results = [(name, stored.get(name), fresh.get(name)) for name in loaded.result_columns]
+    report.add_table("Results", ("result", "stored", "now"), results)
+    report.note_files(replay.files)
+    return report

@@ -4,33 +4,37 @@ from __future__ import annotations
 
 from argparse import Namespace
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.output import Facts, Report, TableText, fact_table
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
 
-_FACTS = (  # words, field, unit
-    ("system", "name", ""),
-    ("frame rate", "frame_rate_hz", "Hz"),
-    ("total delay", "delay_frames", "frames"),
-    ("sensor gain", "sensor_gain", ""),
-    ("controller", "controller_name", ""),
-    ("gain file, SHA-256", "controller_digest", ""),
-    ("Strehl ratio", "strehl", ""),
-    ("imaging wavelength", "imaging_wavelength_um", "um"),
-    ("pixel of the image", "psf_pixel_mas", "mas"),
-    ("telescope diameter", "diameter_m", "m"),
-    ("central obstruction", "obstruction", ""),
-    ("seed", "seed", ""),
-)
+
+@table_row
+class TelemetryFacts:
+    """The loop that telemetry is from."""
+
+    name: str = column("system")
+    frame_rate_hz: float = column("frame rate", unit="Hz")
+    delay_frames: float = column("total delay", unit="frames")
+    sensor_gain: float | None = column("sensor gain")
+    controller_name: str | None = column("controller")
+    controller_digest: str | None = column("gain file, SHA-256")
+    strehl: float | None = column("Strehl ratio")
+    imaging_wavelength_um: float | None = column("imaging wavelength", unit="um")
+    psf_pixel_mas: float | None = column("pixel of the image", unit="mas")
+    diameter_m: float | None = column("telescope diameter", unit="m")
+    obstruction: float | None = column("central obstruction")
+    seed: int | None = column("seed")
+    controller_states: int | None = column("states of the controller")
 
 
 def run(arguments: Namespace) -> Report:
@@ -64,57 +68,50 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     rms = {
         name: _rms(array) for name, array, layer in arrays if layer.is_series and name != "times_s"
     }
-    rows = [
-        (
-            name,
-            " x ".join(map(str, array.shape)),
-            layer.axes,
-            layer.unit_in(telemetry),
-            rms.get(name),
-        )
-        for name, array, layer in arrays
-    ]
-    facts: Facts = [
-        (word, getattr(telemetry, name), unit)
-        for word, name, unit in _FACTS
-        if getattr(telemetry, name) not in (None, "")
-    ]
-    if telemetry.controller is not None:
-        facts.append(("states of the controller", telemetry.controller.n_states, ""))
-    if telemetry.mirror is not None:
-        facts += [
-            (f"mirror, {name}", value, "") for name, value in asdict(telemetry.mirror).items()
-        ]
-    facts += [(key, value, "") for key, value in telemetry.metadata.items()]
-    data: dict[str, Any] = {name: getattr(telemetry, name) for _, name, _ in _FACTS}
-    data |= {
-        "frames": telemetry.frames,
-        "modes": telemetry.modes,
-        "arrays": {name: list(array.shape) for name, array, _ in arrays},
-        "units": {name: layer.unit_in(telemetry) for name, _, layer in arrays},
-        "rms": rms,
-        "controller_states": None
-        if telemetry.controller is None
-        else telemetry.controller.n_states,
-        "integrator_gains": telemetry.integrator_gains,
-        "metadata": dict(telemetry.metadata),
-        "mirror": None if telemetry.mirror is None else asdict(telemetry.mirror),
-        "mirror_taps": telemetry.mirror_taps,
-        "convention": telemetry.convention,
-    }
+    units = {name: layer.unit_in(telemetry) for name, _, layer in arrays}
+    controller, mirror = telemetry.controller, telemetry.mirror
+    facts = fill_row(
+        TelemetryFacts,
+        telemetry,
+        controller_states=None if controller is None else controller.n_states,
+    )
+    mirror_record = None if mirror is None else asdict(mirror)
+    report = Report(
+        data={
+            **json_record(facts),
+            "frames": telemetry.frames,
+            "modes": telemetry.modes,
+            "arrays": {name: list(array.shape) for name, array, _ in arrays},
+            "units": json_units(facts) | units,
+            "rms": rms,
+            "integrator_gains": telemetry.integrator_gains,
+            "metadata": dict(telemetry.metadata),
+            "mirror": mirror_record,
+            "mirror_taps": telemetry.mirror_taps,
+            "convention": telemetry.convention,
+        }
+    )
     seconds = telemetry.frames / telemetry.frame_rate_hz
-    return Report(
-        data=data,
-        tables=[
-            TableText(
-                title=f"{telemetry.frames} frames, {seconds:.6g} s, {telemetry.modes} "
-                f"mode{'s' if telemetry.modes > 1 else ''}",
-                headings=("array", "shape", "axes", "unit", "rms"),
-                rows=rows,
-            ),
-            fact_table("Loop", facts),
+    report.add_table(
+        f"{telemetry.frames} frames, {seconds:.6g} s, {telemetry.modes} "
+        f"mode{'s' if telemetry.modes > 1 else ''}",
+        ("array", "shape", "axes", "unit", "rms"),
+        [
+            (name, " x ".join(map(str, array.shape)), layer.axes, units[name], rms.get(name))
+            for name, array, layer in arrays
         ],
     )
+    loop = fact_table("Loop", facts)
+    report.add_table(
+        loop.caption,
+        loop.headings,
+        [
+            *loop.rows,
+            *((f"mirror, {name}", value, "") for name, value in (mirror_record or {}).items()),
+            *((key, value, "") for key, value in telemetry.metadata.items()),
+        ],
+    )
+    return report
 
 
 def _rms(series: FloatArray) -> float:

@@ -13,6 +13,7 @@ from lbt_synth.report.figures.robustness import robustness_figure
 from lbt_synth.report.figures.sigma import sigma_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.rows import csv_rows
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
 from lbt_synth.studies.paper.parameters import PARAMETERS, VIBRATION_HZ
@@ -36,18 +37,8 @@ def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) ->
     folder = Path(directory)
     second, third = table_ii(), compare_with_paper(rows)
     kalman_design, hinf_design = paper_filters()
-    headings = ("row", "method", "strehl_percent", "paper_strehl_percent", "difference_points")
     files = [
-        write_atomically(
-            folder / name,
-            csv_bytes(
-                headings,
-                [
-                    (e.label, e.method, f"{e.ours:.2f}", e.paper, f"{e.difference:.2f}")
-                    for e in entries
-                ],
-            ),
-        )
+        write_atomically(folder / name, csv_rows(entries))
         for name, entries in (("table_ii.csv", second), ("table_iii.csv", third))
     ]
     files.append(

@@ -147,7 +147,7 @@ def row_table(caption: str, rows: Sequence[Any], *, without: Collection[str] = (
 
 
 def fact_table(caption: str, *rows: Any) -> Table:
-    """Return a table with one line per value of the rows; None does not apply and is left out."""
+    """Return a table with one line per value of the rows, leaving out None and empty texts."""
     return Table(
         caption=caption,
         headings=("quantity", "value", "unit"),
@@ -155,7 +155,7 @@ def fact_table(caption: str, *rows: Any) -> Table:
             (each.heading, each.text(row), each.unit)
             for row in rows
             for each in columns(row)
-            if each.heading and getattr(row, each.name) is not None
+            if each.heading and getattr(row, each.name) not in (None, "")
         ),
         words=(2,),
     )

@@ -3,32 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import field, replace
 
 import numpy as np
 
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, optimal_integrator
 from lbt_synth.loop import close_loop, residual_budget, strehl
 from lbt_synth.models import Truth
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.published import TABLE_II, TABLE_III
 from lbt_synth.studies.robustness import RobustnessRow, robustness
+from lbt_synth.validation import set_fields
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class TableEntry:
-    """One entry of a table, ours beside the paper's [% Strehl]."""
+    """One entry of ``table``, "II" or "III", ours beside the paper's."""
 
-    table: str  # "II" or "III"
-    label: str  # of the row
-    method: str  # "classical", or the method of the filter
-    ours: float  # Strehl ratio [%]
-    paper: float  # Strehl ratio [%]
+    table: str = field()
+    label: str = column(key="row", help="Its row")
+    method: str = column(help='"classical", or the method of the filter')
+    ours: float = column(key="strehl_percent", help="Strehl ratio [%]")
+    paper: float = column(key="paper_strehl_percent", help="Strehl ratio [%]")
+    difference: float = column(
+        key="difference_points", help="Ours less the paper's [points]", init=False
+    )
 
-    @property
-    def difference(self) -> float:
-        """Ours less the paper's [points]."""
-        return self.ours - self.paper
+    def __post_init__(self) -> None:
+        set_fields(self, difference=self.ours - self.paper)
 
 
 def rms_difference(entries: list[TableEntry]) -> float:
