@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.validation import integer, number
 
 Stretches: TypeAlias = tuple[tuple[int, int], ...]
+StretchesLike: TypeAlias = Sequence[tuple[int, int]]
 
 
-def checked_stretches(stretches: Any, frames: int) -> Stretches:
+def checked_stretches(stretches: StretchesLike | None, frames: int) -> Stretches:
     """Return stretches as pairs of integers; the whole record for None."""
     if stretches is None:
         return ((0, frames),)
@@ -33,7 +34,7 @@ def checked_stretches(stretches: Any, frames: int) -> Stretches:
 
 
 def split_halves(
-    stretches: Any, frames: int, *, gap_frames: int = 0, fit_share: float = 0.5
+    stretches: StretchesLike | None, frames: int, *, gap_frames: int = 0, fit_share: float = 0.5
 ) -> tuple[Stretches, Stretches]:
     """Split a record into frames to fit and later frames to test on, with a gap between them.
 

@@ -24,7 +24,7 @@ from lbt_synth.identification.fit.physical_parameters import (
     standard_errors,
 )
 from lbt_synth.identification.fit.whittle import FittedModel
-from lbt_synth.identification.stretches import checked_stretches
+from lbt_synth.identification.stretches import StretchesLike, checked_stretches
 from lbt_synth.validation import FloatArray, number, real_array, require_instance
 
 _GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
@@ -38,7 +38,7 @@ def identify_axis(
     correction: Any = None,
     *,
     frame_rate_hz: float,
-    stretches: Sequence[tuple[int, int]] | None = None,
+    stretches: StretchesLike | None = None,
     sensor_gain: float | None = None,
     sensor_gain_error: float = 0.0,
     assumed_gain: float = 1.0,
@@ -50,10 +50,10 @@ def identify_axis(
     """Identify one axis of a loop.
 
     The pseudo-open-loop measurement ``y(k) + g c(k)``, with c(k) the correction that y(k)
-    contains and g the sensor gain, is g times the phase plus the noise. Its spectrum is that of
-    turbulence (a second-order process, behind a first-order low pass where the data ask for
-    it), of resonances, and of white noise; its Whittle likelihood chooses all parameters, the
-    sensor gain among them, and a penalised criterion the number of resonances.
+    contains and g the sensor gain, is g times the phase plus the noise. Its spectrum is the sum
+    of turbulence (a second-order process, with a first-order low pass if the data ask for it),
+    resonances and white noise. The Whittle likelihood chooses all parameters, the sensor gain
+    among them, and a penalised criterion the number of resonances.
 
     Parameters
     ----------
@@ -66,19 +66,19 @@ def identify_axis(
     stretches : sequence of (start, stop), optional
         Frames to use; all by default.
     sensor_gain : float, optional
-        Sensor gain, if it is known; found from the data of a closed loop otherwise.
+        Known sensor gain; by default it is found from the data of a closed loop.
     sensor_gain_error : float, optional
-        Standard error of a given gain; it enters the errors of all that depends on the gain.
+        Standard error of a given gain, part of the errors of all that depends on it.
     assumed_gain : float, optional
-        Sensor gain to take where it cannot be found.
+        Sensor gain to use if the data do not determine it.
     announced : sequence of (frequency, error), optional
-        Frequencies of lines that are known beforehand, with their standard errors [Hz].
+        Known frequencies of lines, with their standard errors [Hz].
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
         Most resonances above it.
     start : IdentifiedAxis, optional
-        A result to start from, for instance that of a moment ago.
+        An earlier result to start from.
 
     Returns
     -------
@@ -88,15 +88,13 @@ def identify_axis(
     Raises
     ------
     ProblemError
-        If a value is out of range or not finite, sizes clash, or there are less than 512 frames
-        in one stretch.
+        If a value is out of range or not finite, sizes clash, or no stretch has 512 frames.
     NumericalError
         If the fit fails.
 
     Notes
     -----
-    Standard errors are those of the likelihood: of what the model leaves open, not of what it
-    cannot describe.
+    Standard errors are those of the likelihood. They do not cover errors of the model itself.
 
     Examples
     --------
@@ -190,8 +188,8 @@ def identify_spectrum(
         Frame rate of the loop to come [Hz].
     averages : float, optional
         Number of independent periodograms that the density is the mean of; by default found
-        from its scatter. One that scatters less than the mean of 1000 was smoothed, interpolated
-        or computed: its scatter tells nothing, and it is taken for one periodogram.
+        from its scatter. A density that scatters less than the mean of 1000 was smoothed,
+        interpolated or computed, and counts as one periodogram.
     **options
         ``announced``, ``lowest_line_hz`` and ``most_lines`` of :func:`identify_axis`.
 
@@ -203,7 +201,7 @@ def identify_spectrum(
     Raises
     ------
     ProblemError
-        If the table is no spectrum.
+        If the frequencies or densities are not a spectrum.
     NumericalError
         If the fit fails.
 
@@ -261,8 +259,8 @@ def identify_spectrum(
 def estimate_averages(density: FloatArray) -> float | None:
     """Return how many periodograms were averaged in a density, by its scatter about a curve.
 
-    It is the shape of a gamma distribution; None above what anybody averages: whatever the model
-    leaves would count as evidence for one more line, and standard errors would vanish.
+    It is the shape of a gamma distribution. None above what anybody averages: otherwise each
+    misfit would count as evidence for a line, and standard errors would vanish.
     """
     from scipy.optimize import brentq
     from scipy.special import polygamma

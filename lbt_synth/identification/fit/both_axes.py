@@ -23,7 +23,7 @@ from lbt_synth.identification.fit.record_doubts import (
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
-from lbt_synth.identification.stretches import Stretches, checked_stretches
+from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.validation import real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
@@ -42,35 +42,30 @@ def identify(
     announced: Sequence[LinePrior] = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
     most_lines: int = MOST_LINES,
-    stretches: Sequence[tuple[int, int]] | None = None,
+    stretches: StretchesLike | None = None,
     start: IdentifiedModel | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> IdentifiedModel:
     """Identify turbulence, vibrations, noise and sensor gain of a loop from its record.
 
-    Each axis by itself, see :func:`identify_axis`. A sensor has one gain for tip and tilt as a
-    rule: gains that agree within three standard errors are averaged, and all the rest is fitted
-    again with the mean; an axis that does not show its gain takes that of the other.
+    Each axis is identified separately (:func:`identify_axis`). A sensor usually has one gain for
+    tip and tilt: gains that agree within three standard errors are averaged, and the rest is
+    fitted again with the mean. An axis that does not show its gain takes that of the other.
 
     Parameters
     ----------
     record : LoopRecord or SpectrumRecord
-        What the loop recorded, in closed or open loop, or spectra; the delay must be known in
-        closed loop.
+        What the loop recorded, or spectra; in closed loop the delay must be known.
     frame_rate_hz : float, optional
-        Frame rate of the loop to come [Hz], for a record of spectra that does not have it.
+        Frame rate of the loop to design for [Hz], for spectra without one.
     delay_frames : float, optional
-        Total delay of the loop to come [frames], if the record does not have it; 2 by default.
+        Total delay of that loop [frames], if the record does not have it; 2 by default.
     sensor_gain : float or one per axis, optional
-        Sensor gain, if it is known.
-    assumed_gain : float, optional
-        Sensor gain to take where the data do not show it.
+        Known sensor gain.
+    assumed_gain, lowest_line_hz, most_lines
+        As for :func:`identify_axis`.
     announced : sequence of LinePrior, optional
-        Lines that are known beforehand, from accelerometers for instance.
-    lowest_line_hz : float, optional
-        A resonance below is a part of the turbulence [Hz].
-    most_lines : int, optional
-        Most resonances above it per axis.
+        Lines that are known beforehand, for instance from accelerometers.
     stretches : sequence of (start, stop), optional
         Frames to use; all that are usable by default.
     start : IdentifiedModel, optional
@@ -216,7 +211,7 @@ def _check_record(
             )
 
 
-def _usable_stretches(stretches: Sequence[tuple[int, int]], record: LoopRecord) -> Stretches:
+def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches:
     """Return given stretches in order; refuse those with frames that are not usable."""
     out = checked_stretches(sorted(stretches), record.frames)
     for a, b in out:

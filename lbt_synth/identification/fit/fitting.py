@@ -96,10 +96,9 @@ class Search:
 
     def priors(self, spectrum: SpectrumModel) -> Priors:
         """Return the priors of a fit."""
-        corner = (
-            (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH) if spectrum.rolls_off else _FIXED
-        )
-        rows = [_GAIN_PRIOR if self.finds_gain else _FIXED, _NONE, corner]
+        gain = _GAIN_PRIOR if self.finds_gain else _FIXED
+        corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
+        rows = [gain, _NONE, corner if spectrum.rolls_off else _FIXED]
         for c in spectrum.components:
             frequency, damping = (self.log_angle(1.0), _SLOWEST), _DAMPING_PRIORS[c.kind]
             if c.kind == "line":
@@ -195,20 +194,18 @@ def required_gain(
         return _ANNOUNCED
     if component.kind == "line":
         centre, half = search.place(component)
-        for other in spectrum.components[: i if earlier else None]:
-            if other.kind == "line" and other is not component:
-                its_centre, its_half = search.place(other)
-                if abs(centre - its_centre) < 4 * (half + its_half):
-                    return _SPLIT
+        lines = [c for c in spectrum.components[: i if earlier else None] if c.kind == "line"]
+        places = [search.place(line) for line in lines if line is not component]
+        if any(abs(centre - at) < 4 * (half + its_half) for at, its_half in places):
+            return _SPLIT
     return search.price
 
 
 def cost(search: Search, model: FittedModel) -> float:
     """Return the contrast of a model plus what the criterion asks for its components."""
-    others = range(1, len(model.spectrum.components))
-    return model.contrast + sum(
-        required_gain(search, model.spectrum, i, earlier=True) for i in others
-    )
+    spectrum = model.spectrum
+    others = range(1, len(spectrum.components))
+    return model.contrast + sum(required_gain(search, spectrum, i, earlier=True) for i in others)
 
 
 def add_evidence(search: Search, model: FittedModel) -> FittedModel:

@@ -31,13 +31,13 @@ class IdentifiedLine:
     Attributes
     ----------
     kind : {"line", "broad", "turbulence"}
-        A narrow line; a resonance that is wide (damping ratio of 0.1 and more) or drowns in the
-        rest of the spectrum; a part of the turbulence, below the lowest frequency of lines.
+        A narrow line; a resonance that is wide (damping ratio at least 0.1) or below the rest of
+        the spectrum; a part of the turbulence, below the lowest frequency of lines.
     frequency_hz, frequency_error_hz : float
         Natural frequency and its standard error [Hz].
     damping, damping_error : float
-        Damping ratio and its standard error. Where the line is not resolved, both are the
-        largest damping that the record does not tell from none.
+        Damping ratio and its standard error. If the line is not resolved, both are the largest
+        damping that the record cannot distinguish from none.
     resolved : bool
         Whether the record is long enough to see the line's width.
     rms_nm, rms_error_nm : float
@@ -122,12 +122,12 @@ class IdentifiedAxis:
     parts : tuple of IdentifiedLine
         All other resonances, by frequency.
     noise_nm, noise_error_nm : float
-        Measurement noise per frame on y, and its standard error [nm]; at least a
-        hundredth of the innovations' deviation.
+        Measurement noise per frame on y, at least a hundredth of the innovations' deviation, and
+        its standard error [nm].
     sensor_gain : float
         Sensor gain: found, given or assumed.
     sensor_gain_error : float or None
-        Its standard error; None if it was not found from the data.
+        Its standard error; None if it is unknown.
     sensor_gain_note : str
         Where it comes from, or why it could not be found.
     whiteness : Whiteness

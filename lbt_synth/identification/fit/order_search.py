@@ -50,10 +50,9 @@ def search_model(search: Search, start: SpectrumModel | None = None) -> FittedMo
 
 
 def gain_ambiguity(search: Search, best: FittedModel) -> float:
-    """Return how far the gain of another, nearly as likely model is, as a logarithm.
+    """Return how far the logarithm of the gain of another, nearly as likely model is.
 
-    Wide resonances can stand for what a wrong gain leaves. Models are searched for at other
-    gains, which are then set free.
+    Wide resonances can explain what a wrong gain leaves: other gains are tried, then fitted.
     """
     least, gain = fitting.cost(search, best), best.spectrum.log_gain
     away = 0.0

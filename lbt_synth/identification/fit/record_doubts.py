@@ -52,11 +52,7 @@ def find_jumps(
 
 
 def _axis_jumps(series: FloatArray, axis: IdentifiedAxis, stretches: Stretches) -> list[Jump]:
-    """Find the jumps of one axis.
-
-    The innovations are differences divided by the root of the fitted spectrum, without a shift
-    in time.
-    """
+    """Find the jumps of one axis, in differences over the root of the fitted spectrum."""
     out: list[Jump] = []
     log_f, log_density = np.log(axis.frequency_hz), np.log(axis.fitted_nm2_hz)
     for start, stop in stretches:
@@ -155,10 +151,9 @@ def better_delay(
     later = [(a + 2, b) for a, b in stretches if b - a > 2 * SHORTEST_SEGMENT]
     if not later:
         return None
-    simple = axis.fitted_model.spectrum.drop_wide(WIDE_DAMPING)
+    whole = axis.fitted_model.spectrum
     found: dict[float, float] = {}
-    for shift in (0.0, *_SHIFTS):
-        delay = record.delay_frames + shift
+    for delay in record.delay_frames + np.array([0.0, *_SHIFTS]):
         if delay < 1:
             continue
         shifted = record.with_delay(delay, mirror=record.mirror)
@@ -170,17 +165,15 @@ def better_delay(
         )
         # the model keeps its parts; its gain is free
         search = Search(data=data, lowest_line_hz=0.0)
-        start = _set_noise(simple, data) if shift else axis.fitted_model.spectrum
-        model = refit(search, start)
+        simple = _set_noise(whole.drop_wide(WIDE_DAMPING), data)
+        model = refit(search, whole if delay == record.delay_frames else simple)
         if model is not None:
-            count = len(model.spectrum.components)
-            found[delay] = model.contrast + search.price * count
+            found[delay] = model.contrast + search.price * len(model.spectrum.components)
     here = found.pop(record.delay_frames, None)
-    if here is None or not found:
+    best = min(found, key=lambda delay: found[delay], default=None)
+    if here is None or best is None or here - found[best] <= _CLEARLY:
         return None
-    best = min(found, key=lambda delay: found[delay])
-    more = here - found[best]
-    return (best, more) if more > _CLEARLY else None
+    return best, here - found[best]
 
 
 def _set_noise(spectrum: SpectrumModel, data: LoopPeriodogram) -> SpectrumModel:

@@ -17,8 +17,7 @@ _LOWEST = 3  # bins in which the ends of the taper show
 class Whiteness:
     """Tests of the innovations, the prediction errors of the fitted model.
 
-    Their spectrum is the ratio of periodogram to model, and their autocorrelation its
-    transform.
+    Their spectrum is the ratio of periodogram to model.
 
     Attributes
     ----------

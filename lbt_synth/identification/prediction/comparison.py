@@ -23,7 +23,12 @@ from lbt_synth.identification.prediction.residual import (
     prediction_data,
 )
 from lbt_synth.identification.prediction.residual_estimate import ResidualEstimate
-from lbt_synth.identification.stretches import Stretches, checked_stretches, split_halves
+from lbt_synth.identification.stretches import (
+    Stretches,
+    StretchesLike,
+    checked_stretches,
+    split_halves,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
@@ -162,9 +167,9 @@ def prediction_against_data(
     open_loop: ArrayLike,
     controllers: Mapping[str, Controller | Design],
     *,
-    stretches: Sequence[tuple[int, int]] | None = None,
-    fit: Sequence[tuple[int, int]] | None = None,
-    test: Sequence[tuple[int, int]] | None = None,
+    stretches: StretchesLike | None = None,
+    fit: StretchesLike | None = None,
+    test: StretchesLike | None = None,
     measurements: ArrayLike | None = None,
     running: Controller | Design | None = None,
     noise_error_nm: ArrayLike = 0.0,
@@ -174,15 +179,15 @@ def prediction_against_data(
 ) -> PredictionTable:
     """Replay controllers on frames that nothing was fitted to, and compare with the model.
 
-    Beside the controllers stand the integrator of least residual by the model, a predictor by
-    least squares on the frames of the fit (:func:`least_squares_predictor`), and the least
-    residual of any linear controller where the model is the truth.
+    Other rows are the integrator of least residual by the model, a least-squares predictor from
+    the frames of the fit (:func:`least_squares_predictor`), and the least residual of any linear
+    controller if the model is the truth.
 
     Parameters
     ----------
     plant : TipTiltPlant
-        The model: turbulence, vibrations, noise, and the loop with its sensor gain in the sensor
-        matrix. For an honest comparison it has not seen the frames of the test.
+        The model, with its sensor gain in the sensor matrix. For an honest comparison it was not
+        identified from the frames of the test.
     open_loop : (frames, n) array_like
         Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + w(k) / g`` [nm].
     controllers : mapping of str to Controller or Design
@@ -203,8 +208,8 @@ def prediction_against_data(
     taps : int, optional
         Coefficients of the predictor per mode.
     settle_frames : int, optional
-        Frames dropped before each stretch of the test; by default as many as the slowest of the
-        loops needs (:func:`replayed_residual`).
+        Frames dropped before each stretch of the test; by default the most of any loop
+        (:func:`replayed_residual`).
 
     Returns
     -------
@@ -256,25 +261,28 @@ def prediction_against_data(
     chosen = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
     loops = {name: _close_stable_loop(plant, name, one) for name, one in chosen.items()}
     settle = choose_settling(settle_frames, loops.values())
-    found: dict[str, tuple[ResidualEstimate | None, FloatArray | None]] = {}
+    rows = []
     if measurements is not None:
         promised = None
         if running is not None:
             promised = model_budget(_close_stable_loop(plant, RAN, running), plant).total_nm2
-        found[RAN] = _measured_residual(data, hardware, measurements, settle), promised
+        ran = _measured_residual(data, hardware, measurements, settle)
+        rows.append(_build_row(RAN, ran, promised, imaging))
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
     for name, loop in loops.items():
         replayed = predict_residual(data, loop, settle)
-        found[name] = replayed, model_budget(loop, plant).total_nm2
-    notes = _note_refuted(found)
+        rows.append(_build_row(name, replayed, model_budget(loop, plant).total_nm2, imaging))
+    notes = _note_refuted(rows)
     try:
         limit = least_model_residual(plant)
-        found[LIMIT] = None, limit.directions.T * limit.variance_nm2 @ limit.directions
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
         notes = [f"no {LIMIT}: {error}", *notes]
+    else:
+        along = limit.directions.T * limit.variance_nm2 @ limit.directions
+        rows.append(_build_row(LIMIT, None, along, imaging))
     return PredictionTable(
-        entries=tuple(_build_row(name, *row, imaging) for name, row in found.items()),
+        entries=tuple(rows),
         fit=fitted,
         test=drop_settling(tested, settle),
         settle_frames=settle,
@@ -282,34 +290,26 @@ def prediction_against_data(
     )
 
 
-def _note_refuted(
-    found: Mapping[str, tuple[ResidualEstimate | None, FloatArray | None]],
-) -> list[str]:
+def _note_refuted(rows: Sequence[PredictionRow]) -> list[str]:
     """Return a note on the rows for which the noise cannot be right."""
-    below = {
-        name: replayed.errors_below_zero
-        for name, (replayed, _) in found.items()
-        if replayed is not None and replayed.refuted
-    }
-    if not below:
+    refuted = {row.name: row.replayed for row in rows if row.replayed and row.replayed.refuted}
+    if not refuted:
         return []
+    most = max(replayed.errors_below_zero for replayed in refuted.values())
     return [
-        f"no residual on the data of {', '.join(below)}: its variance is {max(below.values()):.3g} "
-        "standard errors below zero, more than chance; the model has more noise than the data, or "
-        "another sensor gain. Identify the noise again."
+        f"no residual on the data of {', '.join(refuted)}: its variance is {most:.3g} standard "
+        "errors below zero, more than chance; the model has more noise than the data, or another "
+        "sensor gain. Identify the noise again."
     ]
 
 
 def _split_frames(
-    usable: Stretches,
-    fit: Sequence[tuple[int, int]] | None,
-    test: Sequence[tuple[int, int]] | None,
-    frames: int,
+    usable: Stretches, fit: StretchesLike | None, test: StretchesLike | None, frames: int
 ) -> tuple[Stretches, Stretches]:
-    if (fit is None) != (test is None):
-        raise ProblemError("fit and test must both be given, or neither; got one of them.")
-    if fit is None:
+    if fit is None and test is None:
         return split_halves(usable, frames)
+    if fit is None or test is None:
+        raise ProblemError("fit and test must both be given, or neither; got one of them.")
     fitted, tested = checked_stretches(fit, frames), checked_stretches(test, frames)
     for (a, b), (c, d) in product(fitted, tested):
         if a < d and c < b:
@@ -343,8 +343,7 @@ def _measured_residual(
             f"measurements must have the {len(data.open_loop)} frames of open_loop; got {len(y)}."
         )
     residual = y @ inverse_sensor(hardware).T
-    kept = drop_settling(data.stretches, settle)
-    return data.estimate([residual[start:stop] for start, stop in kept], kept)
+    return data.estimate(lambda start, stop: residual[start:stop], settle)
 
 
 def _build_row(

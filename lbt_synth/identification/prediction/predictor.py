@@ -8,7 +8,6 @@ replay measures, for fractional delays and mirrors that move as well.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.prediction.residual import check_series, inverse_sensor
+from lbt_synth.identification.stretches import StretchesLike
 from lbt_synth.linear import Controller
 from lbt_synth.loop import youla_controller
 from lbt_synth.models import LoopHardware
@@ -35,8 +35,7 @@ class LeastSquaresPredictor:
     coefficients : (n, n, taps) ndarray
         ``a[i, j, l]``: what z_j(k-l) adds to the correction of mode i that u(k) commands.
     fitted_nm2 : (n,) ndarray
-        Mean square of the measured residual of each mode in the fit, noise included [nm^2]; less
-        than on other data.
+        Mean square of the measured residual of each mode in the fit, with noise [nm^2].
     frames : int
         Frames that were fitted.
     controller : Controller
@@ -55,7 +54,7 @@ def least_squares_predictor(
     *,
     taps: int = 32,
     sensor_gain: float = 1.0,
-    stretches: Sequence[tuple[int, int]] | None = None,
+    stretches: StretchesLike | None = None,
     coupled: bool = False,
     ridge: float = 0.0,
 ) -> LeastSquaresPredictor:
@@ -76,21 +75,20 @@ def least_squares_predictor(
     coupled : bool, optional
         Predict each mode from all modes, instead of from itself.
     ridge : float, optional
-        Added to the mean squares of the regressors, relative to their mean. 0, the default, is
-        plain least squares; of regressors that depend on each other, the coefficients of least
-        norm are taken.
+        Added to the mean squares of the regressors, relative to their mean; 0 is least squares.
+        Regressors that depend on each other get the coefficients of least norm.
 
     Returns
     -------
     LeastSquaresPredictor
-        Coefficients and controller. The filter of the pseudo-open-loop measurement is its Youla
-        parameter (:func:`youla_controller`): the loop is stable whatever the coefficients.
+        Coefficients and controller. The filter is its Youla parameter
+        (:func:`youla_controller`): the loop is stable for any coefficients.
 
     Raises
     ------
     ProblemError
-        If a value is out of its range, sizes clash, or the stretches hold fewer than four
-        frames per coefficient.
+        If a value is out of range, sizes clash, or there are fewer than four frames per
+        coefficient.
 
     Examples
     --------

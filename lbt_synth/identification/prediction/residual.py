@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from lbt_synth.identification.prediction.residual_estimate import (
     ResidualEstimate,
     estimate_residual,
 )
-from lbt_synth.identification.stretches import Stretches, checked_stretches
+from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, close_loop, filter_series
 from lbt_synth.loop.simulation.run import settling_frames
@@ -37,14 +37,11 @@ class PredictionData:
     noise_nm2: FloatArray  # (n, n): covariance of the noise in z
     noise_error_nm4: FloatArray  # (n, n): covariance of the errors of the noise variances
 
-    def estimate(self, measured: Sequence[FloatArray], stretches: Stretches) -> ResidualEstimate:
-        """Return the residual of some stretches from its measured values in each."""
-        return estimate_residual(
-            np.concatenate(measured),
-            stretches,
-            noise_nm2=self.noise_nm2,
-            noise_error_nm4=self.noise_error_nm4,
-        )
+    def estimate(self, measure: Callable[[int, int], FloatArray], settle: int) -> ResidualEstimate:
+        """Return the residual of a loop that settles, given what it leaves of some frames."""
+        kept = drop_settling(self.stretches, settle)
+        measured = np.concatenate([measure(start, stop) for start, stop in kept])
+        return estimate_residual(measured, kept, self.noise_nm2, self.noise_error_nm4)
 
 
 def replayed_residual(
@@ -55,17 +52,16 @@ def replayed_residual(
     noise_nm: ArrayLike,
     noise_error_nm: ArrayLike = 0.0,
     sensor_gain: float = 1.0,
-    stretches: Sequence[tuple[int, int]] | None = None,
+    stretches: StretchesLike | None = None,
     settle_frames: int | None = None,
 ) -> ResidualEstimate:
     """Residual that a controller would have left of a recorded disturbance.
 
     The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + w(k) / g`` does not depend on the
-    controller that ran. Fed with ``y(k) = g S (z(k) - c(k))``, with c(k) its own correction, a
-    controller gives exactly the commands that it would have given in that loop, under that
-    disturbance and that noise. Its measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) +
-    w(k) / g``. As c(k) knows the noise up to frame k-1 only, white noise adds its variance to
-    that of the residual, no more and no less, and is subtracted.
+    controller that ran. From ``y(k) = g S (z(k) - c(k))``, with c(k) its own correction, a
+    controller computes exactly the commands of that loop under that disturbance and noise. Its
+    measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + w(k) / g``. As c(k) depends on the
+    noise up to frame k-1 only, white noise adds exactly its variance, which is subtracted.
 
     Parameters
     ----------
@@ -84,16 +80,15 @@ def replayed_residual(
     stretches : sequence of (start, stop), optional
         Contiguous usable frames, in order; by default the whole record.
     settle_frames : int, optional
-        Frames dropped at the beginning of each stretch, where the controller starts from a zero
-        state; by default until the slowest mode of the loop has decayed to 1e-4, and at
-        least as many as the loop has states. A stretch that is no longer is left out.
+        Frames dropped at the beginning of each stretch, where the controller starts from zero; by
+        default until the slowest mode of the loop has decayed to 1e-4, and at least as many as
+        the loop has states. Shorter stretches are left out.
 
     Returns
     -------
     ResidualEstimate
-        Measured residual, its variance without the noise, and standard errors. They hold the
-        sampling of a Gaussian disturbance and noise and the error of ``noise_nm``, not that of
-        the sensor gain.
+        Measured residual, its variance without the noise, and standard errors. They include the
+        sampling of Gaussian series and the error of ``noise_nm``, not that of the sensor gain.
 
     Raises
     ------
@@ -139,13 +134,12 @@ def prediction_data(
     *,
     noise_error_nm: ArrayLike,
     sensor_gain: float = 1.0,
-    stretches: Sequence[tuple[int, int]] | None,
+    stretches: StretchesLike | None,
 ) -> PredictionData:
-    """Check a recorded series against a loop, and refer the noise to the modes.
+    """Check a recorded series against a loop, and refer the noise (q, q) to the modes.
 
-    ``noise_nm2`` is the covariance of the measurements' noise, (q, q). The errors of their
-    standard deviations are independent, and leave its correlations as they are: an error of one
-    measurement is common to all modes that it is seen in.
+    The errors of the standard deviations of measurements are independent: an error of one is
+    common to all modes that it measures.
     """
     gain = number(sensor_gain, "sensor_gain", above=0)
     series, parts = check_series(open_loop, hardware.modes, stretches)
@@ -163,10 +157,7 @@ def prediction_data(
 
 
 def check_series(
-    open_loop: ArrayLike,
-    modes: int,
-    stretches: Sequence[tuple[int, int]] | None,
-    name: str = "open_loop",
+    open_loop: ArrayLike, modes: int, stretches: StretchesLike | None, name: str = "open_loop"
 ) -> tuple[FloatArray, Stretches]:
     """Return a series (frames, modes) that is finite within its stretches, and the stretches."""
     series = float_array(open_loop, name)
@@ -211,11 +202,9 @@ def choose_settling(given: int | None, loops: Iterable[ClosedLoop]) -> int:
 
 def predict_residual(data: PredictionData, loop: ClosedLoop, settle: int) -> ResidualEstimate:
     """Return the residual of a stable loop replayed on recorded data."""
-    kept = drop_settling(data.stretches, settle)
     # z(k) for phi_tot(k-1), and no noise: the residual of frame k-1 is e(k)
-    path = loop.rejection()
-    pieces = [data.open_loop[start - settle : stop] for start, stop in kept]
-    return data.estimate([filter_series(path, piece)[settle:] for piece in pieces], kept)
+    path, z = loop.rejection(), data.open_loop
+    return data.estimate(lambda a, b: filter_series(path, z[a - settle : b])[settle:], settle)
 
 
 def drop_settling(stretches: Stretches, settle: int) -> Stretches:

@@ -26,9 +26,9 @@ _TOO_FAR = 4.0  # standard errors below zero that chance does not explain
 class ResidualEstimate:
     """Residual of a loop, estimated from the measured residual ``phi_res(k-1) + noise``.
 
-    The variance of the noise is subtracted: an estimate may be negative within its error, and is
-    then shown as such; its rms is nan, and :attr:`upper_nm` says what it is below. One that is
-    negative by more than that refutes the noise that was subtracted (:attr:`refuted`).
+    The variance of the noise is subtracted: an estimate may be negative within its error. Its rms
+    is then nan, and :attr:`upper_nm` an upper bound. One that is negative by more refutes the
+    noise that was subtracted (:attr:`refuted`).
 
     Attributes
     ----------
@@ -114,8 +114,7 @@ class ResidualEstimate:
     def above(self, other: ResidualEstimate) -> tuple[float, float]:
         """Variance of this residual less that of another on the same frames, and its error.
 
-        What both share, the noise and most of the disturbance, cancels: the error is smaller
-        than that of either.
+        The noise and most of the disturbance cancel: the error is smaller than that of either.
 
         Parameters
         ----------
@@ -153,8 +152,8 @@ class ResidualEstimate:
         Returns
         -------
         float
-            Long-exposure Strehl ratio, in [0, 1]; nan where the covariance is not positive
-            semidefinite within its error: the residual is then lost in the noise.
+            Long-exposure Strehl ratio, in [0, 1]; nan if the covariance is not positive
+            semidefinite, because the residual is lost in the noise.
         """
         if np.linalg.eigvalsh(self.covariance_nm2)[0] < 0:
             return float("nan")
@@ -166,11 +165,7 @@ def _roots(variance: FloatArray) -> FloatArray:
 
 
 def estimate_residual(
-    measured: FloatArray,
-    stretches: Stretches,
-    *,
-    noise_nm2: FloatArray,
-    noise_error_nm4: FloatArray,
+    measured: FloatArray, stretches: Stretches, noise_nm2: FloatArray, noise_error_nm4: FloatArray
 ) -> ResidualEstimate:
     """Estimate a residual from the measured residual (frames, n) of some stretches."""
     if len(measured) < _FEWEST:

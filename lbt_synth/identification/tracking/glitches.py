@@ -33,9 +33,8 @@ def find_glitches(open_loop: FloatArray) -> BoolArray:
 def stand_alone(flags: BoolArray, delay_frames: float) -> bool:
     """Whether glitches are short and far from each other.
 
-    A glitch ends before its own command comes back. Otherwise the sensor does not see the
-    commands as the model assumes, and the series after a glitch shows what it did to them:
-    leaving out a part of that would be wrong.
+    A glitch ends before its own command comes back. Otherwise the sensor gain differs from the
+    model's, the series also shows the response to the glitch, and must not be left out in part.
     """
     each = runs(flags)
     lengths, gaps = each[:, 1] - each[:, 0], each[1:, 0] - each[:-1, 1]

@@ -31,13 +31,12 @@ _RESOLUTION = 2.0  # bins from the top of a line to the first zero of a Hann win
 class LineFollower:
     """Find the vibrations of a plant again at their present frequencies.
 
-    Turbulence, noise, sensor gain, dampings and rms stay those of the plant. Of each line the
-    frequency is found by the Whittle likelihood (P. Whittle, Ark. Mat. 2, 423 (1953),
-    doi:10.1007/BF02590998) of the pseudo-open-loop series along its direction, tapered with a
-    Hann window, within ``span_hz`` of where it was last; its power is free in the fit. It may
-    be narrower than the window can tell. Lines along one direction (cosine above 0.9) whose
-    searches overlap are fitted together, keep their order, and must stay two bins of the window
-    apart: no two of them are found on one peak.
+    Turbulence, noise, sensor gain, dampings and rms stay those of the plant. The Whittle
+    likelihood (P. Whittle, Ark. Mat. 2, 423 (1953), doi:10.1007/BF02590998) of the
+    pseudo-open-loop series along a line, with a Hann window, gives its frequency, within
+    ``span_hz`` of the last one; its power is free in the fit, and it may be narrower than the
+    window resolves. Lines along one direction (cosine above 0.9) whose searches overlap are fitted
+    together, keep their order, and must stay two bins apart: no two are found on one peak.
 
     Parameters
     ----------
@@ -49,8 +48,7 @@ class LineFollower:
     Raises
     ------
     ProblemError
-        If the plant has no vibration, the modes cannot be told from the measurements, or the
-        span is out of range.
+        If the plant has no vibration, a mode is not measured, or the span is out of range.
 
     Examples
     --------

@@ -17,8 +17,8 @@ from lbt_synth.validation import FloatArray, integer, require_instance
 class LoopIdentifier:
     """Identify turbulence, lines and noise of each axis in a window (:func:`identify_axis`).
 
-    Each window starts from the model of the last one. The sensor gain is found in the data, too; a
-    window that does not show it takes the plant's.
+    Each window starts from the model of the last one. A window that does not show the sensor gain
+    takes that of the plant.
 
     Parameters
     ----------
@@ -27,8 +27,8 @@ class LoopIdentifier:
     find_gain : bool, optional
         Whether the sensor gain is found; otherwise it is the plant's.
     most_lines : int, optional
-        Number of resonances of an axis, at most. A line that drifts within the window looks like
-        several; many of them take long and change nothing.
+        Most resonances per axis. A line that drifts within the window looks like several, which
+        take long and change nothing.
 
     Raises
     ------

@@ -1,11 +1,9 @@
 """Filters exchanged in a running loop without a bump.
 
-The error of an estimator does not depend on the commands (:attr:`FilterDesign.estimator`): what
-it sees are the measurements with the correction taken out, the pseudo-open-loop series
-``ybar(k) = y(k) + sensor_matrix c(k)``. So a new filter, run over the recorded ``ybar``, is in
-the state that it would have had it always run, whoever gave the commands. The correction c(k)
-follows from the commands that were really given, by the mirror's own states, which outlive
-every filter.
+The error of an estimator does not depend on the commands (:attr:`FilterDesign.estimator`): its
+input is the pseudo-open-loop series ``ybar(k) = y(k) + sensor_matrix c(k)``. A new filter that
+runs over the recorded ``ybar`` has the state that it would have if it had always run. The
+correction c(k) follows from the commands that were given and the states of the mirror.
 """
 
 from __future__ import annotations
@@ -33,8 +31,8 @@ class SwitchReport:
     frames : int
         Recorded frames that the new filter was run over.
     left : float
-        What is left of its unknown state at the first of them: the spectral radius of its
-        error to the power of ``frames``. 0 where the record reaches back to the reset.
+        What is left of its unknown initial state: the spectral radius of its error to the power
+        of ``frames``; 0 if the record reaches back to the reset.
     """
 
     copied: bool
@@ -161,9 +159,9 @@ class SwitchedController:
     def switch(self, design: FilterDesign) -> SwitchReport:
         """Let another filter run from the next frame on, as if it had always run.
 
-        The same filter keeps its state to the last bit. Another one is run over the recorded
-        pseudo-open-loop measurements; with a record longer than its memory (``left`` small) its
-        commands are those of the filter that had run in parallel all the time.
+        The same filter keeps its state to the last bit. Another one runs over the recorded
+        pseudo-open-loop measurements. If ``left`` is small, its commands are those of a filter
+        that has run in parallel all the time.
 
         Parameters
         ----------

@@ -51,7 +51,7 @@ class TrackingUpdate:
     fitted_hz : tuple of float
         Frequencies in the window [Hz], none if there was no fit.
     frequencies_hz : tuple of float
-        Frequencies that the filter assumes which runs from now on [Hz].
+        Frequencies for which the filter that runs from now on was designed [Hz].
     rms_nm : tuple of float
         Their rms [nm].
     noise_nm : tuple of float
@@ -97,25 +97,22 @@ def _keeping_filter_if(step: str) -> Iterator[None]:
 class TrackingController(SwitchedController):
     """A controller that identifies and redesigns its filter while it runs.
 
-    Every ``update_s`` seconds the last ``window_s`` seconds of measurements and commands are
-    identified, a filter is designed for what was found, and takes over without a bump
-    (:class:`SwitchedController`). A window gives the frequency of its middle, the filter is
-    needed for the middle of the time until the next update: the last fits are extrapolated by
-    their trend, as far as it is significant.
+    Every ``update_s`` seconds it identifies the last ``window_s`` seconds, designs a filter for
+    them, and switches to it without a bump (:class:`SwitchedController`). A window shows the
+    frequency of its middle, but the filter needs that of the middle of the time to the next
+    update: the trend of the last fits is extrapolated as far as it is significant.
 
-    No update can stop the loop: where a window holds too few good measurements, the fit fails or
-    the design does not pass its certificate, the running filter stays, and :attr:`history` says
-    why. A measurement that is not finite is left out and the command held. A finite one that
-    cannot be right moves the mirror as the filter lets it, but the fit does not see it: single
-    outliers of the pseudo-open-loop series are interpolated, and count like missing ones.
+    No update can stop the loop: if a window has too few good measurements, the fit fails or the
+    design does not pass its certificate, the running filter stays, and :attr:`history` says why.
+    Frames that are not finite are left out and the command held. Single outliers of the
+    pseudo-open-loop series count like them in the fit, though they move the mirror.
 
     Parameters
     ----------
     plant : TipTiltPlant
         The plant of the first filter.
     identifier : Identifier, optional
-        Makes a plant of a window: :class:`LoopIdentifier` by default, which finds the whole
-        model; :class:`LineFollower` is the quickest.
+        :class:`LoopIdentifier` by default, for the whole model; :class:`LineFollower` is quicker.
     window_s : float, optional
         Length of the window [s], at least 16 frames.
     update_s : float, optional
@@ -123,8 +120,7 @@ class TrackingController(SwitchedController):
     extrapolate : bool, optional
         Whether the trend is followed; otherwise the frequencies are those of the window.
     trend_s : float, optional
-        How long fits count for the trend [s]; twice the window by default, and at least five
-        updates.
+        How long fits count for the trend [s]; by default twice the window, at least 5 updates.
     design : callable, optional
         From plant to :class:`FilterDesign`; :func:`kalman` by default.
 
