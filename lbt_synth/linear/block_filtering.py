@@ -10,10 +10,11 @@ recursion up to rounding.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear import StateSpace
@@ -26,7 +27,7 @@ _STEPS = 16  # blocks per block of the recursion
 _CACHED = 500_000  # input and output values worked on at once
 
 
-def filter_series(system: StateSpace, inputs: Any) -> FloatArray:
+def filter_series(system: StateSpace, inputs: ArrayLike) -> FloatArray:
     """Compute the outputs of a discrete-time system from a zero state.
 
     Parameters

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
 
 from lbt_synth.errors import NumericalError, UnstableLoopError
@@ -184,7 +185,7 @@ def _climb(
     )
 
 
-def largest_singular_values(system: StateSpace, frequency_hz: Any) -> FloatArray:
+def largest_singular_values(system: StateSpace, frequency_hz: ArrayLike) -> FloatArray:
     """Largest singular value of the transfer matrix at each frequency.
 
     Parameters

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import matrix_balance, schur
 
 from lbt_synth.errors import DimensionError, ProblemError
@@ -170,7 +171,7 @@ class StateSpace(LinearSystem):
         """Largest modulus of the poles."""
         return float(np.max(np.abs(self.poles)))
 
-    def frequency_response(self, frequency_hz: Any) -> ComplexArray:
+    def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Transfer matrix ``D + C (zI - A)^-1 B`` at ``z = exp(2 pi i f dt)``.
 
         Parameters
@@ -330,7 +331,7 @@ class RunningController:
         """Set the state to zero."""
         self.state = np.zeros(self.controller.n_states)
 
-    def step(self, y: Any) -> FloatArray:
+    def step(self, y: ArrayLike) -> FloatArray:
         """Take the measurements y(k), (q,), and return the command u(k), (m,)."""
         k = self.controller
         measured = np.asarray(y, dtype=np.float64)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
@@ -69,12 +70,12 @@ class ClosedLoop:
                 spectral_radius=radius,
             )
 
-    def sensitivity(self, frequency_hz: Any) -> ComplexArray:
+    def sensitivity(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Transfer from the total phase to the residual, (f, n, n) (the rejection)."""
         n = self.hardware.modes
         return self.system.frequency_response(frequency_hz)[:, :n, :n]
 
-    def noise_transfer(self, frequency_hz: Any) -> ComplexArray:
+    def noise_transfer(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Transfer from the measurement noise to the residual, (f, n, q)."""
         n = self.hardware.modes
         return self.system.frequency_response(frequency_hz)[:, :n, n:]

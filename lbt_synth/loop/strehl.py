@@ -15,6 +15,7 @@ from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import j0
 
 from lbt_synth.errors import DimensionError, ProblemError
@@ -121,7 +122,9 @@ def strehl(budget: ResidualBudget, imaging: Imaging) -> float:
     )
 
 
-def jitter_strehl(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any = ()) -> float:
+def jitter_strehl(
+    covariance_nm2: ArrayLike, *, imaging: Imaging, line_amplitudes_nm: ArrayLike = ()
+) -> float:
     """Strehl ratio of Gaussian and sinusoidal jitter.
 
     Parameters
@@ -266,7 +269,7 @@ def _choose_rules(
     return np.stack([fineness, directions], axis=1)
 
 
-def series_strehl(residual_nm: Any, imaging: Imaging) -> float:
+def series_strehl(residual_nm: ArrayLike, imaging: Imaging) -> float:
     """Long-exposure Strehl ratio of a residual series, whatever its distribution.
 
     Parameters

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import (
@@ -78,7 +78,7 @@ class ARModel:
         """Stationary standard deviation [nm]."""
         return self.driving_rms_nm * float(np.sqrt(variance_ratios(self.coefficients)))
 
-    def psd(self, frequency_hz: Any) -> FloatArray:
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """One-sided power spectrum [nm^2/Hz] at frequencies [Hz] up to Nyquist, of their shape.
 
         It is ``2 s^2 / (f_s |1 - a1 z^-1 - a2 z^-2 - ...|^2)``; a frequency that is not finite

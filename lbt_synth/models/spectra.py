@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
@@ -16,7 +17,7 @@ from lbt_synth.validation import FloatArray, frozen_copy, real_array, sequence, 
 class Spectrum(Protocol):
     """Anything with a one-sided power spectrum [nm^2/Hz]: Atmosphere, ARModel, a table."""
 
-    def psd(self, frequency_hz: Any) -> FloatArray:
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """Return the spectrum at frequencies [Hz]."""
         ...
 
@@ -67,7 +68,7 @@ class TabulatedSpectrum:
         """Frequencies where the spectrum has kinks [Hz]."""
         return self.frequency_hz
 
-    def psd(self, frequency_hz: Any) -> FloatArray:
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """Return the spectrum at frequencies [Hz] by linear interpolation [nm^2/Hz]."""
         x = real_array(frequency_hz, "frequency_hz")
         return np.asarray(np.interp(x, self.frequency_hz, self.density_nm2_hz, left=0, right=0))
@@ -120,7 +121,7 @@ class SumSpectrum:
         kinks = [breakpoints_below(part, np.inf) for part in self.parts]
         return frozen_copy(np.unique(np.concatenate(kinks)))
 
-    def psd(self, frequency_hz: Any) -> FloatArray:
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """Return the spectrum at frequencies [Hz], the sum of the parts' [nm^2/Hz]."""
         x = real_array(frequency_hz, "frequency_hz")
         return np.asarray(sum(part.psd(x) for part in self.parts), dtype=np.float64)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
 from lbt_synth.errors import DimensionError, ProblemError
@@ -59,9 +60,9 @@ def robustness_map(
     truth: Truth,
     imaging: Imaging,
     *,
-    errors_hz: Any,
-    sensor_gains: Any,
-    delay_errors_frames: Any = (0.0,),
+    errors_hz: ArrayLike,
+    sensor_gains: ArrayLike,
+    delay_errors_frames: ArrayLike = (0.0,),
     advance: Callable[[int], object] | None = None,
 ) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design.certificate import (
     GAIN_TOLERANCE,
@@ -170,10 +171,10 @@ class ModalFilters:
 def modal_filters(
     turbulence: ModalTurbulence | Sequence[ARModel],
     *,
-    noise_nm: Any,
+    noise_nm: ArrayLike,
     vibrations: Vibrations | None = None,
     delay_frames: float = 2.0,
-    sensor_gain: Any = 1.0,
+    sensor_gain: ArrayLike = 1.0,
     mirror: PositionLoop | None = None,
 ) -> ModalFilters:
     """Design a Kalman filter for every mode, all at once.

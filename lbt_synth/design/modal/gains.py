@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial.polynomial import polyadd, polyval
+from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
@@ -75,11 +76,11 @@ class ModalGains:
 def modal_gains(
     spectra: ModalTurbulence | Sequence[Spectrum],
     *,
-    noise_nm: Any,
+    noise_nm: ArrayLike,
     frame_rate_hz: float,
     vibrations: Vibrations | None = None,
     delay_frames: float = 2.0,
-    sensor_gain: Any = 1.0,
+    sensor_gain: ArrayLike = 1.0,
     margin: float = 0.001,
     mirror: PositionLoop | None = None,
 ) -> ModalGains:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design.certificate import RESIDUAL_TOLERANCE, VARIANCE_TOLERANCE
 from lbt_synth.design.modal.closed_loops import LoopBlock, close_bank, filter_phase
@@ -117,7 +118,7 @@ class ModalLoop:
         self,
         turbulence: ModalTurbulence | Sequence[ARModel],
         *,
-        noise_nm: Any,
+        noise_nm: ArrayLike,
         vibrations: Vibrations | None = None,
     ) -> FloatArray:
         """Exact stationary residual of each mode, by Lyapunov equations.
@@ -175,7 +176,12 @@ class ModalLoop:
         return read_only(out)
 
     def run(
-        self, total_nm: Any, noise_nm: Any, *, settle_frames: int = 0, all_series: bool = False
+        self,
+        total_nm: ArrayLike,
+        noise_nm: ArrayLike,
+        *,
+        settle_frames: int = 0,
+        all_series: bool = False,
     ) -> ModalRun:
         """Run the loop over given series, from zero states.
 
@@ -249,7 +255,7 @@ def modal_loop(
     controller: MixedController | ModalFilters,
     *,
     delay_frames: float | None = None,
-    sensor_gain: Any = 1.0,
+    sensor_gain: ArrayLike = 1.0,
     mirror: PositionLoop | None = None,
     frame_rate_hz: float | None = None,
 ) -> ModalLoop:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from lbt_synth.design.modal.banks import Bank, RunningBanks
@@ -106,7 +107,7 @@ class MixedController:
 
     @classmethod
     def integrators(
-        cls, gains: Any, *, leak: Any = 1.0, reconstructor: Reconstructor | None = None
+        cls, gains: ArrayLike, *, leak: ArrayLike = 1.0, reconstructor: Reconstructor | None = None
     ) -> MixedController:
         """Return the classical controller: an integrator for every mode.
 
@@ -131,7 +132,9 @@ class MixedController:
         >>> [float(u) for u in classical.step([1.0, 1.0, 1.0])]
         [0.5, 0.3, 0.2]
         """
-        return cls(filter=None, gains=gains, leak=leak, reconstructor=reconstructor)
+        return cls(
+            filter=None, gains=float_array(gains, "gains"), leak=leak, reconstructor=reconstructor
+        )
 
     @property
     def n_modes(self) -> int:
@@ -165,7 +168,7 @@ class MixedController:
         if self._running is not None:
             self._running.reset()
 
-    def step(self, y: Any) -> FloatArray:
+    def step(self, y: ArrayLike) -> FloatArray:
         """Take the measurements y(k) and return the modal commands u(k), (n,).
 
         Parameters

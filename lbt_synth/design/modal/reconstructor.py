@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.validation import FloatArray, frozen_copy, integer, matrix, number, real_array
@@ -65,7 +66,7 @@ class Reconstructor:
 
 
 def reconstructor(
-    interaction_matrix: Any, *, condition: float | None = None, kept: int | None = None
+    interaction_matrix: ArrayLike, *, condition: float | None = None, kept: int | None = None
 ) -> Reconstructor:
     """Invert an interaction matrix by its singular values.
 
@@ -143,11 +144,11 @@ def reconstructor(
 
 
 def project_out(
-    modes: Any,
+    modes: ArrayLike,
     removed: Sequence[int] = (0, 1),
     *,
-    weights: Any = None,
-    influence_matrix: Any = None,
+    weights: ArrayLike | None = None,
+    influence_matrix: ArrayLike | None = None,
 ) -> FloatArray:
     """Take some modes, such as tip and tilt, out of all the others.
 

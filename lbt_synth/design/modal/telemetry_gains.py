@@ -12,9 +12,8 @@ cut off at zero it would add up to turbulence over the whole band.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design.modal.gains import ModalGains, find_gains
 from lbt_synth.design.modal.plants import number_per_mode
@@ -27,13 +26,13 @@ _QUIET = 0.4  # of the frame rate, above which the noise is found
 
 
 def modal_gains_from_telemetry(
-    measurements: Any,
-    commands: Any,
+    measurements: ArrayLike,
+    commands: ArrayLike,
     *,
     frame_rate_hz: float,
-    noise_nm: Any = None,
+    noise_nm: ArrayLike | None = None,
     delay_frames: float = 2.0,
-    sensor_gain: Any = 1.0,
+    sensor_gain: ArrayLike = 1.0,
     margin: float = 0.001,
     segment_frames: int = 1024,
     mirror: PositionLoop | None = None,

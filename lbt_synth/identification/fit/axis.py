@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import GAINS, LOWEST_LINE_HZ, MOST_LINES, Search
@@ -34,8 +35,8 @@ _LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0
 
 
 def identify_axis(
-    measurement: Any,
-    correction: Any = None,
+    measurement: ArrayLike,
+    correction: ArrayLike | None = None,
     *,
     frame_rate_hz: float,
     stretches: StretchesLike | None = None,
@@ -169,8 +170,8 @@ def identify_axis(
 
 
 def identify_spectrum(
-    frequency_hz: Any,
-    density_nm2_hz: Any,
+    frequency_hz: ArrayLike,
+    density_nm2_hz: ArrayLike,
     *,
     frame_rate_hz: float,
     averages: float | None = None,

@@ -9,10 +9,10 @@ replay measures, for fractional delays and mirrors that move as well.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.prediction.residual import check_series, inverse_sensor
@@ -49,7 +49,7 @@ class LeastSquaresPredictor:
 
 
 def least_squares_predictor(
-    open_loop: Any,
+    open_loop: ArrayLike,
     hardware: LoopHardware,
     *,
     taps: int = 32,

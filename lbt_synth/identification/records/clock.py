@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import FloatArray, IntArray, number, real_array
@@ -42,8 +43,8 @@ def build_clock(
     rows: int,
     *,
     frame_rate_hz: float | None,
-    times_s: FloatArray | None = None,
-    frame_numbers: FloatArray | None = None,
+    times_s: ArrayLike | None = None,
+    frame_numbers: ArrayLike | None = None,
 ) -> Clock:
     """Lay rows on a regular grid, by their times (rows,) or frame numbers (rows,)."""
     rate = None if frame_rate_hz is None else number(frame_rate_hz, "frame_rate_hz", above=0)
@@ -92,7 +93,7 @@ def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray
     return []
 
 
-def _check_rising(values: FloatArray, name: str, rows: int) -> FloatArray:
+def _check_rising(values: ArrayLike, name: str, rows: int) -> FloatArray:
     out = real_array(values, name)
     if out.shape != (rows,):
         raise DimensionError(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.identification.records.clock import build_clock
@@ -33,15 +34,15 @@ Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
 
 
 def loop_record(
-    measurements: Any,
-    commands: Any = None,
+    measurements: ArrayLike,
+    commands: ArrayLike | None = None,
     *,
     frame_rate_hz: float | None = None,
     unit: str,
     delay_frames: float | None = None,
     mirror: PositionLoop | None = None,
-    times_s: Any = None,
-    frame_numbers: Any = None,
+    times_s: ArrayLike | None = None,
+    frame_numbers: ArrayLike | None = None,
     command_unit: str | None = None,
     diameter_m: float | None = None,
     obstruction: float | None = None,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
 from lbt_synth.identification.records.column_selection import CLOCKS
@@ -173,11 +174,11 @@ def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
 
 
 def accelerometer_lines(
-    accelerations: Any,
-    measurement: Any,
+    accelerations: ArrayLike,
+    measurement: ArrayLike,
     frame_rate_hz: float,
     *,
-    usable: Any = None,
+    usable: ArrayLike | None = None,
     segment_frames: int | None = None,
     false_alarm: float = 1e-3,
     lowest_hz: float = 1.0,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.records.faults import runs
@@ -187,7 +188,7 @@ class LoopRecord:
             return np.zeros(self.measurements.shape)
         return past_corrections(self.mirror_taps, self.commands)
 
-    def pseudo_open_loop(self, sensor_gain: Any = 1.0) -> FloatArray:
+    def pseudo_open_loop(self, sensor_gain: ArrayLike = 1.0) -> FloatArray:
         """Return the measurements that an open loop would have given [nm].
 
         Parameters
@@ -269,7 +270,7 @@ class LoopRecord:
         most: int = _BRIDGED_FRAMES,
         *,
         most_fraction: float = _BRIDGED_FRACTION,
-        sensor_gain: Any = 1.0,
+        sensor_gain: ArrayLike = 1.0,
     ) -> LoopRecord:
         """Return the record with short holes interpolated.
 

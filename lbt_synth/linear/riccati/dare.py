@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear.riccati.equations import Equations, Solutions
@@ -103,7 +104,9 @@ class DareSolution:
         return ", ".join(solvers or [attempt.route for attempt in self.attempts])
 
 
-def solve_dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> DareSolution:
+def solve_dare(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None = None
+) -> DareSolution:
     """Solve ``X = A'XA + Q - (A'XB + S)(R + B'XB)^-1 (B'XA + S')`` for its stabilising X.
 
     Three routes are tried in turn: structured doubling in balanced units; doubling from

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.plant.tip_tilt import TipTiltPlant, with_vibrations
@@ -21,8 +22,8 @@ def spread_plant(
     *,
     half_width_hz: float | None = None,
     lines: int = 5,
-    frequencies_hz: Any = None,
-    weights: Any = None,
+    frequencies_hz: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
 ) -> TipTiltPlant:
     """Return a plant whose vibrations have a distribution of frequencies.
 

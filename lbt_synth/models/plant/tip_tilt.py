@@ -15,9 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
@@ -163,11 +164,11 @@ def tip_tilt_plant(
     *,
     frame_rate_hz: float,
     turbulence: ARModel | Sequence[ARModel],
-    noise_nm: Any,
+    noise_nm: ArrayLike,
     vibrations: Sequence[Vibration] | None = None,
     delay_frames: float = 2.0,
-    sensor_matrix: Any = None,
-    influence_matrix: Any = None,
+    sensor_matrix: ArrayLike | None = None,
+    influence_matrix: ArrayLike | None = None,
     sensor_gain: float | Sequence[float] | FloatArray = 1.0,
     modes: int = 2,
     mirror: PositionLoop | None = None,
@@ -225,8 +226,8 @@ def tip_tilt_plant(
     hardware = LoopHardware(
         frame_rate_hz=frame_rate_hz,
         delay_frames=delay_frames,
-        sensor_matrix=sensor_matrix,
-        influence_matrix=influence_matrix,
+        sensor_matrix=cast("FloatArray | None", sensor_matrix),  # checked there
+        influence_matrix=cast("FloatArray | None", influence_matrix),
         modes=modes,
         mirror=mirror,
     )

@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import j0, j1, jv
 
 from lbt_synth.errors import ProblemError
@@ -86,7 +87,7 @@ class Atmosphere:
         """Telescope diameter over the outer scale; 0 for Kolmogorov turbulence."""
         return 0.0 if self.outer_scale_m is None else self.diameter_m / self.outer_scale_m
 
-    def psd(self, frequency_hz: Any) -> FloatArray:
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """One-sided temporal power spectrum of one axis [nm^2/Hz] at frequencies [Hz].
 
         The mean over wind directions: the two axes have the same spectrum and are taken as

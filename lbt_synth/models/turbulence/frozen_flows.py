@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.turbulence.atmosphere import (
@@ -112,7 +113,7 @@ class FrozenFlows:
         variances = np.array([tilt_variance(float(ratio), obstruction) for ratio in ratios])
         return np.asarray(np.sqrt(self._strength * variances[which.reshape(-1)]))
 
-    def psd(self, frequency_hz: Any) -> FloatArray:
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """One-sided temporal power spectra (p, f) of one axis [nm^2/Hz] at frequencies (f,) [Hz].
 
         A frequency that is not a finite number above 0 raises a ProblemError.

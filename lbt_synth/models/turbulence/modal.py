@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel, companions, densities, variance_ratios
@@ -141,7 +141,7 @@ class ModalTurbulence:
             frame_rate_hz=self.frame_rate_hz,
         )
 
-    def psd(self, frequency_hz: Any) -> FloatArray:
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """One-sided power spectra (n, f) [nm^2/Hz] at frequencies (f,) [Hz] up to Nyquist."""
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         return densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)

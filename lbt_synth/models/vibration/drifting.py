@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar_model import variance_ratios
@@ -74,12 +75,12 @@ class DriftingVibration:
         """Peak displacement of the sinusoid [nm rms wavefront]."""
         return float(np.sqrt(2) * self.rms_nm)
 
-    def frequency_hz_at(self, time_s: Any) -> FloatArray:
+    def frequency_hz_at(self, time_s: ArrayLike) -> FloatArray:
         """Return the frequency [Hz] at finite times [s]; the drift begins at time 0."""
         moved = np.clip(real_array(time_s, "time_s") / self.duration_s, 0.0, 1.0)
         return np.asarray(self.start_hz + (self.end_hz - self.start_hz) * moved)
 
-    def turns_at(self, time_s: Any) -> FloatArray:
+    def turns_at(self, time_s: ArrayLike) -> FloatArray:
         """Return the phase over 2 pi at finite times [s]: the frequency's integral from time 0."""
         t = real_array(time_s, "time_s")
         inside = np.clip(t, 0.0, self.duration_s)
