@@ -7,9 +7,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.number_text import NO_BREAK
@@ -35,7 +35,7 @@ from lbt_synth.studies.study.summary import short_names
 
 def write_study_page(
     study: Study,
-    columns: Mapping[str, Any],
+    columns: Mapping[str, ArrayLike],
     path: str | os.PathLike[str],
     *,
     statistics: StudyStatistics | None = None,
@@ -98,7 +98,9 @@ def write_study_page(
     return write_page(study_page(info, statistics, columns), path, pdf)
 
 
-def study_page(info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, Any]) -> Page:
+def study_page(
+    info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, ArrayLike]
+) -> Page:
     """Return the page of a study's results; columns (n,) have one value per sample."""
     found = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
     if any(len(each.strehl) != statistics.samples for each in found):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.studies.study.comparison import Comparison, Loss, compare, losses, mean_and_error
@@ -105,7 +105,7 @@ class StudyStatistics:
 
 
 def study_statistics(
-    columns: Mapping[str, Any],
+    columns: Mapping[str, ArrayLike],
     parameters: Sequence[str],
     controllers: Sequence[str],
     *,
