@@ -236,9 +236,9 @@ class ShapedDesign(Design):
             prefix = f"mode {mode + 1}: " if len(claims) > 1 else ""
             checks += [replace(c, name=prefix + c.name) for c in _mode_checks(hardware, *claim)]
         whole = controller_from_parameters(hardware, self.parameters)
-        difference = controller_difference(self.controller, whole)
+        apart = controller_difference(self.controller, whole)
         checks += [
-            Check("controller against its parameters", difference, _SAME, "assembled again"),
+            Check("controller against its parameters", apart, _SAME, "matrices assembled again"),
             certify_loop(hardware, self.controller),
         ]
         if checks[-1].passed:

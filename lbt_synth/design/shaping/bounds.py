@@ -6,14 +6,14 @@ the real loop over all frequencies, which know nothing of the programme.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, discs
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, DeclaredBounds, discs
 from lbt_synth.design.shaping.frequency_grid import Grid, spectrum_edges
 from lbt_synth.design.shaping.objectives import ResidualVariance
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
@@ -23,11 +23,11 @@ from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBou
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.models import Spectrum
-from lbt_synth.validation import FloatArray, number, set_fields
+from lbt_synth.validation import FloatArray, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModulusMargin:
+class ModulusMargin(DeclaredBounds):
     """Least distance of the loop from instability, ``1 / max |S|``, at unit sensor gain.
 
     Parameters
@@ -47,10 +47,7 @@ class ModulusMargin:
     'modulus margin of at least 0.45'
     """
 
-    at_least: float
-
-    def __post_init__(self) -> None:
-        set_fields(self, at_least=number(self.at_least, "at_least", above=0, below=1))
+    at_least: float = field(metadata={"above": 0, "below": 1})
 
     @property
     def label(self) -> str:
@@ -69,7 +66,7 @@ class ModulusMargin:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NoisePeak:
+class NoisePeak(DeclaredBounds):
     """Largest amplification of measurement noise into the residual, at any frequency.
 
     Parameters
@@ -89,10 +86,7 @@ class NoisePeak:
     2.0
     """
 
-    at_most: float
-
-    def __post_init__(self) -> None:
-        set_fields(self, at_most=number(self.at_most, "at_most", above=0))
+    at_most: float = field(metadata={"above": 0})
 
     @property
     def label(self) -> str:
@@ -138,13 +132,11 @@ class Attenuation(Band):
     'attenuation to 0.01 in 0-2 Hz at sensor gain 1'
     """
 
-    at_most: float
-    sensor_gain: float = 1.0
+    at_most: float = field(metadata={"above": 0})
+    sensor_gain: float = field(default=1.0, metadata={"above": 0})
 
     def __post_init__(self) -> None:
         Band.__post_init__(self)
-        gain = number(self.sensor_gain, "sensor_gain", above=0)
-        set_fields(self, at_most=number(self.at_most, "at_most", above=0), sensor_gain=gain)
         if not self.at_most * abs(1 - self.sensor_gain) < 1:
             raise ProblemError(
                 f"at_most must be below {1 / abs(1 - self.sensor_gain):.6g} at sensor gain "
@@ -177,7 +169,7 @@ class Attenuation(Band):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CommandRms:
+class CommandRms(DeclaredBounds):
     """Bound on the stroke or on the step of the commands, under turbulence and noise.
 
     Parameters
@@ -206,18 +198,18 @@ class CommandRms:
     'command step of at most 30 nm rms'
     """
 
-    at_most_nm: float
+    at_most_nm: float = field(metadata={"above": 0})
     turbulence: Spectrum | None
     noise_nm: float
     rate: bool = False
 
     def __post_init__(self) -> None:
-        limit = number(self.at_most_nm, "at_most_nm", above=0)
+        DeclaredBounds.__post_init__(self)
         if not isinstance(self.rate, bool):
             raise ProblemError(f"rate must be True or False; got {self.rate!r}.")
         # the same disturbances as those of a variance
         disturbance = ResidualVariance(turbulence=self.turbulence, noise_nm=self.noise_nm)
-        set_fields(self, at_most_nm=limit, noise_nm=disturbance.noise_nm)
+        set_fields(self, noise_nm=disturbance.noise_nm)
 
     @property
     def label(self) -> str:

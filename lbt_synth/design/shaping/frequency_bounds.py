@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from typing import Any, cast
 
 import numpy as np
 
@@ -16,8 +17,20 @@ ROOM = 1e-3  # part of a bound that the programme leaves for what lies between i
 LEVEL_SETS = "level sets, all frequencies"
 
 
+class DeclaredBounds:
+    """Base of dataclasses whose fields declare the bounds of a number as their metadata."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for own in fields(cast(Any, self)):
+            if own.metadata:
+                value = number(getattr(self, own.name), own.name, **own.metadata)
+                set_fields(self, **{own.name: value})
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Band:
+class Band(DeclaredBounds):
     """Band from ``low_hz`` to ``high_hz``, both included, from which terms and demands derive.
 
     Raises
@@ -26,12 +39,12 @@ class Band:
         If the ends are no numbers of at least 0 in increasing order.
     """
 
-    low_hz: float
+    low_hz: float = field(metadata={"at_least": 0})
     high_hz: float
 
     def __post_init__(self) -> None:
-        low = number(self.low_hz, "low_hz", at_least=0)
-        set_fields(self, low_hz=low, high_hz=number(self.high_hz, "high_hz", above=low))
+        DeclaredBounds.__post_init__(self)
+        set_fields(self, high_hz=number(self.high_hz, "high_hz", above=self.low_hz))
 
     @property
     def band_text(self) -> str:

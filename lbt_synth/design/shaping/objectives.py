@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import Band
+from lbt_synth.design.shaping.frequency_bounds import Band, DeclaredBounds
 from lbt_synth.design.shaping.frequency_grid import Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
@@ -18,17 +18,11 @@ from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, T
 from lbt_synth.validation import ComplexArray, FloatArray, number, sequence, set_fields
 
 
-def require_spectrum(value: object, name: str) -> None:
-    """Refuse a spectrum that cannot be written into a gain file."""
-    if value is not None and not isinstance(value, ARModel | Atmosphere | TabulatedSpectrum):
-        raise ProblemError(
-            f"{name} must be an Atmosphere, an ARModel, a TabulatedSpectrum or None; got "
-            f"{type(value).__name__}. Sample it into a TabulatedSpectrum."
-        )
+_RECORDED = ARModel | Atmosphere | TabulatedSpectrum | None  # what a gain file can hold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ResidualVariance:
+class ResidualVariance(DeclaredBounds):
     """Variance of turbulence and noise in the residual of one mode.
 
     Parameters
@@ -53,13 +47,17 @@ class ResidualVariance:
     """
 
     turbulence: Spectrum | None
-    noise_nm: float
-    sensor_gain: float = 1.0
+    noise_nm: float = field(metadata={"at_least": 0})
+    sensor_gain: float = field(default=1.0, metadata={"above": 0})
 
     def __post_init__(self) -> None:
-        require_spectrum(self.turbulence, "turbulence")
-        gain = number(self.sensor_gain, "sensor_gain", above=0)
-        set_fields(self, noise_nm=number(self.noise_nm, "noise_nm", at_least=0), sensor_gain=gain)
+        spectrum = self.turbulence
+        if not isinstance(spectrum, _RECORDED):
+            raise ProblemError(
+                "turbulence must be an Atmosphere, an ARModel, a TabulatedSpectrum or None; got "
+                f"{type(spectrum).__name__}. Sample it into a TabulatedSpectrum."
+            )
+        DeclaredBounds.__post_init__(self)
         if self.turbulence is None and self.noise_nm == 0:
             raise ProblemError("a variance needs turbulence or noise; got neither.")
 
@@ -113,13 +111,8 @@ class VibrationBand(Band):
     ((16.5, 23.5),)
     """
 
-    rms_nm: float
-    sensor_gain: float = 1.0
-
-    def __post_init__(self) -> None:
-        Band.__post_init__(self)
-        gain = number(self.sensor_gain, "sensor_gain", above=0)
-        set_fields(self, rms_nm=number(self.rms_nm, "rms_nm", above=0), sensor_gain=gain)
+    rms_nm: float = field(metadata={"above": 0})
+    sensor_gain: float = field(default=1.0, metadata={"above": 0})
 
     @property
     def label(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, discs
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, DeclaredBounds, discs
 from lbt_synth.design.shaping.frequency_grid import Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, append_taps
 from lbt_synth.errors import ProblemError
@@ -18,11 +18,13 @@ from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
 from lbt_synth.linear.norms import largest_real_part
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, number, set_fields
+from lbt_synth.validation import FloatArray
+
+_HOLDS_ONE = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorGainRange:
+class SensorGainRange(DeclaredBounds):
     """Guaranteed stability for every sensor gain of an interval.
 
     The loop is stable at g while ``1 - (1 - g) T`` does not vanish: the real part of T is
@@ -45,13 +47,8 @@ class SensorGainRange:
     'stability for sensor gains 0.25 to 1.3'
     """
 
-    low: float
-    high: float
-
-    def __post_init__(self) -> None:
-        hint = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
-        low = number(self.low, "low", above=0, at_most=1, hint=hint)
-        set_fields(self, low=low, high=number(self.high, "high", at_least=1, hint=hint))
+    low: float = field(metadata={"above": 0, "at_most": 1, "hint": _HOLDS_ONE})
+    high: float = field(metadata={"at_least": 1, "hint": _HOLDS_ONE})
 
     @property
     def label(self) -> str:
@@ -87,7 +84,7 @@ class SensorGainRange:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DelayError:
+class DelayError(DeclaredBounds):
     """Guaranteed stability for every error of the delay up to a bound, late or early.
 
     Delays, fractions included, are those of :class:`LoopHardware`: with the mirror's response
@@ -113,10 +110,7 @@ class DelayError:
     0.25
     """
 
-    frames: float
-
-    def __post_init__(self) -> None:
-        set_fields(self, frames=number(self.frames, "frames", above=0, at_most=1))
+    frames: float = field(metadata={"above": 0, "at_most": 1})
 
     @property
     def label(self) -> str:
@@ -188,11 +182,7 @@ class MirrorUncertainty(Band):
     0.5
     """
 
-    relative: float
-
-    def __post_init__(self) -> None:
-        Band.__post_init__(self)
-        set_fields(self, relative=number(self.relative, "relative", above=0))
+    relative: float = field(metadata={"above": 0})
 
     @property
     def label(self) -> str:
