@@ -17,7 +17,6 @@ from lbt_synth.loop import residual_budget
 from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth
 from lbt_synth.validation import ComplexArray, FloatArray, number, sequence, set_fields
 
-
 _RECORDED = ARModel | Atmosphere | TabulatedSpectrum | None  # what a gain file can hold
 
 
