@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,8 @@ def render_code(
         "m": len(controller.C),
         "type": "float" if single else "double",
         "controller": controller,
-        "facts": _facts(controller, provenance, single=single),
+        "provenance": provenance,
+        "cost": frame_cost(controller),
         "header_name": header_name,
         "gain_digest": gain_digest,
         "straight_line": _write_out(prefix, controller, zero=constant(0.0))
@@ -56,31 +58,6 @@ def render_code(
         environment.get_template(f"controller.{ending}.jinja").render(values) for ending in "ch"
     )
     return source, header
-
-
-def _facts(
-    controller: Controller, provenance: Sequence[tuple[str, str]], *, single: bool
-) -> list[str]:
-    """Return the lines on this controller in the comment that begins both files."""
-    cost = frame_cost(controller)
-    sizes = (
-        _count(controller.n_states, "state"),
-        _count(controller.B.shape[1], "measurement"),
-        _count(len(controller.C), "command"),
-        "float" if single else "double",
-    )
-    operations = (
-        _count(cost.multiplications, "multiplication"),
-        _count(cost.additions, "addition"),
-    )
-    facts = [
-        *provenance,
-        ("form", "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k), x(0) = 0"),
-        ("sizes", ", ".join(sizes)),
-        ("a frame", ", ".join(operations)),
-    ]
-    width = max(len(label) for label, _ in facts)
-    return [f"{label:{width}s}  {text}".rstrip() for label, text in facts]
 
 
 def _write_out(prefix: str, controller: Controller, *, zero: str) -> dict[str, Any]:
@@ -116,14 +93,13 @@ def _write_out(prefix: str, controller: Controller, *, zero: str) -> dict[str, A
 
 def _wrap(terms: list[tuple[str, str]], column: int) -> str:
     """Return a sum that begins at a column, its terms wrapped over lines."""
-    text = ""
-    for i, (sign, term) in enumerate(terms):
-        lead = "" if i == 0 and sign == "+" else ("-" if i == 0 else f"{sign} ")
-        if column + len(lead) + len(term) + 2 > _WIDTH:
-            text, column = f"{text}\n       ", 7
-        text += f" {lead}{term}"
-        column += 1 + len(lead) + len(term)
-    return text
+    text = " ".join(f"{sign} {term}".replace(" ", "\0") for sign, term in terms)
+    text = text.removeprefix("+\0").replace("-\0", "-", text.startswith("-"))
+    begin, more = " " * (column + 1), " " * 8
+    wrapped = textwrap.fill(
+        text, _WIDTH - 1, initial_indent=begin, subsequent_indent=more, break_long_words=False
+    )
+    return wrapped[column:].replace("\0", " ")
 
 
 def _count(number: int, word: str) -> str:

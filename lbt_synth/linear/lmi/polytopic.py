@@ -60,8 +60,7 @@ def segment_filter(
     scale: float,
 ) -> SegmentFilter:
     """Filter of the least bound over a segment of plants, given the state matrices at its ends."""
-    segment = _ScaledSegment.from_problem(problem, ends, coordinates, scale)
-    programme = _Programme(segment)
+    programme = _Programme(problem, ends, coordinates, scale)
     level = cp.Variable(nonneg=True)
     constraints = [
         inequality >> 0 for k in range(3) for inequality in programme.inequalities(k, norm, level)
@@ -74,90 +73,64 @@ def segment_filter(
         raise NumericalError(
             "the slack matrix of the filter is singular. Try a narrower interval.", status=run[0]
         ) from error
-    back = segment.basis @ inverse
+    back = programme.basis @ inverse
     return SegmentFilter(
-        A=frozen_copy(back @ programme.KA.value @ segment.inverse),
-        B=frozen_copy(-back @ programme.KB.value @ segment.measurement_scale),
-        C=frozen_copy(programme.output.value @ segment.inverse * scale),
+        A=frozen_copy(back @ programme.KA.value @ programme.inverse),
+        B=frozen_copy(-back @ programme.KB.value @ programme.measurement_scale),
+        C=frozen_copy(programme.output.value @ programme.inverse * scale),
         bound=float(np.sqrt(level.value)) * scale,
         status=run[0],
         iterations=run[1],
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ScaledSegment:
-    """The segment in independent states of size one; states that never move are dropped.
+class _Programme:
+    """The segment in independent states of size one, and the variables of the programme.
 
-    The errors of these states are ``basis`` times errors of size one.
+    The errors of these states are ``basis`` times errors of size one; states that never move are
+    dropped.
     """
 
-    ends: tuple[FloatArray, FloatArray]
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    L: FloatArray
-    basis: FloatArray
-    inverse: FloatArray
-    measurement_scale: FloatArray
-
-    @classmethod
-    def from_problem(
-        cls,
+    def __init__(
+        self,
         problem: EstimationProblem,
         ends: tuple[FloatArray, FloatArray],
         coordinates: FloatArray,
         scale: float,
-    ) -> _ScaledSegment:
+    ) -> None:
         states = stationary_covariance((ends[0] + ends[1]) / 2, problem.Q)
         wide, narrow = whitening_coordinates(states)
         errors = narrow @ coordinates @ narrow.T
-        basis, inverse = whitening_coordinates(
+        self.basis, self.inverse = whitening_coordinates(
             errors + _RANK * np.trace(errors) * np.eye(len(errors))
         )
-        measurement_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
-        return cls(
-            ends=(narrow @ ends[0] @ wide, narrow @ ends[1] @ wide),
-            B=narrow @ problem.B,
-            C=measurement_scale @ problem.C @ wide,
-            D=measurement_scale @ problem.D,
-            L=problem.L @ wide / scale,
-            basis=basis,
-            inverse=inverse,
-            measurement_scale=np.asarray(measurement_scale, dtype=np.float64),
-        )
-
-
-class _Programme:
-    """Variables of the programme, and its inequalities."""
-
-    def __init__(self, segment: _ScaledSegment) -> None:
-        n, (outputs, q) = len(segment.basis), (len(segment.L), len(segment.C))
-        self.segment = segment
-        self.Z = [cp.Variable((n, n)) for _ in range(2)]
-        self.U = [cp.Variable((n, n)) for _ in range(2)]
-        self.K = cp.Variable((n, n))
-        self.KA = cp.Variable((n, n))
+        self.measurement_scale = np.linalg.inv(np.linalg.cholesky(problem.R))
+        self.ends = [narrow @ end @ wide for end in ends]
+        self.B, self.L = narrow @ problem.B, problem.L @ wide / scale
+        self.C = self.measurement_scale @ problem.C @ wide
+        self.D = self.measurement_scale @ problem.D
+        n, (outputs, q) = len(self.basis), (len(self.L), len(self.C))
+        self.Z, self.U = ([cp.Variable((n, n)) for _ in range(2)] for _ in range(2))
+        self.K, self.KA = cp.Variable((n, n)), cp.Variable((n, n))
         self.KB = cp.Variable((n, q))  # of -Bf
         self.output = cp.Variable((outputs, n))
 
     def inequalities(self, k: int, norm: str, level: Any) -> list[Any]:
         """Bernstein coefficients of index k, the matrices that must be positive."""
-        f, n = self.segment, len(self.segment.basis)
-        p, outputs = f.B.shape[1], len(f.L)
+        n, p, outputs = len(self.basis), self.B.shape[1], len(self.L)
         Z, U = _coefficient(self.Z, k), _coefficient(self.U, k)
         zero = np.zeros((n, n))
-        own = U + self.K @ f.inverse  # of what drives the states
+        own = U + self.K @ self.inverse  # of what drives the states
         G = cp.bmat([[Z, zero], [U, self.K]])
-        after = _product(self.U, f.ends, k) + self.K @ f.inverse @ _coefficient(f.ends, k)
+        after = _product(self.U, self.ends, k) + self.K @ self.inverse @ _coefficient(self.ends, k)
         GA = cp.bmat(
             [
-                [_product(self.Z, f.ends, k), zero],
-                [after + self.KB @ f.C - self.KA @ f.inverse, self.KA],
+                [_product(self.Z, self.ends, k), zero],
+                [after + self.KB @ self.C - self.KA @ self.inverse, self.KA],
             ]
         )
-        GB = cp.vstack([Z @ f.B, own @ f.B + self.KB @ f.D])
-        C = cp.hstack([f.L - self.output @ f.inverse, self.output])
+        GB = cp.vstack([Z @ self.B, own @ self.B + self.KB @ self.D])
+        C = cp.hstack([self.L - self.output @ self.inverse, self.output])
         P = cp.Variable((2 * n, 2 * n), symmetric=True)
         slack, none = G + G.T - P, np.zeros((2 * n, outputs))
         if norm == "h2":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import eigvals
+from scipy.linalg import block_diag, eigvals
 
 from lbt_synth.errors import DefinitenessError, DetectabilityError
 from lbt_synth.linear.riccati.equations import Equations
@@ -102,23 +102,11 @@ def _unit_circle_zero(
     A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray, name: str
 ) -> complex | None:
     """Eigenvalue on the unit circle of the extended symplectic pencil, or None."""
-    n, m = B.shape
+    (n, m), zero = B.shape, np.zeros
     weight = max(np.abs(Q).max(), np.abs(R).max(), np.abs(S).max(), 1e-300)
-    zero = np.zeros
-    M = np.block(
-        [
-            [A, zero((n, n)), B],
-            [-Q / weight, np.eye(n), -S / weight],
-            [S.T / weight, zero((m, n)), R / weight],
-        ]
-    )
-    N = np.block(
-        [
-            [np.eye(n), zero((n, n + m))],
-            [zero((n, n)), A.T, zero((n, m))],
-            [zero((m, n)), -B.T, zero((m, m))],
-        ]
-    )
+    Q, R, S = Q / weight, R / weight, S / weight
+    M = np.block([[A, zero((n, n)), B], [-Q, np.eye(n), -S], [S.T, zero((m, n)), R]])
+    N = block_diag(np.eye(n), np.vstack([A.T, -B.T]), zero((0, m)))
     size = float(np.linalg.norm(M, 2))
     elsewhere = np.linalg.svd(M - _ELSEWHERE * N, compute_uv=False)[-1]
     if size < _LARGE and elsewhere < _SINGULAR * size:

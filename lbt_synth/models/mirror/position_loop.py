@@ -286,8 +286,10 @@ class PositionLoop:
         grid = np.geomspace(1e-3 * self.natural_frequency_hz, self.sampling_hz / 2, 2000)
         amplitude = np.abs(loop.frequency_response(grid)[:, 0, 0]) / self.static_gain
         below = np.flatnonzero(amplitude < np.sqrt(0.5))
-        if below.size == 0 or below[0] == 0:
-            return float("nan") if below.size else float(grid[-1])
+        if below.size == 0:
+            return float(grid[-1])
+        if below[0] == 0:
+            return float("nan")
         return float(brentq(excess, grid[below[0] - 1], grid[below[0]]))
 
     def _law(self) -> FloatArray:
@@ -330,10 +332,8 @@ def _exponential(omega: float, damping: float, time: float) -> FloatArray:
 
 def _crossing(time: FloatArray, x: FloatArray, level: float) -> float:
     """Time at which a series first crosses a level from below, between its points."""
-    i = int(np.argmax(x >= level))
-    if i == 0:
-        return float(time[0])
-    return float(time[i - 1] + (level - x[i - 1]) / (x[i] - x[i - 1]) * (time[i] - time[i - 1]))
+    i = max(int(np.argmax(x >= level)), 1)
+    return float(np.interp(level, x[i - 1 : i + 1], time[i - 1 : i + 1]))
 
 
 def _last_outside(time: FloatArray, x: FloatArray, band: float) -> float:
