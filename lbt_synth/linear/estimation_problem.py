@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
 from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
@@ -107,8 +108,10 @@ class EstimationProblem(LinearSystem):
         0.5
         """
         gain = self._checked_gain(gain_predictor)
-        A, B, D = self.A - gain @ self.C, self.B - gain @ self.D, np.zeros_like(self.L @ self.B)
-        return StateSpace(A=A, B=B, C=self.L, D=D, dt_s=self.dt_s)
+        D = np.zeros((len(self.L), self.B.shape[1]))
+        return StateSpace(
+            A=self.A - gain @ self.C, B=self.B - gain @ self.D, C=self.L, D=D, dt_s=self.dt_s
+        )
 
     def with_unit_weights(self) -> EstimationProblem:
         """Return the problem with each disturbance scaled to unit size.
@@ -159,12 +162,9 @@ class EstimationProblem(LinearSystem):
         >>> [round(lbt.kalman(walk, horizon=h).rms ** 2, 6) for h in (-1, 0, 1, 2)]
         [0.472136, 0.618034, 1.618034, 2.618034]
         """
-        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
-        if steps > LONGEST_HORIZON:
-            raise ProblemError(f"horizon must be at most {LONGEST_HORIZON} samples; got {steps}.")
+        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON, at_most=LONGEST_HORIZON)
         if steps == 1:
             return self
-        n, p, q = self.n_states, self.B.shape[1], self.C.shape[0]
         if steps > 1:
             size = np.linalg.norm(self.B, 2) * np.linalg.norm(self.D, 2)
             if np.linalg.norm(self.S, 2) > 1e-12 * size:
@@ -173,22 +173,20 @@ class EstimationProblem(LinearSystem):
                     "uncorrelated (B D' = 0); got B D' with a norm of "
                     f"{np.linalg.norm(self.S, 2):.3g}. Try horizon=1, or separate the noises."
                 )
-            late, entry = (steps - 1) * q, self.C
-        else:
-            late, entry = (1 - steps) * len(self.L), self.L
-        width = len(entry)
-        A = np.zeros((n + late, n + late))
-        A[:n, :n], A[n : n + width, :n] = self.A, entry
-        A[n + width :, n:-width] = np.eye(late - width)
-        last = np.zeros((width, n + late))
-        last[:, -width:] = np.eye(width)
-        padding = np.zeros((max(q, len(self.L)), late))
+        entry = self.C if steps > 1 else self.L
+        n, width = self.n_states, len(entry)
+        late = width * (steps - 1 if steps > 1 else 1 - steps)
+        A = np.eye(n + late, k=-width)
+        A[:n] = 0.0
+        A[: n + width, :n] = np.vstack([self.A, entry])
+        last = np.eye(width, n + late, k=n + late - width)
+        C, L = (np.hstack([part, np.zeros((len(part), late))]) for part in (self.C, self.L))
         return EstimationProblem(
             A=A,
-            B=np.vstack([self.B, np.zeros((late, p))]),
-            C=last if steps > 1 else np.hstack([self.C, padding[:q]]),
+            B=np.vstack([self.B, np.zeros((late, self.B.shape[1]))]),
+            C=last if steps > 1 else C,
             D=self.D,
-            L=np.hstack([self.L, padding[: len(self.L)]]) if steps > 1 else last,
+            L=L if steps > 1 else last,
             dt_s=self.dt_s,
         )
 
@@ -214,9 +212,7 @@ class EstimationProblem(LinearSystem):
                 f"taps must have a multiple of {q} columns, one for each measurement of each past "
                 f"sample; got {weights.shape}."
             )
-        A = np.zeros((self.n_states + size, self.n_states + size))
-        A[: self.n_states, : self.n_states] = self.A
-        A[self.n_states + q :, self.n_states : -q] = np.eye(size - q)
+        A = block_diag(self.A, np.eye(size, k=-q))
         return replace(
             self,
             A=A,

@@ -9,7 +9,6 @@ sinusoids of complex amplitude a::
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any
@@ -197,7 +196,9 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
     # jitter along the axes is the same in all four quadrants
     aligned = ~np.any(turns[..., 1], axis=1) & (widths[:, 1] == 0)
     out = np.empty(count)
-    for members, rule in _group_by_rule(np.column_stack([rules, aligned])):
+    unique, own = np.unique(np.column_stack([rules, aligned]), axis=0, return_inverse=True)
+    for i, rule in enumerate(unique.tolist()):
+        members = np.flatnonzero(own.reshape(-1) == i)
         squares, weight = _weighted_otf(imaging.obstruction, *rule)
         squares = squares * imaging.cycles_per_nm**2
         step = max(1, _POINT_CHUNK // weight.size)
@@ -234,15 +235,8 @@ def widest_jitter_nm(imaging: Imaging) -> float:
 def _quadratic_form(matrices: FloatArray) -> FloatArray:
     """Coefficients of symmetric matrices' quadratic forms, as factors of the squares of f."""
     if matrices.shape[-1] == 1:
-        return np.concatenate([matrices[..., 0], np.zeros((*matrices.shape[:-2], 2))], axis=-1)
+        matrices = matrices * np.diag([1.0, 0.0])
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
-
-
-def _group_by_rule(rules: IntArray) -> Iterator[tuple[IntArray, list[int]]]:
-    """Yield each rule with the indices of the jitters that share it."""
-    unique, own = np.unique(rules, axis=0, return_inverse=True)
-    for i, rule in enumerate(unique.tolist()):
-        yield np.flatnonzero(own.reshape(-1) == i), rule
 
 
 def _choose_rules(

@@ -34,12 +34,11 @@ def draw_disturbance(
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
     total = np.zeros((cases, frames, n))
-    if truth.is_uniform:
-        for spectrum, _ in truth.turbulence_groups(n):
-            drawn = _draw(spectrum, hardware, frames, cases * n, turbulence_rng)
-            total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
-    else:
-        spectra = truth.turbulence_per_mode(n)
+    spectra = truth.turbulence_per_mode(n)
+    if truth.is_uniform and spectra[0] is not None:
+        drawn = _draw(spectra[0], hardware, frames, cases * n, turbulence_rng)
+        total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
+    elif not truth.is_uniform:
         for mode, (own, mode_rng) in enumerate(zip(spectra, turbulence_rng.spawn(n), strict=True)):
             if own is not None:
                 total[:, :, mode] += _draw(own, hardware, frames, cases, mode_rng)

@@ -14,7 +14,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.models.plant.tip_tilt import TipTiltPlant
 from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, number, set_fields
+from lbt_synth.validation import FloatArray, NotNegative, check_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -22,7 +22,7 @@ class FrequencyInterval:
     """The plants of an interval of frequencies, all with the same driving noise."""
 
     plant: TipTiltPlant  # at the centre; its vibrations share frequency and damping
-    half_width_hz: float  # [Hz]; 0 for the plant alone
+    half_width_hz: NotNegative  # [Hz]; 0 for the plant alone
 
     def __post_init__(self) -> None:
         plant = self.plant
@@ -39,17 +39,15 @@ class FrequencyInterval:
             )
         first = plant.vibrations[0]
         for line in plant.vibrations:
-            if not np.allclose(
-                (line.frequency_hz, line.damping), (first.frequency_hz, first.damping), rtol=1e-9
-            ):
+            pair = (line.frequency_hz, line.damping)
+            if not np.allclose(pair, (first.frequency_hz, first.damping), rtol=1e-9):
                 raise ProblemError(
                     "one uncertain frequency at a time: the vibrations must share frequency and "
                     f"damping; got {first.frequency_hz:.6g} Hz with {first.damping:.6g} and "
                     f"{line.frequency_hz:.6g} Hz with {line.damping:.6g}. Try a plant with one of "
                     "them (without spread_hz in a configuration), or kalman with spread_plant."
                 )
-        half = number(self.half_width_hz, "half_width_hz", at_least=0)
-        set_fields(self, half_width_hz=half)
+        check_fields(self)
         for end in (self.low_hz, self.high_hz):
             first.at_frequency(end).ar_model(plant.hardware.frame_rate_hz)
 
