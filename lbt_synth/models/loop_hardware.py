@@ -98,15 +98,12 @@ class LoopHardware:
             n = influence.shape[0]
         if n < 1 or (influence is not None and influence.shape[1] < 1):
             raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
-        for name, value in (("sensor_matrix", sensor), ("influence_matrix", influence)):
+        given = {"sensor_matrix": sensor, "influence_matrix": influence}
+        for name, value in given.items():
             if value is not None and not np.any(value):
                 raise ProblemError(f"{name} must respond to something; got only zeros.")
-        set_fields(
-            self,
-            modes=n,
-            sensor_matrix=frozen_copy(np.eye(n)) if sensor is None else sensor,
-            influence_matrix=frozen_copy(np.eye(n)) if influence is None else influence,
-        )
+            set_fields(self, **{name: frozen_copy(np.eye(n)) if value is None else value})
+        set_fields(self, modes=n)
         if self.mirror is not None:
             require_instance(self.mirror, PositionLoop)
             _ = self.mirror_system  # refuses a mirror that does not fit the frame rate

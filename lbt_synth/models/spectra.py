@@ -102,17 +102,15 @@ class SumSpectrum:
     parts: tuple[Spectrum, ...]
 
     def __post_init__(self) -> None:
-        given = sequence(self.parts, "parts")
-        for part in given:
+        flat: list[Spectrum] = []
+        for part in sequence(self.parts, "parts"):
             if not isinstance(part, Spectrum):
                 raise ProblemError(
                     f"parts must have a method psd(frequency_hz); got {type(part).__name__}."
                 )
-        if not given:
-            raise ProblemError("parts must hold at least one spectrum; got none.")
-        flat: list[Spectrum] = []
-        for part in given:
             flat += part.parts if isinstance(part, SumSpectrum) else (part,)
+        if not flat:
+            raise ProblemError("parts must hold at least one spectrum; got none.")
         set_fields(self, parts=tuple(flat))
 
     @property

@@ -118,29 +118,29 @@ def calibrate(
     facts = {"layout": _LAYOUT, "specula": specula_version(), **system.calibration_facts()}
     key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     path = cache_directory(cache) / f"calibration-{key[:16]}.npz"
-    found = _load_cached(path, key)
-    if found is not None:
-        if progress is not None:
-            progress(system.modes)
-        return found
+    arrays = _read_cached(path, key)
+    cached = arrays is not None
+    if arrays is None:
+        arrays = _measure(system, progress)
+        meta = {"key": key, "facts": facts}
+        meta["digest"] = digest(arrays, meta)
+        write_atomically(path, npz_bytes(arrays, json.dumps(meta)))
+    elif progress is not None:
+        progress(system.modes)
+    return Calibration(
+        modes=Modes(mask=arrays["MASK"] > 0, shapes=arrays["SHAPES"].astype(np.float32)),
+        reference=frozen_copy(arrays["REFERENCE"]),
+        reconstructor=reconstructor(arrays["INTERACTION"]),
+        key=key,
+        cached=cached,
+    )
+
+
+def _measure(
+    system: EndToEndSystem, progress: Callable[[int], None] | None
+) -> dict[str, npt.NDArray[Any]]:
+    """Compute the modes; measure the slopes of a flat wavefront and of each mode."""
     modes = make_modes(system)
-    reference, matrix = _measure_interaction(system, modes, progress)
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "MASK": modes.mask.astype(np.uint8),
-        "SHAPES": modes.shapes,
-        "REFERENCE": reference,
-        "INTERACTION": matrix,
-    }
-    meta = {"key": key, "facts": facts}
-    meta["digest"] = digest(arrays, meta)
-    write_atomically(path, npz_bytes(arrays, json.dumps(meta)))
-    return _make_calibration(modes, reference, matrix, key, cached=False)
-
-
-def _measure_interaction(
-    system: EndToEndSystem, modes: Modes, progress: Callable[[int], None] | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return the slopes of a flat wavefront (q,), and the interaction matrix (q, modes)."""
     optics = Optics(system, modes)
     still, n = np.zeros(2), len(modes.shapes)
     reference = optics.expose(np.zeros(n), still)
@@ -152,29 +152,19 @@ def _measure_interaction(
         matrix[:, mode] = pair / (2 * system.calibration_nm)
         if progress is not None:
             progress(1)
-    return reference, matrix
+    return {
+        "MASK": modes.mask.astype(np.uint8),
+        "SHAPES": modes.shapes,
+        "REFERENCE": reference,
+        "INTERACTION": matrix,
+    }
 
 
-def _load_cached(path: Path, key: str) -> Calibration | None:
-    """Return the calibration of a file, None if it is missing, damaged or another one."""
+def _read_cached(path: Path, key: str) -> dict[str, npt.NDArray[Any]] | None:
+    """Return the arrays of a file, None if it is missing, damaged or another one."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         arrays, text = read_npz(path.read_bytes())
         meta = json.loads(text)
         if meta["key"] == key and meta["digest"] == digest(arrays, meta):
-            modes = Modes(mask=arrays["MASK"] > 0, shapes=arrays["SHAPES"].astype(np.float32))
-            return _make_calibration(
-                modes, arrays["REFERENCE"], arrays["INTERACTION"], key, cached=True
-            )
+            return dict(arrays)
     return None
-
-
-def _make_calibration(
-    modes: Modes, reference: FloatArray, matrix: FloatArray, key: str, *, cached: bool
-) -> Calibration:
-    return Calibration(
-        modes=modes,
-        reference=frozen_copy(reference),
-        reconstructor=reconstructor(matrix),
-        key=key,
-        cached=cached,
-    )

@@ -147,9 +147,9 @@ def simulate(
             "controller must be a Controller, or an object with step(y) and reset(); "
             f"got {type(controller).__name__}."
         )
-    settle = (
-        default if settle_frames is None else integer(settle_frames, "settle_frames", at_least=0)
-    )
+    settle = default
+    if settle_frames is not None:
+        settle = integer(settle_frames, "settle_frames", at_least=0)
     channels = 2 * (hardware.modes + hardware.n_measurements) + hardware.n_commands
     gigabytes = 8e-9 * (settle + frames) * cases * channels
     if gigabytes > _MOST_GIGABYTES:

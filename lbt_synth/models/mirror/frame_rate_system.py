@@ -86,10 +86,9 @@ def instant_mirror(delay_frames: float) -> MirrorSystem:
     """System of a mirror that settles at once; its states are past commands, newest first."""
     lead = int(np.floor(delay_frames - 1))
     fraction = delay_frames - 1 - lead
-    taps = np.zeros(lead + (2 if fraction > 0 else 1))
+    taps = np.zeros(lead + 1 + (fraction > 0))
     taps[lead] = 1 - fraction
-    if fraction > 0:
-        taps[lead + 1] = fraction
+    taps[lead + 1 :] = fraction
     return MirrorSystem(
         whole=tapped_mirror(taps),
         core=tapped_mirror(taps[lead:]),
@@ -134,12 +133,12 @@ def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
         )
     samples = round(ratio)
     if samples < 1 or abs(ratio - samples) > _WHOLE * ratio:
-        low, high = int(np.floor(ratio)), int(np.floor(ratio)) + 1
-        fitting = [loop.sampling_hz / n for n in (high, low) if n > 0]
+        counts = [n for n in (int(ratio) + 1, int(ratio)) if n > 0]
+        fitting = " and ".join(f"{loop.sampling_hz / n:.9g}" for n in counts)
         raise ProblemError(
             "the local loop of the mirror must run a whole number of samples per frame; got "
             f"{loop.sampling_hz:.9g} Hz over {frame_rate_hz:.9g} Hz = {ratio:.9g}. Frame rates "
-            f"that fit are {' and '.join(f'{rate:.9g}' for rate in fitting)} Hz."
+            f"that fit are {fitting} Hz."
         )
     if loop.ramp_samples > samples:
         raise ProblemError(
@@ -205,20 +204,19 @@ def _delay(core: Response, lead: int) -> Response:
     """Delay the output of a core by ``lead`` frames."""
     if not lead:
         return core
-    n = core.n_states
-    A, B, C = np.eye(n + lead, k=-1), np.zeros(n + lead), np.zeros(n + lead)
-    A[: n + 1], B[:n] = 0.0, core.B
-    A[:n, :n] = core.A
-    A[n, :n], B[n], C[-1] = core.C, core.D, 1.0
-    return Response(A=A, B=B, C=C, D=0.0)
+    n, late = core.n_states, np.eye(lead)[0]
+    return Response(
+        A=np.block([[core.A, np.zeros((n, lead))], [np.outer(late, core.C), np.eye(lead, k=-1)]]),
+        B=np.concatenate([core.B, core.D * late]),
+        C=np.concatenate([np.zeros(n), np.eye(lead)[-1]]),
+        D=0.0,
+    )
 
 
 def tapped_mirror(taps: FloatArray) -> Response:
     """System with an impulse response; its states are the past commands."""
     n = len(taps) - 1
-    B = np.zeros(n)
-    B[:1] = 1.0
-    return Response(A=np.eye(n, k=-1), B=B, C=frozen_copy(taps[1:]), D=float(taps[0]))
+    return Response(A=np.eye(n, k=-1), B=np.eye(n, 1)[:, 0], C=taps[1:], D=float(taps[0]))
 
 
 def _balance(core: Response) -> Response:
