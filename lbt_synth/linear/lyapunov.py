@@ -43,12 +43,11 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
         return np.asarray(squared[0])
     with warnings.catch_warnings():
         # from states of very different sizes; the residual is measured below
-        warnings.simplefilter("ignore", LinAlgWarning)
-        warnings.simplefilter("ignore", RuntimeWarning)
+        warnings.simplefilter("ignore", (LinAlgWarning, RuntimeWarning))
         X = solve_discrete_lyapunov(A, Q)
         X = X + solve_discrete_lyapunov(A, A @ X @ A.T - X + Q)
-    other: FloatArray = np.asarray((X + X.T) / 2, dtype=np.float64)
-    return np.asarray(squared[0]) if residuals[0] <= lyapunov_residual(A, Q, other) else other
+    X = symmetrise(np.asarray(X, dtype=np.float64))
+    return np.asarray(squared[0]) if residuals[0] <= lyapunov_residual(A, Q, X) else X
 
 
 def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -81,7 +80,7 @@ def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:
     return float(np.linalg.norm(AXA - X + Q, 1) / scale) if scale > 0 else 0.0
 
 
-def smith_sum(A: FloatArray, Q: FloatArray, *, max_steps: int = 60) -> FloatArray:
+def smith_sum(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Sum ``A^i Q A'^i`` over all i by squaring, for a stack of matrices.
 
     R. A. Smith, SIAM J. Appl. Math. 16, 198 (1968), doi:10.1137/0116017. Not finite where A is
@@ -96,7 +95,7 @@ def smith_sum(A: FloatArray, Q: FloatArray, *, max_steps: int = 60) -> FloatArra
     """
     X = Q
     with np.errstate(all="ignore"):
-        for _ in range(max_steps):
+        for _ in range(60):
             X = X + A @ X @ transpose(A)
             A = A @ A
             size = frobenius_norms(A)

@@ -26,10 +26,8 @@ class ARModel:
     ----------
     coefficients : (order,) array_like
         a1, a2, ...
-    driving_rms_nm : float
-        Standard deviation of the white noise v [nm].
-    frame_rate_hz : float
-        Sampling frequency [Hz].
+    driving_rms_nm, frame_rate_hz : float
+        Standard deviation of the white noise v [nm]; sampling frequency [Hz].
 
     Raises
     ------

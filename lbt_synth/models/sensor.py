@@ -59,18 +59,11 @@ def pyramid_tilt_noise_nm(
 
     Parameters
     ----------
-    photons : float
-        Photons per subaperture and frame.
-    read_noise_electrons : float
-        Read noise [electrons rms per pixel].
-    modulation_lambda_over_d : float
-        Modulation radius [lambda/D].
-    subapertures : float
-        Number of illuminated subapertures.
-    wavelength_um : float
-        Sensing wavelength [um].
-    diameter_m : float
-        Telescope diameter [m].
+    photons, read_noise_electrons, modulation_lambda_over_d : float
+        Photons per subaperture and frame; read noise [electrons rms per pixel]; modulation radius
+        [lambda/D].
+    subapertures, wavelength_um, diameter_m : float
+        Number of illuminated subapertures; sensing wavelength [um]; telescope diameter [m].
 
     Returns
     -------

@@ -28,10 +28,8 @@ class TabulatedSpectrum:
 
     Parameters
     ----------
-    frequency_hz : (f,) array_like
-        Increasing frequencies [Hz].
-    density_nm2_hz : (f,) array_like
-        Spectrum [nm^2/Hz], at least 0.
+    frequency_hz, density_nm2_hz : (f,) array_like
+        Increasing frequencies [Hz]; spectrum [nm^2/Hz], at least 0.
 
     Raises
     ------

@@ -42,34 +42,22 @@ class EndToEndSystem:
     hardware : LoopHardware
         Frame rate and delay, or the response of a slow mirror; its sensor and influence
         matrices are the identity, because the optics replace them.
-    diameter_m : float
-        Telescope diameter [m].
-    obstruction : float
-        Diameter of the central obstruction as a fraction of the telescope's.
-    seeing_arcsec : float
-        Seeing at ``seeing_wavelength_um`` [arcsec].
-    outer_scale_m : float
-        Outer scale [m].
-    wind_speed_m_s : float
-        Speed of the one layer [m/s].
-    sensing_wavelength_um : float
-        Wavelength of the pyramid [um].
+    diameter_m, obstruction, seeing_arcsec : float
+        Telescope diameter [m]; diameter of the central obstruction as a fraction of the
+        telescope's; seeing at ``seeing_wavelength_um`` [arcsec].
+    outer_scale_m, wind_speed_m_s, sensing_wavelength_um : float
+        Outer scale [m]; speed of the one layer [m/s]; wavelength of the pyramid [um].
     modulation_lambda_over_d : float
         Radius of its modulation [lambda/D].
     subapertures_across : int
         Subapertures across the pupil.
-    photons : float
-        Photons per subaperture and frame.
-    read_noise_electrons : float
-        Read noise per pixel [electrons].
-    modes : int, optional
-        Controlled modes of the mirror, tip and tilt first.
-    actuators_across : int, optional
-        Actuators across the mirror, in concentric rings.
-    seeing_wavelength_um : float, optional
-        Wavelength of the seeing [um].
-    imaging_wavelength_um : float, optional
-        Wavelength of the camera [um].
+    photons, read_noise_electrons : float
+        Photons per subaperture and frame; read noise per pixel [electrons].
+    modes, actuators_across : int, optional
+        Controlled modes of the mirror, tip and tilt first; actuators across the mirror, in
+        concentric rings.
+    seeing_wavelength_um, imaging_wavelength_um : float, optional
+        Wavelength of the seeing [um]; wavelength of the camera [um].
     wind_direction_deg : float, optional
         Direction in which the layer moves [degrees]; 0 is along tip.
     pixels : int, optional

@@ -170,9 +170,7 @@ def solve_dare(
 
 def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     """Solve a stack, verify each answer, and put the leading dimensions back."""
-    factors = equations.normalising_factors()
-    units = equations.balancing_units()
-    balanced = equations.divide_weights(factors).change_units(units)
+    balanced, factors, units = equations.scaled()
     best, attempts = _try_routes(balanced)
     radius = np.abs(best.poles).max(axis=-1)
 

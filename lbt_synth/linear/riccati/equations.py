@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -49,25 +49,26 @@ class Equations:
         """Return some of the equations."""
         return Equations(**{name: getattr(self, name)[which] for name in "ABQRS"})
 
-    def normalising_factors(self) -> FloatArray:
-        """Powers of two by which to divide Q, R and S so that the largest is of size one, (N,)."""
+    def scaled(self) -> tuple[Equations, FloatArray, FloatArray]:
+        """Divide the weights by factors (N,), the states by units (N, n), all powers of two.
+
+        The largest of Q, R and S is then of size one, and X is divided by the same factor.
+        """
         sizes = [np.max(np.abs(part), axis=(-2, -1)) for part in (self.Q, self.R, self.S)]
-        largest = np.max(np.stack(sizes), axis=0)
-        exponents = np.round(np.log2(np.where(largest > 0, largest, 1.0)))
-        return np.asarray(np.exp2(exponents), dtype=np.float64)
-
-    def divide_weights(self, factors: FloatArray) -> Equations:
-        """Divide the weights of each equation by its factor, and with them its X."""
-        f = factors[:, None, None]
-        return replace(self, Q=self.Q / f, R=self.R / f, S=self.S / f)
-
-    def change_units(self, units: FloatArray) -> Equations:
-        """Change to states ``x_i / units_i``, (N, n); exact for powers of two."""
+        largest = np.max(sizes, axis=0)
+        factors = np.exp2(np.round(np.log2(np.where(largest > 0, largest, 1.0))))
+        f, units = factors[:, None, None], self._balancing_units()
         column, row = units[:, None, :], units[:, :, None]
-        Q = self.Q * column * row
-        return replace(self, A=self.A * column / row, B=self.B / row, Q=Q, S=self.S * row)
+        scaled = Equations(
+            A=self.A * column / row,
+            B=self.B / row,
+            Q=self.Q / f * column * row,
+            R=self.R / f,
+            S=self.S / f * row,
+        )
+        return scaled, factors, units
 
-    def balancing_units(self) -> FloatArray:
+    def _balancing_units(self) -> FloatArray:
         """Powers of two that make rows and columns of A, bordered by B and Q, alike, (N, n)."""
         off = np.abs(self.A) * (1 - np.eye(self.A.shape[-1]))
         scale = np.maximum(np.abs(self.A).max(axis=(-2, -1)), 1e-300)[:, None]

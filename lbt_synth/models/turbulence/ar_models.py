@@ -28,12 +28,8 @@ def le_roux_pole(
 
     Parameters
     ----------
-    wind_speed_m_s : float
-        Wind speed V [m/s].
-    diameter_m : float
-        Telescope diameter D [m].
-    frame_rate_hz : float
-        Sampling frequency f_s [Hz].
+    wind_speed_m_s, diameter_m, frame_rate_hz : float
+        Wind speed V [m/s]; telescope diameter D [m]; sampling frequency f_s [Hz].
     radial_order : int, optional
         Radial order n of the Zernike mode; 1 for tip and tilt.
 

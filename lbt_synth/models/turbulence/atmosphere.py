@@ -35,14 +35,10 @@ class Atmosphere:
         Seeing (full width at half maximum) at ``seeing_wavelength_um`` [arcsec].
     outer_scale_m : float or None
         Outer scale L0 [m]; None for Kolmogorov turbulence, L0 infinite.
-    wind_speed_m_s : float
-        Speed of the layer [m/s].
-    diameter_m : float
-        Telescope diameter D [m].
-    obstruction : float, optional
-        Diameter of the central obstruction as a fraction of D.
-    seeing_wavelength_um : float, optional
-        Wavelength of the seeing [um].
+    wind_speed_m_s, diameter_m : float
+        Speed of the layer [m/s]; telescope diameter D [m].
+    obstruction, seeing_wavelength_um : float, optional
+        Diameter of the central obstruction as a fraction of D; wavelength of the seeing [um].
 
     Raises
     ------
