@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from lbt_synth.identification.stretches import split_halves
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.plant_inputs import PlantInputs
 from lbt_synth.methods.registry import record_methods, reference_methods
-from lbt_synth.methods.request import design_request
+from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
@@ -140,29 +141,18 @@ def design_from_record(
             "record.with_delay(...)."
         )
     require_length(record)
-
     step = progress or (lambda _: None)
-    found: dict[str, Any] = {
-        "sensor_gain": sensor_gain,
-        "assumed_gain": assumed_gain,
-        "announced": announced,
-        **options,
-    }
-    fit, test = split_halves(record.stretches(), record.frames)
-    half = identify(record, stretches=fit, **found)
-    step(1)
-    plant = half.plant()
+    gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
+    fit_model = partial(identify, record, announced=announced, **gains, **options)
     request = design_request(chosen, {})
-
-    def design_for(model: IdentifiedModel) -> Design:
-        plant = PlantInputs(plant=model.plant(), design_defaults={"gamma_ratio": gamma_ratio})
-        return request.build(plant)
-
+    fit, test = split_halves(record.stretches(), record.frames)
+    half = fit_model(stretches=fit)
+    step(1)
     name = request.method.title
     held_out = prediction_against_data(
-        plant,
+        half.plant(),
         record.pseudo_open_loop(half.sensor_gains),
-        {name: design_for(half)},
+        {name: _design(request, half, gamma_ratio)},
         fit=fit,
         test=test,
         measurements=None if record.commands is None else record.measurements,
@@ -171,8 +161,8 @@ def design_from_record(
         taps=taps,
     )
     step(1)
-    model = identify(record, start=half, **found)
-    design = design_for(model)
+    model = fit_model(start=half)
+    design = _design(request, model, gamma_ratio)
     step(1)
     return RecordedDesign(
         model=model,
@@ -182,6 +172,11 @@ def design_from_record(
         name=name,
         notes=_check_gains(model, half, design),
     )
+
+
+def _design(request: DesignRequest, model: IdentifiedModel, gamma_ratio: float) -> Design:
+    defaults = {"gamma_ratio": gamma_ratio}
+    return request.build(PlantInputs(plant=model.plant(), design_defaults=defaults))
 
 
 def _check_gains(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ import io
 import json
 import warnings
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -96,9 +97,9 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     images = {}
     for name, data in _arrays(seen).items():
         # series have a clock, and the precision that was chosen
-        kind, time = (precision, clock) if name in units else ("float64", None)
+        digits, time = (precision, clock) if name in units else ("float64", None)
         text, unit = name.upper().replace("_", " "), units.get(name) or None
-        images[name] = aotpy.Image(text, data.astype(kind), unit=unit, time=time)
+        images[name] = aotpy.Image(text, data.astype(digits), unit=unit, time=time)
     sensor = aotpy.Pyramid(
         "Pyramid",
         source=star,
@@ -108,18 +109,9 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         measurements=images.pop("measurements"),
         optical_gain=images.pop("optical_gain", None),
     )
-    cameras = []
-    if seen.psf is not None:
-        pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
-        detector = aotpy.Detector(
-            "Camera detector", pixel_intensities=images.pop("psf"), pixel_scale=pixel
-        )
-        camera = aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))
-        cameras.append(camera)
-    if m == 2:
-        mirror = aotpy.TipTiltMirror("Mirror", telescope=telescope)
-    else:
-        mirror = aotpy.DeformableMirror("Mirror", telescope=telescope, n_valid_actuators=m)
+    cameras = _cameras(aotpy, seen, images.pop("psf", None))
+    kind = aotpy.TipTiltMirror if m == 2 else partial(aotpy.DeformableMirror, n_valid_actuators=m)
+    mirror = kind("Mirror", telescope=telescope)
     loop = aotpy.ControlLoop(
         "Control loop",
         input_sensor=sensor,
@@ -143,6 +135,15 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
         loops=[loop],
         metadata=_header_cards(aotpy, seen),
     )
+
+
+def _cameras(aotpy: Any, seen: Telemetry, picture: Any) -> list[Any]:
+    """Return the camera that took the image, if there is one."""
+    if picture is None:
+        return []
+    pixel = None if seen.psf_pixel_mas is None else seen.psf_pixel_mas * _RAD_PER_MAS
+    detector = aotpy.Detector("Camera detector", pixel_intensities=picture, pixel_scale=pixel)
+    return [aotpy.ScoringCamera("Camera", detector=detector, wavelength=_wavelength_m(seen))]
 
 
 def _units(seen: Telemetry) -> dict[str, str]:

@@ -91,40 +91,16 @@ def record_from_telemetry(
     True
     """
     require_instance(telemetry, Telemetry)
-    n, is_foreign = telemetry.modes, _FOREIGN in telemetry.metadata
+    n = telemetry.modes
     chosen = choose_axes(modes, "modes", n, "modes")
     facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
-    columns: dict[str, list[Column]] = {}
-    for role, series, matrix, word, own in (
-        (
-            "measurements",
-            telemetry.measurements,
-            _inverse_response(telemetry),
-            "the inverse of the interaction matrix",
-            telemetry.measurement_unit,
-        ),
-        (
-            "commands",
-            telemetry.commands,
-            _influence(telemetry),
-            "the influence matrix",
-            telemetry.command_unit,
-        ),
-    ):
-        known, said = unit_name(own), f"in {own!r}"
-        if matrix is not None:
-            series, said = series @ matrix.T, f"behind {word}"
-            known = "nm" if known or not is_foreign else None  # our own modes are in nm
-            contents.notes.append(f"{role}: {word} times what was recorded")
-        columns[role] = [
-            Column(name=f"mode {k} {said}", values=series[:, k], unit=known) for k in chosen
-        ]
+    columns = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in _MATRICES}
     if telemetry.times_s is not None:
         columns["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
     if max(n, telemetry.measurements.shape[1], telemetry.commands.shape[1]) > len(chosen):
         contents.notes.append(f"axes are modes {', '.join(map(str, chosen))} of {n}")
-    if is_foreign:
+    if _FOREIGN in telemetry.metadata:
         contents.notes.append(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
@@ -141,6 +117,19 @@ def record_from_telemetry(
         source=(telemetry.name or "telemetry") if source is None else source,
     )
     return cast(LoopRecord, record)
+
+
+def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[str]) -> list[Column]:
+    """Return the measurements or the commands of the chosen modes."""
+    own = seen.measurement_unit if role == "measurements" else seen.command_unit
+    series, unit, said = getattr(seen, role), unit_name(own), f"in {own!r}"
+    find, word = _MATRICES[role]
+    if (matrix := find(seen)) is not None:
+        series, said = series @ matrix.T, f"behind {word}"
+        # the modes of our own telemetry are in nm
+        unit = "nm" if unit or _FOREIGN not in seen.metadata else None
+        notes.append(f"{role}: {word} times what was recorded")
+    return [Column(name=f"mode {k} {said}", values=series[:, k], unit=unit) for k in chosen]
 
 
 def _inverse_response(seen: Telemetry) -> FloatArray | None:
@@ -174,3 +163,9 @@ def _influence(seen: Telemetry) -> FloatArray | None:
         )
     is_identity = influence is None or np.array_equal(influence, np.eye(n))
     return None if is_identity else influence
+
+
+_MATRICES = {  # from what was recorded to modes
+    "measurements": (_inverse_response, "the inverse of the interaction matrix"),
+    "commands": (_influence, "the influence matrix"),
+}
