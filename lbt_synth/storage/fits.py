@@ -46,17 +46,14 @@ def fits_bytes(
     from astropy.io import fits
 
     primary = fits.PrimaryHDU()
-    units = [primary]
-    units += [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
+    primary.header.update(cards)
+    for line in comments:
+        primary.header.add_comment(line)
+    units = [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
     for unit in units:
-        own = cards if unit is primary else (headers or {}).get(unit.name, {})
-        for key, value in own.items():
-            unit.header[key] = value
-        for line in comments if unit is primary else ():
-            unit.header.add_comment(line)
-        unit.add_checksum(
-            when="of this unit"
-        )  # instead of the time, so that equal contents give equal files
+        unit.header.update((headers or {}).get(unit.name, {}))
+    for unit in (primary, *units):  # instead of the time, so that equal contents give equal files
+        unit.add_checksum(when="of this unit")
     buffer = io.BytesIO()
-    fits.HDUList(units).writeto(buffer)
+    fits.HDUList([primary, *units]).writeto(buffer)
     return buffer.getvalue()

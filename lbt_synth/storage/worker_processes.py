@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -27,21 +27,16 @@ class WorkerPool:
 
     def __init__(self, workers: int) -> None:
         self._others: set[BaseProcess] = set(multiprocessing.active_children())
-        self._pool = ProcessPoolExecutor(
+        self.executor = ProcessPoolExecutor(
             workers,
             mp_context=multiprocessing.get_context("spawn"),
             initializer=_watch_parent,
             initargs=(os.getpid(),),
         )
 
-    @property
-    def executor(self) -> Executor:
-        """The executor."""
-        return self._pool
-
     def close(self) -> None:
         """Wait for what is running, and end."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self.executor.shutdown(wait=True, cancel_futures=True)
 
     def kill(self) -> None:
         """End at once, without waiting for what is running."""

@@ -229,6 +229,13 @@ class Telemetry:
         return self.measurements if self.slopes is None else self.slopes
 
     @property
+    def modal_response(self) -> FloatArray | None:
+        """Response of the measurements to the modes, behind a reconstructor of slopes."""
+        if self.slopes is None or self.interaction_matrix is None:
+            return self.interaction_matrix
+        return None if self.reconstructor is None else self.reconstructor @ self.interaction_matrix
+
+    @property
     def mirror_taps(self) -> FloatArray | None:
         """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``, if there is a mirror."""
         if self.mirror is None or self.delay_frames is None:
@@ -254,11 +261,7 @@ class Telemetry:
         if self.delay_frames is None:
             raise ProblemError("this telemetry does not tell the delay of its loop.")
         n, q, m = self.modes, self.measurements.shape[1], self.commands.shape[1]
-        sensor, influence = self.interaction_matrix, self.influence_matrix
-        if self.slopes is not None and sensor is not None:
-            sensor = (
-                None if self.reconstructor is None else frozen_copy(self.reconstructor @ sensor)
-            )
+        sensor, influence = self.modal_response, self.influence_matrix
         for what, name, missing, size in (
             ("measurements", "interaction", sensor is None, q),
             ("commands", "influence", influence is None, m),

@@ -7,7 +7,7 @@ filter times a constant row: ``H_i(z) = f_i(z) k_i``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,7 @@ _SAME = 1e-8  # largest difference, relative to the response at each frequency
 _NOTHING = 1e-14  # entries smaller than this part of the largest count as zero
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TimeFilters:
+class TimeFilters(NamedTuple):
     """Scalar filters after a constant matrix."""
 
     matrix: FloatArray  # from measurements to filter inputs, (m, q); 1 is each row's largest entry

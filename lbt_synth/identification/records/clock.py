@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,13 +30,12 @@ _BLOCKS = 16  # of rows, whose mean distance from the grid is compared
 _SEARCH = 60
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Clock:
+class Clock(NamedTuple):
     """Where each row of a record lies."""
 
     frame_rate_hz: float
     frame_of_row: IntArray  # (rows,), from 0, never falling; equal for rows of the same time
-    notes: tuple[str, ...] = ()
+    notes: list[str]
 
 
 def build_clock(
@@ -71,7 +70,7 @@ def build_clock(
             notes += _compare_rates(rate, found, times, frame)
     if rate is None:
         raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
-    return Clock(frame_rate_hz=rate, frame_of_row=frame, notes=tuple(notes))
+    return Clock(rate, frame, notes)
 
 
 def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:

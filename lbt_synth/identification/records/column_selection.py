@@ -200,14 +200,13 @@ def _require_same_axes(chosen: Roles) -> None:
     """Refuse measurements of one axis with commands of another."""
     y, u = chosen["measurements"], chosen["commands"]
     mine, theirs = ([each.axis for each in own] for own in (y, u))
-    from_one = [mine, theirs] in ([[0, 1], [1, 2]], [[1, 2], [0, 1]])  # one counts from 1
-    if None in (*mine, *theirs) or len(mine) != len(theirs) or mine == theirs or from_one:
-        return
-    raise ProblemError(
-        f"measurements and commands must be of the same axes; got {join_names(y)} with "
-        f"{join_names(u)}. Choose by columns={{'measurements': ..., 'commands': ...}} if they do "
-        "belong together."
-    )
+    from_one = sorted([mine, theirs], key=str) == [[0, 1], [1, 2]]  # one of them counts from 1
+    if None not in (*mine, *theirs) and len(y) == len(u) and mine != theirs and not from_one:
+        raise ProblemError(
+            f"measurements and commands must be of the same axes; got {join_names(y)} with "
+            f"{join_names(u)}. Choose by columns={{'measurements': ..., 'commands': ...}} if they "
+            "do belong together."
+        )
 
 
 def join_names(columns: Sequence[Column]) -> str:

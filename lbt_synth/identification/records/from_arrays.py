@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from lbt_synth.identification.records.faults import (
     mark,
     runs,
 )
-from lbt_synth.identification.records.health import Finding, RecordHealth, finding_in, merge_notes
+from lbt_synth.identification.records.health import Finding, RecordHealth, findings_in, merge_notes
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.units import nm_per
 from lbt_synth.models import PositionLoop
@@ -130,7 +130,7 @@ def loop_record(
     commanded = np.ones(frames, dtype=np.bool_)
     if u is not None:
         u, commanded = _judge_series(rows[:, axes:], there, "commands", _COMMANDED, findings)
-        _report_held(u, commanded, findings)
+        findings += _held_commands(u, commanded)
     said += _note_trends(y, measured)
     record = LoopRecord(
         frame_rate_hz=clock.frame_rate_hz,
@@ -181,8 +181,8 @@ def _lay_on_grid(
     differs = ~np.all((rows == earlier) | (np.isnan(rows) & np.isnan(earlier)), axis=1)
     there, torn = np.zeros((2, frame[-1] + 1), dtype=np.bool_)
     there[frame], torn[frame[differs]] = True, True
-    _report(findings, "missing", "frames", None, ~there)
-    _report(findings, "repeated", "frames", None, torn)
+    findings += findings_in(~there, "missing", "frames")
+    findings += findings_in(torn, "repeated", "frames")
     if again := len(rows) - len(first):
         said.append(f"{again} rows of a time that had been recorded already were left out")
     out = np.full((len(there), rows.shape[1]), np.nan)
@@ -197,27 +197,14 @@ def _judge_series(
     out, all_good = np.empty(series.shape), np.ones(len(series), dtype=np.bool_)
     for axis, column in enumerate(series.T):
         good = there & np.isfinite(column)
-        _report(findings, "not finite", name, axis, there & ~good)
+        findings += findings_in(there & ~good, "not finite", name, axis)
         for kind, finder in finders:
             found = finder(np.where(np.isfinite(column), column, 0.0), good)
-            _report(findings, kind, name, axis, found)
+            findings += findings_in(found, kind, name, axis)
             good &= ~found
         out[:, axis] = fill(column, good)
         all_good &= good
     return out, all_good
-
-
-def _report(
-    findings: list[Finding],
-    kind: str,
-    series: str,
-    axis: int | None,
-    found: BoolArray,
-    *,
-    spoils: bool = True,
-) -> None:
-    if found.any():
-        findings.append(finding_in(found, kind, series, axis, spoils=spoils))
 
 
 def _find_clipped(series: FloatArray, good: BoolArray) -> BoolArray:
@@ -233,14 +220,14 @@ _MEASURED: Finders = (
 _COMMANDED: Finders = (("saturated", _find_clipped),)
 
 
-def _report_held(commands: FloatArray, good: BoolArray, findings: list[Finding]) -> None:
-    """Report where the loop was open, and where its commands stood still."""
+def _held_commands(commands: FloatArray, good: BoolArray) -> Iterator[Finding]:
+    """Yield where the loop was open, and where its commands stood still."""
     frames, is_zero = len(commands), np.all(commands == 0, axis=1)
     is_open = mark(_longest(runs(is_zero & good)), frames)
-    _report(findings, "loop open", "commands", None, is_open, spoils=False)
+    yield from findings_in(is_open, "loop open", "commands", spoils=False)
     for axis, column in enumerate(commands.T):
-        held = mark(_longest(equal_runs(column, good)), frames)
-        _report(findings, "held", "commands", axis, held & ~is_open, spoils=False)
+        held = mark(_longest(equal_runs(column, good)), frames) & ~is_open
+        yield from findings_in(held, "held", "commands", axis, spoils=False)
 
 
 def _longest(stretches: IntArray) -> IntArray:

@@ -134,9 +134,7 @@ def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[st
 
 def _inverse_response(seen: Telemetry) -> FloatArray | None:
     """Return the matrix from measurements to modes, None for the identity."""
-    n, q, response = seen.modes, seen.measurements.shape[1], seen.interaction_matrix
-    if seen.slopes is not None and response is not None:
-        response = None if seen.reconstructor is None else seen.reconstructor @ response
+    n, q, response = seen.modes, seen.measurements.shape[1], seen.modal_response
     if (response is None and q != n) or (response is not None and q > n > 2):
         raise ProblemError(
             f"this telemetry has {q} measurements and {f'{n} modes' if n != q else 'no modes'}: "

@@ -103,12 +103,14 @@ class RecordHealth:
         return f"{text}; {', '.join(spoilt)}." if spoilt else f"{text}."
 
 
-def finding_in(
-    found: BoolArray, kind: str, series: str, axis: int | None, *, spoils: bool
-) -> Finding:
-    """Return the finding of a fault in some frames, (frames,), at least one."""
+def findings_in(
+    found: BoolArray, kind: str, series: str, axis: int | None = None, *, spoils: bool = True
+) -> tuple[Finding, ...]:
+    """Return the finding of a fault in some frames, (frames,); none where there are none."""
     where = np.flatnonzero(found)
-    return Finding(
+    if not where.size:
+        return ()
+    only = Finding(
         kind=kind,
         series=series,
         axis=axis,
@@ -117,6 +119,7 @@ def finding_in(
         fraction=where.size / len(found),
         spoils=spoils,
     )
+    return (only,)
 
 
 def merge_notes(*parts: Sequence[str]) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.records.faults import runs
-from lbt_synth.identification.records.health import RecordHealth, finding_in, merge_notes
+from lbt_synth.identification.records.health import RecordHealth, findings_in, merge_notes
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import (
@@ -253,8 +253,7 @@ class LoopRecord:
             unknown = np.convolve(spoilt, [0, *(path.mirror_taps != 0)])[: self.frames] > 0
             unknown[: len(path.mirror_taps)] = True  # commands before the record
             usable = measured & ~unknown
-            found = finding_in(unknown, _NOT_KNOWN, "frames", None, spoils=True)
-            findings = (*findings, found)
+            findings += findings_in(unknown, _NOT_KNOWN, "frames")
         health = replace(self.health, usable=int(np.sum(usable)), findings=findings, bridged=0)
         return replace(
             self,
@@ -313,14 +312,11 @@ class LoopRecord:
         count = int(np.sum(lengths[chosen]))
         if not count:
             return self
-        measurements = self.measurements.copy()
-        new = usable & ~self.usable
-        gains = self._gains(sensor_gain)
-        measurements[new] = (gains * (series - self.corrections()))[new]
-        left = int(np.sum(lengths <= longest)) - len(chosen)
-        note = f"{count} frames in {len(chosen)} holes of at most {longest} were interpolated" + (
-            f"; {left} more such holes were left, beyond {100 * part:g} %" if left else ""
-        )
+        new = (usable & ~self.usable)[:, None]
+        back = self._gains(sensor_gain) * (series - self.corrections())
+        note = f"{count} frames in {len(chosen)} holes of at most {longest} were interpolated"
+        if left := int(np.sum(lengths <= longest)) - len(chosen):
+            note += f"; {left} more such holes were left, beyond {100 * part:g} %"
         health = replace(
             self.health,
             usable=int(np.sum(usable)),
@@ -328,10 +324,9 @@ class LoopRecord:
             notes=merge_notes(self.health.notes, [note]),
         )
         # a measurement that was replaced is none of another delay
-        measured = (self.usable if self.measured is None else self.measured) & ~new
-        return replace(
-            self, measurements=measurements, usable=usable, measured=measured, health=health
-        )
+        measured = (self.usable if self.measured is None else self.measured) & ~new[:, 0]
+        y = np.where(new, back, self.measurements)
+        return replace(self, measurements=y, usable=usable, measured=measured, health=health)
 
 
 def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:

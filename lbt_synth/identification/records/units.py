@@ -17,15 +17,16 @@ _MAS = {
     "rad": math.degrees(1.0) * 3600e3,
 }
 UNITS = (*_NM, *_MAS)
-_ALIASES = {
-    **dict.fromkeys(("nanometer", "nanometre"), "nm"),
-    **dict.fromkeys(("micron", "micrometer", "micrometre", "µm", "μm"), "um"),
-    **dict.fromkeys(("meter", "metre"), "m"),
-    **dict.fromkeys(("µrad", "μrad", "microrad"), "urad"),
-    "radian": "rad",
-    **dict.fromkeys(("arcsecond", "asec", '"'), "arcsec"),
-    **dict.fromkeys(("milliarcsec", "milliarcsecond"), "mas"),
+_OTHER_NAMES = {
+    "nm": "nanometer nanometre",
+    "um": "micron micrometer micrometre µm μm",
+    "m": "meter metre",
+    "urad": "µrad μrad microrad",
+    "rad": "radian",
+    "arcsec": 'arcsecond asec "',
+    "mas": "milliarcsec milliarcsecond",
 }
+_ALIASES = {other: unit for unit, names in _OTHER_NAMES.items() for other in names.split()}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _HERTZ = {"hz": 1.0, "khz": 1e3, "mHz": 1e-3, "MHz": 1e6}  # capitals matter where both exist
 _CLOCK_UNITS = {*_SECONDS, *(word.lower() for word in _HERTZ)}
