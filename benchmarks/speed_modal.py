@@ -7,7 +7,7 @@ import scipy.linalg
 from harness import Row, paired, seconds, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.design.modal.plants import lines_per_mode, plant_batches
+from lbt_synth.design.modal.plants import ModalModels
 from lbt_synth.loop.simulation.run import step_loop
 
 RATE_HZ = 800.0
@@ -96,13 +96,7 @@ def designs() -> dict[int, Row]:
     rows = {}
     for count in (42, 168, 672, 2688):
         air = turbulence(count)
-        (stack,) = plant_batches(
-            air,
-            lines_per_mode(None, count),
-            noise_nm=np.full(count, NOISE_NM),
-            delay_frames=2.0,
-            sensor_gain=np.ones(count),
-        )
+        (stack,) = ModalModels.of(air, NOISE_NM, None).plants(2.0, np.ones(count))
 
         def peer(stack=stack, count=count) -> None:
             for i in range(count):

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lbt_synth.design.modal.banks import Bank
-from lbt_synth.design.modal.plants import Lines, disturbances
+from lbt_synth.design.modal.plants import ModalModels
 from lbt_synth.linear.batched import transpose
 from lbt_synth.linear.block_filtering import BatchedSystems
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.loop.closed_loop import loop_matrices
-from lbt_synth.models import ModalTurbulence
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.validation import FloatArray
 
@@ -56,30 +55,28 @@ class LoopBlock:
         """Spectral radius of each loop, (N,)."""
         return spectral_radii(self.A)
 
-    def variances(
-        self, turbulence: ModalTurbulence, lines: Lines, noise_nm: FloatArray
-    ) -> LoopVariances:
+    def variances(self, models: ModalModels) -> LoopVariances:
         """Exact variances under models and white noise: Lyapunov equations of loops and models.
 
         The variances are small differences where a process is nearly a random walk.
         """
         count, w = self.modes.shape
         n = self.A.shape[-1]
-        models, drives, rows = disturbances(turbulence, lines, self.modes.ravel())
+        systems, drives, rows = models.disturbances(self.modes.ravel())
         k, p = drives.shape[1:]
-        models, drives = models.reshape(count, w, k, k), drives.reshape(count, w, k, p)
+        systems, drives = systems.reshape(count, w, k, k), drives.reshape(count, w, k, p)
         rows = rows.reshape(count, w, 1, k)
         A = np.zeros((count, n + w * k, n + w * k))
         B = np.zeros((count, n + w * k, w + w * p))
         C, D = np.zeros((count, w, n + w * k)), np.zeros((count, w, w + w * p))
-        noise = noise_nm[self.modes][:, None, :]
+        noise = models.noise_nm[self.modes][:, None, :]
         A[:, :n, :n], C[..., :n] = self.A, self.C[:, :w]
         B[:, :n, :w], D[..., :w] = self.B[..., w:] * noise, self.D[:, :w, w:] * noise
         for i in range(w):
             x, v = slice(n + i * k, n + (i + 1) * k), slice(w + i * p, w + (i + 1) * p)
             A[:, :n, x] = self.B[..., i : i + 1] @ rows[:, i]
             C[..., x] = self.D[:, :w, i : i + 1] @ rows[:, i]
-            A[:, x, x], B[:, x, v] = models[:, i], drives[:, i]
+            A[:, x, x], B[:, x, v] = systems[:, i], drives[:, i]
         P, residuals = stationary_covariances(A, B @ transpose(B))
         output = C @ P @ transpose(C) + D @ transpose(D)
         variances = np.diagonal(output, axis1=-2, axis2=-1).copy()

@@ -23,12 +23,10 @@ from lbt_synth.design.modal.banks import Bank, RunningBanks
 from lbt_synth.design.modal.closed_loops import LoopBlock, LoopVariances, close_bank, spectral_radii
 from lbt_synth.design.modal.plants import (
     Lines,
+    ModalModels,
     PlantBatch,
     Vibrations,
-    as_modal_turbulence,
-    lines_per_mode,
     number_per_mode,
-    plant_batches,
 )
 from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import DetectabilityError, NumericalError
@@ -227,15 +225,13 @@ def modal_filters(
     >>> filters.rms_nm.round(1).tolist(), filters.certificate.passed
     ([135.9, 30.6], True)
     """
-    air = as_modal_turbulence(turbulence)
-    n, rate = air.n_modes, air.frame_rate_hz
-    noise = number_per_mode(noise_nm, "noise_nm", n)
+    models = ModalModels.of(turbulence, noise_nm, vibrations)
+    n, rate = models.turbulence.n_modes, models.turbulence.frame_rate_hz
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
     hardware = LoopHardware(frame_rate_hz=rate, delay_frames=delay_frames, modes=1, mirror=mirror)
-    lines = lines_per_mode(vibrations, n)
     delay, response = hardware.delay_frames, hardware.mirror_system.whole
     applied = mirror is None and delay >= 2 and delay == int(delay)
-    batches = plant_batches(air, lines, noise_nm=noise, delay_frames=delay, sensor_gain=gain)
+    batches = models.plants(delay, gain)
     states = np.zeros(n, dtype=np.int64)
     errors, residual_nm2, estimation_nm2 = np.zeros((8, n)), np.zeros(n), np.zeros(n)
     parts = []
@@ -244,7 +240,7 @@ def modal_filters(
         gains = np.array(transpose(solution.gain_feedback))
         matrices = batch.controllers(gains, response)
         block = close_bank(Bank(modes[:, None], *matrices), gain, response)
-        left = block.variances(air, lines, noise)
+        left = block.variances(models)
         found = batch_errors(batch, gains, solution, (block, left), applied=applied)
         errors[:, modes], estimation_nm2[modes] = found
         states[modes], residual_nm2[modes] = batch.A.shape[-1], left.variances[:, 0]
@@ -255,9 +251,9 @@ def modal_filters(
     joined = [_join_batches(batches, each) for each in zip(*parts, strict=True)]
     gain_predictor, A, B, C, D, poles = joined
     return ModalFilters(
-        turbulence=air,
-        vibrations=lines,
-        noise_nm=noise,
+        turbulence=models.turbulence,
+        vibrations=models.lines,
+        noise_nm=models.noise_nm,
         sensor_gain=gain,
         delay_frames=delay,
         mirror=mirror,

@@ -16,12 +16,7 @@ from lbt_synth.design.certificate import RESIDUAL_TOLERANCE, VARIANCE_TOLERANCE
 from lbt_synth.design.modal.closed_loops import LoopBlock, close_bank, filter_phase
 from lbt_synth.design.modal.filters import ModalFilters
 from lbt_synth.design.modal.mixed_controller import MixedController
-from lbt_synth.design.modal.plants import (
-    Vibrations,
-    as_modal_turbulence,
-    lines_per_mode,
-    number_per_mode,
-)
+from lbt_synth.design.modal.plants import ModalModels, Vibrations, number_per_mode
 from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import (
     DimensionError,
@@ -148,17 +143,14 @@ class ModalLoop:
             If rounding leaves too few digits: a process that is nearly a random walk.
         """
         self.require_stable()
-        air, rate = as_modal_turbulence(turbulence, self.n_modes), self.frame_rate_hz
-        if rate is not None and not np.isclose(air.frame_rate_hz, rate, rtol=1e-9):
-            raise ProblemError(
-                f"turbulence must be sampled at the loop's frame rate, {rate:.6g} Hz; got "
-                f"{air.frame_rate_hz:.6g} Hz."
-            )
-        noise = number_per_mode(noise_nm, "noise_nm", self.n_modes, zero=True)
-        lines = lines_per_mode(vibrations, self.n_modes)
+        models = ModalModels.of(turbulence, noise_nm, vibrations, modes=self.n_modes)
+        own, rate = models.turbulence.frame_rate_hz, self.frame_rate_hz
+        if rate is not None and not np.isclose(own, rate, rtol=1e-9):
+            got = f"{rate:.6g} Hz; got {own:.6g} Hz"
+            raise ProblemError(f"turbulence must be sampled at the loop's frame rate, {got}.")
         out = np.zeros(self.n_modes)
         for block in self.blocks:
-            left = block.variances(air, lines, noise)
+            left = block.variances(models)
             for what, error, limit in (
                 ("the residual of the Lyapunov equation", left.residuals, RESIDUAL_TOLERANCE),
                 ("rounding of the variance", left.rounding, VARIANCE_TOLERANCE),

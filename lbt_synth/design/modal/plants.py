@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.batched import transpose
@@ -36,16 +37,6 @@ def number_per_mode(
     return frozen_copy(np.broadcast_to(given, (modes,)))
 
 
-def as_modal_turbulence(
-    turbulence: ModalTurbulence | Sequence[ARModel], modes: int | None = None
-) -> ModalTurbulence:
-    """Return the turbulence as arrays, of a given number of modes."""
-    air = turbulence if isinstance(turbulence, ModalTurbulence) else ModalTurbulence.of(turbulence)
-    if modes is not None and air.n_modes != modes:
-        raise DimensionError(f"turbulence must have {modes} modes; got {air.n_modes}.")
-    return air
-
-
 def lines_per_mode(vibrations: Vibrations | None, modes: int) -> Lines:
     """Return the vibrations of each mode, from a mapping of some modes."""
     lines: list[tuple[Vibration, ...]] = [()] * modes
@@ -63,35 +54,6 @@ def lines_per_mode(vibrations: Vibrations | None, modes: int) -> Lines:
             raise ProblemError(f"mode {i} must have a list of Vibration; got {given!r}.")
         lines[i] = tuple(each)
     return tuple(lines)
-
-
-def disturbances(
-    turbulence: ModalTurbulence, lines: Lines, modes: np.ndarray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Total phase of some modes as linear systems ``x+ = A x + B v``, ``phi_tot = row x``.
-
-    Return A (N, k, k), B (N, k, p + 1), from white noise of unit variance, and the rows (N, k) to
-    the newest sample. The states are vibrations now and before, and turbulence; all systems have
-    the size of the one with most vibrations.
-    """
-    count, order = len(modes), turbulence.order
-    p = max((len(lines[i]) for i in modes), default=0)
-    size = 2 * p + order
-    A, row = np.zeros((count, size, size)), np.zeros((count, size))
-    B = np.zeros((count, size, p + 1))
-    each = [(i, j, line) for i, mode in enumerate(modes) for j, line in enumerate(lines[mode])]
-    if each:
-        i, j = np.array([place[:2] for place in each]).T
-        numbers = np.array([[line.frequency_hz, line.damping, line.rms_nm] for *_, line in each])
-        frequency, damping, rms = numbers.T
-        coefficients, driving = sampled_lines(frequency, damping, rms, turbulence.frame_rate_hz)
-        A[i, j, j], A[i, j, p + j] = coefficients.T
-        B[i, j, j] = driving
-    A[:, p : 2 * p, :p] = np.eye(p)
-    A[:, 2 * p :, 2 * p :] = turbulence.companions[modes]
-    B[:, 2 * p, p] = turbulence.driving_rms_nm[modes]
-    row[:, :p] = row[:, 2 * p] = 1
-    return A, B, row
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,31 +90,77 @@ class PlantBatch:
         return A, self.Q + gains @ self.R @ transpose(gains)
 
 
-def plant_batches(
-    turbulence: ModalTurbulence,
-    lines: Lines,
-    *,
-    noise_nm: FloatArray,
-    delay_frames: float,
-    sensor_gain: FloatArray,
-) -> list[PlantBatch]:
-    """Return the plants of all modes, one batch for each number of vibrations."""
-    counts = np.array([len(each) for each in lines])
-    steps = max(int(np.ceil(delay_frames)), 2)
-    late, chain = steps - delay_frames, steps - 1
-    batches = []
-    for lines_each in np.unique(counts):
-        modes = np.flatnonzero(counts == lines_each)
-        models, drives, row = disturbances(turbulence, lines, modes)
-        count, k = row.shape
-        s = k + chain
-        A, Q = np.zeros((2, count, s, s))
-        A[:, :k, :k], A[:, k, :k] = models, row
-        A[:, k + 1 :, k : s - 1] = np.eye(chain - 1)
-        Q[:, :k, :k] = drives @ transpose(drives)
-        C, L = np.zeros((2, count, 1, s))
-        C[:, 0, -1] = sensor_gain[modes]
-        L[:, 0, :k], L[:, 0, k] = (1 - late) * row, late
-        R = noise_nm[modes, None, None] ** 2
-        batches.append(PlantBatch(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
-    return batches
+@dataclass(frozen=True, slots=True, eq=False)
+class ModalModels:
+    """Models of n modes: turbulence, vibrations and measurement noise."""
+
+    turbulence: ModalTurbulence
+    lines: Lines
+    noise_nm: FloatArray  # (n,)
+
+    @classmethod
+    def of(
+        cls,
+        turbulence: ModalTurbulence | Sequence[ARModel],
+        noise_nm: ArrayLike,
+        vibrations: Vibrations | None,
+        *,
+        modes: int | None = None,
+    ) -> ModalModels:
+        """Check the models of all modes; for a given number of modes, noise may be 0."""
+        if not isinstance(turbulence, ModalTurbulence):
+            turbulence = ModalTurbulence.of(turbulence)
+        n = turbulence.n_modes
+        if modes not in (None, n):
+            raise DimensionError(f"turbulence must have {modes} modes; got {n}.")
+        noise = number_per_mode(noise_nm, "noise_nm", n, zero=modes is not None)
+        return cls(turbulence, lines_per_mode(vibrations, n), noise)
+
+    def disturbances(self, modes: np.ndarray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Total phase of some modes as linear systems ``x+ = A x + B v``, ``phi_tot = row x``.
+
+        Return A (N, k, k), B (N, k, p + 1), from white noise of unit variance, and the rows (N, k)
+        to the newest sample. The states are vibrations now and before, and turbulence; all systems
+        have the size of the one with most vibrations.
+        """
+        turbulence, lines = self.turbulence, self.lines
+        count, order = len(modes), turbulence.order
+        p = max((len(lines[i]) for i in modes), default=0)
+        size = 2 * p + order
+        A, row = np.zeros((count, size, size)), np.zeros((count, size))
+        B = np.zeros((count, size, p + 1))
+        each = [(i, j, line) for i, mode in enumerate(modes) for j, line in enumerate(lines[mode])]
+        if each:
+            i, j = np.array([place[:2] for place in each]).T
+            numbers = np.array([[x.frequency_hz, x.damping, x.rms_nm] for *_, x in each])
+            frequency, damping, rms = numbers.T
+            coefficients, driving = sampled_lines(frequency, damping, rms, turbulence.frame_rate_hz)
+            A[i, j, j], A[i, j, p + j] = coefficients.T
+            B[i, j, j] = driving
+        A[:, p : 2 * p, :p] = np.eye(p)
+        A[:, 2 * p :, 2 * p :] = turbulence.companions[modes]
+        B[:, 2 * p, p] = turbulence.driving_rms_nm[modes]
+        row[:, :p] = row[:, 2 * p] = 1
+        return A, B, row
+
+    def plants(self, delay_frames: float, sensor_gain: FloatArray) -> list[PlantBatch]:
+        """Return the plants of all modes, one batch for each number of vibrations."""
+        counts = np.array([len(each) for each in self.lines])
+        steps = max(int(np.ceil(delay_frames)), 2)
+        late, chain = steps - delay_frames, steps - 1
+        batches = []
+        for lines_each in np.unique(counts):
+            modes = np.flatnonzero(counts == lines_each)
+            models, drives, row = self.disturbances(modes)
+            count, k = row.shape
+            s = k + chain
+            A, Q = np.zeros((2, count, s, s))
+            A[:, :k, :k], A[:, k, :k] = models, row
+            A[:, k + 1 :, k : s - 1] = np.eye(chain - 1)
+            Q[:, :k, :k] = drives @ transpose(drives)
+            C, L = np.zeros((2, count, 1, s))
+            C[:, 0, -1] = sensor_gain[modes]
+            L[:, 0, :k], L[:, 0, k] = (1 - late) * row, late
+            R = self.noise_nm[modes, None, None] ** 2
+            batches.append(PlantBatch(modes=modes, A=A, Q=Q, C=C, L=L, R=R))
+        return batches

@@ -9,7 +9,7 @@ from support.modal import HUM, LINE, RATE, single_plant, some_air
 import lbt_synth as lbt
 from lbt_synth.design.modal.closed_loops import LoopBlock, LoopVariances
 from lbt_synth.design.modal.filters import batch_errors, modal_certificate
-from lbt_synth.design.modal.plants import plant_batches
+from lbt_synth.design.modal.plants import ModalModels
 
 
 @pytest.mark.parametrize("delay", [1, 1.3, 2, 2.6, 3, 4.5])
@@ -88,13 +88,8 @@ def test_filters_know_the_mirror_as_kalman_does(delay, bandwidth):
 def test_a_failing_mode_is_named():
     air = some_air(4)
     filters = lbt.design.modal.modal_filters(air, noise_nm=10.0)
-    (batch,) = plant_batches(
-        air,
-        filters.vibrations,
-        noise_nm=filters.noise_nm,
-        delay_frames=2.0,
-        sensor_gain=filters.sensor_gain,
-    )
+    models = ModalModels.of(air, filters.noise_nm, None)
+    (batch,) = models.plants(2.0, filters.sensor_gain)
     solution = lbt.solve_dare(
         np.swapaxes(batch.A, 1, 2), np.swapaxes(batch.C, 1, 2), batch.Q, batch.R
     )

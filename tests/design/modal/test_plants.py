@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from support.modal import HUM, LINE, single_plant, some_air
 
-from lbt_synth.design.modal.plants import lines_per_mode, plant_batches
+from lbt_synth.design.modal.plants import ModalModels, lines_per_mode
 
 
 @pytest.mark.parametrize("delay", [1, 2.6, 3])
 def test_stacked_plants_are_tip_tilt_plants(delay):
     air, lines = some_air(3), lines_per_mode({2: [LINE, HUM]}, 3)
-    stacks = plant_batches(
-        air, lines, noise_nm=np.full(3, 7.0), delay_frames=delay, sensor_gain=np.full(3, 0.8)
-    )
+    stacks = ModalModels(air, lines, np.full(3, 7.0)).plants(delay, np.full(3, 0.8))
     for stack in stacks:
         for j, mode in enumerate(stack.modes):
             plant = single_plant(air, mode, lines[mode], 7.0, 0.8, delay)
