@@ -1,16 +1,14 @@
-"""Figures drawn by matplotlib: as SVG in a page, as a file, or on a user's own axes.
-
-The layout is in inches and fixed, so that the same chart is always the same drawing.
-"""
+"""Figures drawn by matplotlib: as SVG in a page, as a file, or on a user's own axes."""
 
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
+from html import escape
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -30,6 +28,13 @@ from lbt_synth.report.charts.description import (
 )
 from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
 from lbt_synth.report.charts.map_cells import blank_cells, cell_edges, level_colour, levels_within
+from lbt_synth.report.charts.paper_layout import (
+    LETTER_IN,
+    LONGEST_CATEGORY,
+    LONGEST_NAME,
+    WIDTH_IN,
+    lay_out,
+)
 from lbt_synth.report.charts.scales import (
     bar_places,
     log_tick_texts,
@@ -41,17 +46,12 @@ from lbt_synth.report.charts.scales import (
 from lbt_synth.report.figures.style import house_style
 
 if TYPE_CHECKING:
+    import matplotlib.figure
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-WIDTH_IN = 7.0
-_PANEL_IN, _BAR_IN = 2.1, 0.24  # height of a panel, and of one bar
-_LEFT, _RIGHT, _BOTTOM, _TOP = 0.62, 0.12, 0.42, 0.08
-_TITLE, _LEGEND_ROW, _SCALE = 0.22, 0.2, 0.62
-_LETTER = 0.068  # width of a letter at 8 points [inch], generously
+Figure: TypeAlias = "matplotlib.figure.Figure"
+OwnAxes: TypeAlias = "Axes | Sequence[Axes] | None"  # of the user, to draw on
 _FLAG_IN = 0.15  # width of an upright text
-_LONGEST = 60
-_HIGHEST = 7.5  # of a panel with bars [inch], so that it fits a sheet
 _MARKERS = {
     "circle": "o",
     "square": "s",
@@ -67,7 +67,6 @@ _BLANK: dict[str, Any] = {
     "hatch": "////",
     "linewidth": 0,
 }
-_SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 
 @contextmanager
@@ -82,35 +81,27 @@ def _chart_style() -> Iterator[None]:
 
 
 def chart_svg(chart: Chart) -> str:
-    """Return a chart as an SVG element to be set into a page.
+    """Return a chart as an SVG element to be set into a page, whose size follows its place."""
+    import matplotlib as mpl
 
-    Its identifiers begin with the chart's key, its size follows the place that it gets.
-    """
     buffer = io.BytesIO()
-    with _chart_style():
+    # the salt makes the identifiers of each chart its own
+    with _chart_style(), mpl.rc_context({"svg.hashsalt": chart.key}):
         figure = draw_figure(chart.panels, columns=chart.columns)
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    root = ElementTree.fromstring(buffer.getvalue())
-    for child in root.findall(f"{{{_SVG}}}metadata"):
-        root.remove(child)
-    for name in ("width", "height"):
-        root.attrib.pop(name, None)
-    root.attrib |= {"role": "img", "aria-label": chart.alt}
+    svg = buffer.getvalue().decode()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    words = f' role="img" aria-label="{escape(chart.alt)}"'
+    svg = re.sub(r' width="[^"]*" height="[^"]*"', lambda _: words, svg, count=1)
+    svg = svg.replace('<g id="', f'<g id="{chart.key}_')  # the same in every chart
     seen: set[str] = set()
-    for element in root.iter():
-        if element.attrib.get("id") in seen:  # the same path, defined again
-            del element.attrib["id"]
-        for name, value in element.attrib.items():
-            if name == "id":
-                seen.add(value)
-                element.attrib[name] = f"{chart.key}_{value}"
-            elif name == f"{{{_LINK}}}href" and value.startswith("#"):
-                element.attrib[name] = f"#{chart.key}_{value[1:]}"
-            elif "url(#" in value and name != "aria-label":
-                element.attrib[name] = value.replace("url(#", f"url(#{chart.key}_")
-    ElementTree.register_namespace("", _SVG)
-    ElementTree.register_namespace("xlink", _LINK)
-    return ElementTree.tostring(root, encoding="unicode")
+
+    def named_once(found: re.Match[str]) -> str:
+        repeated = found[2] in seen  # the same path, defined again
+        seen.add(found[2])
+        return found[1] if repeated else found[0]
+
+    return re.sub(r'(<(?:path|image|pattern|clipPath)\b[^>]*?) id="([^"]*)"', named_once, svg)
 
 
 def chart_png(chart: Chart) -> bytes:
@@ -126,7 +117,7 @@ def draw_figure(
     *,
     columns: int = 1,
     title: str = "",
-    axes: Axes | Sequence[Axes] | None = None,
+    axes: OwnAxes = None,
 ) -> Figure:
     """Draw panels, row by row, on a new figure, or each on one of the user's own axes."""
     with _chart_style():
@@ -147,7 +138,7 @@ def draw_figure(
     return figure
 
 
-def _own_places(axes: Axes | Sequence[Axes], count: int) -> list[Axes]:
+def _own_places(axes: OwnAxes, count: int) -> list[Axes]:
     """Return the user's axes as a list, one per panel."""
     from matplotlib.axes import Axes as Place
 
@@ -164,81 +155,18 @@ def _new_places(panels: Sequence[Panel], columns: int, title: str) -> tuple[Figu
     """Return a new figure with its title, its legend and the axes of its panels."""
     from matplotlib.figure import Figure
 
-    height = chart_height(panels, columns) + bool(title) * _TITLE
+    layout = lay_out(panels, columns, title)
+    height = layout.height
     figure = Figure(figsize=(WIDTH_IN, height))
-    y = height
     if title:
         figure.text(0.5, 1 - 0.05 / height, title, ha="center", va="top", fontsize=10)
-        y -= _TITLE
-    names = list(legend_entries(panels))
-    if names:
-        anchor = (0.5, y / height)
-        ncols = _legend_columns(names)
-        _draw_legend(figure, panels, loc="upper center", bbox_to_anchor=anchor, ncols=ncols)
-    y -= _legend_height(panels)
-    places = []
-    margin, cell = _left_margin(panels), WIDTH_IN / columns
-    for row, row_height in zip(_rows(panels, columns), _row_heights(panels, columns), strict=True):
-        y -= row_height
-        above, below = _row_margins(panels, row)
-        for i in range(len(row)):
-            left, bottom = i * cell + margin, y + below
-            size = cell - margin - _RIGHT, row_height - below - above
-            places.append(
-                figure.add_axes(
-                    (left / WIDTH_IN, bottom / height, size[0] / WIDTH_IN, size[1] / height)
-                )
-            )
-    return figure, places
-
-
-def chart_height(panels: Sequence[Panel], columns: int) -> float:
-    """Height of a figure [inch]."""
-    return _legend_height(panels) + sum(_row_heights(panels, columns))
-
-
-def _rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
-    return [panels[i : i + columns] for i in range(0, len(panels), columns)]
-
-
-def _row_heights(panels: Sequence[Panel], columns: int) -> list[float]:
-    """Heights of the rows [inch], with labels, titles and the colour scale."""
-    inside = WIDTH_IN / columns - _left_margin(panels) - _RIGHT
-
-    def own(panel: Panel) -> float:
-        if panel.height_in is not None:
-            return panel.height_in
-        if panel.equal:
-            (x0, x1), (y0, y1) = scale_ends(panel)
-            return min(inside * abs((y1 - y0) / (x1 - x0)), 5.0)
-        if panel.categories:
-            bars = len(panel.categories) * max(1, len(panel.select(Bars)))
-            return min(max(0.8, _BAR_IN * bars + 0.2), _HIGHEST)
-        return _PANEL_IN
-
-    return [max(map(own, row)) + sum(_row_margins(panels, row)) for row in _rows(panels, columns)]
-
-
-def _row_margins(panels: Sequence[Panel], row: Sequence[Panel]) -> tuple[float, float]:
-    """Room above and below the axes of a row [inch]."""
-    last_map = [panel for panel in panels if panel.select(Map)][-1:]
-    scale = _SCALE * any(panel in last_map for panel in row)  # one, below the last of the maps
-    return _TOP + _TITLE * any(panel.title for panel in row), _BOTTOM + scale
-
-
-def _left_margin(panels: Sequence[Panel]) -> float:
-    longest = max((len(shorten(name, 36)) for p in panels for name in p.categories), default=0)
-    return _LEFT if longest == 0 else 0.25 + _LETTER * longest
-
-
-def _legend_columns(names: Sequence[str]) -> int:
-    widest = 0.55 + _LETTER * max(len(shorten(name, _LONGEST)) for name in names)
-    return int(max(1, min(len(names), (WIDTH_IN - 0.2) // widest)))
-
-
-def _legend_height(panels: Sequence[Panel]) -> float:
-    names = list(legend_entries(panels))
-    return 0.1 + _LEGEND_ROW * -(-len(names) // _legend_columns(names)) if names else 0.0
+    anchor = (0.5, 1 - layout.legend_top / height)
+    ncols = layout.legend_columns
+    _draw_legend(figure, panels, loc="upper center", bbox_to_anchor=anchor, ncols=ncols)
+    return figure, [
+        figure.add_axes((x / WIDTH_IN, 1 - (top + high) / height, wide / WIDTH_IN, high / height))
+        for x, top, wide, high in layout.boxes
+    ]
 
 
 def _draw_legend(owner: Figure | Axes, panels: Sequence[Panel], **options: Any) -> None:
@@ -250,7 +178,7 @@ def _draw_legend(owner: Figure | Axes, panels: Sequence[Panel], **options: Any) 
     names = [f" {name}" if name.startswith("_") else name for name in entries]
     owner.legend(
         [_legend_handle(mark) for mark in entries.values()],
-        [shorten(name, _LONGEST) for name in names],
+        [shorten(name, LONGEST_NAME) for name in names],
         borderaxespad=0.0,
         handlelength=3.2,
         **options,
@@ -303,7 +231,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> Any:
     """Draw a panel, and return the image of its map if it has one."""
     image = None
     width_in = axes.get_window_extent().width / axes.figure.dpi
-    title = shorten(panel.title, max(8, int(width_in / _LETTER)))
+    title = shorten(panel.title, max(8, int(width_in / LETTER_IN)))
     axes.set_title(title, loc="left", parse_math=False)
     for mark in panel.marks:
         match mark:
@@ -342,7 +270,7 @@ def _set_scales(axes: Axes, panel: Panel) -> None:
         getattr(axes, f"set_{end}lim")(low, high)
         scale.set_label_text(own.text, parse_math=False)
     if panel.categories:
-        names = [shorten(name, 36) for name in panel.categories]
+        names = [shorten(name, LONGEST_CATEGORY) for name in panel.categories]
         axes.set_yticks(range(len(names)), names)
         axes.set_ylabel("")
         axes.tick_params(axis="y", length=0)
@@ -417,7 +345,7 @@ def _draw_colour_bar(
         boxes = [place.get_position() for place in mapped]
         left, right = min(box.x0 for box in boxes), max(box.x1 for box in boxes)
         height = figure.get_size_inches()[1]
-        lowest = min(box.y0 for box in boxes) - (_BOTTOM + _SCALE - 0.44) / height
+        lowest = min(box.y0 for box in boxes) - 0.6 / height
         where = (left + 0.2 * (right - left), lowest, 0.6 * (right - left), 0.11 / height)
         bar = figure.colorbar(image, cax=figure.add_axes(where), orientation="horizontal")
     else:

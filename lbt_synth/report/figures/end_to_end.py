@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from lbt_synth.interop import EndToEndRun
 from lbt_synth.report.charts.description import Axis, Curve, Map, Panel
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 
 _SHOWN_MAS = 700.0
 _FAINTEST = 1e-5  # of the peak
 
 
-def end_to_end_figure(run: EndToEndRun, *, axes: Axes | Sequence[Axes] | None = None) -> Figure:
+def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
     """Image, tip and tilt over time, and residual of each mode of an end-to-end run.
 
     Parameters

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Panel
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, draw_figure
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
 from lbt_synth.studies import EndToEndEntry
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:

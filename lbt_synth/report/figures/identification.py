@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,12 +12,8 @@ from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.report.charts.description import Area, Axis, Curve, Flags, Panel, Span
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.validation import FloatArray, require_instance
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _BANDS = 240  # of equal ratio over which the periodogram is averaged
 _KOLMOGOROV = 1.6276  # Kolmogorov's statistic at 1 %
@@ -29,7 +24,7 @@ def identification_figure(
     model: IdentifiedModel,
     *,
     designs: Mapping[str, Controller | Design] | None = None,
-    axes: Axes | Sequence[Axes] | None = None,
+    axes: OwnAxes = None,
 ) -> Figure:
     """Draw what was identified, one column per axis.
 

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Panel, Rule
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import stable_curve
 from lbt_synth.studies import LimitStudy
 from lbt_synth.validation import FloatArray
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-
-def limits_figure(study: LimitStudy, *, axes: Axes | Sequence[Axes] | None = None) -> Figure:
+def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
     """Draw the residual of each design over the vibration's frequency, and the limits.
 
     Parameters

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,13 +11,9 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.frequency_grid import frequency_grid
 from lbt_synth.validation import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 FREQUENCY = Axis(label="frequency", unit="Hz", log=True)
 # Frequencies, largest singular values of the rejection and of the noise transfer, (f,) each; the
@@ -26,9 +21,7 @@ FREQUENCY = Axis(label="frequency", unit="Hz", log=True)
 LoopNorms = tuple[FloatArray, FloatArray | None, FloatArray | None]
 
 
-def loop_figure(
-    loops: Mapping[str, ClosedLoop], *, axes: Axes | Sequence[Axes] | None = None
-) -> Figure:
+def loop_figure(loops: Mapping[str, ClosedLoop], *, axes: OwnAxes = None) -> Figure:
     """Rejection and noise transfer of closed loops.
 
     Parameters

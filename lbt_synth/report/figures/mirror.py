@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
 from lbt_synth.report.charts.description import Area, Axis, Curve, Panel, Rule, Span
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.validation import FloatArray, require_instance
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MOST_POINTS = 4000
 _SHOWN = 5e-3  # taps after the last one of this size are not drawn
@@ -25,7 +18,7 @@ def mirror_figure(
     hardware: LoopHardware,
     *,
     tolerance: float = 0.1,
-    axes: Axes | Sequence[Axes] | None = None,
+    axes: OwnAxes = None,
 ) -> Figure:
     """Draw the mirror's answer to a step of its command, and its taps.
 

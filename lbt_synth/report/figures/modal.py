@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.report.charts.description import Axis, Curve, Panel
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.validation import FloatArray, real_array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def modal_figure(
@@ -23,7 +18,7 @@ def modal_figure(
     *,
     gains: ArrayLike | None = None,
     turbulence_nm: ArrayLike | None = None,
-    axes: Axes | Sequence[Axes] | None = None,
+    axes: OwnAxes = None,
 ) -> Figure:
     """Draw the residual of each mode under several controllers, and integrator gains.
 

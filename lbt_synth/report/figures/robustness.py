@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Panel
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.studies import RobustnessRow
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 FREQUENCY_ERROR = Axis(label="frequency error, design less truth", unit="Hz")
 
@@ -24,7 +20,7 @@ def robustness_figure(
     rows: Sequence[RobustnessRow],
     published: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     *,
-    axes: Axes | Sequence[Axes] | None = None,
+    axes: OwnAxes = None,
 ) -> Figure:
     """Strehl ratio over the error of the model's vibration frequency.
 

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.charts.description import Axis, Map, Panel, Rule
 from lbt_synth.report.charts.map_cells import STREHL_LEVELS, strehl_scale
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.charts.scales import count_columns
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
 from lbt_synth.studies import RobustnessMap
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-
-def robustness_map_figure(
-    maps: Mapping[str, RobustnessMap], *, axes: Axes | Sequence[Axes] | None = None
-) -> Figure:
+def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = None) -> Figure:
     """Draw the Strehl ratio of designs over frequency error and sensor gain.
 
     Parameters

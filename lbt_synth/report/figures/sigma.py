@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
 
 from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.errors import ProblemError
@@ -11,13 +10,9 @@ from lbt_synth.linear import largest_singular_values
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.report.charts.description import Panel
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import frequency_panel, loop_norms, loop_panels, stable_curve
 from lbt_synth.report.frequency_grid import frequency_grid
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def sigma_figure(
@@ -25,7 +20,7 @@ def sigma_figure(
     *,
     sensor_gain: float = 1.0,
     unit_weights: bool = False,
-    axes: Axes | Sequence[Axes] | None = None,
+    axes: OwnAxes = None,
 ) -> Figure:
     """Largest singular values of the estimation error, the rejection and the noise transfer.
 

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lbt_synth.loop import Simulation
 from lbt_synth.report.charts.description import Axis, Curve, Panel
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import FREQUENCY
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-
-def simulation_figure(
-    run: Simulation, *, title: str = "", axes: Axes | Sequence[Axes] | None = None
-) -> Figure:
+def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None) -> Figure:
     """Residual series and spectra before and after the correction.
 
     Parameters

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +11,8 @@ from lbt_synth.identification import TrackingUpdate
 from lbt_synth.loop import Simulation
 from lbt_synth.models import DriftingVibration
 from lbt_synth.report.charts.description import Axis, Curve, Panel
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.validation import FloatArray, number
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def tracking_figure(
@@ -27,7 +22,7 @@ def tracking_figure(
     truth: Sequence[DriftingVibration] = (),
     start_s: float = 0.0,
     bin_s: float = 1.0,
-    axes: Axes | Sequence[Axes] | None = None,
+    axes: OwnAxes = None,
 ) -> Figure:
     """Draw the frequencies that a filter followed, and the residuals of several runs.
 

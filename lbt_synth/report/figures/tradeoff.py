@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.charts.description import Area, Axis, Curve, Mark, Panel, Rule, Span
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.studies import TradeoffPoint
 from lbt_synth.studies.tradeoff import FAMILIES
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _NAMES = dict(
     zip(FAMILIES, ("least variance at this norm", "central H∞ filter of this norm"), strict=True)
 )
 
 
-def tradeoff_figure(
-    points: Sequence[TradeoffPoint], *, axes: Axes | Sequence[Axes] | None = None
-) -> Figure:
+def tradeoff_figure(points: Sequence[TradeoffPoint], *, axes: OwnAxes = None) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
     Parameters

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lbt_synth.report.charts.description import Chart, Map, Panel
-from lbt_synth.report.charts.matplotlib_charts import chart_height, chart_png, chart_svg
+from lbt_synth.report.charts.matplotlib_charts import chart_png, chart_svg
+from lbt_synth.report.charts.paper_layout import lay_out
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.storage.tables import Cell, Table
 
@@ -180,7 +181,7 @@ def _write_chart(pdf: FPDF, chart: Chart) -> None:
     pdf.image(
         io.BytesIO(drawing),
         w=INSIDE,
-        h=chart_height(chart.panels, chart.columns),
+        h=lay_out(chart.panels, chart.columns).height,
         alt_text=chart.alt,
     )
     pdf.y += 0.05
@@ -262,7 +263,7 @@ def block_height(block: Block) -> float:
     match block:
         case Chart():
             words = math.ceil(len(block.caption) / 95) + math.ceil(len(block.title) / 75)
-            return chart_height(block.panels, block.columns) + words * _leading(8) + 0.35
+            return lay_out(block.panels, block.columns).height + words * _leading(8) + 0.35
         case Table() | Listing():
             return 1.0
     return math.ceil(len(block.text) / 80) * _leading(9) + 0.3
