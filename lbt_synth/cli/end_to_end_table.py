@@ -12,7 +12,7 @@ from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.specula.optics import specula_version
-from lbt_synth.report.figures.end_to_end_table import end_to_end_table_figure
+from lbt_synth.report.figures.end_to_end import end_to_end_table_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
 from lbt_synth.storage.rows import csv_rows, json_record, json_units, row_table

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from lbt_synth.report.charts.bokeh_hover import add_hover, hover_curves, value_format
 from lbt_synth.report.charts.description import (
     Area,
     Axis,
@@ -28,6 +28,7 @@ from lbt_synth.report.charts.scales import (
     scale_ends,
     shorten,
 )
+from lbt_synth.validation import FloatArray
 
 _FONT = "system-ui, sans-serif"
 _HEIGHT = 300  # of a panel [px]
@@ -87,7 +88,7 @@ def panel_figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str
         names = {i: shorten(name, 24) for i, name in enumerate(panel.categories)}
         figure.yaxis[0].update(ticker=list(names), major_label_overrides=names, axis_label=None)
         figure.ygrid.grid_line_color = None
-    hover_curves(figure, panel)
+    _hover_curves(figure, panel)
     return figure
 
 
@@ -195,15 +196,15 @@ def _draw_bars(figure: Any, panel: Panel, bars: Bars) -> list[Any]:
     }
     tips = [
         (panel.y.label or "bar", "@category"),
-        (bars.name or panel.x.label, value_format("right", panel.x.unit)),
+        (bars.name or panel.x.label, _value_format("right", panel.x.unit)),
     ]
     ranged = bars.low is not None and bars.high is not None
     if bars.low is not None and bars.high is not None:
         source |= {"low": bars.low[drawn], "high": bars.high[drawn]}
-        tips.append(("interval", f"@low{{%.4g}} to {value_format('high', panel.x.unit)}"))
+        tips.append(("interval", f"@low{{%.4g}} to {_value_format('high', panel.x.unit)}"))
     shade = colour(bars.look)
     box = figure.hbar(y="y", right="right", height=height, color=shade, source=source)
-    add_hover(figure, box, tips, ("right", "low", "high"))
+    _add_hover(figure, box, tips, ("right", "low", "high"))
     if not ranged:
         return [box]
     ends = {"x0": "low", "x1": "high", "y0": "y", "y1": "y"}
@@ -262,8 +263,8 @@ def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
     )
     figure.add_layout(bar, "below")
     shown = (("x", panel.x), ("y", panel.y), ("value", found))
-    tips = [(what.label, value_format(column, what.unit)) for column, what in shown]
-    add_hover(figure, cells, tips, ("x", "y", "value"))
+    tips = [(what.label, _value_format(column, what.unit)) for column, what in shown]
+    _add_hover(figure, cells, tips, ("x", "y", "value"))
 
 
 def _draw_levels(figure: Any, found: Map) -> None:
@@ -280,3 +281,70 @@ def _draw_levels(figure: Any, found: Map) -> None:
         line_color=[level_colour(level, found.low, found.high) for _, level in lines],
         line_width=1.0,
     )
+
+
+def _value_format(column: str, unit: str) -> str:
+    """Return how a value of a column is shown: four digits and its unit."""
+    return f"@{column}{{%.4g}}" + (f" {unit}" if unit and unit != "-" else "")
+
+
+def _add_hover(
+    figure: Any, glyphs: Any, tips: list[tuple[str, str]], columns: Iterable[str], **options: Any
+) -> None:
+    """Show values under the pointer; columns are those of the source that hold numbers."""
+    from bokeh.models import HoverTool
+
+    figure.add_tools(
+        HoverTool(
+            renderers=[glyphs],
+            tooltips=tips,
+            formatters={f"@{name}": "printf" for name in columns},
+            visible=False,
+            **options,
+        )
+    )
+
+
+def _hover_curves(figure: Any, panel: Panel) -> None:
+    """Show the values of all curves of the same abscissae in one box."""
+    from bokeh.models import ColumnDataSource
+
+    groups: list[list[Curve]] = []
+    for curve in panel.select(Curve):
+        if not curve.x.size or not curve.hover:
+            continue
+        for group in groups:
+            if curve.line and group[0].line and np.array_equal(group[0].x, curve.x):
+                group.append(curve)
+                break
+        else:
+            groups.append([curve])
+    for group in groups:
+        joined = group[0].line
+        columns: dict[str, FloatArray] = {"x": np.array(group[0].x)}
+        columns |= {f"y{i}": np.array(curve.y) for i, curve in enumerate(group)}
+        tips = [(panel.x.label, _value_format("x", panel.x.unit))]
+        tips += [
+            (curve.name or panel.y.label, _value_format(f"y{i}", panel.y.unit))
+            for i, curve in enumerate(group)
+        ]
+        # what the box follows: the finite mean, or the points themselves
+        columns["at"] = _mean_height(np.array([curve.y for curve in group]), log=panel.y.log)
+        source = ColumnDataSource(columns)
+        follower = (
+            figure.line("x", "at", source=source, line_alpha=0)
+            if joined
+            else figure.scatter("x", "at", source=source, size=12, line_alpha=0, fill_alpha=0)
+        )
+        mode = "vline" if joined else "mouse"
+        _add_hover(figure, follower, tips, columns, mode=mode, line_policy="nearest")
+
+
+def _mean_height(heights: FloatArray, *, log: bool) -> FloatArray:
+    """Mean of several curves at each abscissa, (curves, n) -> (n,); nan where none has a value."""
+    shown = np.where(heights > 0, heights, np.nan) if log else heights
+    known = np.isfinite(shown)
+    filled = np.where(known, np.log(np.where(known, shown, 1.0)) if log else shown, 0.0)
+    count = known.sum(axis=0)
+    mean = filled.sum(axis=0) / np.maximum(count, 1)
+    return np.where(count > 0, np.exp(mean) if log else mean, np.nan)

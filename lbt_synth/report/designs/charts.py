@@ -14,8 +14,7 @@ from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.simulation import STEP_NM
 from lbt_synth.report.figures.limits import limits_panel
 from lbt_synth.report.figures.loop import frequency_panel, loop_panels, stable_curve
-from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, strehl_panel
-from lbt_synth.report.figures.robustness_map import map_panels
+from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, map_panels, strehl_panel
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
 from lbt_synth.report.page.words import chart

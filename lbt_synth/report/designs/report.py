@@ -18,7 +18,7 @@ from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.report.designs.assessment import DesignAssessment, assess_design, require_compatible
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
-from lbt_synth.report.frequency_grid import frequency_grid
+from lbt_synth.report.figures.loop import frequency_grid
 from lbt_synth.report.provenance import (
     SourceFile,
     creation_time,

@@ -5,7 +5,7 @@ from .loop import loop_figure as loop_figure
 from .mirror import mirror_figure as mirror_figure
 from .modal import modal_figure as modal_figure
 from .robustness import robustness_figure as robustness_figure
-from .robustness_map import robustness_map_figure as robustness_map_figure
+from .robustness import robustness_map_figure as robustness_map_figure
 from .sigma import sigma_figure as sigma_figure
 from .simulation import simulation_figure as simulation_figure
 from .tracking import tracking_figure as tracking_figure

@@ -12,9 +12,9 @@ from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
-from lbt_synth.report.frequency_grid import frequency_grid
 from lbt_synth.validation import FloatArray
 
+_POINTS = 1200  # of a grid of frequencies
 FREQUENCY = Axis(label="frequency", unit="Hz", log=True)
 # Frequencies, largest singular values of the rejection and of the noise transfer, (f,) each; the
 # latter are None where the loop is unstable
@@ -99,3 +99,16 @@ def stable_curve(
     if y is None:
         return Curve(name=f"{name}: unstable", x=np.zeros(0), y=np.zeros(0), look=look)
     return Curve(name=name, x=np.asarray(x), y=np.asarray(y), look=look, step=step)
+
+
+def frequency_grid(
+    rate_hz: float, special_hz: Sequence[float] = (), *, decades: float = 3.6
+) -> FloatArray:
+    """Logarithmic grid up to Nyquist, denser around special frequencies."""
+    nyquist = rate_hz / 2
+    grids = [np.geomspace(nyquist / 10**decades, nyquist, _POINTS)]
+    for centre in special_hz:
+        spread = np.geomspace(1e-4, 0.2, 60)
+        grids += [centre * (1 + spread), centre * (1 - spread), np.array([centre])]
+    grid = np.unique(np.concatenate(grids))
+    return grid[(grid > 0) & (grid <= nyquist)]

@@ -11,8 +11,13 @@ from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.report.charts.description import Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
-from lbt_synth.report.figures.loop import frequency_panel, loop_norms, loop_panels, stable_curve
-from lbt_synth.report.frequency_grid import frequency_grid
+from lbt_synth.report.figures.loop import (
+    frequency_grid,
+    frequency_panel,
+    loop_norms,
+    loop_panels,
+    stable_curve,
+)
 
 
 def sigma_figure(

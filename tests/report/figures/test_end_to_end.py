@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from support.end_to_end import make_table
 
-from lbt_synth.report.figures.end_to_end_table import end_to_end_table_figure
+from lbt_synth.report.figures.end_to_end import end_to_end_table_figure
 
 
 def test_the_figure_has_a_panel_a_controller():
