@@ -13,6 +13,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import nullcontext
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,8 @@ class _Workers:
     def __init__(
         self, study: Study, evaluate: Evaluate, jobs: int, executor: Executor | None
     ) -> None:
-        self._study, self._evaluate, self._jobs = study, evaluate, jobs
+        self._study, self._jobs = study, jobs
+        self._call = partial(evaluate_timed, evaluate, study)
         self._pool = WorkerPool(jobs) if executor is None and jobs > 1 else None
         self._executor = self._pool.executor if self._pool else executor or _InlineExecutor()
         self._broken: BrokenExecutor | None = None
@@ -68,11 +70,8 @@ class _Workers:
 
     def submit(self, rows: RowRange) -> Future[TimedBatch]:
         """Begin to evaluate some rows."""
-        study, evaluate = self._study, self._evaluate
         try:
-            return self._executor.submit(
-                evaluate_timed, evaluate, study, study.values(*rows), rows[0]
-            )
+            return self._executor.submit(self._call, self._study.values(*rows), rows[0])
         except BrokenExecutor as error:
             lost: Future[TimedBatch] = Future()
             lost.set_exception(error)
@@ -206,17 +205,15 @@ def _error_to_raise(error: BaseException, rows: RowRange) -> BaseException:
     """Return the error to raise where a batch as a whole failed."""
     if isinstance(error, LbtSynthError | MemoryError):
         return error
-    if isinstance(error, CancelledError):
-        raised = NumericalError(
-            "the executor cancelled what was running: its scheduler is gone, perhaps. What is "
-            "finished is kept: start again."
-        )
-    else:
-        text = f"{type(error).__name__}: {error}".rstrip(".")
-        raised = NumericalError(
-            f"rows {rows[0]} to {rows[1] - 1} could not be computed ({text}). What is finished is "
-            "kept. Every process needs the same lbt_synth as this one."
-        )
+    kept = "What is finished is kept"
+    text = (
+        f"the executor cancelled what was running: its scheduler is gone, perhaps. {kept}: start "
+        "again."
+        if isinstance(error, CancelledError)
+        else f"rows {rows[0]} to {rows[1] - 1} could not be computed ({type(error).__name__}: "
+        f"{str(error).rstrip('.')}). {kept}. Every process needs the same lbt_synth as this one."
+    )
+    raised = NumericalError(text)
     raised.__cause__ = error
     return raised
 

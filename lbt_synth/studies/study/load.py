@@ -22,7 +22,7 @@ from lbt_synth.studies.study.distributions import ParameterSection
 from lbt_synth.studies.study.reference_evaluation import close_sample_loop
 from lbt_synth.studies.study.sample import Sample, find_number, make_sample, parse_path
 from lbt_synth.studies.study.schema import StudySection
-from lbt_synth.studies.study.store import read_design, read_manifest, require_same_study
+from lbt_synth.studies.study.store import read_designs, read_manifest
 from lbt_synth.studies.study.study import (
     ERRORS,
     Parameter,
@@ -146,10 +146,8 @@ def _require_names(settings: StudySection, source: Path) -> None:
 
 def _read_designs(study: Study, directory: str | os.PathLike[str] | None) -> dict[str, Design]:
     """Return the designs of a study in its directory, none if it was not begun there."""
-    if directory is None or (manifest := read_manifest(Path(directory))) is None:
-        return {}
-    require_same_study(manifest, study.digest, Path(directory))
-    return {name: read_design(Path(directory), name, manifest) for name in manifest.designs}
+    manifest = None if directory is None else read_manifest(Path(directory), study.digest)
+    return {} if manifest is None else read_designs(Path(directory or ""), manifest)
 
 
 def _designed_controller(study: Study, name: str, stored: Design | None) -> StudyController:

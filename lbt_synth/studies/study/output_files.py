@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import itertools
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from lbt_synth.errors import OutputError
 from lbt_synth.storage.atomic_files import open_atomically, write_atomically
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.study.parquet import read_parquet, write_parquet
-from lbt_synth.studies.study.store import FAILED, Part, read_part
+from lbt_synth.studies.study.store import FAILED, Part, read_part, refuse
 from lbt_synth.studies.study.study import Failure, Study
 from lbt_synth.validation import FloatArray
 
@@ -32,23 +31,23 @@ def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
     A CSV table has 12 digits for parameters and 9 for results; a Parquet table has all digits.
     """
     path = results_path(folder, study)
-    blocks = ((part.start, _part_rows(study, part)) for part in parts)
+    blocks = (_part_rows(study, part) for part in parts)
     with open_atomically(path) as stream:
         if study.settings.results == "parquet":
             write_parquet(stream, study.columns, blocks)
             return path
         stream.write((",".join(study.columns) + "\n").encode())
         formats = [_PARAMETER] * len(study.parameters) + [_RESULT] * len(study.result_columns)
-        line = ",".join(["%d", *formats])
-        for start, values in blocks:
-            rows = enumerate(values.tolist(), start)
-            stream.write("".join([f"{line % (row, *cells)}\n" for row, cells in rows]).encode())
+        line = ",".join(["%d", *formats]) + "\n"
+        for block in blocks:
+            stream.write("".join([line % tuple(row) for row in block.tolist()]).encode())
     return path
 
 
 def _part_rows(study: Study, part: Part) -> FloatArray:
-    """Return parameters and results of a part side by side."""
-    return np.hstack([study.values(part.start, part.stop), read_part(part, study)[0]])
+    """Return numbers, parameters and results of the rows of a part side by side."""
+    rows = part.start, part.stop
+    return np.column_stack([np.arange(*rows), study.values(*rows), read_part(part, study)[0]])
 
 
 def write_failures(folder: Path, failures: Sequence[Failure]) -> Path:
@@ -66,31 +65,30 @@ def read_failures(folder: Path) -> list[tuple[int, str, str]]:
 def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict[str, FloatArray]:
     """Return all columns (n,), from the parts if there are any, else from the table of results."""
     if parts:
-        rows = np.vstack([_part_rows(study, part) for part in parts])
-        first = np.arange(study.samples, dtype=np.float64)
-        return dict(zip(study.columns, (first, *rows.T), strict=True))
+        stacked = np.vstack([_part_rows(study, part) for part in parts])
+        return dict(zip(study.columns, stacked.T, strict=True))
     path = results_path(folder, study)
-    if study.settings.results == "parquet":
-        found = read_parquet(path)
-        names: Sequence[str] = list(found)
-        size = len(next(iter(found.values()), np.zeros(0)))
-    else:
-        try:
-            with path.open(encoding="utf-8") as stream:
-                names = stream.readline().rstrip("\n").split(",")
-                content = np.loadtxt(stream, delimiter=",", ndmin=2)
-        except (OSError, ValueError) as error:
-            raise OutputError(f"cannot read {path}: {error}.", path=path) from error
-        found = dict(zip(names, content.T, strict=False))
-        size = len(content)
-    if tuple(names) != study.columns or size != study.samples:
-        raise OutputError(
-            f"{path} is not the table of this study: it has {size} rows and {len(names)} columns, "
+    found = (read_parquet if study.settings.results == "parquet" else _read_csv)(path)
+    size = len(next(iter(found.values()), ()))
+    if tuple(found) != study.columns or size != study.samples:
+        refuse(
+            path,
+            f"is not the table of this study: it has {size} rows and {len(found)} columns, "
             f"expected are {study.samples} and {len(study.columns)}. Delete the directory, and "
             "start again.",
-            path=path,
         )
     return found
+
+
+def _read_csv(path: Path) -> dict[str, FloatArray]:
+    """Return all columns of a file, (n,) each."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            names = stream.readline().rstrip("\n").split(",")
+            content = np.loadtxt(stream, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"cannot read {path}: {error}.", path=path) from error
+    return dict(zip(names, content.T, strict=False))
 
 
 def read_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dict[str, float]:
@@ -105,10 +103,9 @@ def read_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dic
     if study.settings.results == "parquet":
         table = read_results(folder, study)
         return {name: float(table[name][row]) for name in study.result_columns}
-    cells: list[str] = []
-    with contextlib.suppress(OSError), path.open(encoding="utf-8") as stream:
+    with path.open(encoding="utf-8") as stream:
         cells = next(itertools.islice(stream, row + 1, None), "").split(",")
     if len(cells) != len(study.columns) or cells[0] != str(row):
-        raise OutputError(f"{path} has no row {row} of this study.", path=path)
-    first = 1 + len(study.parameters)
-    return dict(zip(study.result_columns, map(float, cells[first:]), strict=True))
+        refuse(path, f"has no row {row} of this study.")
+    found = dict(zip(study.columns, map(float, cells), strict=True))
+    return {name: found[name] for name in study.result_columns}

@@ -24,19 +24,16 @@ def require_parquet() -> None:
         ) from error
 
 
-def write_parquet(
-    stream: BinaryIO, names: Sequence[str], blocks: Iterable[tuple[int, FloatArray]]
-) -> None:
-    """Write blocks (n, columns - 1) of rows, with the number of the row as the first column."""
+def write_parquet(stream: BinaryIO, names: Sequence[str], blocks: Iterable[FloatArray]) -> None:
+    """Write blocks (n, columns) of rows, of which the first column has integers."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     kinds = [pa.int64(), *[pa.float64()] * (len(names) - 1)]
     schema = pa.schema(list(zip(names, kinds, strict=True)))
     with pq.ParquetWriter(stream, schema) as writer:
-        for start, values in blocks:
-            columns = [np.arange(start, start + len(values)), *values.T]
-            arrays = [pa.array(c, kind) for c, kind in zip(columns, kinds, strict=True)]
+        for block in blocks:
+            arrays = [pa.array(c, kind) for c, kind in zip(block.T, kinds, strict=True)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.store import (
     list_parts,
     read_manifest,
-    require_same_study,
     require_unchanged,
 )
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Failure, Study
@@ -108,77 +107,68 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     if row >= study.samples:
         raise ProblemError(f"the study has rows 0 to {study.samples - 1}; got row {row}.")
     folder = Path(directory)
-    manifest = read_manifest(folder)
     stored = {}
-    if manifest is not None:
-        require_same_study(manifest, study.digest, folder)
+    if (manifest := read_manifest(folder, study.digest)) is not None:
         require_unchanged(folder, manifest)
         stored = read_row(folder, study, row, list_parts(folder))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
-    sample = make_sample(study, values)
+    sample, noiseless = make_sample(study, values), _NOISELESS.format(row=row)
+    has_noise = bool(np.all(np.asarray(sample.truth.noise_nm) > 0))
     return Replay(
         row=row,
         parameters=study.parameters_by_name(values),
         stored=stored,
         fresh=fresh,
         failures=failures,
-        files=_write_files(study, folder, row, sample),
-        unwritten="" if sample.noise_factor > 0 else _NOISELESS.format(row=row),
+        files=_write_files(study, folder, row, sample, with_config=has_noise),
+        unwritten="" if has_noise else noiseless,
     )
 
 
-def _write_files(study: Study, folder: Path, row: int, sample: Sample) -> tuple[Path, ...]:
+def _write_files(
+    study: Study, folder: Path, row: int, sample: Sample, *, with_config: bool
+) -> tuple[Path, ...]:
     """Write the configuration of a sample and its own designs, and return their paths."""
-    own = [controller for controller in study.controllers if controller.for_sample]
     path = folder / f"row_{row}.yaml"
-    gains = {c.name: folder / f"row_{row}_{c.name}.fits" for c in own}
-    refuse_replacing([path, *gains.values()], study.inputs)
+    own = {folder / f"row_{row}_{c.name}.fits": c for c in study.controllers if c.for_sample}
+    refuse_replacing([path, *own], study.inputs)
     files = []
-    if sample.noise_factor > 0:
-        settings, comments = row_settings(study, row, sample)
+    if with_config:
+        settings, comments = _row_settings(study, row, sample)
         files.append(save_config(path, settings, comments=comments))
-    for controller in own:
-        try:
-            design = design_for_sample(controller, sample)
-        except EXPECTED_ERRORS:  # it is among the failures
-            continue
-        files.append(save_gain(gains[controller.name], design))
+    for gain, controller in own.items():
+        with contextlib.suppress(*EXPECTED_ERRORS):  # they are among the failures
+            files.append(save_gain(gain, design_for_sample(controller, sample)))
     return tuple(files)
 
 
-def row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
+def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
     """Return the configuration of the real loop of a sample, and comments on it."""
-    content = sample.config.settings.model_dump(exclude_unset=True)
+    config, truth = sample.config, sample.truth
+    content = config.settings.model_dump(exclude_unset=True)
     comments = {"": f"Row {row} of the study {study.source.name}: the real loop of the sample."}
-    if sample.delay_error_frames != 0:
+    if sample.hardware is not config.hardware:
         content["loop"]["delay_frames"] = sample.hardware.delay_frames
-        assumed = sample.config.hardware.delay_frames
+        assumed = config.hardware.delay_frames
         comments["loop.delay_frames"] = f"designs assume {assumed:.12g} ({DELAY_ERROR})"
-    if sample.noise_factor != 1:
-        _set_noise(content, sample, comments)
+    if truth is not config.truth:
+        sensor = content["sensor"]
+        content["sensor"] = {k: v for k, v in sensor.items() if k not in ("noise_mas", "pyramid")}
+        content["sensor"]["noise_nm"] = np.asarray(truth.noise_nm).tolist()
+        assumed_nm = ", ".join(f"{value:.12g}" for value in np.ravel(config.noise_nm))
+        comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
+        if any(isinstance(section, Ar2Section) for section in turbulence_sections(config.settings)):
+            # keep what was fitted above the noise that designs assume
+            sections = [
+                {
+                    "kind": "ar",
+                    "coefficients": model.coefficients.tolist(),
+                    "driving_rms_nm": model.driving_rms_nm,
+                }
+                for model in config.plant.turbulence
+            ]
+            same = all(section == sections[0] for section in sections)
+            content["model"]["turbulence"] = sections[0] if same else sections
     content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)
-    settings = validate_sections(FileSection, content, study.config.source)
-    return settings, comments
-
-
-def _set_noise(content: dict[str, Any], sample: Sample, comments: dict[str, str]) -> None:
-    """Set the real noise, and keep the turbulence that was fitted with the assumed noise."""
-    config = sample.config
-    for name in ("noise_mas", "pyramid"):
-        content["sensor"].pop(name, None)
-    content["sensor"]["noise_nm"] = np.asarray(sample.truth.noise_nm).tolist()
-    assumed_nm = ", ".join(f"{value:.12g}" for value in np.ravel(config.noise_nm))
-    comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
-    if any(isinstance(section, Ar2Section) for section in turbulence_sections(config.settings)):
-        # fitted above the noise that designs assume
-        sections = [
-            {
-                "kind": "ar",
-                "coefficients": np.asarray(model.coefficients).tolist(),
-                "driving_rms_nm": model.driving_rms_nm,
-            }
-            for model in config.plant.turbulence
-        ]
-        same = all(section == sections[0] for section in sections)
-        content["model"]["turbulence"] = sections[0] if same else sections
+    return validate_sections(FileSection, content, study.config.source), comments

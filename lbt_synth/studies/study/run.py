@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,17 +30,16 @@ from lbt_synth.studies.study.store import (
     PARTS,
     PRINT,
     Manifest,
-    Part,
     file_digest,
     list_parts,
     missing_rows,
     new_manifest,
-    read_design,
+    read_designs,
     read_manifest,
     read_part,
+    refuse,
     remove_parts,
     remove_unfinished_files,
-    require_same_study,
     require_unchanged,
     write_designs,
     write_part,
@@ -177,13 +176,13 @@ def run_study(
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
     computed, computing_s = 0, 0.0
+    count = progress or (lambda rows: None)
     with exclusive_lock(folder, "study"):
         remove_unfinished_files(folder, [path.name for path in output_paths(folder, study)])
         manifest = _begin(folder, study)
         if manifest.finished:
             remove_parts(folder)  # a run was killed while it removed them
-            if progress is not None:
-                progress(study.samples)
+            count(study.samples)
             if whole is not None:
                 found, spent = read_results(folder, study), manifest.computing_seconds
                 whole(FinishedStudy(columns=found, computing_s=spent, new=False))
@@ -191,12 +190,11 @@ def run_study(
             computed = _compute_missing(
                 study,
                 folder,
-                _usable_parts(folder, study),
+                count,
                 executor=executor,
                 jobs=jobs,
                 workers=workers,
                 evaluate=evaluate,
-                progress=progress,
             )
             computing_s = time.perf_counter() - began
             manifest = _write_tables(folder, study, manifest, computed, began, whole)
@@ -222,31 +220,23 @@ def output_paths(folder: Path, study: Study) -> list[Path]:
 
 def _begin(folder: Path, study: Study) -> Manifest:
     """Return the manifest of a directory; begin the study if there is none."""
-    manifest = read_manifest(folder)
+    manifest = read_manifest(folder, study.digest)
     if manifest is not None:
-        require_same_study(manifest, study.digest, folder)
-        for name in manifest.designs:
-            read_design(folder, name, manifest)
+        read_designs(folder, manifest)
         if manifest.finished:
             written = results_path(folder, study).exists() and (folder / FAILED).exists()
             if written:
                 require_unchanged(folder, manifest)
             if manifest.retry or not written:
                 manifest = manifest.write(folder, finished=False, tables={})
-    elif list_parts(folder):
-        raise OutputError(
-            f"{folder} holds parts of a study without its {MANIFEST}. Name another directory, or "
-            f"delete {folder / PARTS}.",
-            path=folder,
-        )
     else:
+        if list_parts(folder):
+            why = f"holds parts of a study without its {MANIFEST}. Name another directory, or"
+            refuse(folder, f"{why} delete {folder / PARTS}.")
         for path in output_paths(folder, study):
             if path.exists():
-                raise OutputError(
-                    f"{path} is of no study that was begun there, and would be replaced. Name "
-                    "another directory, or delete it.",
-                    path=path,
-                )
+                why = "is of no study that was begun there, and would be replaced. Name another"
+                refuse(path, f"{why} directory, or delete it.")
         manifest = new_manifest(study).write(folder)
     if set(manifest.designs) != {c.name for c in study.controllers if c.is_designed}:
         # begun now, or killed before they were written
@@ -254,28 +244,14 @@ def _begin(folder: Path, study: Study) -> Manifest:
     return manifest
 
 
-def _usable_parts(folder: Path, study: Study) -> list[Part]:
-    """Return the parts to keep, and remove those to compute again."""
-    usable = []
-    for part in list_parts(folder):
-        failures = read_part(part, study)[1]
-        if any(failure.retry for failure in failures):  # a part of one row, see the engine
-            part.path.unlink()
-        else:
-            usable.append(part)
-    return usable
-
-
 def _compute_missing(
-    study: Study,
-    folder: Path,
-    parts: Sequence[Part],
-    *,
-    progress: Callable[[int], None] | None,
-    **options: Any,
+    study: Study, folder: Path, progress: Callable[[int], None], **options: Any
 ) -> int:
-    """Compute the missing rows, and return their number."""
-    missing = missing_rows(list(parts), study.samples)
+    """Compute the rows that no part has, and those to try again; return their number."""
+    for part in list_parts(folder):
+        if any(failure.retry for failure in read_part(part, study)[1]):
+            part.path.unlink()  # a part of one row, see the engine
+    missing = missing_rows(list_parts(folder), study.samples)
     count = sum(stop - start for start, stop in missing)
     try:
         (folder / PARTS).mkdir(exist_ok=True)
@@ -283,13 +259,12 @@ def _compute_missing(
         raise OutputError(
             f"cannot make the directory {folder / PARTS}: {error.strerror}.", path=folder
         ) from error
-    if progress is not None and count < study.samples:
+    if count < study.samples:
         progress(study.samples - count)
     with contextlib.closing(run_batches(study, missing, **options)) as batches:
         for batch, seconds in batches:
             part = write_part(folder, study, batch, seconds)
-            if progress is not None:
-                progress(part.stop - part.start)
+            progress(part.stop - part.start)
     return count
 
 

@@ -28,8 +28,6 @@ class Sample:
     config: Config  # what designs assume
     hardware: LoopHardware  # the real loop: that of ``config`` with the delay error
     truth: Truth  # what it really meets: that of ``config`` with the real noise
-    delay_error_frames: float  # real delay less that of ``config`` [frames]
-    noise_factor: float  # real noise over that of ``config``
 
 
 def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
@@ -42,21 +40,14 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
             set_number(content, keys, float(value), full=full)
     config = build_config(validate_sections(FileSection, content, base.source), base.source)
     parameters = study.parameters_by_name(values)
-    delay_error = parameters.get(DELAY_ERROR, 0.0)
-    factor = parameters.get(NOISE_FACTOR, 1.0)
+    delay_error, factor = parameters.get(DELAY_ERROR, 0.0), parameters.get(NOISE_FACTOR, 1.0)
     hardware, truth = config.hardware, config.truth
     with refuse_config(f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}"):
         if delay_error != 0:
             hardware = replace(hardware, delay_frames=hardware.delay_frames + delay_error)
         if factor != 1:
             truth = replace(truth, noise_nm=truth.noise_nm * factor)
-    return Sample(
-        config=config,
-        hardware=hardware,
-        truth=truth,
-        delay_error_frames=delay_error,
-        noise_factor=factor,
-    )
+    return Sample(config=config, hardware=hardware, truth=truth)
 
 
 def parse_path(path: str) -> Keys:

@@ -14,7 +14,7 @@ from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -33,6 +33,7 @@ MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
 _UNFINISHED = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # the temporary files of write_atomically
+_DELETE = "Delete it, and it is computed again."
 RowRange = tuple[int, int]
 
 
@@ -100,8 +101,13 @@ def new_manifest(study: Study) -> Manifest:
     )
 
 
-def read_manifest(folder: Path) -> Manifest | None:
-    """Return the manifest of a directory, None if it has none."""
+def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:
+    """Refuse a file or a directory."""
+    raise OutputError(f"{path} {why}", path=path) from cause
+
+
+def read_manifest(folder: Path, digest: str) -> Manifest | None:
+    """Return the manifest of a study in its directory, None if it was not begun there."""
     path = folder / MANIFEST
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -112,38 +118,34 @@ def read_manifest(folder: Path) -> Manifest | None:
             f"cannot read {path}: {error}. Name another directory.", path=path
         ) from error
     try:
-        return Manifest.model_validate(content)
+        manifest = Manifest.model_validate(content)
     except ValidationError as error:
-        raise OutputError(
-            f"{path} is no manifest of a study that this version reads. Name another directory.",
-            path=path,
-        ) from error
-
-
-def require_same_study(manifest: Manifest, digest: str, folder: Path) -> None:
-    """Refuse a directory whose study has another digest."""
+        why = "is no manifest of a study that this version reads. Name another directory."
+        refuse(path, why, error)
     if manifest.digest == digest:
-        return
+        return manifest
     why = (
         f"was made by lbt_synth {manifest.version}; this is {lbt_synth.__version__}"
         if manifest.version != lbt_synth.__version__
         else f"is of another study: {manifest.source} as it was, with its configuration and "
         "gain files"
     )
-    raise OutputError(f"{folder} {why}. Name another directory, or delete it.", path=folder)
+    refuse(folder, f"{why}. Name another directory, or delete it.")
 
 
-def read_design(folder: Path, name: str, manifest: Manifest) -> Design:
-    """Return the design that a study wrote for a controller."""
-    path = folder / f"{name}.fits"
-    design, digest = load_with_digest(path)
-    if digest != manifest.designs[name]:
-        raise OutputError(
-            f"{path} is not the design that the study was begun with. Put that back, or name "
-            "another directory.",
-            path=path,
-        )
-    return design
+def read_designs(folder: Path, manifest: Manifest) -> dict[str, Design]:
+    """Return the designs that a study wrote for its controllers."""
+    designs = {}
+    for name, expected in manifest.designs.items():
+        path = folder / f"{name}.fits"
+        designs[name], digest = load_with_digest(path)
+        if digest != expected:
+            refuse(
+                path,
+                "is not the design that the study was begun with. Put that back, or name another "
+                "directory.",
+            )
+    return designs
 
 
 def write_designs(folder: Path, study: Study) -> dict[str, str]:
@@ -167,11 +169,7 @@ def list_parts(folder: Path) -> list[Part]:
     parts.sort(key=lambda part: part.start)
     for one, other in pairwise(parts):
         if other.start < one.stop:
-            raise OutputError(
-                f"{other.path} has rows that are in {one.path.name}, too. Delete it, and they are "
-                "computed again.",
-                path=other.path,
-            )
+            refuse(other.path, f"has rows that are in {one.path.name}, too. {_DELETE}")
     return parts
 
 
@@ -209,18 +207,12 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
         seconds = float(meta["seconds"])
         whole = meta["digest"] == array_file.digest(arrays, meta)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _damage_error(path) from error
+        refuse(path, f"is damaged. {_DELETE}", error)
     if not whole or results.shape != (part.stop - part.start, len(study.result_columns)):
-        raise _damage_error(path)
+        refuse(path, f"is damaged. {_DELETE}")
     if meta["study"] != study.digest:
-        raise OutputError(
-            f"{path} is of another study. Name another directory, or delete it.", path=path
-        )
+        refuse(path, "is of another study. Name another directory, or delete it.")
     return results, failures, seconds
-
-
-def _damage_error(path: Path) -> OutputError:
-    return OutputError(f"{path} is damaged. Delete it, and its rows are computed again.", path=path)
 
 
 def remove_unfinished_files(folder: Path, names: Collection[str]) -> None:
@@ -247,11 +239,7 @@ def require_unchanged(folder: Path, manifest: Manifest) -> None:
     for name, digest in manifest.tables.items():
         path = folder / name
         if path.exists() and file_digest(path) != digest:
-            raise OutputError(
-                f"{path} is not as the study wrote it. Put that back, or delete it, and it is "
-                "computed again.",
-                path=path,
-            )
+            refuse(path, f"is not as the study wrote it. Put that back, or {_DELETE.lower()}")
 
 
 def remove_parts(folder: Path) -> None:
