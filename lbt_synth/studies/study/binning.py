@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.studies.study.variance_index import is_list
-from lbt_synth.validation import FloatArray, IntArray, frozen_copy
+from lbt_synth.validation import FloatArray, frozen_copy
 
 _POINTS = 200  # of a cumulative distribution
 _BINS = 30  # of a histogram, at most
@@ -80,35 +80,33 @@ def binned_map(x: FloatArray, y: FloatArray, result: FloatArray) -> BinnedMap:
     cells = len(x) / _PER_CELL
     lists = [value_shares(x), value_shares(y)]
     for found in lists:
-        cells /= len(found[0]) if found is not None else 1
-    free = sum(found is None for found in lists)
-    width = int(np.clip(cells ** (1 / free), 3, _CELLS)) if free else 0
-    columns, x_places = _assign_cells(x, lists[0], width)
-    rows, y_places = _assign_cells(y, lists[1], width)
-    cell = y_places * len(columns) + x_places
-    size = len(rows) * len(columns)
-    samples = np.bincount(cell, minlength=size).astype(np.float64)
-    sums = np.bincount(cell, weights=result, minlength=size)
-    mean = np.full(size, np.nan)
+        cells /= 1 if found is None else len(found[0])
+    width = int(np.clip(cells ** (1 / max(lists.count(None), 1)), 3, _CELLS))
+    columns, x_edges = _cells(x, lists[0], width)
+    rows, y_edges = _cells(y, lists[1], width)
+    samples = np.histogram2d(y, x, bins=(y_edges, x_edges))[0]
+    sums = np.histogram2d(y, x, bins=(y_edges, x_edges), weights=result)[0]
+    mean = np.full(samples.shape, np.nan)
     np.divide(sums, samples, out=mean, where=samples > 0)
-    shape = len(rows), len(columns)
     return BinnedMap(
         x=frozen_copy(columns),
         y=frozen_copy(rows),
-        mean=frozen_copy(mean.reshape(shape)),
-        samples=frozen_copy(samples.reshape(shape)),
+        mean=frozen_copy(mean),
+        samples=frozen_copy(samples),
     )
 
 
-def _assign_cells(
+def _cells(
     values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
-) -> tuple[FloatArray, IntArray]:
-    """Return the centres of the cells along one axis, and the cell of each sample."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return the centres of the cells along one axis, and their edges."""
     if listed is not None:
-        return listed[0], np.searchsorted(listed[0], values)
-    low, high = np.percentile(values, _WITHIN)
-    if not low < high:
-        low, high = float(np.min(values)), float(np.max(values))
-    edges = np.linspace(low, high, cells + 1)
-    places = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, cells - 1)
-    return (edges[:-1] + edges[1:]) / 2, places
+        centres = listed[0]
+        inner = (centres[:-1] + centres[1:]) / 2
+    else:
+        low, high = np.percentile(values, _WITHIN)
+        if not low < high:
+            low, high = float(np.min(values)), float(np.max(values))
+        edges = np.linspace(low, high, cells + 1)
+        centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
+    return centres, np.concatenate(([-np.inf], inner, [np.inf]))

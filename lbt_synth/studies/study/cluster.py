@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
@@ -79,9 +78,3 @@ def _require_versions(address: str, client: Any) -> None:
                 f"scheduler and workers must have lbt_synth {lbt_synth.__version__}, as here; "
                 f"{who} of {address} has {version or 'none'}. Start them from the same environment."
             )
-
-
-def is_death_of_workers(error: BaseException) -> bool:
-    """Whether a task failed because every worker that tried it died."""
-    scheduler = sys.modules.get("distributed.scheduler")
-    return scheduler is not None and isinstance(error, scheduler.KilledWorker)

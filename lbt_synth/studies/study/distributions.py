@@ -123,10 +123,9 @@ class ParameterSection(Section):
         if self.uniform is not None:
             return f"uniform from {self.uniform[0]:g} to {self.uniform[1]:g}"
         if self.normal is not None:
-            low, high = self.normal.low, self.normal.high
             out = f"normal, {self.normal.mean:g} with deviation {self.normal.deviation:g}"
-            out += "" if low is None else f", from {low:g}"
-            return out if high is None else f"{out}, to {high:g}"
+            ends = {"from": self.normal.low, "to": self.normal.high}
+            return out + "".join(f", {k} {v:g}" for k, v in ends.items() if v is not None)
         shown = [f"{value:g}" for value in self.values]
         if len(set(self.weights or ())) > 1:
             shown = [f"{v} ({w:g})" for v, w in zip(shown, self.weights or (), strict=True)]

@@ -21,7 +21,6 @@ import numpy as np
 from lbt_synth.errors import LbtSynthError, NumericalError
 from lbt_synth.storage.worker_processes import WorkerPool, limit_threads
 from lbt_synth.studies.study.batch_queue import BatchQueue
-from lbt_synth.studies.study.cluster import is_death_of_workers
 from lbt_synth.studies.study.store import RowRange
 from lbt_synth.studies.study.study import BatchResult, Failure, Study
 from lbt_synth.validation import FloatArray
@@ -30,6 +29,7 @@ Evaluate = Callable[[Study, FloatArray, int], BatchResult]
 TimedBatch = tuple[BatchResult, float]  # with its seconds
 
 DIED = "its process ended without a word: killed, or for want of memory"
+_DASK_DEATH = "KilledWorker"  # the error of Dask where every worker that tried a batch died
 _MOST_DEATHS = 40  # in a row, without a batch that comes back
 _IN_FLIGHT = 2  # batches per worker, so that none waits
 
@@ -92,7 +92,7 @@ class _Workers:
             return future.result()
         if isinstance(error, BrokenExecutor):
             self._broken = error
-        elif not is_death_of_workers(error):
+        elif type(error).__name__ != _DASK_DEATH:
             raise _error_to_raise(error, rows)
         return None
 

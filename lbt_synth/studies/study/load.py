@@ -23,13 +23,7 @@ from lbt_synth.studies.study.reference_evaluation import close_sample_loop
 from lbt_synth.studies.study.sample import Sample, find_number, make_sample, parse_path
 from lbt_synth.studies.study.schema import StudySection
 from lbt_synth.studies.study.store import read_designs, read_manifest
-from lbt_synth.studies.study.study import (
-    ERRORS,
-    Parameter,
-    Study,
-    StudyController,
-    result_columns,
-)
+from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController, result_columns
 
 # The oldest version whose results this one repeats to rounding: studies that it began are read
 # and resumed. Raise it with any change that moves a result.

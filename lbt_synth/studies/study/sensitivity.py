@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -166,24 +166,15 @@ def conditional_curve(
         groups = next((k for limit, k in _GROUPS if n < limit), _MOST_GROUPS)
         starts = group_starts(n, groups)
     rows = []
-    for first, last in zip(starts, np.append(starts[1:], n), strict=True):
-        inside, here = ordered[first:last], strehl[first:last]
-        low, high = np.percentile(here, (10, 90))
+    for group in np.split(np.arange(n), starts[1:]):
+        inside, here = ordered[group], strehl[group]
         mean, error = mean_and_error(here)
-        rows.append(
-            {
-                "parameter": (inside[(len(inside) - 1) // 2] + inside[len(inside) // 2]) / 2,
-                "low_edge": inside[0],
-                "high_edge": inside[-1],
-                "mean": mean,
-                "mean_error": error,
-                "low": low,
-                "high": high,
-                "unstable": np.mean(unstable[first:last]),
-                "samples": last - first,
-            }
-        )
-    columns = {name: frozen_copy([row[name] for row in rows]) for name in rows[0]}
+        low, high = np.percentile(here, (10, 90))
+        part = np.mean(unstable[group])
+        ends = np.median(inside), inside[0], inside[-1]
+        rows.append((*ends, mean, error, low, high, part, len(group)))
+    names = (field.name for field in fields(ConditionalCurve) if field.name != "discrete")
+    columns = dict(zip(names, map(frozen_copy, zip(*rows, strict=True)), strict=True))
     return ConditionalCurve(**columns, discrete=discrete)
 
 

@@ -106,8 +106,7 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
     # what a sample adds to the index, to first order; then the scatter of the fit
     influence = (squares - unexplained * spread * spread) * (n / total)
     error = max(
-        float(np.std(influence)) / np.sqrt(n),
-        unexplained * np.sqrt(2 * (coefficients - 1)) / n,
+        float(np.std(influence)) / np.sqrt(n), unexplained * np.sqrt(2 * (coefficients - 1)) / n
     )
     return VarianceIndex(
         value=1 - unexplained - correction,
