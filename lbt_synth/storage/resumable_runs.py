@@ -131,21 +131,15 @@ def _cancel(futures: Iterable[Future[Any]]) -> None:
 
 @contextlib.contextmanager
 def _processes(workers: int) -> Iterator[Executor]:
-    """Provide processes, which are waited for unless this one is interrupted."""
-    with limit_threads():
-        pool = WorkerPool(workers)
-        try:
-            yield pool.executor
-        except BrokenExecutor as error:
-            raise NumericalError(
-                "a worker process ended without a word, perhaps for want of memory. "
-                "Finished results are kept: start again, with fewer jobs."
-            ) from error
-        except (KeyboardInterrupt, SystemExit, GeneratorExit):
-            pool.kill()
-            raise
-        finally:
-            pool.close()
+    """Provide processes; an error in the block ends them at once."""
+    try:
+        with limit_threads(), WorkerPool(workers) as pool:
+            yield pool
+    except BrokenExecutor as error:
+        raise NumericalError(
+            "a worker process ended without a word, perhaps for want of memory. "
+            "Finished results are kept: start again, with fewer jobs."
+        ) from error
 
 
 def _digest(name: str, case: Case) -> str:

@@ -19,30 +19,27 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _ORPHAN_SECONDS = 1.0
 
 
-class WorkerPool:
+class WorkerPool(ProcessPoolExecutor):
     """Fresh processes that end with their parent, however it ends.
 
-    Start it within :func:`limit_threads`, whose limit the processes inherit.
+    Start it within :func:`limit_threads`, whose limit the processes inherit. An error in its
+    ``with`` block ends them at once, without waiting for what is running.
     """
 
     def __init__(self, workers: int) -> None:
         self._others: set[BaseProcess] = set(multiprocessing.active_children())
-        self.executor = ProcessPoolExecutor(
+        super().__init__(
             workers,
             mp_context=multiprocessing.get_context("spawn"),
             initializer=_watch_parent,
             initargs=(os.getpid(),),
         )
 
-    def close(self) -> None:
-        """Wait for what is running, and end."""
-        self.executor.shutdown(wait=True, cancel_futures=True)
-
-    def kill(self) -> None:
-        """End at once, without waiting for what is running."""
-        for worker in set(multiprocessing.active_children()) - self._others:
-            worker.terminate()
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            for worker in set(multiprocessing.active_children()) - self._others:
+                worker.terminate()
+        self.shutdown(wait=True, cancel_futures=True)
 
 
 @contextlib.contextmanager

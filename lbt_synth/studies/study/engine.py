@@ -54,19 +54,17 @@ class _Workers:
     ) -> None:
         self._study, self._jobs = study, jobs
         self._call = partial(evaluate_timed, evaluate, study)
-        self._pool = WorkerPool(jobs) if executor is None and jobs > 1 else None
-        self._executor = self._pool.executor if self._pool else executor or _InlineExecutor()
+        self._executor = executor or (WorkerPool(jobs) if jobs > 1 else _InlineExecutor())
+        self._is_own = executor is None
         self._broken: BrokenExecutor | None = None
         self._deaths = 0  # in a row
 
     def __enter__(self) -> _Workers:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._pool is not None and kind is not None:
-            self._pool.kill()
-        elif self._pool is not None:
-            self._pool.close()
+    def __exit__(self, *error: Any) -> None:
+        if self._is_own:
+            self._executor.__exit__(*error)
 
     def submit(self, rows: RowRange) -> Future[TimedBatch]:
         """Begin to evaluate some rows."""
@@ -109,14 +107,13 @@ class _Workers:
         """Start new processes after some died; refuse to go on after too many deaths in a row."""
         error, self._broken = self._broken, None
         if error is not None:
-            if self._pool is None:
+            if not self._is_own:
                 raise NumericalError(
                     f"the executor broke: {error or type(error).__name__}. What is finished is "
                     "kept: start again, with a new executor."
                 ) from error
-            self._pool.close()
-            self._pool = WorkerPool(self._jobs)
-            self._executor = self._pool.executor
+            self._executor.shutdown()
+            self._executor = WorkerPool(self._jobs)
         self._deaths += 1
         if self._deaths > _MOST_DEATHS:
             raise NumericalError(
@@ -148,9 +145,8 @@ def run_batches(
     """
     queue = BatchQueue(ranges, workers or jobs)
     most = 1 if executor is None and jobs == 1 else _IN_FLIGHT * (workers or jobs)
-    own = executor is None and jobs > 1
     with (
-        limit_threads() if own else nullcontext(),
+        limit_threads() if executor is None and jobs > 1 else nullcontext(),
         _Workers(study, evaluate, jobs, executor) as engine,
     ):
         while queue.left:
