@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,6 +93,14 @@ class ARModel:
         frequency = real_array(frequency_hz, "frequency_hz")
         density = densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)
         return density.reshape(frequency.shape)
+
+
+def padded_coefficients(models: Sequence[ARModel]) -> FloatArray:
+    """Coefficients (models, largest order) of several processes."""
+    out = np.zeros((len(models), max(model.order for model in models)))
+    for row, model in zip(out, models, strict=True):
+        row[: model.order] = model.coefficients
+    return out
 
 
 def companions(coefficients: FloatArray) -> FloatArray:

@@ -43,11 +43,11 @@ def minimize(
     Return the coefficients, None if the constraints cannot hold together, and the solver's status.
     """
     c = cp.Variable(size)
-    held: list[cp.Constraint] = []
-    objective = _expression(function, c, held, scale, start)
+    objective = _Objective(c, scale, start)
+    goal = cp.Minimize(objective.expression(function))
     for constraint in constraints:
-        held += _as_constraints(constraint, c, 0.0)
-    status, _ = solve(cp.Minimize(objective), held)
+        objective.needs += _as_constraints(constraint, c, 0.0)
+    status, _ = solve(goal, objective.needs)
     return (np.asarray(c.value, dtype=np.float64) if status in USABLE else None), status
 
 
@@ -75,65 +75,57 @@ def minimize_relaxation(
     return np.asarray(np.where(rigid, 0.0, slack.value), dtype=np.float64)
 
 
-def _expression(
-    function: Function,
-    c: cp.Variable,
-    held: list[cp.Constraint],
-    scale: float,
-    start: FloatArray | None,
-) -> cp.Expression:
-    """Convex expression of a function over its scale; it adds its own constraints to ``held``."""
-    if isinstance(function, CombinedFunction):
-        parts = [
-            weight * _expression(part, c, held, scale, start)
-            for weight, part in zip(function.weights, function.parts, strict=True)
-        ]
-        return cp.maximum(*parts) if function.worst and len(parts) > 1 else cp.sum(parts)
-    if function.steering is not None:
-        assert start is not None  # a function with denominators is minimised from a start
-        return _majorant(function, function.steering, c, held, scale, start)
-    unit = 1 / np.sqrt(scale)
-    if function.worst:
-        level = cp.Variable(nonneg=True)
-        held.append(_norm_bounds(level, function.centres * unit, function.rows * unit, c))
-        return cp.square(level)
-    root, target = _least_squares_form(function)
-    return cp.sum_squares(unit * root @ c - unit * target)
+class _Objective:
+    """Convex expressions of functions over their scale, and the constraints that they need."""
 
+    def __init__(self, c: cp.Variable, scale: float, start: FloatArray | None) -> None:
+        self.c, self.scale, self.start = c, scale, start
+        self.needs: list[cp.Constraint] = []
 
-def _majorant(
-    function: Fractions,
-    steering: ComplexArray,
-    c: cp.Variable,
-    held: list[cp.Constraint],
-    scale: float,
-    start: FloatArray,
-) -> cp.Expression:
-    """Convex upper bound of a function with denominators that touches it at the start."""
-    b0, a0 = function.denominators(start), np.sqrt(function.numerators(start))
-    values = a0**2 / np.abs(b0) ** 2
-    largest = float(np.max(values))
-    # 2 Re(conj(b0) b) - |b0|^2 over |b0|^2: one at the start
-    slopes = np.real(-2 * b0.conj()[:, None] * steering) / np.abs(b0[:, None]) ** 2
-    denominators = (1 - slopes @ start) + slopes @ c
-    # each fraction in units of its own value, but not of a vanishing one
-    sizes = np.maximum(values, max(1e-9 * largest, 1e-12 * scale))
-    largest = float(np.max(sizes))
-    unit = np.sqrt(sizes) * np.abs(b0)
-    stacked = _real_parts(function.centres / unit[:, None], function.rows / unit[:, None, None], c)
-    if function.worst:
-        level: cp.Expression = cp.Variable(nonneg=True)
-        # in units of the largest value
-        ratio = np.sqrt(sizes / largest)
-        stacked = cp.multiply(stacked, np.broadcast_to(ratio, stacked.shape))
-        levels: cp.Expression = level * np.ones(len(b0))
-        total = level * (largest / scale)
-    else:
-        levels = cp.Variable(len(b0), nonneg=True)
-        total = (sizes / scale) @ levels
-    difference = cp.reshape(levels - denominators, (1, len(b0)), order="C")
-    held.append(cp.SOC(levels + denominators, cp.vstack([2 * stacked, difference])))
-    return total
+    def expression(self, function: Function) -> cp.Expression:
+        """Return the expression of a function."""
+        if isinstance(function, CombinedFunction):
+            pairs = zip(function.weights, function.parts, strict=True)
+            parts = [weight * self.expression(part) for weight, part in pairs]
+            return cp.maximum(*parts) if function.worst and len(parts) > 1 else cp.sum(parts)
+        if function.steering is not None:
+            return self._majorant(function, function.steering)
+        unit = 1 / np.sqrt(self.scale)
+        if function.worst:
+            level = cp.Variable(nonneg=True)
+            centres, rows = function.centres * unit, function.rows * unit
+            self.needs.append(_norm_bounds(level, centres, rows, self.c))
+            return cp.square(level)
+        root, target = _least_squares_form(function)
+        return cp.sum_squares(unit * root @ self.c - unit * target)
+
+    def _majorant(self, function: Fractions, steering: ComplexArray) -> cp.Expression:
+        """Convex upper bound of a function with denominators that touches it at the start."""
+        assert self.start is not None  # such a function is minimised from a start
+        b0, a0 = function.denominators(self.start), np.sqrt(function.numerators(self.start))
+        values = a0**2 / np.abs(b0) ** 2
+        # 2 Re(conj(b0) b) - |b0|^2 over |b0|^2: one at the start
+        slopes = np.real(-2 * b0.conj()[:, None] * steering) / np.abs(b0[:, None]) ** 2
+        denominators = (1 - slopes @ self.start) + slopes @ self.c
+        # each fraction in units of its own value, but not of a vanishing one
+        sizes = np.maximum(values, max(1e-9 * float(np.max(values)), 1e-12 * self.scale))
+        largest = float(np.max(sizes))
+        unit = np.sqrt(sizes) * np.abs(b0)
+        centres, rows = function.centres / unit[:, None], function.rows / unit[:, None, None]
+        stacked = _real_parts(centres, rows, self.c)
+        if function.worst:
+            level: cp.Expression = cp.Variable(nonneg=True)
+            # in units of the largest value
+            ratio = np.sqrt(sizes / largest)
+            stacked = cp.multiply(stacked, np.broadcast_to(ratio, stacked.shape))
+            levels: cp.Expression = level * np.ones(len(b0))
+            total = level * (largest / self.scale)
+        else:
+            levels = cp.Variable(len(b0), nonneg=True)
+            total = (sizes / self.scale) @ levels
+        difference = cp.reshape(levels - denominators, (1, len(b0)), order="C")
+        self.needs.append(cp.SOC(levels + denominators, cp.vstack([2 * stacked, difference])))
+        return total
 
 
 def _as_constraints(
@@ -144,15 +136,9 @@ def _as_constraints(
         unit = 1 / constraint.bounds
         return [cp.multiply(unit, constraint.rows @ c) <= 1 + slack]
     if isinstance(constraint, Discs):
-        unit = 1 / constraint.radii
-        return [
-            _norm_bounds(
-                1 + slack,
-                constraint.centres[:, None] * unit[:, None],
-                constraint.rows[:, None, :] * unit[:, None, None],
-                c,
-            )
-        ]
+        unit = (1 / constraint.radii)[:, None]
+        rows = constraint.rows[:, None, :] * unit[..., None]
+        return [_norm_bounds(1 + slack, constraint.centres[:, None] * unit, rows, c)]
     assert isinstance(constraint, FunctionBound)
     root, target = _least_squares_form(constraint.function)
     unit = 1 / np.sqrt(constraint.limit)
@@ -170,10 +156,8 @@ def _real_parts(centres: ComplexArray, rows: ComplexArray, c: cp.Variable) -> cp
     """Real and imaginary parts of the responses, (2 r, F)."""
     parts = []
     for i in range(centres.shape[1]):
-        parts += [
-            centres[:, i].real + rows[:, i].real @ c,
-            centres[:, i].imag + rows[:, i].imag @ c,
-        ]
+        centre, row = centres[:, i], rows[:, i]
+        parts += [centre.real + row.real @ c, centre.imag + row.imag @ c]
     return cp.vstack(parts)
 
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
-from lbt_synth.models.ar_model import ARModel
+from lbt_synth.models.ar_model import ARModel, padded_coefficients
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.full_state import FullStatePlant
@@ -256,9 +256,7 @@ def assemble(parts: PlantParts) -> TipTiltPlant:
     hardware, p, n = parts.hardware, len(parts.vibrations), parts.hardware.modes
     ar2 = [line.ar_model(hardware.frame_rate_hz) for line in parts.vibrations]
     lines = np.array([model.coefficients for model in ar2]).reshape(p, 2)
-    air = np.zeros((n, parts.order))
-    for row, model in zip(air, parts.turbulence, strict=True):
-        row[: model.order] = model.coefficients
+    air = padded_coefficients(parts.turbulence)
 
     tur, tot, size = 2 * p, 2 * p + air.size, parts.size  # where parts of the state begin, and end
     total = np.zeros((n, size))

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.ar_model import ARModel, companions, densities, variance_ratios
+from lbt_synth.models.ar_model import (
+    ARModel,
+    companions,
+    densities,
+    padded_coefficients,
+    variance_ratios,
+)
 from lbt_synth.models.turbulence.ar_models import pole
 from lbt_synth.models.turbulence.atmosphere import Atmosphere
 from lbt_synth.models.turbulence.zernike import noll_orders, zernike_variances
@@ -103,11 +109,8 @@ class ModalTurbulence:
         rate = each[0].frame_rate_hz
         if not all(np.isclose(model.frame_rate_hz, rate, rtol=1e-9) for model in each):
             raise ProblemError("all models must be sampled at the same frame rate; they are not.")
-        coefficients = np.zeros((len(each), max(model.order for model in each)))
-        for row, model in zip(coefficients, each, strict=True):
-            row[: model.order] = model.coefficients
         return cls(
-            coefficients=coefficients,
+            coefficients=padded_coefficients(each),
             driving_rms_nm=frozen_copy([model.driving_rms_nm for model in each]),
             frame_rate_hz=rate,
         )
