@@ -14,8 +14,8 @@ import numpy.typing as npt
 import lbt_synth
 from lbt_synth.design import Design, certify_loop
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
-from lbt_synth.interop.arithmetic_cost import block_matrix
 from lbt_synth.linear import Controller
+from lbt_synth.linear.state_space import LinearSystem
 from lbt_synth.loop.simulation.run import SteppedController, step_loop
 from lbt_synth.validation import FloatArray, require_instance
 
@@ -49,7 +49,7 @@ def require_exportable(design: Design, written: Controller | None = None) -> Non
 class MatrixForm:
     """A controller in new-state form, stepped in a given precision."""
 
-    def __init__(self, controller: Controller, dtype: Any) -> None:
+    def __init__(self, controller: LinearSystem, dtype: Any) -> None:
         with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is noticed
             self._matrices = [getattr(controller, name).astype(dtype) for name in "ABCD"]
         self._dtype = dtype
@@ -67,41 +67,26 @@ class MatrixForm:
         return np.asarray(C @ self._state + D @ measured, dtype=np.float64)
 
 
-class WrittenTerms:
+class WrittenTerms(MatrixForm):
     """A controller stepped as the C source is written: term by term, each rounded.
 
-    In each row of ``[A, B]`` and ``[C, D]`` the terms that are not zero are added from left to
-    right, as one statement of the straight-line source does and as the loops over whole matrices
-    do, which add zeros besides.
+    In each row of ``[A, B]`` and ``[C, D]`` the terms are added from left to right, as one
+    statement of the straight-line source does and as the loops over whole matrices do; terms that
+    are zero change nothing.
     """
-
-    def __init__(self, controller: Controller, dtype: Any) -> None:
-        with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is noticed
-            whole = block_matrix(controller).astype(dtype)
-        n = controller.n_states
-        self._rows = [_list_terms(whole[:n]), _list_terms(whole[n:])]
-        self._dtype, self._n = dtype, n
-        self.reset()
-
-    def reset(self) -> None:
-        """Set the state to zero."""
-        self._state = np.zeros(self._n, dtype=self._dtype)
 
     def step(self, y: FloatArray) -> FloatArray:
         """Take y(k), return u(k)."""
-        (old_places, old), (new_places, new) = self._rows
+        A, B, C, D = self._matrices
         measured = y.astype(self._dtype)
-        known = np.concatenate([self._state, measured])
-        self._state = np.add.accumulate(old * known[old_places])[-1]
-        known = np.concatenate([self._state, measured])
-        return np.asarray(np.add.accumulate(new * known[new_places])[-1], dtype=np.float64)
+        self._state = self._add(A, B, measured)
+        return np.asarray(self._add(C, D, measured), dtype=np.float64)
 
-
-def _list_terms(rows: npt.NDArray[Any]) -> tuple[npt.NDArray[np.intp], npt.NDArray[Any]]:
-    """Places and factors of the terms, (longest row, rows); short rows end with zeros."""
-    length = max(1, int(np.max(np.count_nonzero(rows, axis=1), initial=0)))
-    places = np.argsort(rows == 0, axis=1, kind="stable")[:, :length]
-    return places.T, np.ascontiguousarray(np.take_along_axis(rows, places, axis=1).T)
+    def _add(
+        self, on_state: npt.NDArray[Any], on_y: npt.NDArray[Any], y: npt.NDArray[Any]
+    ) -> npt.NDArray[Any]:
+        terms = np.hstack([on_state * self._state, on_y * y])
+        return np.asarray(np.add.accumulate(terms, axis=1)[:, -1])
 
 
 def rehearsal_error(design: Design, other: SteppedController) -> float:

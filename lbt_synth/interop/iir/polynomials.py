@@ -28,26 +28,22 @@ def axis_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
             f"a filter per axis needs as many commands as measurements; got {m} commands and {q} "
             "measurements. Use the gain file itself."
         )
-    balanced = StateSpace(
-        A=controller.A, B=controller.B, C=controller.C, D=controller.D, dt_s=controller.dt_s
-    ).balanced()
+    balanced = StateSpace.of([getattr(controller, name) for name in "ABCD"]).balanced()
     links = {name: _find_links(getattr(balanced, name)) for name in "ABC"}
-    reached = [_reach(links["A"], links["B"][:, i]) for i in range(q)]
-    shown = [_reach(links["A"].T, links["C"][i]) for i in range(q)]
+    reached, shown = _reach(links["A"], links["B"]), _reach(links["A"].T, links["C"].T)
     direct = np.abs(controller.D) > _COUPLED * max(
         np.max(np.abs(controller.D)), np.max(np.abs(controller.C @ controller.B))
     )
-    for i in range(q):
-        for j in range(q):
-            if i != j and (direct[i, j] or np.any(reached[j] & shown[i])):
-                raise ProblemError(
-                    f"the axes must decouple: one transfer function each; here measurement {j + 1} "
-                    f"moves command {i + 1}. Use the gain file itself, which SPECULA's SsrFilter "
-                    "loads."
-                )
+    coupled = np.argwhere((direct | (shown.T @ reached)) & ~np.eye(q, dtype=bool))
+    if coupled.size:
+        raise ProblemError(
+            "the axes must decouple: one transfer function each; here measurement "
+            f"{coupled[0, 1] + 1} moves command {coupled[0, 0] + 1}. Use the gain file itself, "
+            "which SPECULA's SsrFilter loads."
+        )
     pairs = []
     for i in range(q):
-        own = np.flatnonzero(reached[i] & shown[i])
+        own = np.flatnonzero(reached[:, i] & shown[:, i])
         if own.size > _MOST_STATES:
             raise ProblemError(
                 f"an axis must have at most {_MOST_STATES} states for a transfer function; got "
@@ -76,7 +72,7 @@ def _drop_negligible(matrix: FloatArray) -> FloatArray:
 
 
 def _reach(steps: BoolArray, start: BoolArray) -> BoolArray:
-    """Return the states reached from ``start``, where ``steps[i, j]`` leads from j to i."""
+    """Return the states reached from each start (n, k), where ``steps[i, j]`` leads from j to i."""
     found = start.copy()
     while True:
         more = found | (steps @ found)

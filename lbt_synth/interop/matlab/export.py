@@ -18,7 +18,6 @@ from lbt_synth.interop.export_checks import (
     rehearsal_error,
     require_exportable,
 )
-from lbt_synth.linear import StateSpace
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.validation import FloatArray
 
@@ -31,20 +30,13 @@ _CONVENTION = (
 )
 
 
-class _Textbook:
+class _Textbook(MatrixForm):
     """A system stepped in the textbook form: the command, then the new state."""
 
-    def __init__(self, system: StateSpace) -> None:
-        self._system = system
-        self.reset()
-
-    def reset(self) -> None:
-        self._state = np.zeros(self._system.n_states)
-
     def step(self, y: FloatArray) -> FloatArray:
-        s = self._system
-        u = s.C @ self._state + s.D @ y
-        self._state = s.A @ self._state + s.B @ y
+        A, B, C, D = self._matrices
+        u = C @ self._state + D @ y
+        self._state = A @ self._state + B @ y
         return np.asarray(u)
 
 
@@ -101,7 +93,7 @@ def export_mat(
     if design.hardware is not None:
         content["frame_rate_hz"] = design.hardware.frame_rate_hz
         content["delay_frames"] = design.hardware.delay_frames
-    error = rehearsal_error(design, _Textbook(textbook))
+    error = rehearsal_error(design, _Textbook(textbook, np.float64))
     single = rehearsal_error(design, MatrixForm(design.controller, np.float32))
     written = write_atomically(target, _mat_bytes(content))
     return Exported(files=(written,), error=error, error_single=single)

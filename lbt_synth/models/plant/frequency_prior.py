@@ -80,18 +80,18 @@ def spread_plant(
             "give one of half_width_hz and frequencies_hz; "
             f"got half_width_hz={half_width_hz!r} and frequencies_hz={frequencies_hz!r}."
         )
+    first = plant.vibrations[0].frequency_hz
     made: list[Vibration] = []
     for line in plant.vibrations:
-        if frequencies_hz is not None:
+        if frequencies_hz is None:
+            given = line_frequencies(line.frequency_hz, half_width_hz, lines)
+        else:
             given = np.atleast_1d(real_array(frequencies_hz, "frequencies_hz"))
-            if line.frequency_hz != plant.vibrations[0].frequency_hz:
+            if line.frequency_hz != first:
                 raise ProblemError(
                     "frequencies_hz is for vibrations of one frequency; got vibrations at "
-                    f"{plant.vibrations[0].frequency_hz:.6g} and {line.frequency_hz:.6g} Hz. "
-                    "Try half_width_hz."
+                    f"{first:.6g} and {line.frequency_hz:.6g} Hz. Try half_width_hz."
                 )
-        else:
-            given = line_frequencies(line.frequency_hz, half_width_hz, lines)
         made += spread_lines(line, given, weights)
     return with_vibrations(plant, made)
 
