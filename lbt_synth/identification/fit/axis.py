@@ -112,32 +112,7 @@ def identify_axis(
     >>> [round(line.frequency_hz) for line in found.lines], round(found.noise_nm)
     ([40], 5)
     """
-    y = real_array(measurement, "measurement")
-    if y.ndim != 1:
-        raise DimensionError(f"measurement must be a series (frames,); got shape {y.shape}.")
-    c = None if correction is None else real_array(correction, "correction")
-    if c is not None and c.shape != y.shape:
-        raise DimensionError(
-            f"correction must have shape {y.shape} like measurement; got {c.shape}."
-        )
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
-    longest = max(stop - begin for begin, stop in pieces)
-    if longest < 2 * SHORTEST_SEGMENT:
-        raise ProblemError(
-            f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "
-            f"longest has {longest}. Record more, or bridge short gaps."
-        )
-    if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
-        raise ProblemError("the measurement is constant: there is nothing to identify.")
-    with np.errstate(over="ignore", invalid="ignore"):
-        data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
-        power = data.power(1.0)
-    if not (np.all(np.isfinite(power)) and np.min(data.measured) > 0):
-        raise ProblemError(
-            "the spectrum of the series overflows or vanishes; got values up to "
-            f"{np.max(np.abs(y)):.6g} nm. Check the units."
-        )
+    data = _checked_periodogram(measurement, correction, frame_rate_hz, stretches)
     search = Search(
         data=data,
         gain=sensor_gain,
@@ -167,6 +142,42 @@ def identify_axis(
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
     return describe_axis(search, search_model(search, model.spectrum), None, note)
+
+
+def _checked_periodogram(
+    measurement: ArrayLike,
+    correction: ArrayLike | None,
+    frame_rate_hz: float,
+    stretches: StretchesLike | None,
+) -> LoopPeriodogram:
+    """Return the periodogram of series that can be identified."""
+    y = real_array(measurement, "measurement")
+    if y.ndim != 1:
+        raise DimensionError(f"measurement must be a series (frames,); got shape {y.shape}.")
+    c = None if correction is None else real_array(correction, "correction")
+    if c is not None and c.shape != y.shape:
+        raise DimensionError(
+            f"correction must have shape {y.shape} like measurement; got {c.shape}."
+        )
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
+    longest = max(stop - begin for begin, stop in pieces)
+    if longest < 2 * SHORTEST_SEGMENT:
+        raise ProblemError(
+            f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "
+            f"longest has {longest}. Record more, or bridge short gaps."
+        )
+    if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
+        raise ProblemError("the measurement is constant: there is nothing to identify.")
+    with np.errstate(over="ignore", invalid="ignore"):
+        data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
+        finite = np.all(np.isfinite(data.power(1.0)))
+    if not finite or np.min(data.measured) <= 0:
+        raise ProblemError(
+            "the spectrum of the series overflows or vanishes; got values up to "
+            f"{np.max(np.abs(y)):.6g} nm. Check the units."
+        )
+    return data
 
 
 def identify_spectrum(

@@ -124,7 +124,8 @@ def identify(
         if progress is not None:
             progress(next(fits), total)
 
-    fit = partial(_fit_axes, record, step, {**options, "assumed_gain": assumed_gain})
+    options |= {"frame_rate_hz": record.frame_rate_hz, "assumed_gain": assumed_gain}
+    fit = partial(_fit_axes, record, step, options)
     early = find_correction_jumps(record.corrections(), pieces)
     pieces, notes = cut_at_jumps(pieces, early, "commands")
     axes = fit(pieces, gains, [None] * record.axes if start is None else start.axes)
@@ -159,21 +160,11 @@ def _fit_axes(
     gain_error: float = 0.0,
 ) -> list[IdentifiedAxis]:
     """Identify each axis, at its gain or at a free one, and from its start."""
-    series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
     axes = []
-    for y, c, gain, start in series:
-        axes.append(
-            identify_axis(
-                y,
-                c,
-                frame_rate_hz=record.frame_rate_hz,
-                stretches=stretches,
-                sensor_gain=gain,
-                sensor_gain_error=gain_error,
-                start=start,
-                **options,
-            )
-        )
+    each = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
+    for y, c, gain, start in each:
+        own: Any = {"sensor_gain": gain, "sensor_gain_error": gain_error, "start": start}
+        axes.append(identify_axis(y, c, stretches=stretches, **own, **options))
         step()
     return axes
 
@@ -243,11 +234,11 @@ def _pool_gains(
         return axes, f"warning: the axes have different sensor gains, {values}"
     gain = float(np.exp(mean))
     pooled = fit([gain] * len(axes), axes, gain / float(np.sqrt(np.sum(weight))))
-    for i, axis in enumerate(pooled):
-        note = "found in the closed loop's data" if i in found_gain else "that of the other axis"
-        if len(found_gain) == len(axes):
-            note = "mean of the axes"
-        pooled[i] = replace(axis, sensor_gain_note=note)
+    notes = ["that of the other axis"] * len(axes)
+    for i in found_gain:
+        alone = len(found_gain) < len(axes)
+        notes[i] = "found in the closed loop's data" if alone else "mean of the axes"
+    pooled = [replace(a, sensor_gain_note=note) for a, note in zip(pooled, notes, strict=True)]
     return pooled, "one sensor gain for all axes"
 
 

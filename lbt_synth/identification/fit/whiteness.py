@@ -53,30 +53,26 @@ class Whiteness:
 
 def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Whiteness:
     """Test whether power and model (f,) differ as white innovations do."""
-    from scipy.special import chdtrc, kolmogorov
+    from scipy.stats import chi2, kstwobign
 
     ratio = power / model
     effective = float(np.sum(data.count))
     cumulative = np.cumsum(ratio) / np.sum(ratio)
-    even = np.arange(1, ratio.size + 1) / ratio.size
-    deviation = float(np.max(np.abs(cumulative - even)))
+    deviation = float(np.max(np.abs(cumulative - np.arange(1, ratio.size + 1) / ratio.size)))
     # a periodogram of n frames has n / 2 values; bins count as they are independent
     size = 2 * (ratio.size + 1)
     whole = data.frequency_hz.size / data.frequency_hz[-1] * data.frame_rate_hz / 2
-    complete = ratio.size > 0.95 * whole  # up to the Nyquist frequency
-    lags = min(LAGS, ratio.size // 16)
-    if complete:
+    correlation, p_value = np.zeros(0), float("nan")
+    if ratio.size > 0.95 * whole:  # up to the Nyquist frequency
+        lags = min(LAGS, ratio.size // 16)
         filled = np.zeros(size // 2 + 1)  # from 0 to the Nyquist frequency
         filled[1:-1] = ratio - np.mean(ratio[_LOWEST:])
         filled[: 1 + _LOWEST] = 0
         correlation = np.fft.irfft(filled, size)[1 : lags + 1] * size / (2 * np.sum(ratio))
-        statistic = 2 * effective * float(np.sum(correlation**2))
-        p_value = float(chdtrc(lags, statistic))
-    else:
-        correlation, p_value = np.zeros(0), float("nan")
+        p_value = float(chi2.sf(2 * effective * float(np.sum(correlation**2)), lags))
     return Whiteness(
         deviation=deviation,
-        p_value=float(kolmogorov(deviation * np.sqrt(effective))),
+        p_value=float(kstwobign.sf(deviation * np.sqrt(effective))),
         autocorrelation=frozen_copy(correlation),
         correlation_p_value=p_value,
         frequency_hz=data.frequency_hz,

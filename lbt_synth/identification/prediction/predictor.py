@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.prediction.residual import check_series, inverse_sensor
+from lbt_synth.identification.prediction.residual import check_series, inverse_sensor, invert
 from lbt_synth.identification.stretches import StretchesLike
 from lbt_synth.linear import Controller
 from lbt_synth.loop import youla_controller
@@ -109,17 +109,12 @@ def least_squares_predictor(
         raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {count}.")
     gain = number(sensor_gain, "sensor_gain", above=0)
     share = number(ridge, "ridge", at_least=0)
-    back = inverse_sensor(hardware) / gain
-    N, n = hardware.influence, hardware.modes
-    if N.shape[0] != N.shape[1] or np.linalg.matrix_rank(N) < n:
-        raise ProblemError(
-            "a predictor needs a command for every mode, and an influence matrix that can be "
-            f"inverted; got {N.shape} of rank {np.linalg.matrix_rank(N)}."
-        )
+    back, n = inverse_sensor(hardware) / gain, hardware.modes
+    need = "a predictor needs a command for every mode, and an influence matrix"
+    to_command = invert(hardware.influence, need)
     series, parts = check_series(open_loop, n, stretches)
     blocks = [_regression(series[a:b], hardware.mirror_taps, count) for a, b in parts]
-    X = np.concatenate([block[0] for block in blocks])  # (rows, n, taps)
-    Z = np.concatenate([block[1] for block in blocks])  # (rows, n)
+    X, Z = (np.concatenate(each) for each in zip(*blocks, strict=True))
     unknowns = count * (n if coupled else 1)
     if len(X) < _LEAST_ROWS * unknowns:
         raise ProblemError(
@@ -130,13 +125,24 @@ def least_squares_predictor(
     coefficients, fitted = np.zeros((n, n, count)), np.zeros(n)
     for i in range(n):
         seen = slice(None) if coupled else slice(i, i + 1)
-        found, fitted[i] = _solve_least_squares(X[:, seen].reshape(len(X), -1), Z[:, i], share)
+        regressors = X[:, seen].reshape(len(X), unknowns)
+        found = _solve_least_squares(regressors, Z[:, i], share)
+        fitted[i] = np.mean((Z[:, i] - regressors @ found) ** 2)
         coefficients[i, seen] = found.reshape(-1, count)
+    # an FIR filter of z from y to u, whose states are the last z
+    parameter = Controller(
+        A=np.eye(n * count, k=-n),
+        B=np.vstack([back, np.zeros((n * (count - 1), n))]),
+        C=to_command @ coefficients.transpose(0, 2, 1).reshape(n, n * count),
+        D=np.zeros((n, n)),
+        dt_s=hardware.dt_s,
+    )
+    believed = replace(hardware, sensor_matrix=gain * hardware.sensor)
     return LeastSquaresPredictor(
         coefficients=frozen_copy(coefficients),
         fitted_nm2=frozen_copy(fitted),
         frames=len(X),
-        controller=_build_controller(hardware, coefficients, back, gain),
+        controller=youla_controller(believed, parameter),
     )
 
 
@@ -154,30 +160,11 @@ def _regression(
     return np.asarray(late), part[m - 1 + count :]
 
 
-def _solve_least_squares(X: FloatArray, z: FloatArray, share: float) -> tuple[FloatArray, float]:
-    """Return the least-squares coefficients of least norm, and the mean square that is left."""
+def _solve_least_squares(X: FloatArray, z: FloatArray, share: float) -> FloatArray:
+    """Return the least-squares coefficients of least norm."""
     unknowns = X.shape[1]
     weight = np.sqrt(share * np.mean(np.sum(X**2, axis=0)))
     left = np.vstack([X, weight * np.eye(unknowns)])
-    right = np.concatenate([z, np.zeros(unknowns)])
+    right = np.append(z, np.zeros(unknowns))
     found = np.linalg.lstsq(left, right, rcond=np.finfo(float).eps * (unknowns + 1))[0]
-    return np.asarray(found), float(np.mean((z - X @ found) ** 2))
-
-
-def _build_controller(
-    hardware: LoopHardware, coefficients: FloatArray, back: FloatArray, gain: float
-) -> Controller:
-    """Return the controller from y to u of an FIR filter of z; its states are the last z."""
-    n, _, count = coefficients.shape
-    B = np.zeros((n * count, n))
-    B[:n] = back
-    rows = coefficients.transpose(0, 2, 1).reshape(n, count * n)
-    believed = replace(hardware, sensor_matrix=gain * hardware.sensor)
-    parameter = Controller(
-        A=np.eye(n * count, k=-n),
-        B=B,
-        C=np.linalg.inv(hardware.influence) @ rows,
-        D=np.zeros((n, n)),
-        dt_s=hardware.dt_s,
-    )
-    return youla_controller(believed, parameter)
+    return np.asarray(found)

@@ -63,7 +63,7 @@ class LoopIdentifier:
                 "each measurement must be of one axis, with a gain above 0; got a sensor matrix "
                 f"{sensor.tolist()}. Recombine the measurements into axes before the controller."
             )
-        self._plant, self._gains, self._find_gain = plant, gains, bool(find_gain)
+        self._plant, self._gains, self._find_gain = plant, gains.tolist(), bool(find_gain)
         self._most_lines = integer(most_lines, "most_lines", at_least=0)
         self.reset()
 
@@ -82,22 +82,23 @@ class LoopIdentifier:
         last, self._last = self._last, [None] * count  # a fit that fails is no start
         found = tuple(
             identify_axis(
-                measurements[:, i],
-                corrections[:, i],
+                y,
+                c,
                 frame_rate_hz=hw.frame_rate_hz,
-                sensor_gain=None if self._find_gain else float(self._gains[i]),
-                assumed_gain=float(self._gains[i]),
+                sensor_gain=None if self._find_gain else gain,
+                assumed_gain=gain,
                 most_lines=self._most_lines,
-                start=last[i],
+                start=start,
             )
-            for i in range(count)
+            for y, c, gain, start in zip(
+                measurements.T, corrections.T, self._gains, last, strict=True
+            )
         )
-        plant = IdentifiedModel(
+        model = IdentifiedModel(
             axes=found,
             frame_rate_hz=hw.frame_rate_hz,
             delay_frames=hw.delay_frames,
             mirror=hw.mirror,
-        ).plant()
-        loop = replace(plant.hardware, influence_matrix=hw.influence)
-        self._last = found
-        return replace(plant, hardware=loop)
+        )
+        plant, self._last = model.plant(), found
+        return replace(plant, hardware=replace(plant.hardware, influence_matrix=hw.influence))

@@ -230,22 +230,21 @@ class TrackingController(SwitchedController):
             reason = f"{type(error).__name__}: {error}"
         clock += [time.perf_counter()] * (4 - len(clock))
         identify_s, design_s, switch_s = np.diff(clock).tolist()
-        self._history.append(
-            TrackingUpdate(
-                time_s=time_s,
-                middle_s=time_s - self._window_s / 2,
-                fitted_hz=tuple(line.frequency_hz for line in found.vibrations) if found else (),
-                frequencies_hz=tuple(line.frequency_hz for line in self._plant.vibrations),
-                rms_nm=tuple(line.rms_nm for line in self._plant.vibrations),
-                noise_nm=tuple(np.sqrt(np.diag(self._plant.R)).tolist()),
-                left_out=self._left_out,
-                switched=not reason,
-                reason=reason,
-                identify_s=identify_s,
-                design_s=design_s,
-                switch_s=switch_s,
-            )
+        update = TrackingUpdate(
+            time_s=time_s,
+            middle_s=time_s - self._window_s / 2,
+            fitted_hz=tuple(line.frequency_hz for line in found.vibrations) if found else (),
+            frequencies_hz=tuple(line.frequency_hz for line in self._plant.vibrations),
+            rms_nm=tuple(line.rms_nm for line in self._plant.vibrations),
+            noise_nm=tuple(np.sqrt(np.diag(self._plant.R)).tolist()),
+            left_out=self._left_out,
+            switched=not reason,
+            reason=reason,
+            identify_s=identify_s,
+            design_s=design_s,
+            switch_s=switch_s,
         )
+        self._history.append(update)
 
     def _identify_window(self) -> TipTiltPlant:
         """Return the plant of the last window."""
@@ -292,7 +291,7 @@ class TrackingController(SwitchedController):
             expected = track.frequency_at(ahead_s, overlap=self._window_s / self._update_s)
             lines.append(_move_line(line, expected, self._rate))
         every = dict.fromkeys([*tracks, *self._tracks])
-        self._tracks = [track for track in every if track.time_s[-1] >= recent_s]
+        self._tracks = [track for track in every if track.points[-1][0] >= recent_s]
         return with_vibrations(found, lines)
 
 

@@ -58,19 +58,16 @@ class LineTrack:
     """The frequencies of one line, window after window."""
 
     direction: FloatArray
-    time_s: list[float] = field(default_factory=list)
-    frequency_hz: list[float] = field(default_factory=list)
+    points: list[tuple[float, float]] = field(default_factory=list)  # time [s], frequency [Hz]
 
     def add(self, time_s: float, frequency_hz: float, *, since_s: float) -> None:
         """Add the frequency of a window, and forget those before a time."""
-        self.time_s.append(time_s)
-        self.frequency_hz.append(frequency_hz)
-        while self.time_s[0] < since_s - 1e-6:  # not for rounding
-            del self.time_s[0], self.frequency_hz[0]
+        every = [*self.points, (time_s, frequency_hz)]
+        self.points = [point for point in every if point[0] >= since_s - 1e-6]  # not for rounding
 
     def frequency_at(self, time_s: float, *, overlap: float) -> float:
         """Return the frequency at a time by the trend [Hz]."""
-        times, frequencies = np.array(self.time_s), np.array(self.frequency_hz)
+        times, frequencies = np.array(self.points).T
         return extrapolate(times, frequencies, time_s, overlap=overlap)[0]
 
 
@@ -80,7 +77,7 @@ def match_tracks(tracks: list[LineTrack], lines: tuple[Vibration, ...]) -> list[
     The closest pairs are matched first. A line without a near track begins a new one.
     """
     pairs = sorted(
-        (abs(track.frequency_hz[-1] - line.frequency_hz), i, j)
+        (abs(track.points[-1][1] - line.frequency_hz), i, j)
         for i, line in enumerate(lines)
         for j, track in enumerate(tracks)
         if abs(float(track.direction @ np.array(line.direction))) > _ALIGNED
