@@ -21,6 +21,31 @@ PAGES = sorted(
 )
 
 
+ADDRESS = re.compile(r"\s*(?:[-*] )?(?:!?\[[^\]]*\]\(\S+\)|\S+)[.,;:]?")
+NOT_ENGLISH = re.compile(
+    r"\b(?:anew|told|answers? to a step|one a (?:mode|frame))\b", re.IGNORECASE
+)
+
+
+def prose(text):
+    """Return the lines of a page outside code, tables, headings and addresses that stand alone."""
+    text = re.sub(r"^ *\$\$.+\$\$ *$", "", text, flags=re.MULTILINE)
+    text = re.sub(
+        r"^ *(`{3,}|~{3,}|\$\$)[^\n]*\n.*?^ *\1 *$", "", text, flags=re.MULTILINE | re.DOTALL
+    )
+    lines = [line for line in text.splitlines() if not line.lstrip().startswith(("#", "|"))]
+    return [line for line in lines if not ADDRESS.fullmatch(line)]
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda page: str(page.relative_to(ROOT))
+)
+def test_prose_is_plain_and_no_line_is_longer_than_100(page):
+    lines = prose(page.read_text(encoding="utf-8"))
+    assert [line for line in lines if len(line) > 100] == []
+    assert NOT_ENGLISH.findall(" ".join(lines)) == []
+
+
 @pytest.fixture(scope="module")
 def house():
     spec = importlib.util.spec_from_file_location("house", ROOT / "docs" / "house.py")
