@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from pathlib import Path
 
-from lbt_synth.cli.identification_files import (
-    figure_path,
-    model_text,
-    require_model_name,
-    require_places,
-)
 from lbt_synth.cli.identification_tables import add_model, add_record, marked_note
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
-from lbt_synth.cli.record_arguments import identification_options, read_record
+from lbt_synth.cli.record_files import (
+    find_places,
+    identification_options,
+    read_record,
+    write_files,
+)
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import (
     LoopRecord,
@@ -26,9 +23,6 @@ from lbt_synth.identification import (
 )
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.loop import Imaging, close_loop, loop_margins
-from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.figures.style import save_figure
-from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.rows import column, fill_row, table_row
 
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
@@ -36,12 +30,7 @@ _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no wa
 
 def run(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
-    output = Path(require_gain_name(arguments.output))
-    figure_file = figure_path(arguments, output)
-    model_file = require_model_name(
-        output.with_suffix(".yaml") if arguments.model is None else Path(arguments.model)
-    )
-    require_places(arguments, output, model_file, figure_file)
+    places = find_places(arguments, arguments.model, require_gain_name(arguments.output))
     record = read_record(arguments)
     if isinstance(record, SpectrumRecord):
         raise ProblemError(
@@ -65,16 +54,13 @@ def run(arguments: Namespace) -> Report:
     add_record(report, record)
     add_model(report, found.model)
     _add_comparison(report, found, record)
-    _add_certificate(report, found)
-    # everything is computed before the first file is written
-    text = model_text(found.model, arguments, record)
-    figure = None
-    if figure_file is not None:
-        figure = identification_figure(found.model, designs={found.name: found.design})
-    report.note_written(save_gain(output, found.design))
-    report.note_written(write_atomically(model_file, text), "model")
-    if figure_file is not None:
-        report.note_written(save_figure(figure, figure_file), "figure")
+    loop = close_loop(found.model.hardware, found.design.controller)
+    report.data["certificate"] = found.design.certificate.passed
+    report.notes.append(
+        f"certified: spectral radius of the loop {loop.spectral_radius:.6f}, modulus margin "
+        f"{loop_margins(loop).modulus:.3f}."
+    )
+    write_files(report, places, arguments, record, found.model, found)
     return report
 
 
@@ -121,13 +107,3 @@ def _add_comparison(report: Report, found: RecordedDesign, record: LoopRecord) -
             "leaves something out."
         )
     report.notes += [marked_note(note) for note in found.notes]
-
-
-def _add_certificate(report: Report, found: RecordedDesign) -> None:
-    loop = close_loop(found.model.hardware, found.design.controller)
-    margins = loop_margins(loop)
-    report.data["certificate"] = found.design.certificate.passed
-    report.notes.append(
-        f"certified: spectral radius of the loop {loop.spectral_radius:.6f}, modulus margin "
-        f"{margins.modulus:.3f}."
-    )

@@ -21,7 +21,7 @@ from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.report.figures import end_to_end_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import column, fill_row, percent_column, table_row
 
 _FILES = ("run.png", "telemetry.fits", "summary.json")
 
@@ -37,9 +37,9 @@ class EndToEndFacts:
     frames: int = column()
     settle_frames: int = column()
     seed: int = column()
-    strehl: float = column("Strehl ratio", unit="%", scale=100, format=".2f")
+    strehl: float = percent_column("Strehl ratio")
     strehl_error: float | None = column("  standard error", unit="points", scale=100, format=".2f")
-    other_modes_strehl: float = column("  without tip and tilt", unit="%", scale=100, format=".2f")
+    other_modes_strehl: float = percent_column("  without tip and tilt")
     tip_rms_nm: float = column("tip", unit="nm rms", format=".1f")
     tilt_rms_nm: float = column("tilt", unit="nm rms", format=".1f")
     other_modes_rms_nm: float = column("all other modes", unit="nm rms", format=".1f")

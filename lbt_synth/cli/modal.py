@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
-from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.errors import ConfigError
 from lbt_synth.models import (
     ModalTurbulence,
     Vibration,
@@ -26,6 +27,11 @@ from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import FloatArray, integer
 
 _MOST_MODES = 20_000
+_MIRROR_NOTE = (
+    "mirror: its local loop on every mode; the Kalman filters know its real positions, but command "
+    "their estimates as if it were there at once (lbt-synth mirror, design lqg: tip and tilt "
+    "without this lag)."
+)
 
 
 @table_row
@@ -76,7 +82,7 @@ def run(arguments: Namespace) -> Report:
         "turbulence: AR1 models, von Karman variances, poles by radial order.",
         "vibrations: those of the model, on tip and tilt.",
         assumed,
-        *_mirror_notes(config),
+        *([] if config.hardware.mirror is None else [_MIRROR_NOTE]),
         "the modes are those of Zernike, independent; nothing leaks from one to another.",
     ]
     write_outputs(
@@ -92,15 +98,10 @@ def _design_controllers(
     config: Config, air: ModalTurbulence, noise: FloatArray
 ) -> tuple[float, FloatArray, dict[str, FloatArray]]:
     """Return the best single gain, the best of each mode, and the residuals by controller [nm]."""
-    path: dict[str, Any] = {
-        "delay_frames": config.hardware.delay_frames,
-        "sensor_gain": config.sensor_gain,
-        "mirror": config.hardware.mirror,
-    }
-    seen: dict[str, Any] = {
-        "noise_nm": noise,
-        "vibrations": _axis_vibrations(config, noise.size),
-    }
+    hardware = config.hardware
+    path: dict[str, Any] = {name: getattr(hardware, name) for name in ("delay_frames", "mirror")}
+    path["sensor_gain"] = config.sensor_gain
+    seen: dict[str, Any] = {"noise_nm": noise, "vibrations": _axis_vibrations(config, noise.size)}
     gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **path, **seen)
 
     def integrator_rms(gain: float) -> FloatArray:
@@ -123,17 +124,13 @@ def _design_controllers(
 
 
 def _mode_count(given: int | None, config: Config) -> int:
-    if given is None:
-        given = config.settings.mirror.modes
-        if given is None:
-            raise ConfigError(
-                f"{config.source}: the key mirror.modes is missing; give it, or --modes.",
-                path="mirror.modes",
-            )
-    count = integer(given, "modes", at_least=2)
-    if count > _MOST_MODES:
-        raise ProblemError(f"modes must be at most {_MOST_MODES}; got {count}.")
-    return count
+    count = config.settings.mirror.modes if given is None else given
+    if count is None:
+        raise ConfigError(
+            f"{config.source}: the key mirror.modes is missing; give it, or --modes.",
+            path="mirror.modes",
+        )
+    return integer(count, "modes", at_least=2, at_most=_MOST_MODES)
 
 
 def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
@@ -167,25 +164,9 @@ def _axis_vibrations(config: Config, count: int) -> dict[int, list[Vibration]]:
         for axis, part in enumerate(line.direction):
             size = abs(part) * line.rms_nm
             if axis < count and size > 1e-9 * line.rms_nm:
-                own = Vibration(
-                    frequency_hz=line.frequency_hz,
-                    damping=line.damping,
-                    rms_nm=size,
-                    direction=(1.0,),
-                )
+                own = replace(line, rms_nm=size, direction=(1.0,))
                 found.setdefault(axis, []).append(own)
     return found
-
-
-def _mirror_notes(config: Config) -> list[str]:
-    """Say what the controllers know of the mirror, unless it settles at once."""
-    if config.hardware.mirror is None:
-        return []
-    return [
-        "mirror: its local loop on every mode; the Kalman filters know its real positions, but "
-        "command their estimates as if it were there at once (lbt-synth mirror, design lqg: tip "
-        "and tilt without this lag)."
-    ]
 
 
 def _total_rms(rms: FloatArray) -> float:

@@ -21,6 +21,7 @@ from lbt_synth.storage.rows import (
     fill_row,
     json_record,
     json_units,
+    percent_column,
     row_table,
     table_row,
 )
@@ -83,9 +84,9 @@ class AssessmentRow:
     turbulence_nm: float | None = column(unit="nm", default=None)
     vibration_nm: float | None = column(unit="nm", default=None)
     noise_nm: float | None = column(unit="nm", default=None)
-    strehl: float = column("Strehl", unit="%", scale=100, format=".2f")
+    strehl: float = percent_column("Strehl")
     strehl_simulated: float | None = column()
-    worst_strehl: float = column("worst Strehl", unit="%", scale=100, format=".2f")
+    worst_strehl: float = percent_column("worst Strehl")
     above_limit_percent: float = column(unit="%")
     worst_nm: float = column(unit="nm")
     above_band_limit_percent: float = column(unit="%")

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from lbt_synth import studies
-from lbt_synth.cli.loop_inputs import load_designs, truth_at_sensor_gain
+from lbt_synth.cli.loop_inputs import given_options, load_designs, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import count_progress, track_progress
@@ -18,7 +18,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import stable_sensor_gains
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
-from lbt_synth.storage.rows import column, row_table, table_row
+from lbt_synth.storage.rows import column, percent_column, row_table, table_row
 from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.studies.robustness import default_methods
 from lbt_synth.validation import FloatArray, frozen_copy, number
@@ -37,21 +37,15 @@ def run(arguments: Namespace) -> Report:
 
 def _refuse_unused_options(arguments: Namespace) -> None:
     """Refuse the options of redesigning beside gain files, and those of maps without them."""
-    redesign = {"--sensor-gain": arguments.sensor_gain, "--gamma-ratio": arguments.gamma_ratio}
-    maps = {
-        "--errors-hz": arguments.errors_hz,
-        "--sensor-gains": arguments.sensor_gains,
-        "--delay-errors": arguments.delay_errors,
-    }
+    redesign: tuple[str, ...] = ("sensor_gain", "gamma_ratio")
+    maps: tuple[str, ...] = ("errors_hz", "sensor_gains", "delay_errors")
+    names = {name: f"--{name.replace('_', '-')}" for name in (*redesign, *maps)}
     unused, reason = maps, "goes with gain files, whose designs stay as they are; name some"
     if arguments.gains:
-        unused = redesign
-        reason = (
-            f"is for redesigning, without gain files; the options of these are {', '.join(maps)}"
-        )
-    for option, value in unused.items():
-        if value is not None:
-            raise ProblemError(f"{option} {reason}.")
+        unused, reason = redesign, "is for redesigning, without gain files; the options of these "
+        reason += f"are {', '.join(names[name] for name in maps)}"
+    for name in given_options(arguments, *unused):
+        raise ProblemError(f"{names[name]} {reason}.")
 
 
 def _redesign(config: Config, arguments: Namespace) -> Report:
@@ -197,8 +191,8 @@ class MapLine:
     sensor_gain: float = column("sensor gain", format=".3f")
     delay_error_frames: float = column("delay error", unit="frames", format="+g")
     stable: bool = column("stable")
-    centre: float = column("Strehl at 0 Hz", unit="%", scale=100, format=".2f")
-    worst: float = column("worst Strehl", unit="%", scale=100, format=".2f")
+    centre: float = percent_column("Strehl at 0 Hz")
+    worst: float = percent_column("worst Strehl")
     worst_hz: float = column("at", unit="Hz", format="+.2f")
 
 

@@ -58,8 +58,15 @@ def column(
     return dataclasses.field(default=default, init=init, metadata={"column": printed})
 
 
+def percent_column(heading: str, **printing: Any) -> Any:
+    """Return a column of ratios that tables show in percent, with two decimals."""
+    return column(heading, **{"unit": "%", "scale": 100, "format": ".2f", **printing})
+
+
 @dataclass_transform(
-    kw_only_default=True, frozen_default=True, field_specifiers=(column, dataclasses.field)
+    kw_only_default=True,
+    frozen_default=True,
+    field_specifiers=(column, percent_column, dataclasses.field),
 )
 def table_row(kind: type[Row]) -> type[Row]:
     r"""Make a frozen dataclass of columns, whose docstring lists them.

@@ -23,7 +23,7 @@ from lbt_synth.loop import (
 )
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, percent_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _GRID = 65  # shifts over the range of errors, at least
@@ -42,9 +42,7 @@ class LimitRow:
         missing="unstable",
         help="Residual under the truth, rms",
     )
-    strehl: float = column(
-        "Strehl", unit="%", scale=100, format=".2f", help="Strehl ratio in [0, 1]"
-    )
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
     above_limit_percent: float = column(
         "above the limit",
         unit="%",

@@ -11,7 +11,7 @@ from lbt_synth.design import Design, kalman, lqg, optimal_integrator
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, settling_error, strehl
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, percent_column, table_row
 from lbt_synth.validation import require_instance
 
 
@@ -29,9 +29,7 @@ class MirrorRow:
         help="Residual under the truth, rms",
         default=np.nan,
     )
-    strehl: float = column(
-        "Strehl", unit="%", scale=100, format=".2f", help="Strehl ratio in [0, 1]", default=np.nan
-    )
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
     unsettled_nm: float = column(
         "settled less real position",
         unit="nm",

@@ -12,7 +12,7 @@ from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.methods.plant_inputs import reference_design
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.models import TipTiltPlant, Truth, retuned_plant
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import column, fill_row, percent_column, table_row
 from lbt_synth.validation import choice, number
 
 
@@ -24,9 +24,7 @@ class RobustnessRow:
         "error", unit="Hz", format="+.2f", help="Frequency in the model less the true one"
     )
     method: str = column("method", help="Method of synthesis")
-    strehl: float = column(
-        "Strehl", unit="%", scale=100, format=".2f", help="Strehl ratio in [0, 1]", default=np.nan
-    )
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
     residual_nm: float = column(
         "residual", unit="nm", format=".1f", help="Residual of tip and tilt, rms", default=np.nan
     )

@@ -179,7 +179,7 @@ def robustness_map(
     )
 
 
-def _checked_axis(values: Any, name: str, **bounds: Any) -> FloatArray:
+def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     """Return the values of one axis of the map, each within its bounds and given once."""
     axis = real_array(values, name)
     if axis.ndim != 1 or axis.size == 0:

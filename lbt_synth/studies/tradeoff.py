@@ -9,7 +9,6 @@ import numpy as np
 
 from lbt_synth.design import FilterDesign, central_filter, hinf, kalman, mixed
 from lbt_synth.design.mixed import require_taps
-from lbt_synth.errors import ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import close_loop, loop_margins
@@ -105,9 +104,7 @@ def tradeoff(
     True
     """
     require_problem(problem)
-    count = integer(points, "points", at_least=2)
-    if count > _MOST_POINTS:
-        raise ProblemError(f"points must be at most {_MOST_POINTS}; got {count}.")
+    count = integer(points, "points", at_least=2, at_most=_MOST_POINTS)
     length = require_taps(taps)
     for family in families:
         choice(family, "families", FAMILIES)
