@@ -21,7 +21,7 @@ PAGES = sorted(
 )
 
 
-ADDRESS = re.compile(r"\s*(?:[-*] )?(?:!?\[[^\]]*\]\(\S+\)|\S+)[.,;:]?")
+ADDRESS = re.compile(r"\s*(?:[-*] )?(?:!?\[[^\]]*\]\(\S+\)|\S{90,})[.,;:]?")
 NOT_ENGLISH = re.compile(
     r"\b(?:anew|told|answers? to a step|one a (?:mode|frame))\b", re.IGNORECASE
 )
