@@ -95,11 +95,7 @@ def shape(
     >>> lbt.loop_margins(loop).modulus > 0.6
     True
     """
-    if not isinstance(hardware, LoopHardware):
-        raise ProblemError(
-            "hardware must be a LoopHardware, such as plant.hardware; got "
-            f"{type(hardware).__name__}."
-        )
+    require_instance(hardware, LoopHardware, "hardware, such as plant.hardware,")
     given: Any = specification
     given = tuple(given) if isinstance(given, list | tuple) else (given,) * hardware.modes
     for spec in given:

@@ -206,7 +206,10 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
         ),
         (lambda: spec(3), "a demand must be one of ModulusMargin"),
         (lambda: spec(objective=3), "an objective is made of"),
-        (lambda: lbt.design.shape(3, spec()), "hardware must be a LoopHardware"),
+        (
+            lambda: lbt.design.shape(3, spec()),
+            "hardware, such as plant.hardware, must be a LoopHardware; got int",
+        ),
         (lambda: lbt.design.shape(ONE, 3), "expected a Specification"),
         (lambda: lbt.design.shape(ONE, [spec(), spec()]), "one for each of 1 modes; got 2"),
         (lambda: lbt.design.shape(ONE, spec(), functions=401), "functions must be at most 400"),

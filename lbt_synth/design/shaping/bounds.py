@@ -6,14 +6,14 @@ the real loop over all frequencies, which know nothing of the programme.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, DeclaredBounds, discs
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, CheckedFields, discs
 from lbt_synth.design.shaping.frequency_grid import Grid, spectrum_edges
 from lbt_synth.design.shaping.objectives import ResidualVariance
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
@@ -23,11 +23,11 @@ from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBou
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.models import Spectrum
-from lbt_synth.validation import FloatArray, set_fields
+from lbt_synth.validation import FloatArray, Positive, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModulusMargin(DeclaredBounds):
+class ModulusMargin(CheckedFields):
     """Least distance of the loop from instability, ``1 / max |S|``, at unit sensor gain.
 
     Parameters
@@ -47,7 +47,7 @@ class ModulusMargin(DeclaredBounds):
     'modulus margin of at least 0.45'
     """
 
-    at_least: float = field(metadata={"above": 0, "below": 1})
+    at_least: Annotated[float, ("above", 0), ("below", 1)]
 
     @property
     def label(self) -> str:
@@ -66,7 +66,7 @@ class ModulusMargin(DeclaredBounds):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NoisePeak(DeclaredBounds):
+class NoisePeak(CheckedFields):
     """Largest amplification of measurement noise into the residual, at any frequency.
 
     Parameters
@@ -86,7 +86,7 @@ class NoisePeak(DeclaredBounds):
     2.0
     """
 
-    at_most: float = field(metadata={"above": 0})
+    at_most: Positive
 
     @property
     def label(self) -> str:
@@ -132,8 +132,8 @@ class Attenuation(Band):
     'attenuation to 0.01 in 0-2 Hz at sensor gain 1'
     """
 
-    at_most: float = field(metadata={"above": 0})
-    sensor_gain: float = field(default=1.0, metadata={"above": 0})
+    at_most: Positive
+    sensor_gain: Positive = 1.0
 
     def __post_init__(self) -> None:
         Band.__post_init__(self)
@@ -169,7 +169,7 @@ class Attenuation(Band):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CommandRms(DeclaredBounds):
+class CommandRms(CheckedFields):
     """Bound on the stroke or on the step of the commands, under turbulence and noise.
 
     Parameters
@@ -198,13 +198,13 @@ class CommandRms(DeclaredBounds):
     'command step of at most 30 nm rms'
     """
 
-    at_most_nm: float = field(metadata={"above": 0})
+    at_most_nm: Positive
     turbulence: Spectrum | None
     noise_nm: float
     rate: bool = False
 
     def __post_init__(self) -> None:
-        DeclaredBounds.__post_init__(self)
+        CheckedFields.__post_init__(self)
         if not isinstance(self.rate, bool):
             raise ProblemError(f"rate must be True or False; got {self.rate!r}.")
         # the same disturbances as those of a variance

@@ -132,6 +132,11 @@ class Channel:
         """Slopes of T, (f, n)."""
         return self.noise_rows(frequency_hz) / self._z(frequency_hz)[:, None]
 
+    def steering_rows(self, frequency_hz: FloatArray, sensor_gain: float) -> ComplexArray | None:
+        """Slopes of the denominator at a sensor gain, (f, n); None at 1, where it is 1."""
+        rest = 1 - sensor_gain
+        return rest * self.complementary_rows(frequency_hz) if rest else None
+
     def mirror(self, frequency_hz: FloatArray) -> ComplexArray:
         """Response M of the mirror's delay, (f,)."""
         taps = self.hardware.mirror_taps

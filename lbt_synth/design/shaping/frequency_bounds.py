@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any, cast
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,26 +10,30 @@ from lbt_synth.design.certificate import Check
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.convex_functions import Discs
 from lbt_synth.linear.norms import band_norm
-from lbt_synth.validation import ComplexArray, FloatArray, number, set_fields
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    NotNegative,
+    check_fields,
+    number,
+    set_fields,
+)
 
 ROOM = 1e-3  # part of a bound that the programme leaves for what lies between its points
 LEVEL_SETS = "level sets, all frequencies"
 
 
-class DeclaredBounds:
-    """Base of dataclasses whose fields declare the bounds of a number as their metadata."""
+class CheckedFields:
+    """Base of dataclasses of which the types of fields hold the bounds of numbers."""
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        for own in fields(cast(Any, self)):
-            if own.metadata:
-                value = number(getattr(self, own.name), own.name, **own.metadata)
-                set_fields(self, **{own.name: value})
+        check_fields(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Band(DeclaredBounds):
+class Band(CheckedFields):
     """Band from ``low_hz`` to ``high_hz``, both included, from which terms and demands derive.
 
     Raises
@@ -39,11 +42,11 @@ class Band(DeclaredBounds):
         If the ends are no numbers of at least 0 in increasing order.
     """
 
-    low_hz: float = field(metadata={"at_least": 0})
+    low_hz: NotNegative
     high_hz: float
 
     def __post_init__(self) -> None:
-        DeclaredBounds.__post_init__(self)
+        CheckedFields.__post_init__(self)
         set_fields(self, high_hz=number(self.high_hz, "high_hz", above=self.low_hz))
 
     @property

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import Band, DeclaredBounds
+from lbt_synth.design.shaping.frequency_bounds import Band, CheckedFields
 from lbt_synth.design.shaping.frequency_grid import Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function
 from lbt_synth.loop import residual_budget
 from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth
-from lbt_synth.validation import ComplexArray, FloatArray, number, sequence, set_fields
+from lbt_synth.validation import FloatArray, NotNegative, Positive, number, sequence, set_fields
 
-_RECORDED = ARModel | Atmosphere | TabulatedSpectrum | None  # what a gain file can hold
+_RECORDED = Atmosphere | ARModel | TabulatedSpectrum | None  # what a gain file can hold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ResidualVariance(DeclaredBounds):
+class ResidualVariance(CheckedFields):
     """Variance of turbulence and noise in the residual of one mode.
 
     Parameters
@@ -46,17 +46,16 @@ class ResidualVariance(DeclaredBounds):
     """
 
     turbulence: Spectrum | None
-    noise_nm: float = field(metadata={"at_least": 0})
-    sensor_gain: float = field(default=1.0, metadata={"above": 0})
+    noise_nm: NotNegative
+    sensor_gain: Positive = 1.0
 
     def __post_init__(self) -> None:
-        spectrum = self.turbulence
-        if not isinstance(spectrum, _RECORDED):
+        if not isinstance(self.turbulence, _RECORDED):
             raise ProblemError(
                 "turbulence must be an Atmosphere, an ARModel, a TabulatedSpectrum or None; got "
-                f"{type(spectrum).__name__}. Sample it into a TabulatedSpectrum."
+                f"{type(self.turbulence).__name__}. Sample it into a TabulatedSpectrum."
             )
-        DeclaredBounds.__post_init__(self)
+        CheckedFields.__post_init__(self)
         if self.turbulence is None and self.noise_nm == 0:
             raise ProblemError("a variance needs turbulence or noise; got neither.")
 
@@ -68,14 +67,13 @@ class ResidualVariance(DeclaredBounds):
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the variance over a grid as a function of the coefficients [nm^2]."""
         f, w = grid.nodes_hz, grid.weights_hz
-        complementary = channel.complementary_rows(f)
         density = np.zeros(f.size) if self.turbulence is None else self.turbulence.psd(f)
         size = np.sqrt(w * density)
         noise = self.noise_nm * np.sqrt(w / channel.nyquist_hz)
         noise_rows = noise[:, None] * channel.noise_rows(f)
-        rows = np.stack([-size[:, None] * complementary, noise_rows], axis=1)
+        rows = np.stack([-size[:, None] * channel.complementary_rows(f), noise_rows], axis=1)
         centres = np.stack([size, np.zeros(f.size)], axis=1).astype(np.complex128)
-        steering = _steering(complementary, self.sensor_gain)
+        steering = channel.steering_rows(f, self.sensor_gain)
         return Fractions(frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=False)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
@@ -110,8 +108,8 @@ class VibrationBand(Band):
     ((16.5, 23.5),)
     """
 
-    rms_nm: float = field(metadata={"above": 0})
-    sensor_gain: float = field(default=1.0, metadata={"above": 0})
+    rms_nm: Positive
+    sensor_gain: Positive = 1.0
 
     @property
     def label(self) -> str:
@@ -126,10 +124,9 @@ class VibrationBand(Band):
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""
         f = grid.within(self.low_hz, self.high_hz)
-        complementary = channel.complementary_rows(f)
-        rows = -self.rms_nm * complementary[:, None, :]
+        rows = -self.rms_nm * channel.complementary_rows(f)[:, None, :]
         centres = np.full((f.size, 1), self.rms_nm, dtype=np.complex128)
-        steering = _steering(complementary, self.sensor_gain)
+        steering = channel.steering_rows(f, self.sensor_gain)
         return Fractions(frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=True)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
@@ -248,10 +245,6 @@ def leaves(term: Term) -> tuple[Leaf, ...]:
     if isinstance(term, _CombinedTerms):
         return tuple(leaf for part in term.terms for leaf in leaves(part))
     return (term,)
-
-
-def _steering(complementary: ComplexArray, sensor_gain: float) -> ComplexArray | None:
-    return None if sensor_gain == 1 else (1 - sensor_gain) * complementary
 
 
 def vibration_bands(term: Term) -> tuple[tuple[float, float], ...]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from dataclasses import dataclass, replace
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, DeclaredBounds, discs
+from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, CheckedFields, discs
 from lbt_synth.design.shaping.frequency_grid import Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, append_taps
 from lbt_synth.errors import ProblemError
@@ -18,13 +18,13 @@ from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
 from lbt_synth.linear.norms import largest_real_part
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, Positive
 
 _HOLDS_ONE = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorGainRange(DeclaredBounds):
+class SensorGainRange(CheckedFields):
     """Guaranteed stability for every sensor gain of an interval.
 
     The loop is stable at g while ``1 - (1 - g) T`` does not vanish: the real part of T is
@@ -47,8 +47,8 @@ class SensorGainRange(DeclaredBounds):
     'stability for sensor gains 0.25 to 1.3'
     """
 
-    low: float = field(metadata={"above": 0, "at_most": 1, "hint": _HOLDS_ONE})
-    high: float = field(metadata={"at_least": 1, "hint": _HOLDS_ONE})
+    low: Annotated[float, ("above", 0), ("at_most", 1), ("hint", _HOLDS_ONE)]
+    high: Annotated[float, ("at_least", 1), ("hint", _HOLDS_ONE)]
 
     @property
     def label(self) -> str:
@@ -84,7 +84,7 @@ class SensorGainRange(DeclaredBounds):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DelayError(DeclaredBounds):
+class DelayError(CheckedFields):
     """Guaranteed stability for every error of the delay up to a bound, late or early.
 
     Delays, fractions included, are those of :class:`LoopHardware`: with the mirror's response
@@ -110,7 +110,7 @@ class DelayError(DeclaredBounds):
     0.25
     """
 
-    frames: float = field(metadata={"above": 0, "at_most": 1})
+    frames: Annotated[float, ("above", 0), ("at_most", 1)]
 
     @property
     def label(self) -> str:
@@ -182,7 +182,7 @@ class MirrorUncertainty(Band):
     0.5
     """
 
-    relative: float = field(metadata={"above": 0})
+    relative: Positive
 
     @property
     def label(self) -> str:
