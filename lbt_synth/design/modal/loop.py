@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design.certificate import RESIDUAL_TOLERANCE, VARIANCE_TOLERANCE
-from lbt_synth.design.modal.closed_loops import LoopBlock, close_bank, filter_phase
+from lbt_synth.design.modal.banks import LoopBlock, close_bank, filter_phase
 from lbt_synth.design.modal.filters import ModalFilters
 from lbt_synth.design.modal.mixed_controller import MixedController
 from lbt_synth.design.modal.plants import ModalModels, Vibrations, number_per_mode

@@ -13,8 +13,15 @@ import numpy as np
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, CheckedFields, discs
-from lbt_synth.design.shaping.frequency_grid import Grid, spectrum_edges
+from lbt_synth.design.shaping.frequencies import (
+    LEVEL_SETS,
+    ROOM,
+    Band,
+    CheckedFields,
+    Grid,
+    discs,
+    spectrum_edges,
+)
 from lbt_synth.design.shaping.objectives import ResidualVariance
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError

@@ -8,8 +8,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import Band, CheckedFields
-from lbt_synth.design.shaping.frequency_grid import Grid
+from lbt_synth.design.shaping.frequencies import Band, CheckedFields, Grid
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import ROOM
-from lbt_synth.design.shaping.frequency_grid import Grid, fine_frequencies
+from lbt_synth.design.shaping.frequencies import ROOM, Grid, fine_frequencies
 from lbt_synth.design.shaping.objectives import noise_level
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import InfeasibleError, NumericalError

@@ -8,8 +8,7 @@ from typing import Any, TypeAlias, get_args
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import Band
-from lbt_synth.design.shaping.frequency_grid import Grid, first_grid
+from lbt_synth.design.shaping.frequencies import Band, Grid, first_grid
 from lbt_synth.design.shaping.objectives import ResidualVariance, Term, leaves, require_term
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.design.shaping.uncertainty import SensorGainRange, Uncertainty

@@ -10,8 +10,7 @@ from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.design.shaping.frequency_bounds import LEVEL_SETS, ROOM, Band, CheckedFields, discs
-from lbt_synth.design.shaping.frequency_grid import Grid
+from lbt_synth.design.shaping.frequencies import LEVEL_SETS, ROOM, Band, CheckedFields, Grid, discs
 from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, append_taps
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import hinf_norm

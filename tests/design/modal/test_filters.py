@@ -7,7 +7,7 @@ import pytest
 from support.modal import HUM, LINE, RATE, single_plant, some_air
 
 import lbt_synth as lbt
-from lbt_synth.design.modal.closed_loops import LoopBlock, LoopVariances
+from lbt_synth.design.modal.banks import LoopBlock, LoopVariances
 from lbt_synth.design.modal.filters import batch_errors, modal_certificate
 from lbt_synth.design.modal.plants import ModalModels
 

@@ -5,7 +5,7 @@ import pytest
 from support.ensembles import AIR, LINE, RATE, plant
 
 import lbt_synth as lbt
-from lbt_synth.loop.ensemble.subloops import split_into_subloops
+from lbt_synth.loop.ensemble.closed_loops import split_into_subloops
 
 
 def test_a_loop_is_split_into_subloops(kalman, coupled):
