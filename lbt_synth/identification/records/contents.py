@@ -6,8 +6,8 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -199,15 +199,15 @@ def _read_text(out: Contents, content: bytes) -> None:
     if not rows:
         raise TelemetryError("it has no rows.")
     sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
-    names = _split_cells(rows[0][1], sign)
+    names = _split_heading(rows[0][1], sign)
     sample = "".join(line for _, line in rows[1:_LOOKED_AT])
     if sign in (";", "\t") and "," in sample and "." not in sample:
         out.notes.append("commas were taken for decimal points")
         rows = [(number, line.replace(",", ".")) for number, line in rows]
-    if None in map(_parse_number, _split_cells(rows[0][1], sign)):
+    if None in map(_parse_number, _split_heading(rows[0][1], sign)):
         rows = rows[1:]
     else:
-        cells = _split_cells(above, sign)
+        cells = _split_heading(above, sign)
         numbers = [cell for cell in cells if not cell or _parse_number(cell) is not None]
         names = [""] * len(names) if numbers or len(cells) != len(names) else cells
     if not rows:
@@ -226,36 +226,37 @@ def _add_comment(out: Contents, comment: str) -> None:
             out.add_fact(fact, match[2], f"the comment {match[1]}")
 
 
-def _split_cells(line: str, sign: str | None) -> list[str]:
-    cells = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
-    return [cell.strip().strip('"') for cell in cells]
+def _split_cells(lines: Iterable[str], sign: str | None) -> Iterator[list[str]]:
+    """Yield the cells of each line."""
+    return map(str.split, lines) if sign is None else csv.reader(lines, delimiter=sign)
+
+
+def _split_heading(line: str, sign: str | None) -> list[str]:
+    return [cell.strip().strip('"') for cell in next(_split_cells([line], sign), [])]
 
 
 def _parse_number(cell: str) -> float | None:
-    word = cell.lower()
     try:
-        return float("nan" if word in _GAPS else word)
+        return float(cell)
     except ValueError:
-        return None
+        return float("nan") if cell.strip().lower() in _GAPS else None
 
 
 def _parse_rows(rows: list[tuple[int, str]], sign: str | None, width: int) -> FloatArray:
-    try:  # the quick way, which knows no gaps
-        lines = [line for _, line in rows]
-        out = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
-        if out.shape == (len(rows), width):
-            return out
-    except ValueError:
-        pass
-    out = np.empty((len(rows), width))
-    for i, (number, line) in enumerate(rows):
-        cells = _split_cells(line, sign)
-        if len(cells) != width:
-            raise TelemetryError(f"line {number} must have {width} cells; got {len(cells)}.")
-        for j, cell in enumerate(cells):
-            if (value := _parse_number(cell)) is None:
-                raise TelemetryError(
-                    f"cell {j + 1} of line {number} must be a number; got {cell!r}."
-                )
-            out[i, j] = value
+    lines, out = [line for _, line in rows], np.empty((len(rows), width))
+    with suppress(ValueError):  # the quick way, which knows no gaps
+        found = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
+        if found.shape == out.shape:
+            return found
+    table = _split_cells(lines, sign)
+    for values, (number, _), cells in zip(out, rows, table, strict=True):
+        parsed = list(map(_parse_number, cells))
+        if len(parsed) != width:
+            raise TelemetryError(f"line {number} must have {width} cells; got {len(parsed)}.")
+        if None in parsed:
+            at = parsed.index(None)
+            raise TelemetryError(
+                f"cell {at + 1} of line {number} must be a number; got {cells[at].strip()!r}."
+            )
+        values[:] = parsed
     return out
