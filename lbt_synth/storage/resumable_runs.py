@@ -157,27 +157,24 @@ def _hash(content: Mapping[str, Any]) -> str:
 
 
 def _read(path: Path, expected: str) -> dict[str, Any] | None:
+    """Return the result in a file, None without a file; refuse one that is not that of the case."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         asked, digest, result = content["asked"], content["digest"], dict(content["result"])
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise OutputError(
-            f"{path} is no result of a run: {error}. Delete it, or name another directory.",
-            path=path,
-        ) from error
+        why = f"is no result of a run: {error}. Delete it, or name another directory."
+        raise OutputError(f"{path} {why}", path=path) from error
+    if asked == expected and digest == _hash(result):
+        return result
+    why = "was changed after it was written. Delete it, and it is run again."
     if asked != expected:
-        raise OutputError(
-            f"{path} is the result of other settings. Name another directory, or delete the "
-            "results of the old settings.",
-            path=path,
+        why = (
+            "is the result of other settings. Name another directory, or delete the results of the "
+            "old settings."
         )
-    if digest != _hash(result):
-        raise OutputError(
-            f"{path} was changed after it was written. Delete it, and it is run again.", path=path
-        )
-    return result
+    raise OutputError(f"{path} {why}", path=path)
 
 
 def _write(

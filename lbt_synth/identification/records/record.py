@@ -19,6 +19,7 @@ from lbt_synth.validation import (
     integer,
     matrix,
     number,
+    read_only,
     require_instance,
     set_fields,
 )
@@ -121,11 +122,17 @@ class LoopRecord:
         for name, limits in _LIMITS.items():
             if (value := getattr(self, name)) is not None:
                 set_fields(self, **{name: number(value, name, **limits)})
+        for name in ("usable", "measured", "commanded"):
+            if (given := getattr(self, name)) is not None:
+                flags = read_only(np.array(given))
+                if flags.dtype != np.bool_ or flags.shape != (len(y),):
+                    raise DimensionError(
+                        f"{name} must be {len(y)} truth values, one per frame; got {flags.dtype} "
+                        f"{flags.shape}."
+                    )
+                set_fields(self, **{name: flags})
         if self.mirror is not None:
             require_instance(self.mirror, PositionLoop)
-        for name in ("usable", "measured", "commanded"):
-            if (flags := getattr(self, name)) is not None:
-                set_fields(self, **{name: _check_flags(flags, name, len(y))})
         if self.delay_frames is not None:
             _ = self.mirror_taps  # refuses a mirror that does not fit the rate
 
@@ -337,13 +344,3 @@ def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: i
     powers = np.vander(known - start, increasing=True)
     inside = np.vander(np.arange(stop - start), known.size, increasing=True)
     return np.asarray(inside @ np.linalg.solve(powers, series[known]))
-
-
-def _check_flags(value: Any, name: str, frames: int) -> BoolArray:
-    out = np.array(value)
-    if out.dtype != np.bool_ or out.shape != (frames,):
-        raise DimensionError(
-            f"{name} must be {frames} truth values, one per frame; got {out.dtype} {out.shape}."
-        )
-    out.setflags(write=False)
-    return out

@@ -66,11 +66,12 @@ def require_length(
             f"least {_SHORTEST_STRETCH}; got {count}, the longest stretch {longest}. "
             f"{record.health.summary()} Record more, or bridge short holes (record.bridged())."
         )
-    if resolution_hz is not None:
-        line = int(np.ceil(rate / number(resolution_hz, "resolution_hz", above=0) * (1 - 1e-12)))
-        if longest < line:
-            raise ProblemError(
-                f"to tell frequencies {resolution_hz:g} Hz apart a stretch of {line} frames "
-                f"({line / rate:.3g} s) is needed; the longest has {longest}."
-            )
+    if resolution_hz is None:
+        return count
+    line = int(np.ceil(rate / number(resolution_hz, "resolution_hz", above=0) * (1 - 1e-12)))
+    if longest < line:
+        raise ProblemError(
+            f"to tell frequencies {resolution_hz:g} Hz apart a stretch of {line} frames "
+            f"({line / rate:.3g} s) is needed; the longest has {longest}."
+        )
     return count

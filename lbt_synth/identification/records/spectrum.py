@@ -78,18 +78,17 @@ class SpectrumRecord:
         for column in density.T:
             TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=column)
         set_fields(self, frequency_hz=frequency, density_nm2_hz=density)
-        if self.frame_rate_hz is not None:
-            rate = number(self.frame_rate_hz, "frame_rate_hz", above=0)
-            set_fields(self, frame_rate_hz=rate)
-            if frequency[-1] > rate / 2 * (1 + 1e-9):
-                raise ProblemError(
-                    f"frequencies must lie below half the frame rate, {rate / 2:.6g} Hz; got "
-                    f"{frequency[-1]:.6g} Hz."
-                )
+        for name in ("frame_rate_hz", "diameter_m"):
+            if (value := getattr(self, name)) is not None:
+                set_fields(self, **{name: number(value, name, above=0)})
         if self.averages is not None:
             set_fields(self, averages=integer(self.averages, "averages", at_least=1))
-        if self.diameter_m is not None:
-            set_fields(self, diameter_m=number(self.diameter_m, "diameter_m", above=0))
+        half = np.inf if self.frame_rate_hz is None else self.frame_rate_hz / 2
+        if frequency[-1] > half * (1 + 1e-9):
+            raise ProblemError(
+                f"frequencies must lie below half the frame rate, {half:.6g} Hz; got "
+                f"{frequency[-1]:.6g} Hz."
+            )
 
     @property
     def axes(self) -> int:
