@@ -175,11 +175,15 @@ def number(value: Any, name: str, *, hint: str = "", **bounds: float) -> float:
         raise ProblemError(f"{name} must be a number; got {value!r}.") from error
     if not math.isfinite(out):
         raise NonFiniteError(f"{name} must be finite; got {out}.")
-    for relation, bound in bounds.items():
-        if not _RELATIONS[relation](out, bound):
-            wanted = f"{relation.replace('_', ' ')} {bound:.12g}"
-            raise ProblemError(f"{name} must be {wanted}; got {out:.12g}. {hint}".strip())
+    _require_bounds(out, name, bounds, hint)
     return out
+
+
+def _require_bounds(value: float, name: str, bounds: dict[str, float], hint: str = "") -> None:
+    for relation, bound in bounds.items():
+        if not _RELATIONS[relation](value, bound):
+            wanted = f"{relation.replace('_', ' ')} {bound:.12g}"
+            raise ProblemError(f"{name} must be {wanted}; got {value:.12g}. {hint}".strip())
 
 
 def positive(values: Any, name: str) -> FloatArray:
@@ -203,16 +207,11 @@ def one_or_each(value: Any, name: str, size: int | None = None, **bounds: Any) -
     return out
 
 
-def integer(value: Any, name: str, *, at_least: int, at_most: float = math.inf) -> int:
-    """Return an integer within its bounds."""
+def integer(value: Any, name: str, **bounds: float) -> int:
+    """Return an integer that is ``at_least`` or ``at_most`` its bounds."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ProblemError(f"{name} must be an integer; got {value!r}.")
-    for word, bound, broken in (
-        ("least", at_least, value < at_least),
-        ("most", at_most, value > at_most),
-    ):
-        if broken:
-            raise ProblemError(f"{name} must be at {word} {bound}; got {value}.")
+    _require_bounds(int(value), name, bounds)
     return int(value)
 
 

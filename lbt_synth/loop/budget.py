@@ -18,13 +18,7 @@ from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
-from lbt_synth.validation import (
-    ComplexArray,
-    FloatArray,
-    frozen_copy,
-    require_instance,
-    set_fields,
-)
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,10 +37,6 @@ class ResidualBudget:
     noise_nm2: FloatArray
     random_vibration_nm2: FloatArray
     line_amplitudes_nm: ComplexArray
-
-    def __post_init__(self) -> None:
-        names = ("turbulence_nm2", "noise_nm2", "random_vibration_nm2")
-        set_fields(self, **{name: frozen_copy(getattr(self, name)) for name in names})
 
     @property
     def gaussian_nm2(self) -> FloatArray:
@@ -150,12 +140,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
             response = loop.sensitivity([vibration.frequency_hz])[0]
             lines.append(vibration.amplitude_nm * response @ direction)
     noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
-    return ResidualBudget(
-        turbulence_nm2=turbulence,
-        noise_nm2=_noise_covariance(loop, np.diag(noise_nm)),
-        random_vibration_nm2=random_vibration,
-        line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
-    )
+    return _make_budget(loop, turbulence, np.diag(noise_nm), random_vibration, lines)
 
 
 def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
@@ -214,20 +199,26 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
     for line in plant.vibrations:
         direction = checked_direction(line, one)
         vibration += ar_covariance(loop, line.ar_model(one.frame_rate_hz), direction[None])
-    return ResidualBudget(
-        turbulence_nm2=turbulence,
-        noise_nm2=_noise_covariance(loop, plant.D[:, -q:]),
-        random_vibration_nm2=vibration,
-        line_amplitudes_nm=np.zeros((0, n), dtype=np.complex128),
-    )
+    return _make_budget(loop, turbulence, plant.D[:, -q:], vibration, [])
 
 
-def _noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
-    """Covariance of the residual that white noise of covariance ``factor factor'`` leaves."""
+def _make_budget(
+    loop: ClosedLoop,
+    turbulence: FloatArray,
+    noise_factor: FloatArray,
+    random_vibration: FloatArray,
+    lines: list[ComplexArray],
+) -> ResidualBudget:
+    """Add what white noise of covariance ``factor factor'`` leaves."""
     n, s = loop.hardware.modes, loop.system.balanced()
-    B, D = s.B[:, n:] @ factor, s.D[:n, n:] @ factor
-    states = stationary_covariance(s.A, B @ B.T)
-    return np.asarray(s.C[:n] @ states @ s.C[:n].T + D @ D.T)
+    B, D = s.B[:, n:] @ noise_factor, s.D[:n, n:] @ noise_factor
+    noise = s.C[:n] @ stationary_covariance(s.A, B @ B.T) @ s.C[:n].T + D @ D.T
+    return ResidualBudget(
+        turbulence_nm2=frozen_copy(turbulence),
+        noise_nm2=frozen_copy(noise),
+        random_vibration_nm2=frozen_copy(random_vibration),
+        line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
+    )
 
 
 def ar_covariance(loop: ClosedLoop, model: ARModel, directions: FloatArray) -> FloatArray:

@@ -224,12 +224,6 @@ class Optics:
         """Pixel of the image [mas]."""
         return float(self._camera.psf_pixel_size)
 
-    @property
-    def image_shape(self) -> tuple[int, int]:
-        """Rows and columns of the image."""
-        rows, columns = self._camera.out_size
-        return int(rows), int(columns)
-
     def _make_input(self, value: FloatArray) -> Any:
         value = np.array(value, dtype=np.float32)
         return _make("base_value:BaseValue", value=value, precision=1)

@@ -126,22 +126,15 @@ class EndToEndSetup:
         filter: Any,  # noqa: A002
         *,
         tip_tilt_gain: float | None = None,
-        calibration: Calibration | None = None,
-        cache: Any = None,
-        progress: Callable[[int], None] | None = None,
+        **options: Any,
     ) -> EndToEndRun:
-        """Close the loop with :meth:`controller`; the other arguments as `run_end_to_end`."""
-        return run_end_to_end(
-            self.system,
-            self.controller(filter, tip_tilt_gain=tip_tilt_gain),
-            vibrations=self.vibrations,
-            frames=self.frames,
-            settle_frames=self.settle_frames,
-            seed=self.seed,
-            calibration=calibration,
-            cache=cache,
-            progress=progress,
-        )
+        """Close the loop with :meth:`controller`.
+
+        The options are calibration, cache and progress, as of :func:`run_end_to_end`.
+        """
+        control = self.controller(filter, tip_tilt_gain=tip_tilt_gain)
+        own = {name: getattr(self, name) for name in ("frames", "settle_frames", "seed")}
+        return run_end_to_end(self.system, control, vibrations=self.vibrations, **own, **options)
 
 
 def run_end_to_end(
@@ -271,7 +264,7 @@ def _run_frames(
     kept = len(tilts) - settle
     out = {name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")}
     strehl, others = np.empty(kept), np.empty(kept)
-    psf = np.zeros(optics.image_shape)
+    psf = np.zeros(())
     past = np.zeros((len(taps), n))  # u(k), u(k-1), ...
     slopes = calibration.reference
     controller.reset()
@@ -282,7 +275,7 @@ def _run_frames(
         row = k - settle
         if row >= 0:
             strehl[row], frame = optics.image()
-            psf += frame
+            psf = psf + frame
             residual, others[row] = _measure_residual(modes, optics)
             for name, value in zip(out, (y, past[0], residual), strict=True):
                 out[name][row] = value

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -153,10 +153,7 @@ class PositionLoop:
         damping: float,
         bandwidth_hz: float,
         bandwidth_damping: float = 0.7,
-        feed_forward: float = 1.0,
-        sampling_hz: float = 72_000.0,
-        delay_samples: int = 1,
-        ramp_samples: int = 1,
+        **options: Any,
     ) -> PositionLoop:
         """Choose the gains that would give a continuous loop this frequency and damping.
 
@@ -170,8 +167,8 @@ class PositionLoop:
             Natural frequency with the local loop, at least that without it [Hz].
         bandwidth_damping : float, optional
             Damping ratio with the local loop.
-        feed_forward, sampling_hz, delay_samples, ramp_samples : optional
-            As in :class:`PositionLoop`.
+        **options
+            feed_forward, sampling_hz, delay_samples and ramp_samples of :class:`PositionLoop`.
 
         Returns
         -------
@@ -204,10 +201,7 @@ class PositionLoop:
             damping=damping,
             proportional_per_s2=wanted**2 - own**2,
             derivative_per_s=max(2 * ratio * wanted - 2 * air * own, 0.0),
-            feed_forward=feed_forward,
-            sampling_hz=sampling_hz,
-            delay_samples=delay_samples,
-            ramp_samples=ramp_samples,
+            **options,
         )
 
     @property
@@ -279,18 +273,16 @@ class PositionLoop:
         """Frequency at which the amplitude has fallen to 0.707 of its static value [Hz]."""
         loop = self.closed_loop()
 
-        def excess(frequency: float) -> float:
-            amplitude = np.abs(loop.frequency_response([frequency])[0, 0, 0])
-            return float(amplitude / self.static_gain - np.sqrt(0.5))
+        def amplitude(frequency_hz: FloatArray | float) -> FloatArray:
+            response = loop.frequency_response(frequency_hz)[:, 0, 0]
+            return np.asarray(np.abs(response) / self.static_gain)
 
         grid = np.geomspace(1e-3 * self.natural_frequency_hz, self.sampling_hz / 2, 2000)
-        amplitude = np.abs(loop.frequency_response(grid)[:, 0, 0]) / self.static_gain
-        below = np.flatnonzero(amplitude < np.sqrt(0.5))
-        if below.size == 0:
-            return float(grid[-1])
-        if below[0] == 0:
-            return float("nan")
-        return float(brentq(excess, grid[below[0] - 1], grid[below[0]]))
+        below = np.flatnonzero(amplitude(grid) < np.sqrt(0.5))
+        if below.size == 0 or below[0] == 0:
+            return float("nan") if below.size else float(grid[-1])
+        ends = grid[below[0] - 1 : below[0] + 1]
+        return float(brentq(lambda f: float(amplitude(f)[0]) - np.sqrt(0.5), *ends))
 
     def _law(self) -> FloatArray:
         """Acceleration [positions per sample^2] that the loop computes, over states and command."""
