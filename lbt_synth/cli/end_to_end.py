@@ -113,25 +113,16 @@ def calibrate_setup(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
 def _telemetry(
     loop_run: EndToEndRun, design: Design, calibration: Calibration, arguments: Namespace
 ) -> Telemetry:
-    system = loop_run.system
-    return Telemetry(
+    system, gain = loop_run.system, loop_run.tip_tilt_gain
+    return fill_row(
+        Telemetry,
+        *(loop_run, system, system.hardware),
         name=f"end to end, {system.modes} modes",
-        frame_rate_hz=system.frame_rate_hz,
-        delay_frames=system.hardware.delay_frames,
-        mirror=system.hardware.mirror,
-        commands=loop_run.commands,
-        measurements=loop_run.measurements,
-        residual_nm=loop_run.residual_nm,
-        psf=loop_run.psf,
-        psf_pixel_mas=loop_run.psf_pixel_mas,
-        imaging_wavelength_um=system.imaging_wavelength_um,
+        influence_matrix=None,
         strehl=min(loop_run.strehl, 1.0),
-        sensor_gain=loop_run.tip_tilt_gain if loop_run.tip_tilt_gain > 0 else None,
+        sensor_gain=gain if gain > 0 else None,
         controller_name=f"mixed: tip and tilt by {design.method}, integrators for the rest",
         controller_digest=hashlib.sha256(Path(arguments.gain).read_bytes()).hexdigest(),
-        diameter_m=system.diameter_m,
-        obstruction=system.obstruction,
-        seed=loop_run.seed,
         metadata={
             "simulator": f"SPECULA {specula_version()}",
             "gain_file": Path(arguments.gain).name,

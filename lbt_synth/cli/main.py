@@ -24,25 +24,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     named = next((word for word in words if not word.startswith("-")), "")
     arguments = build_parser(named).parse_args(words)
-    given = os.environ.get("SOURCE_DATE_EPOCH")
-    if given is not None:  # checked here, as libraries read it when they are loaded
-        try:
-            time.gmtime(int(given))
-        except (ValueError, OverflowError, OSError):
-            return _refuse(
-                ProblemError(
-                    f"SOURCE_DATE_EPOCH must be a number of seconds since 1970; got {given!r}."
-                ),
-                WRONG,
-                as_json=arguments.json,
-            )
-    command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
     try:
+        _check_date()
+        command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
         report = command.run(arguments)
-    except SynthesisError as error:
-        return _refuse(error, FAILED, as_json=arguments.json)
     except LbtSynthError as error:
-        return _refuse(error, WRONG, as_json=arguments.json)
+        if arguments.json:
+            print(json.dumps({"error": type(error).__name__, "message": str(error)}))
+        print(f"lbt-synth: error: {error}", file=sys.stderr)
+        return FAILED if isinstance(error, SynthesisError) else WRONG
     except MemoryError:
         print("lbt-synth: error: not enough memory; ask for less.", file=sys.stderr)
         return WRONG
@@ -53,11 +43,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     return DONE if report.passed else FAILED
 
 
-def _refuse(error: LbtSynthError, status: int, *, as_json: bool) -> int:
-    if as_json:
-        print(json.dumps({"error": type(error).__name__, "message": str(error)}))
-    print(f"lbt-synth: error: {error}", file=sys.stderr)
-    return status
+def _check_date() -> None:
+    """Refuse a wrong SOURCE_DATE_EPOCH before libraries read it, which is when they are loaded."""
+    given = os.environ.get("SOURCE_DATE_EPOCH", "0")
+    try:
+        time.gmtime(int(given))
+    except (ValueError, OverflowError, OSError) as error:
+        raise ProblemError(
+            f"SOURCE_DATE_EPOCH must be a number of seconds since 1970; got {given!r}."
+        ) from error
 
 
 def entry_point() -> None:

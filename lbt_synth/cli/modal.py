@@ -23,7 +23,7 @@ from lbt_synth.models import (
     pyramid_modal_noise_nm,
 )
 from lbt_synth.report.figures import modal_figure
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, integer
 
 _MOST_MODES = 20_000
@@ -40,12 +40,12 @@ class OrderRow:
 
     radial_order: int = column("radial order")
     modes: int = column("modes")
-    turbulence_nm: float = column("turbulence", unit="nm", format=".1f")
-    noise_nm: float = column("noise per mode", unit="nm", format=".2f")
+    turbulence_nm: float = nm_column("turbulence")
+    noise_nm: float = nm_column("noise per mode", format=".2f")
     gain: float = column("mean gain", format=".3f")
-    uniform_nm: float = column("one gain", unit="nm", format=".1f")
-    optimised_nm: float = column("optimised gains", unit="nm", format=".1f")
-    kalman_nm: float = column("Kalman", unit="nm", format=".1f")
+    uniform_nm: float = nm_column("one gain")
+    optimised_nm: float = nm_column("optimised gains")
+    kalman_nm: float = nm_column("Kalman")
 
 
 def run(arguments: Namespace) -> Report:

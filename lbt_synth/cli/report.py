@@ -21,6 +21,7 @@ from lbt_synth.storage.rows import (
     fill_row,
     json_record,
     json_units,
+    nm_column,
     percent_column,
     row_table,
     table_row,
@@ -80,7 +81,7 @@ class AssessmentRow:
     stable: bool = column("stable")
     spectral_radius: float = column()
     certified: bool = column("certified")
-    residual_nm: float = column("residual", unit="nm", format=".2f")
+    residual_nm: float = nm_column("residual", format=".2f")
     turbulence_nm: float | None = column(unit="nm", default=None)
     vibration_nm: float | None = column(unit="nm", default=None)
     noise_nm: float | None = column(unit="nm", default=None)

@@ -58,6 +58,11 @@ def column(
     return dataclasses.field(default=default, init=init, metadata={"column": printed})
 
 
+def nm_column(heading: str, **printing: Any) -> Any:
+    """Return a column of nanometres, with one decimal."""
+    return column(heading, **{"unit": "nm", "format": ".1f", **printing})
+
+
 def percent_column(heading: str, **printing: Any) -> Any:
     """Return a column of ratios that tables show in percent, with two decimals."""
     return column(heading, **{"unit": "%", "scale": 100, "format": ".2f", **printing})
@@ -66,7 +71,7 @@ def percent_column(heading: str, **printing: Any) -> Any:
 @dataclass_transform(
     kw_only_default=True,
     frozen_default=True,
-    field_specifiers=(column, percent_column, dataclasses.field),
+    field_specifiers=(column, nm_column, percent_column, dataclasses.field),
 )
 def table_row(kind: type[Row]) -> type[Row]:
     r"""Make a frozen dataclass of columns, whose docstring lists them.

@@ -23,7 +23,7 @@ from lbt_synth.loop import (
 )
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
-from lbt_synth.storage.rows import column, percent_column, table_row
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _GRID = 65  # shifts over the range of errors, at least
@@ -35,9 +35,8 @@ class LimitRow:
 
     design: str = column("design", help="Its name")
     method: str = column(help="How it was made")
-    residual_nm: float = column(
+    residual_nm: float = nm_column(
         "residual",
-        unit="nm",
         format=".2f",
         missing="unstable",
         help="Residual under the truth, rms",
@@ -49,9 +48,8 @@ class LimitRow:
         format=".2f",
         help="Residual over the limit, less 1; nan where there is no limit, or it is 0",
     )
-    worst_nm: float = column(
+    worst_nm: float = nm_column(
         "worst residual",
-        unit="nm",
         format=".2f",
         help="Largest residual with all true vibrations moved within the range of errors, rms",
     )

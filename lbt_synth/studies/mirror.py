@@ -11,7 +11,7 @@ from lbt_synth.design import Design, kalman, lqg, optimal_integrator
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, settling_error, strehl
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
-from lbt_synth.storage.rows import column, percent_column, table_row
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import require_instance
 
 
@@ -21,18 +21,16 @@ class MirrorRow:
 
     design: str = column("design", help="Its name: for ours, what it assumes about the mirror")
     stable: bool = column(help="Whether its loop is stable")
-    residual_nm: float = column(
+    residual_nm: float = nm_column(
         "residual",
-        unit="nm",
         format=".2f",
         missing="unstable",
         help="Residual under the truth, rms",
         default=np.nan,
     )
     strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
-    unsettled_nm: float = column(
+    unsettled_nm: float = nm_column(
         "settled less real position",
-        unit="nm",
         format=".2f",
         help="What is left of the assumption that the mirror has settled, for the commands of "
         "this design: settled less real position, rms",

@@ -12,7 +12,7 @@ from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.methods.plant_inputs import reference_design
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.models import TipTiltPlant, Truth, retuned_plant
-from lbt_synth.storage.rows import column, fill_row, percent_column, table_row
+from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
 from lbt_synth.validation import choice, number
 
 
@@ -25,18 +25,12 @@ class RobustnessRow:
     )
     method: str = column("method", help="Method of synthesis")
     strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
-    residual_nm: float = column(
-        "residual", unit="nm", format=".1f", help="Residual of tip and tilt, rms", default=np.nan
+    residual_nm: float = nm_column("residual", help="Residual of tip and tilt, rms", default=np.nan)
+    vibration_nm: float = nm_column("vibration", help="Its part of vibrations, rms", default=np.nan)
+    turbulence_nm: float = nm_column(
+        "turbulence", help="Its part of turbulence, rms", default=np.nan
     )
-    vibration_nm: float = column(
-        "vibration", unit="nm", format=".1f", help="Its part of vibrations, rms", default=np.nan
-    )
-    turbulence_nm: float = column(
-        "turbulence", unit="nm", format=".1f", help="Its part of turbulence, rms", default=np.nan
-    )
-    noise_nm: float = column(
-        "noise", unit="nm", format=".1f", help="Its part of noise, rms", default=np.nan
-    )
+    noise_nm: float = nm_column("noise", help="Its part of noise, rms", default=np.nan)
     stable: bool = column("stable", help="Whether the loop is stable with the real sensor gain")
     gamma: float = column(unit="nm", help="H-infinity norm that the design achieves")
 

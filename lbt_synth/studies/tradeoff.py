@@ -13,7 +13,7 @@ from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.mixed import METHOD as MIXED
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import column, fill_row, nm_column, table_row
 from lbt_synth.validation import choice, integer
 
 FAMILIES = (MIXED.name, "central")
@@ -30,15 +30,14 @@ class TradeoffPoint:
         help='"mixed": least variance of all filters with this norm; "central": the H-infinity '
         "filter whose norm this is",
     )
-    gamma: float = column(
-        "norm", unit="nm", format=".2f", help="H-infinity norm of its estimation error, recomputed"
+    gamma: float = nm_column(
+        "norm", format=".2f", help="H-infinity norm of its estimation error, recomputed"
     )
     gamma_ratio: float = column(
         "norm / least", format=".4f", help="The same over the least norm of any filter"
     )
-    rms: float = column(
+    rms: float = nm_column(
         "rms",
-        unit="nm",
         format=".2f",
         help="Standard deviation of its estimation error, recomputed",
     )

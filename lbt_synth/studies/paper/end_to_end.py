@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.studies.paper import parameters as given
-from lbt_synth.studies.paper.published import TABLE_II, TABLE_III, TableII, TableIII
+from lbt_synth.studies.paper.published import TABLE_II, TABLE_III, VIBRATION_HZ, PublishedRow
 from lbt_synth.validation import choice, set_fields
 
 CLASSICAL_GAIN = 0.5
@@ -131,77 +131,59 @@ def plan_tables(
         setup.controller(design)  # refuses a filter of another loop or of other sizes
         if name in ("classical", *given.filter_problems()):
             raise ProblemError(f"the name {name} is taken by the paper's own; rename the file.")
-    lines: list[_Line] = []
-    if "II" in tables:
-        for row in TABLE_II:
-            label, error = ("vibration", 0.0) if row.vibration else ("no vibration", None)
-            lines.append(_Line("II", label, error, seeds, row))
-    if "III" in tables:
-        for line in TABLE_III:
-            error = line.model_hz - given.VIBRATION_HZ
-            own = seeds if error == 0 else row_seeds
-            lines.append(_Line("III", f"{line.model_hz:.1f} Hz", error, own, line))
-    return [row for line in lines for row in _plan_line(setup, line, designs or {})]
-
-
-class _Line(NamedTuple):
-    """One row of a table, for all its controllers."""
-
-    table: str
-    label: str
-    error_hz: float | None  # None without vibration
-    seeds: Sequence[int]
-    published: TableII | TableIII
+    lines = [line for line in (*TABLE_II, *TABLE_III) if line.table in tables]
+    return [
+        row
+        for line in lines
+        for row in _plan_line(
+            setup,
+            line,
+            designs or {},
+            seeds if line.table == "II" or line.error_hz == 0 else row_seeds,
+        )
+    ]
 
 
 def _plan_line(
-    setup: EndToEndSetup, line: _Line, designs: Mapping[str, Design]
+    setup: EndToEndSetup, line: PublishedRow, designs: Mapping[str, Design], seeds: Sequence[int]
 ) -> Iterator[PlannedRow]:
     """Yield the paper's controllers, then the fixed designs.
 
     The paper's filters follow the frequency of the model; under the others the vibration moves.
     """
+    plan = functools.partial(_plan_row, setup, line, seeds)
     true_hz = moved_hz = None
-    model_hz = given.VIBRATION_HZ
     if line.error_hz is not None:
-        true_hz, moved_hz = given.VIBRATION_HZ, given.VIBRATION_HZ - line.error_hz
-        model_hz += line.error_hz
-    if isinstance(line.published, TableII):
-        gain = CLASSICAL_GAIN_VIBRATION if line.published.vibration else CLASSICAL_GAIN
+        true_hz, moved_hz = VIBRATION_HZ, VIBRATION_HZ - line.error_hz
+    if line.table == "II":
+        gain = CLASSICAL_GAIN_VIBRATION if line.vibration else CLASSICAL_GAIN
         classical = integrator(setup.system.hardware, gain=gain).controller
-        paper = line.published.classical
-        yield _plan_row(setup, line, "classical", classical, moved_hz, paper=paper)
+        yield plan("classical", classical, moved_hz, paper=line.classical)
     for method, (plant, gamma) in given.filter_problems().items():
-        tuned = retuned_plant(plant, model_hz - given.VIBRATION_HZ, hold="driving")
-        options = {} if gamma is None else {"gamma": gamma}
-        yield _plan_row(
-            setup,
-            line,
-            method,
-            reference_design(method, tuned, options).controller,
-            true_hz,
-            tuned=f"-{model_hz:g}hz",
-            paper=getattr(line.published, method),
-        )
-    for name, design in designs.items():
-        yield _plan_row(setup, line, name, design.controller, moved_hz)
+        plant = retuned_plant(plant, line.model_hz - VIBRATION_HZ, hold="driving")
+        design = reference_design(method, plant, {} if gamma is None else {"gamma": gamma})
+        name, paper = f"{method}-{line.model_hz:g}hz", getattr(line, method)
+        yield plan(method, design.controller, true_hz, name=name, paper=paper)
+    for method, fixed in designs.items():
+        yield plan(method, fixed.controller, moved_hz)
 
 
 def _plan_row(
     setup: EndToEndSetup,
-    line: _Line,
+    line: PublishedRow,
+    seeds: Sequence[int],
     method: str,
     controller: Controller,
     true_hz: float | None,
     *,
-    tuned: str = "",
+    name: str = "",
     paper: float = np.nan,
 ) -> PlannedRow:
-    lines: tuple[SinusoidalVibration, ...] = ()
-    if true_hz is not None:
-        shake = given.PAPER_TRUTH.vibrations[0]
-        assert isinstance(shake, SinusoidalVibration)
-        lines = (replace(shake, frequency_hz=true_hz),)
+    shakes = tuple(
+        replace(shake, frequency_hz=true_hz)
+        for shake in given.PAPER_TRUTH.vibrations
+        if true_hz is not None and isinstance(shake, SinusoidalVibration)
+    )
     vibration = "none" if true_hz is None else f"{true_hz:g}hz"
     return PlannedRow(
         table=line.table,
@@ -210,12 +192,12 @@ def _plan_row(
         error_hz=line.error_hz,
         paper=paper,
         controller=controller,
-        truth=replace(given.PAPER_TRUTH, vibrations=lines),
+        truth=replace(given.PAPER_TRUTH, vibrations=shakes),
         cases={
-            f"{method}{tuned}-vibration-{vibration}-seed-{seed}": make_case(
-                setup, controller, vibrations=lines, seed=seed
+            f"{name or method}-vibration-{vibration}-seed-{seed}": make_case(
+                setup, controller, vibrations=shakes, seed=seed
             )
-            for seed in line.seeds
+            for seed in seeds
         },
     )
 

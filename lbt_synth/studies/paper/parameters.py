@@ -23,13 +23,13 @@ from lbt_synth.models import (
     nm_per_mas,
     tip_tilt_plant,
 )
+from lbt_synth.studies.paper.published import VIBRATION_HZ as VIBRATION_HZ
 
 # given in the paper
 DIAMETER_M = 8.22
 OBSTRUCTION = 0.11
 FRAME_RATE_HZ = 800.0
 DELAY_FRAMES = 2.0
-VIBRATION_HZ = 20.0
 VIBRATION_MAS = 80.0
 WAVELENGTH_UM = 2.2
 ATMOSPHERE = Atmosphere(

@@ -1,0 +1,100 @@
+"""Terminal, JSON and CSV are printings of the same rows."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from support.commands import run
+from support.plants import LBT_YAML, ROOT
+
+from lbt_synth.cli.output import Report, json_value, text_table
+from lbt_synth.storage.rows import column, nm_column, table_row
+
+SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
+
+
+@table_row
+class Loop:
+    """One loop."""
+
+    name: str = column("loop")
+    method: str = column("method")
+    residual_nm: float = nm_column("residual", missing="unstable")
+
+
+ROWS = [
+    Loop(name="a", method="kalman", residual_nm=1234.56),
+    Loop(name="long", method="hinf", residual_nm=np.nan),
+]
+
+# Each study: its arguments, the key of its rows, what their CSV begins with, and a heading of its
+# table with a unit.
+STUDIES = {
+    "robustness": (LBT_YAML, (), "rows", "error_hz,method,strehl,residual_nm", "Strehl [%]"),
+    "tradeoff": (LBT_YAML, ("--points", 2), "points", "family,gamma,gamma_ratio,rms", "norm [nm]"),
+    "limits": (LBT_YAML, (), "rows", "design,method,residual_nm,strehl", "above the limit [%]"),
+    "mirror": (SLOW_YAML, (), "rows", "design,stable,residual_nm,strehl", "residual [nm]"),
+    "modal": (LBT_YAML, ("--modes", 5), "rows", "radial_order,modes,turbulence_nm", "Kalman [nm]"),
+}
+
+
+@pytest.mark.parametrize("command", STUDIES)
+def test_the_same_rows_are_printed_three_times(tmp_path, capsys, command):
+    config, options, key, headings, shown = STUDIES[command]
+    table = tmp_path / "t.csv"
+    status, text, error = run(capsys, command, config, *options, "-o", table)
+    assert (status, error) == (0, "")
+    assert shown in text
+    data = json.loads(run(capsys, command, config, *options, "--json")[1])
+    written = list(csv.DictReader(table.read_text().splitlines()))
+    assert ",".join(written[0]).startswith(headings)
+    assert list(written[0]) == list(data[key][0])
+    assert len(written) == len(data[key])
+    for name, unit in data["units"].items():
+        assert unit in ("nm", "nm rms", "Hz", "%", "frames")
+        assert name in data or all(name in row for row in data[key])
+    for row, record in zip(written, data[key], strict=True):
+        for name, value in record.items():
+            if isinstance(value, float):
+                assert float(row[name]) == pytest.approx(value, rel=1e-12)
+            else:
+                assert row[name] == ("" if value is None else str(value))
+
+
+def test_rows_and_facts_of_a_report(capsys):
+    report = Report(data={"seed": 1})
+    report.add_rows("loops", "All loops", ROWS)
+    report.add_facts("One loop", ROWS[0], key="first")
+    report.note_files(["a.png", "b.csv"])
+    report.print(as_json=True)
+    data = json.loads(capsys.readouterr().out)
+    assert data["loops"][1] == {"name": "long", "method": "hinf", "residual_nm": None}
+    assert data["first"]["residual_nm"] == 1234.56
+    assert data["units"] == {"residual_nm": "nm"}
+    assert data["files"] == ["a.png", "b.csv"]
+    report.print(as_json=False)
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines[1:5] == [
+        "  loop   method   residual [nm]",
+        " " + 31 * "─",
+        "  a      kalman          1234.6",
+        "  long   hinf          unstable",
+    ]
+    assert lines[-2:] == ["written: a.png", "written: b.csv"]
+    assert "residual   1234.6   nm" in lines[-3]
+
+
+def test_tables_of_any_values():
+    table = text_table("Mixed", ("name", "unit", "value"), [("a", "nm", 1 / 3), ("b", "", None)])
+    assert table.rows == (("a", "nm", "0.333333"), ("b", "", "-"))
+    assert table.words == (1,)
+
+
+def test_values_that_json_does_not_have():
+    assert json_value({"a": np.array([1.0, np.nan]), 2: (np.int64(3), np.True_, 1 + 2j)}) == {
+        "a": [1.0, None],
+        "2": [3, True, [1.0, 2.0]],
+    }
