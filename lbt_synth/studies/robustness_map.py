@@ -100,20 +100,11 @@ def robustness_map(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=797)
-    >>> plant = lbt.tip_tilt_plant(
-    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
-    ... )
-    >>> truth = lbt.Truth(
-    ...     turbulence=slow,
-    ...     noise_nm=15.5,
-    ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797),),
-    ... )
+    >>> config = lbt.load_config("examples/lbt.yaml")
     >>> found = lbt.studies.robustness_map(
-    ...     lbt.kalman(plant),
-    ...     truth,
-    ...     lbt.Imaging(diameter_m=8.22),
+    ...     lbt.kalman(config.plant),
+    ...     config.truth,
+    ...     config.imaging,
     ...     errors_hz=[0, 3],
     ...     sensor_gains=[0.5, 1.0, 9.0],
     ... )
