@@ -19,8 +19,7 @@ PAGES = sorted(
     for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
     if "generated" not in path.parts and "_build" not in path.parts
 )
-
-
+NOTES = [ROOT / "CHANGELOG.md", *ROOT.glob("examples/**/*.md"), *ROOT.glob("tests/**/*.md")]
 ADDRESS = re.compile(r"\s*(?:[-*] )?(?:!?\[[^\]]*\]\(\S+\)|\S{90,})[.,;:]?")
 NOT_ENGLISH = re.compile(
     r"\b(?:anew|told|answers? to a step|one a (?:mode|frame))\b", re.IGNORECASE
@@ -37,9 +36,7 @@ def prose(text):
     return [line for line in lines if not ADDRESS.fullmatch(line)]
 
 
-@pytest.mark.parametrize(
-    "page", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda page: str(page.relative_to(ROOT))
-)
+@pytest.mark.parametrize("page", [*PAGES, *NOTES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_prose_is_plain_and_no_line_is_longer_than_100(page):
     lines = prose(page.read_text(encoding="utf-8"))
     assert [line for line in lines if len(line) > 100] == []
