@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-_CARD, _HEADER = 80, 2880 * 36
+_CARD = 80
+LONGEST_HEADER = 2880 * 36  # that is looked through
 
 
 def has_card(content: bytes, keyword: str) -> bool:
     """Whether the first header of a FITS file has a card of that keyword."""
     mark = keyword.ljust(8).encode() + b"="
-    for start in range(0, min(len(content), _HEADER), _CARD):
+    for start in range(0, min(len(content), LONGEST_HEADER), _CARD):
         card = content[start : start + _CARD]
         if card.startswith(mark):
             return True

@@ -86,14 +86,10 @@ def name_in_errors(path: Path) -> Iterator[None]:
         raise type(error)(f"{path}: {error}") from error
 
 
-def read_record_bytes(path: Path) -> bytes:
-    """Return the content of a file of series."""
-    return read_bytes(require_ending(path, "a record", ENDINGS, TelemetryError), TelemetryError)
-
-
 def read_contents(path: Path) -> Contents:
     """Return what a file holds."""
-    return parse_contents(path, read_record_bytes(path))
+    require_ending(path, "a record", ENDINGS, TelemetryError)
+    return parse_contents(path, read_bytes(path, TelemetryError))
 
 
 def parse_contents(path: Path, content: bytes) -> Contents:

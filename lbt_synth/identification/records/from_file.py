@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,19 +12,13 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_telemetry
 from lbt_synth.identification.records.column_selection import KINDS, select_series
 from lbt_synth.identification.records.commands_file import join_commands
-from lbt_synth.identification.records.contents import (
-    FITS,
-    name_in_errors,
-    parse_contents,
-    read_contents,
-    read_record_bytes,
-)
+from lbt_synth.identification.records.contents import FITS, name_in_errors, read_contents
 from lbt_synth.identification.records.from_series import build_record
 from lbt_synth.identification.records.from_telemetry import record_from_telemetry
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.fits import has_card
+from lbt_synth.storage.fits import LONGEST_HEADER, has_card
 from lbt_synth.validation import choice
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of our own telemetry, and of the AOT standard
@@ -111,7 +104,6 @@ def load_record(
     source = Path(path)
     if kind is not None:
         choice(kind, "kind", KINDS)
-    content = read_record_bytes(source)
     given: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,
@@ -123,7 +115,7 @@ def load_record(
         "source": str(source),
     }
     with name_in_errors(source):
-        if _is_telemetry(source, content):
+        if _is_telemetry(source):
             if kind not in (None, "closed_loop") or columns is not None or commands is not None:
                 raise ProblemError(
                     "telemetry holds measurements and commands: kind must be closed_loop, and "
@@ -132,7 +124,7 @@ def load_record(
             if averages is not None:
                 raise ProblemError("this is telemetry, and averages are of a spectrum.")
             return record_from_telemetry(load_telemetry(source), modes=axes, **given)
-        contents = parse_contents(source, content)
+        contents = read_contents(source)
         if commands is not None:
             other = Path(commands)
             join_commands(contents, read_contents(other), other)
@@ -140,13 +132,13 @@ def load_record(
         return build_record(series, contents, averages=averages, **given)
 
 
-def _is_telemetry(path: Path, content: bytes) -> bool:
-    if path.suffix.lower() in FITS:
-        return any(has_card(content, card) for card in _TELEMETRY_CARDS)
-    if path.suffix.lower() != ".npz":
-        return False
+def _is_telemetry(path: Path) -> bool:
     try:
-        names = {Path(name).stem for name in ZipFile(io.BytesIO(content)).namelist()}
+        if path.suffix.lower() in FITS:
+            with path.open("rb") as stream:
+                header = stream.read(LONGEST_HEADER)
+            return any(has_card(header, card) for card in _TELEMETRY_CARDS)
+        names = ZipFile(path).namelist() if path.suffix.lower() == ".npz" else []
     except (BadZipFile, OSError, ValueError):
-        return False  # parse_contents says so
-    return names >= _TELEMETRY_ARRAYS
+        return False  # read_contents says so
+    return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS

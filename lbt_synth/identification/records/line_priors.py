@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,7 @@ class LinePrior:
             raise ProblemError(f"source must be a text; got {self.source!r}.")
 
 
-def load_lines(lines: Any) -> tuple[LinePrior, ...]:
+def load_lines(lines: str | os.PathLike[str] | Sequence[Any] | FloatArray) -> tuple[LinePrior, ...]:
     """Take vibration lines from a list or from a text file.
 
     Parameters
