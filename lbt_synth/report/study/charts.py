@@ -11,9 +11,9 @@ from lbt_synth.report.number_text import listing_text
 from lbt_synth.report.page.words import chart
 from lbt_synth.studies import StudyStatistics
 from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
-from lbt_synth.studies.study.comparison import sample_losses
 from lbt_synth.studies.study.controller_samples import ControllerSamples
 from lbt_synth.studies.study.sensitivity import ConditionalCurve
+from lbt_synth.studies.study.statistics import sample_losses
 from lbt_synth.studies.study.summary import varying_parameters
 from lbt_synth.validation import FloatArray
 

@@ -7,24 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from lbt_synth.config.ensemble import (
-    EXPECTED_ERRORS,
-    Samples,
-    accepted_samples,
-    build_ensemble,
-    read_config,
-)
+from lbt_synth.config import Config, ensemble
+from lbt_synth.config.ensemble import AssumedAxis, Samples
 from lbt_synth.config.samples import Reads
+from lbt_synth.design.modal import ModalFilters, modal_filters
 from lbt_synth.errors import CertificateError
 from lbt_synth.loop import EnsembleResiduals
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
+from lbt_synth.models import PositionLoop, Vibration
 from lbt_synth.studies.study import reference_evaluation as reference
 from lbt_synth.studies.study.sample import Sample, make_sample
-from lbt_synth.studies.study.sample_designs import (
-    design_for_samples,
-    has_independent_axes,
-    is_kalman_for_sample,
-)
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
     EXACT_COLUMNS,
@@ -101,26 +93,28 @@ def _evaluate_groups(
     study: Study, controller: StudyController, values: FloatArray
 ) -> Iterator[tuple[IntArray, EnsembleResiduals, FloatArray]]:
     """Yield what could be evaluated together: rows, residuals, Strehl ratios."""
-    design, for_sample = controller.design, is_kalman_for_sample(controller)
+    design, for_sample = controller.design, _is_kalman_for_sample(controller)
     if study.settings.evaluation != "exact" or (design is None and not for_sample):
         return
     matrices = None if design is None else textbook_matrices([design.controller])
-    reads = read_config(study.config, designs=for_sample)
+    reads = ensemble.read_config(study.config, designs=for_sample)
     for rows in _find_groups(study, values, reads):
         try:
             sample = make_sample(study, values[rows[0]])
-            if for_sample and not has_independent_axes(sample.config):
+            if for_sample and not _has_independent_axes(sample.config):
                 continue
             samples = _stack_samples(study, sample, values[rows], reads)
-            accepted = accepted_samples(samples)
+            accepted = ensemble.accepted_samples(samples)
             if not accepted.size:
                 continue
             samples = samples.take(accepted)
             with np.errstate(over="raise", divide="raise", invalid="raise"):
-                own = design_for_samples(samples) if matrices is None else matrices
-                found = residuals_from_matrices(own, sample.hardware, build_ensemble(samples))
+                own = _design_for_samples(samples) if matrices is None else matrices
+                found = residuals_from_matrices(
+                    own, sample.hardware, ensemble.build_ensemble(samples)
+                )
             strehl = found.strehl(sample.config.imaging)
-        except EXPECTED_ERRORS:
+        except ensemble.EXPECTED_ERRORS:
             continue  # one of them fails; evaluating them one by one finds which
         yield rows[accepted], found, strehl
 
@@ -175,3 +169,66 @@ def _require_agreement(
                 f"row {row} has {name} {among:.9g} among others, and {expected:.9g} by itself: one "
                 f"of the two is wrong. {fault}"
             )
+
+
+def _is_kalman_for_sample(controller: StudyController) -> bool:
+    """Whether a controller is a Kalman filter without options, designed for each sample."""
+    request = controller.request
+    return (
+        request is not None
+        and controller.design is None
+        and request.method.batched
+        and not request.given
+    )
+
+
+def _has_independent_axes(config: Config) -> bool:
+    """Whether the Kalman filter of a configuration separates into one per axis."""
+    hardware, settings = config.hardware, config.settings
+    return (
+        settings.sensor.matrix is None
+        and np.array_equal(hardware.influence, np.eye(hardware.modes))
+        and all(np.count_nonzero(line.direction) == 1 for line in config.plant.vibrations)
+        and all(section.spread_hz is None for section in settings.model.vibrations or ())
+    )
+
+
+def _design_for_samples(samples: Samples) -> tuple[FloatArray, ...]:
+    """Design a Kalman filter for each sample, and return their textbook matrices."""
+    first, *others = ensemble.assumed_axes(samples)
+    mirror = samples.config.hardware.mirror
+    design = _design_axis(first, mirror)
+    same = (design if axis.equals(first) else _design_axis(axis, mirror) for axis in others)
+    return _combine_axes([design, *same])
+
+
+def _design_axis(axis: AssumedAxis, mirror: PositionLoop | None) -> ModalFilters:
+    """Design the Kalman filters of one axis, one per sample."""
+    return modal_filters(
+        axis.turbulence,
+        noise_nm=axis.noise_nm,
+        vibrations={
+            i: [Vibration(frequency_hz=f, damping=d, rms_nm=r, direction=(1.0,)) for f, d, r in row]
+            for i, row in enumerate(axis.vibrations.tolist())
+            if row
+        },
+        delay_frames=axis.delay_frames,
+        sensor_gain=axis.sensor_gain,
+        mirror=mirror,
+    )
+
+
+def _combine_axes(designs: list[ModalFilters]) -> tuple[FloatArray, ...]:
+    """Combine the controllers of all axes into one, in textbook form."""
+    sizes = [design.A.shape[1] for design in designs]
+    count, axes, states = len(designs[0].A), len(designs), sum(sizes)
+    A, B = np.zeros((count, states, states)), np.zeros((count, states, axes))
+    C, D = np.zeros((count, axes, states)), np.zeros((count, axes, axes))
+    start = 0
+    for axis, (design, size) in enumerate(zip(designs, sizes, strict=True)):
+        x = slice(start, start + size)
+        A[:, x, x], B[:, x, axis] = design.A, design.B[..., 0]
+        C[:, axis, x] = (design.C @ design.A)[:, 0]
+        D[:, axis, axis] = (design.C @ design.B + design.D)[:, 0, 0]
+        start += size
+    return A, B, C, D

@@ -77,22 +77,22 @@ class _Workers:
 
     def receive(self, future: Future[TimedBatch], rows: RowRange) -> TimedBatch | None:
         """Wait for a batch and return it, None if its process died."""
-        error: BaseException | None
         try:
-            error = future.exception()
-        except CancelledError as cancelled:
-            error = cancelled
+            batch = future.result()
+        except BrokenExecutor as error:
+            self._broken = error
+            return None
+        except Exception as error:
+            if type(error).__name__ == _DASK_DEATH:
+                return None
+            if isinstance(error, LbtSynthError | MemoryError):
+                raise
+            raise NumericalError(_describe_failure(error, rows)) from error
         finally:
             future.cancel()  # where the wait is interrupted
-        if error is None:
-            self._deaths = 0
-            _require_whole(future.result()[0], rows, self._study)
-            return future.result()
-        if isinstance(error, BrokenExecutor):
-            self._broken = error
-        elif type(error).__name__ != _DASK_DEATH:
-            raise _error_to_raise(error, rows)
-        return None
+        self._deaths = 0
+        _require_whole(batch[0], rows, self._study)
+        return batch
 
     def failed_row(self, row: int) -> TimedBatch:
         """Return the batch of a row that ends its process."""
@@ -197,21 +197,17 @@ def _run_alone(engine: _Workers, rows: RowRange) -> Iterator[TimedBatch]:
         yield from _run_alone(engine, half)
 
 
-def _error_to_raise(error: BaseException, rows: RowRange) -> BaseException:
-    """Return the error to raise where a batch as a whole failed."""
-    if isinstance(error, LbtSynthError | MemoryError):
-        return error
+def _describe_failure(error: Exception, rows: RowRange) -> str:
+    """Return what to say where a batch as a whole failed."""
     kept = "What is finished is kept"
-    text = (
-        f"the executor cancelled what was running: its scheduler is gone, perhaps. {kept}: start "
-        "again."
-        if isinstance(error, CancelledError)
-        else f"rows {rows[0]} to {rows[1] - 1} could not be computed ({type(error).__name__}: "
-        f"{str(error).rstrip('.')}). {kept}. Every process needs the same lbt_synth as this one."
+    if isinstance(error, CancelledError):
+        why = "the executor cancelled what was running: its scheduler is gone, perhaps"
+        return f"{why}. {kept}: start again."
+    text = f"{type(error).__name__}: {error}".rstrip(".")
+    return (
+        f"rows {rows[0]} to {rows[1] - 1} could not be computed ({text}). {kept}. Every process "
+        "needs the same lbt_synth as this one."
     )
-    raised = NumericalError(text)
-    raised.__cause__ = error
-    return raised
 
 
 def _require_whole(batch: BatchResult, rows: RowRange, study: Study) -> None:

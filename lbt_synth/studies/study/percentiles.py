@@ -1,4 +1,4 @@
-"""Percentiles and shares of samples, with distribution-free confidence intervals."""
+"""Means, percentiles and shares of samples, with their standard errors or confidence intervals."""
 
 from __future__ import annotations
 
@@ -99,3 +99,10 @@ def share(count: int, total: int) -> Share:
     low = float(betaincinv(count, total - count + 1, tail)) if count else 0.0
     high = float(betaincinv(count + 1, total - count, 1 - tail)) if count < total else 1.0
     return Share(count=count, total=total, low=low, high=high)
+
+
+def mean_and_error(values: FloatArray) -> tuple[float, float]:
+    """Return the mean and its standard error for independent samples; nan if too few."""
+    n = len(values)
+    mean = float(np.mean(values)) if n else np.nan
+    return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan

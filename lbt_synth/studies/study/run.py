@@ -14,6 +14,7 @@ from typing import Any
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.worker_processes import exclusive_lock
+from lbt_synth.studies.study import store
 from lbt_synth.studies.study.batch_evaluation import evaluate_samples
 from lbt_synth.studies.study.engine import Evaluate, run_batches
 from lbt_synth.studies.study.output_files import (
@@ -23,27 +24,6 @@ from lbt_synth.studies.study.output_files import (
     write_results,
 )
 from lbt_synth.studies.study.parquet import require_parquet
-from lbt_synth.studies.study.store import (
-    FAILED,
-    MANIFEST,
-    PAGE,
-    PARTS,
-    PRINT,
-    Manifest,
-    file_digest,
-    list_parts,
-    missing_rows,
-    new_manifest,
-    read_designs,
-    read_manifest,
-    read_part,
-    refuse,
-    remove_parts,
-    remove_unfinished_files,
-    require_unchanged,
-    write_designs,
-    write_part,
-)
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
@@ -178,10 +158,10 @@ def run_study(
     computed, computing_s = 0, 0.0
     count = progress or (lambda rows: None)
     with exclusive_lock(folder, "study"):
-        remove_unfinished_files(folder, [path.name for path in output_paths(folder, study)])
+        store.remove_unfinished_files(folder, [path.name for path in output_paths(folder, study)])
         manifest = _begin(folder, study)
         if manifest.finished:
-            remove_parts(folder)  # a run was killed while it removed them
+            store.remove_parts(folder)  # a run was killed while it removed them
             count(study.samples)
             if whole is not None:
                 found, spent = read_results(folder, study), manifest.computing_seconds
@@ -201,7 +181,7 @@ def run_study(
     return StudyRun(
         directory=folder,
         results=results_path(folder, study),
-        failed=folder / FAILED,
+        failed=folder / store.FAILED,
         samples=study.samples,
         computed=computed,
         failures=manifest.failures,
@@ -214,33 +194,33 @@ def run_study(
 def output_paths(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, without its parts."""
     designs = [f"{c.name}.fits" for c in study.controllers if c.is_designed]
-    tables = [results_path(folder, study).name, FAILED, PAGE, PRINT]
-    return [folder / name for name in (MANIFEST, *tables, *designs)]
+    tables = [results_path(folder, study).name, store.FAILED, store.PAGE, store.PRINT]
+    return [folder / name for name in (store.MANIFEST, *tables, *designs)]
 
 
-def _begin(folder: Path, study: Study) -> Manifest:
+def _begin(folder: Path, study: Study) -> store.Manifest:
     """Return the manifest of a directory; begin the study if there is none."""
-    manifest = read_manifest(folder, study.digest)
+    manifest = store.read_manifest(folder, study.digest)
     if manifest is not None:
-        read_designs(folder, manifest)
+        store.read_designs(folder, manifest)
         if manifest.finished:
-            written = results_path(folder, study).exists() and (folder / FAILED).exists()
+            written = results_path(folder, study).exists() and (folder / store.FAILED).exists()
             if written:
-                require_unchanged(folder, manifest)
+                store.require_unchanged(folder, manifest)
             if manifest.retry or not written:
                 manifest = manifest.write(folder, finished=False, tables={})
     else:
-        if list_parts(folder):
-            why = f"holds parts of a study without its {MANIFEST}. Name another directory, or"
-            refuse(folder, f"{why} delete {folder / PARTS}.")
+        if store.list_parts(folder):
+            why = f"holds parts of a study without its {store.MANIFEST}. Name another directory, or"
+            store.refuse(folder, f"{why} delete {folder / store.PARTS}.")
         for path in output_paths(folder, study):
             if path.exists():
                 why = "is of no study that was begun there, and would be replaced. Name another"
-                refuse(path, f"{why} directory, or delete it.")
-        manifest = new_manifest(study).write(folder)
+                store.refuse(path, f"{why} directory, or delete it.")
+        manifest = store.new_manifest(study).write(folder)
     if set(manifest.designs) != {c.name for c in study.controllers if c.is_designed}:
         # begun now, or killed before they were written
-        manifest = manifest.write(folder, designs=write_designs(folder, study))
+        manifest = manifest.write(folder, designs=store.write_designs(folder, study))
     return manifest
 
 
@@ -248,22 +228,22 @@ def _compute_missing(
     study: Study, folder: Path, progress: Callable[[int], None], **options: Any
 ) -> int:
     """Compute the rows that no part has, and those to try again; return their number."""
-    for part in list_parts(folder):
-        if any(failure.retry for failure in read_part(part, study)[1]):
+    for part in store.list_parts(folder):
+        if any(failure.retry for failure in store.read_part(part, study)[1]):
             part.path.unlink()  # a part of one row, see the engine
-    missing = missing_rows(list_parts(folder), study.samples)
+    missing = store.missing_rows(store.list_parts(folder), study.samples)
     count = sum(stop - start for start, stop in missing)
     try:
-        (folder / PARTS).mkdir(exist_ok=True)
+        (folder / store.PARTS).mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"cannot make the directory {folder / PARTS}: {error.strerror}.", path=folder
+            f"cannot make the directory {folder / store.PARTS}: {error.strerror}.", path=folder
         ) from error
     if count < study.samples:
         progress(study.samples - count)
     with contextlib.closing(run_batches(study, missing, **options)) as batches:
         for batch, seconds in batches:
-            part = write_part(folder, study, batch, seconds)
+            part = store.write_part(folder, study, batch, seconds)
             progress(part.stop - part.start)
     return count
 
@@ -271,14 +251,14 @@ def _compute_missing(
 def _write_tables(
     folder: Path,
     study: Study,
-    manifest: Manifest,
+    manifest: store.Manifest,
     computed: int,
     began: float,
     whole: Callable[[FinishedStudy], None] | None,
-) -> Manifest:
+) -> store.Manifest:
     """Write the results of all parts, then the manifest, then remove the parts."""
-    parts = list_parts(folder)
-    logs = [read_part(part, study)[1:] for part in parts]
+    parts = store.list_parts(folder)
+    logs = [store.read_part(part, study)[1:] for part in parts]
     failures = [failure for failed, _ in logs for failure in failed]
     spent = sum(seconds for _, seconds in logs)
     tables = (write_results(folder, study, parts), write_failures(folder, failures))
@@ -289,7 +269,7 @@ def _write_tables(
     manifest = manifest.write(
         folder,
         finished=True,
-        tables={path.name: file_digest(path) for path in tables},
+        tables={path.name: store.file_digest(path) for path in tables},
         settings=study.settings.model_dump(by_alias=True, exclude_none=True),
         failures=len(failures),
         retry=retry,
@@ -298,5 +278,5 @@ def _write_tables(
         computing_seconds=spent,
     )
     if not retry:  # else the parts are needed to try again
-        remove_parts(folder)
+        store.remove_parts(folder)
     return manifest

@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from lbt_synth.studies.study.comparison import mean_and_error
 from lbt_synth.studies.study.controller_samples import ControllerSamples
+from lbt_synth.studies.study.percentiles import mean_and_error
 from lbt_synth.studies.study.variance_index import (
     FEWEST,
     NO_INDEX,

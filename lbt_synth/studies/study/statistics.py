@@ -10,18 +10,45 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.studies.study.comparison import Comparison, Loss, compare, losses, mean_and_error
 from lbt_synth.studies.study.controller_samples import (
     ControllerSamples,
     read_column,
     read_controller_samples,
 )
-from lbt_synth.studies.study.percentiles import Percentile, Share, percentiles, share
+from lbt_synth.studies.study.percentiles import (
+    Percentile,
+    Share,
+    mean_and_error,
+    percentiles,
+    share,
+)
 from lbt_synth.studies.study.sensitivity import ControllerSensitivity, sensitivities
 from lbt_synth.validation import FloatArray, IntArray, integer, number
 
 PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
 LEVELS = (0.3, 0.5, 0.7, 0.8)
+DIFFERENCES = (5.0, 25.0, 50.0, 75.0, 95.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """Two controllers on the samples on which neither failed."""
+
+    first: str
+    second: str
+    better: Share  # samples with a higher Strehl ratio of the first
+    equal: Share  # samples with the same, mostly as both are unstable
+    mean: float  # Strehl ratio of the first less the second
+    mean_error: float  # standard error of that mean
+    difference: tuple[Percentile, ...]  # of the same difference
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loss:
+    """What a controller loses against the best one of each sample."""
+
+    best: Share  # samples on which no controller has a higher Strehl ratio
+    loss: tuple[Percentile, ...]  # highest Strehl ratio less this one: 50th, 95th and 99th
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,9 +207,9 @@ def study_statistics(
         parameters=tuple(parameters),
         controllers=tuple(
             _controller_statistics(each, loss, levels, _worst_rows(each, rows, values, count=worst))
-            for each, loss in zip(found, losses(found), strict=True)
+            for each, loss in zip(found, _losses(found), strict=True)
         ),
-        comparisons=tuple(compare(first, second) for first, second in combinations(found, 2)),
+        comparisons=tuple(_compare(first, second) for first, second in combinations(found, 2)),
         sensitivities=sensitivities(found, values),
     )
 
@@ -237,4 +264,39 @@ def _worst_rows(
             parameters={name: float(values[i]) for name, values in parameters.items()},
         )
         for i in indices[order]
+    )
+
+
+def _compare(first: ControllerSamples, second: ControllerSamples) -> Comparison:
+    """Compare two controllers sample by sample."""
+    both = first.evaluated & second.evaluated
+    difference = first.strehl[both] - second.strehl[both]
+    mean, error = mean_and_error(difference)
+    n = len(difference)
+    return Comparison(
+        first=first.controller,
+        second=second.controller,
+        better=share(int(np.count_nonzero(difference > 0)), n),
+        equal=share(int(np.count_nonzero(difference == 0)), n),
+        mean=mean,
+        mean_error=error,
+        difference=percentiles(difference, DIFFERENCES),
+    )
+
+
+def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray, ...]:
+    """Return for each controller the best Strehl ratio less its own, on every sample (m,)."""
+    whole = np.logical_and.reduce([each.evaluated for each in controllers])
+    best = np.max([each.strehl[whole] for each in controllers], axis=0)
+    return tuple(best - each.strehl[whole] for each in controllers)
+
+
+def _losses(controllers: Sequence[ControllerSamples]) -> tuple[Loss, ...]:
+    """Return the loss of each controller against the best one of each sample."""
+    return tuple(
+        Loss(
+            best=share(int(np.count_nonzero(loss == 0)), len(loss)),
+            loss=percentiles(loss, (50.0, 95.0, 99.0)),
+        )
+        for loss in sample_losses(controllers)
     )
