@@ -132,8 +132,8 @@ def _engine(arguments: Namespace) -> Iterator[tuple[Executor | None, int | None]
     if arguments.dask is None:
         yield None, None
         return
-    with connect_cluster(arguments.dask) as cluster:
-        yield cluster.executor, cluster.workers
+    with connect_cluster(arguments.dask) as found:
+        yield found
 
 
 def _summarise(loaded: Study, files: Sequence[Path], results: FinishedStudy) -> StudyStatistics:

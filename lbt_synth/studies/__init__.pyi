@@ -10,12 +10,12 @@ from .robustness import robustness as robustness
 from .robustness_map import RobustnessMap as RobustnessMap
 from .robustness_map import robustness_map as robustness_map
 from .study.batch_evaluation import evaluate_samples as evaluate_samples
-from .study.estimate import Estimate as Estimate
-from .study.estimate import estimate_study as estimate_study
 from .study.load import load_study as load_study
 from .study.replay import Replay as Replay
 from .study.replay import replay_row as replay_row
+from .study.run import Estimate as Estimate
 from .study.run import StudyRun as StudyRun
+from .study.run import estimate_study as estimate_study
 from .study.run import run_study as run_study
 from .study.statistics import ControllerStatistics as ControllerStatistics
 from .study.statistics import StudyStatistics as StudyStatistics

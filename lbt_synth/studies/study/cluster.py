@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import lbt_synth
@@ -15,17 +14,9 @@ from lbt_synth.errors import MissingExtraError, ProblemError
 _TIMEOUT_S = 10
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cluster:
-    """A connection to a scheduler."""
-
-    executor: Executor
-    workers: int  # threads of all its workers
-
-
 @contextmanager
-def connect_cluster(address: str) -> Iterator[Cluster]:
-    """Connect to a Dask scheduler whose workers have this version of the package."""
+def connect_cluster(address: str) -> Iterator[tuple[Executor, int]]:
+    """Provide the executor of a Dask scheduler with this package, and how many threads it has."""
     try:
         from distributed import Client
         from distributed.comm import get_address_host_port
@@ -51,8 +42,7 @@ def connect_cluster(address: str) -> Iterator[Cluster]:
                 f"the scheduler at {address} has no workers; start some with dask worker {address}."
             ) from error
         _require_versions(address, client)
-        count = sum(client.ncores().values())
-        yield Cluster(executor=client.get_executor(pure=False), workers=count)
+        yield client.get_executor(pure=False), sum(client.ncores().values())
 
 
 @contextmanager

@@ -50,24 +50,18 @@ def percentiles(values: FloatArray, percents: Sequence[float]) -> tuple[Percenti
     """
     from scipy.stats import binom
 
+    n, tail = len(values), (1 - CONFIDENCE) / 2
+    if n == 0:
+        return tuple(Percentile(percent=p, value=np.nan, low=np.nan, high=np.nan) for p in percents)
     ordered = np.sort(values)
-    n = len(ordered)
+    limits = np.concatenate(([np.nan], ordered, [np.nan]))  # none before the first, after the last
     out = []
     for percent in percents:
-        if n == 0:
-            out.append(Percentile(percent=percent, value=np.nan, low=np.nan, high=np.nan))
-            continue
-        tail = (1 - CONFIDENCE) / 2
         first = int(binom.ppf(tail, n, percent / 100))
         last = int(binom.ppf(1 - tail, n, percent / 100)) + 1
-        out.append(
-            Percentile(
-                percent=percent,
-                value=_interpolate(ordered, percent / 100),
-                low=float(ordered[first - 1]) if first >= 1 else np.nan,
-                high=float(ordered[last - 1]) if last <= n else np.nan,
-            )
-        )
+        value = _interpolate(ordered, percent / 100)
+        low, high = limits[[max(first, 0), last]].tolist()
+        out.append(Percentile(percent=percent, value=value, low=low, high=high))
     return tuple(out)
 
 

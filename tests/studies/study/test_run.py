@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 
 import numpy as np
 import pytest
@@ -281,3 +282,19 @@ def test_a_table_of_results_that_was_changed(tmp_path):
     (folder / "failed.csv").unlink()
     lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
     assert_whole(folder, study)
+
+
+def test_an_estimate(tmp_path):
+    study = load_small_study(tmp_path, samples="5000")
+
+    def slow(study, values, start):
+        time.sleep(1e-3 * len(values))
+        return evaluate_quickly(study, values, start)
+
+    cost = lbt.studies.estimate_study(study, workers=1, evaluate=slow)
+    assert 4 < cost.seconds < 9
+    assert cost.measured_rows >= 1000
+    far = lbt.studies.estimate_study(study, workers=100, local=False, evaluate=slow)
+    assert far.seconds < 0.09
+    with pytest.raises(ProblemError, match="workers must be at least 1"):
+        lbt.studies.estimate_study(study, workers=0)
