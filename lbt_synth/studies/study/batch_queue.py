@@ -48,25 +48,18 @@ class BatchQueue:
         if self._best is None or seconds / rows <= self._best[1] / self._best[0] * (1 + 1e-9):
             self._best = rows, seconds
 
-    def _cost(self) -> tuple[float, float]:
-        """Return the fixed seconds of every batch, and the seconds per row."""
-        assert self._small is not None  # both are known after the first batch
-        assert self._best is not None
-        (few, short), (many, long) = self._small, self._best
-        slope = max(long - short, 0.0) / (many - few)
-        fixed = min(short - few * slope, self._least_s)  # the first batch includes the warm-up
-        return max(fixed, 0.0), max(long - fixed, 1e-3 * long) / many
-
     def _size(self) -> int:
         share = -(-self.left // (2 * self._workers))  # towards the end, some for every worker
         if self._small is None or self._best is None:
             return max(1, min(_FIRST_ROWS, share))
-        many, long = self._best
-        if self._small[0] == many:
+        (few, short), (many, long) = self._small, self._best
+        if few == many:
             return max(1, min(int(many * min(_GROWTH, _TRIAL_SECONDS / long)), share))
-        fixed_s, row_s = self._cost()
-        total_s = self.left * row_s
-        target_s = max(_SECONDS, _OVER_FIXED * fixed_s, total_s / _MOST_PARTS)
+        slope = max(long - short, 0.0) / (many - few)
+        # the first batch includes the warm-up
+        fixed_s = max(min(short - few * slope, self._least_s), 0.0)
+        row_s = max(long - fixed_s, 1e-3 * long) / many
+        target_s = max(_SECONDS, _OVER_FIXED * fixed_s, self.left * row_s / _MOST_PARTS)
         most = min(int(target_s / row_s), _GROWTH * many, _MOST_ROWS)
         crumb = int(max(_CRUMB_SECONDS, 4 * fixed_s) / row_s) if _CRUMB_SECONDS else 0
         crumb = min(crumb, -(-self.left // self._workers))

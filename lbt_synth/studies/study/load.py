@@ -103,7 +103,9 @@ def load_study(
         inputs=(source, config_file, *files.values()),
     )
     samples = [(where, _checked_sample(study, where, values)) for where, values in _corners(study)]
-    fixed = _read_designs(study, directory) | {name: design for name, (design, _) in gains.items()}
+    fixed = {name: design for name, (design, _) in gains.items()}
+    if directory is not None and (manifest := read_manifest(Path(directory), study.digest)):
+        fixed |= read_designs(Path(directory), manifest)
     controllers = tuple(
         StudyController(name=name, request=None, design=fixed[name], origin=str(files[name]))
         if name in files
@@ -136,12 +138,6 @@ def _require_names(settings: StudySection, source: Path) -> None:
         else:
             continue
         raise ConfigError(f"{source}: controllers.{name}: {why}.", path=f"controllers.{name}")
-
-
-def _read_designs(study: Study, directory: str | os.PathLike[str] | None) -> dict[str, Design]:
-    """Return the designs of a study in its directory, none if it was not begun there."""
-    manifest = None if directory is None else read_manifest(Path(directory), study.digest)
-    return {} if manifest is None else read_designs(Path(directory or ""), manifest)
 
 
 def _designed_controller(study: Study, name: str, stored: Design | None) -> StudyController:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import BoolArray, FloatArray
 
 CONFIDENCE = 0.95
 
@@ -75,18 +75,22 @@ def _interpolate(ordered: FloatArray, fraction: float) -> float:
     return low + weight * (float(ordered[below + 1]) - low)
 
 
-def share(count: int, total: int) -> Share:
-    """Return a part of the samples, with the interval of Clopper and Pearson.
+def share(where: BoolArray) -> Share:
+    """Return the part of the samples (n,) for which something holds.
+
+    Its interval is that of Clopper and Pearson.
 
     Examples
     --------
+    >>> import numpy as np
     >>> from lbt_synth.studies.study.percentiles import share
-    >>> none = share(0, 100)
+    >>> none = share(np.zeros(100, dtype=bool))
     >>> none.value, none.low, round(none.high, 4)
     (0.0, 0.0, 0.0362)
     """
     from scipy.special import betaincinv
 
+    count, total = int(np.count_nonzero(where)), len(where)
     if total == 0:
         return Share(count=0, total=0, low=np.nan, high=np.nan)
     tail = (1 - CONFIDENCE) / 2

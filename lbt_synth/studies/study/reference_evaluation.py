@@ -65,7 +65,10 @@ def evaluate_row(
             with _note_failure(failures, row, [controller]):
                 design = design_for_sample(controller, sample)
                 loops[controller.name] = close_sample_loop(sample, design)
-        settle = _settle_frames(study, loops)
+        # frames to drop: the same for all controllers, which meet the same disturbances
+        radii = [loop.spectral_radius for loop in loops.values() if loop.is_stable]
+        least = study.config.settings.simulation.settle_frames
+        settle = max([least, *map(settling_frames, radii)])
         for controller in study.controllers:
             if (loop := loops.get(controller.name)) is None:
                 continue
@@ -130,9 +133,3 @@ def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> di
         "strehl": float(np.mean(run.strehl(sample.config.imaging))),
         "residual_nm": float(np.sqrt(np.mean(run.rms_nm**2))),
     }
-
-
-def _settle_frames(study: Study, loops: Mapping[str, ClosedLoop]) -> int:
-    """Return the frames to drop, the same for all controllers: they meet the same disturbances."""
-    needed = [settling_frames(loop.spectral_radius) for loop in loops.values() if loop.is_stable]
-    return max([study.config.settings.simulation.settle_frames, *needed])

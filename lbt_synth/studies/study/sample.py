@@ -79,9 +79,11 @@ def find_number(content: Mapping[str, Any], path: str) -> float:
     walked = ""
     for key in parse_path(path):
         place = walked or "the configuration"
+        kind: Any = list if isinstance(key, int) else dict
+        if not isinstance(here, kind):
+            says = "is no list" if kind is list else "has no keys"
+            raise ConfigError(f"{path}: {place} {says}; {_describe(here)}.")
         if isinstance(key, int):
-            if not isinstance(here, list):
-                raise ConfigError(f"{path}: {place} is no list; {_describe(here)}.")
             if key >= len(here):
                 raise ConfigError(
                     f"{path}: {place} has {len(here)} entr{'y' if len(here) == 1 else 'ies'}, "
@@ -89,8 +91,6 @@ def find_number(content: Mapping[str, Any], path: str) -> float:
                 )
             walked += f"[{key}]"
         else:
-            if not isinstance(here, dict):
-                raise ConfigError(f"{path}: {place} has no keys; {_describe(here)}.")
             if key not in here:
                 close = difflib.get_close_matches(key, list(here), n=1, cutoff=0.6)
                 hint = f"did you mean {close[0]}? " if close else ""

@@ -226,11 +226,11 @@ def _controller_statistics(
         controller=each.controller,
         samples=n,
         failed=len(each.strehl) - n,
-        unstable=share(int(np.count_nonzero(each.unstable)), n),
+        unstable=share(each.unstable[each.evaluated]),
         mean=mean,
         mean_error=error,
         strehl=percentiles(strehl, PERCENTS),
-        above={level: share(int(np.count_nonzero(strehl > level)), n) for level in levels},
+        above={level: share(strehl > level) for level in levels},
         residual_nm=percentiles(each.residual_nm[each.evaluated], PERCENTS),
         parts_nm={
             part: float(np.median(values[stable])) if stable.any() else np.nan
@@ -272,12 +272,11 @@ def _compare(first: ControllerSamples, second: ControllerSamples) -> Comparison:
     both = first.evaluated & second.evaluated
     difference = first.strehl[both] - second.strehl[both]
     mean, error = mean_and_error(difference)
-    n = len(difference)
     return Comparison(
         first=first.controller,
         second=second.controller,
-        better=share(int(np.count_nonzero(difference > 0)), n),
-        equal=share(int(np.count_nonzero(difference == 0)), n),
+        better=share(difference > 0),
+        equal=share(difference == 0),
         mean=mean,
         mean_error=error,
         difference=percentiles(difference, DIFFERENCES),
@@ -294,9 +293,6 @@ def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray,
 def _losses(controllers: Sequence[ControllerSamples]) -> tuple[Loss, ...]:
     """Return the loss of each controller against the best one of each sample."""
     return tuple(
-        Loss(
-            best=share(int(np.count_nonzero(loss == 0)), len(loss)),
-            loss=percentiles(loss, (50.0, 95.0, 99.0)),
-        )
+        Loss(best=share(loss == 0), loss=percentiles(loss, (50.0, 95.0, 99.0)))
         for loss in sample_losses(controllers)
     )

@@ -150,12 +150,11 @@ def read_designs(folder: Path, manifest: Manifest) -> dict[str, Design]:
 
 def write_designs(folder: Path, study: Study) -> dict[str, str]:
     """Write the designs for the whole study, and return the digests of their files."""
-    digests = {}
-    for controller in study.controllers:
-        if controller.is_designed and controller.design is not None:
-            path = save_gain(folder / f"{controller.name}.fits", controller.design)
-            digests[controller.name] = load_with_digest(path)[1]
-    return digests
+    return {
+        each.name: load_with_digest(save_gain(folder / f"{each.name}.fits", each.design))[1]
+        for each in study.controllers
+        if each.request is not None and each.design is not None
+    }
 
 
 def list_parts(folder: Path) -> list[Part]:

@@ -141,14 +141,7 @@ class Study:
         if stop > self.samples:
             raise ProblemError(f"the study has {self.samples} samples; got rows up to {stop}.")
         varying = [p for p in self.parameters if p.distribution.varies]
-        points = unit_points(
-            self.settings.sampling,
-            samples=self.samples,
-            dimensions=len(varying),
-            seed=self.settings.seed,
-            start=start,
-            stop=stop,
-        )
+        points = unit_points(self.settings, len(varying), start, stop)
         levels = iter(points.T)
         out = np.empty((stop - start, len(self.parameters)))
         for column, parameter in enumerate(self.parameters):
@@ -208,29 +201,29 @@ class BatchResult:
     failures: tuple[Failure, ...] = ()
 
 
-def unit_points(
-    sampling: str, *, samples: int, dimensions: int, seed: int, start: int, stop: int
-) -> FloatArray:
-    """Return points ``start`` to ``stop`` of ``samples``, (stop - start, dimensions) in [0, 1).
+def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) -> FloatArray:
+    """Return points ``start`` to ``stop`` of a study's sampling, (., dimensions) in [0, 1).
 
-    Sobol's sequence does not depend on ``samples``: a longer one begins with the same points.
-    Each of its blocks of 2^k points is balanced, so a power of two is the best number of samples;
-    any other is allowed. A Latin hypercube is made as a whole, once per process.
+    The seed fixes every point, whichever are requested with it. Sobol's sequence does not depend
+    on the number of samples: a longer one begins with the same points. Each of its blocks of 2^k
+    points is balanced, so a power of two is the best number of samples; any other is allowed. A
+    Latin hypercube is made as a whole, once per process.
 
     Examples
     --------
+    >>> import lbt_synth as lbt
     >>> from lbt_synth.studies.study.study import unit_points
-    >>> points = unit_points("sobol", samples=8, dimensions=2, seed=1, start=0, stop=8)
+    >>> points = unit_points(lbt.studies.load_study("examples/study.yaml").settings, 2, 0, 8)
     >>> (points < 0.5).sum(axis=0).tolist()
     [4, 4]
     """
     if dimensions == 0 or stop == start:
         return np.zeros((stop - start, dimensions))
-    if sampling == "latin_hypercube":
-        return _hypercube(samples, dimensions, seed)[start:stop]
+    if settings.sampling == "latin_hypercube":
+        return _hypercube(settings.samples, dimensions, settings.seed)[start:stop]
     from scipy.stats import qmc
 
-    engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
+    engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(settings.seed))
     if start > 0:
         engine.fast_forward(start)
         return np.asarray(engine.random(stop - start))
