@@ -7,7 +7,7 @@ from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
 from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identified_model import IdentifiedTurbulence as IdentifiedTurbulence
-from .fit.whiteness import Whiteness as Whiteness
+from .fit.identified_model import Whiteness as Whiteness
 from .prediction.comparison import PredictionRow as PredictionRow
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import TypeAlias
 
 from lbt_synth.errors import ProblemError
@@ -89,3 +90,21 @@ def split_halves(
             "shorten gap_frames."
         )
     return tuple(fit), tuple(test)
+
+
+def split_frames(
+    usable: Stretches, fit: StretchesLike | None, test: StretchesLike | None, frames: int
+) -> tuple[Stretches, Stretches]:
+    """Return the frames to fit and to test on: as given, or the halves of the usable ones."""
+    if fit is None and test is None:
+        return split_halves(usable, frames)
+    if fit is None or test is None:
+        raise ProblemError("fit and test must both be given, or neither; got one of them.")
+    fitted, tested = checked_stretches(fit, frames), checked_stretches(test, frames)
+    for (a, b), (c, d) in product(fitted, tested):
+        if a < d and c < b:
+            raise ProblemError(
+                f"the test must have frames that the fit has not; got ({a}, {b}) to fit and "
+                f"({c}, {d}) to test."
+            )
+    return fitted, tested

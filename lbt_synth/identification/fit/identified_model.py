@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whiteness import Whiteness
 from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.models import (
     ARModel,
@@ -107,6 +106,44 @@ class IdentifiedTurbulence:
     corner_error_hz: float | None
     rms_nm: float
     rms_error_nm: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Whiteness:
+    """Tests of the innovations, the prediction errors of the fitted model.
+
+    Their spectrum is the ratio of periodogram to model.
+
+    Attributes
+    ----------
+    deviation : float
+        Largest distance of the cumulative periodogram of the innovations from the diagonal, as
+        a part of their power.
+    p_value : float
+        Probability of a larger one if the innovations were white (M. S. Bartlett, An
+        Introduction to Stochastic Processes, 1955; Kolmogorov's distribution).
+    autocorrelation : (lags,) ndarray
+        From lag 1.
+    correlation_p_value : float
+        Of Box and Pierce's sum of squares over these lags (doi:10.1080/01621459.1970.10481180).
+    frequency_hz, cumulative : (f,) ndarray
+        The cumulative periodogram, from 0 to 1.
+    effective : float
+        Number of independent values.
+    """
+
+    deviation: float
+    p_value: float
+    autocorrelation: FloatArray
+    correlation_p_value: float
+    frequency_hz: FloatArray
+    cumulative: FloatArray
+    effective: float
+
+    @property
+    def white(self) -> bool:
+        """Whether neither test refuses whiteness at 1 %."""
+        return self.p_value > 0.01 and self.correlation_p_value > 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -216,12 +253,8 @@ class IdentifiedModel:
         )
 
     def _vibrations(self) -> list[Vibration]:
-        count = len(self.axes)
-        return [
-            part.vibration(tuple(float(i == j) for j in range(count)))
-            for i, axis in enumerate(self.axes)
-            for part in axis.parts
-        ]
+        each = zip(np.eye(len(self.axes)).tolist(), self.axes, strict=True)
+        return [part.vibration(tuple(along)) for along, axis in each for part in axis.parts]
 
     def plant(self) -> TipTiltPlant:
         """Return the plant of a design.

@@ -92,7 +92,7 @@ class SpectrumModel:
         return np.array([self.log_gain, self.log_noise, self.log_corner, *chain(*rows)])
 
     def unpack(self, vector: FloatArray) -> SpectrumModel:
-        """Return components of the same kinds with the numbers of a vector (p,)."""
+        """Return the model with the numbers of a vector (p,)."""
         gain, noise, corner, *rest = vector.tolist()
         rows = zip(self.components, rest[::3], rest[1::3], rest[2::3], strict=True)
         each = (Component(c.kind, f, damping, power, c.announced) for c, f, damping, power in rows)

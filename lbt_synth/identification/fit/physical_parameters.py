@@ -9,9 +9,10 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
     IdentifiedTurbulence,
+    Whiteness,
 )
 from lbt_synth.identification.fit.parameters import GAIN, SpectrumModel
-from lbt_synth.identification.fit.whiteness import whiteness
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import FittedModel, densities
 from lbt_synth.models import ARModel
 from lbt_synth.models.resonance_spectrum import coefficients
@@ -21,6 +22,8 @@ UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks
 WIDE_DAMPING = 0.1
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 _DIFFERENCE = 1e-4  # of a logarithm
+_LAGS = 100
+_LOWEST = 3  # bins in which the ends of the taper show
 
 
 def parameter_covariance(model: FittedModel) -> FloatArray:
@@ -160,4 +163,34 @@ def _describe_turbulence(
         corner_error_hz=None if corner is None else corner * errors.log_corner,
         rms_nm=rms(np.zeros(theta.size)),
         rms_error_nm=rms(np.zeros(theta.size)) * float(np.sqrt(slope @ covariance @ slope)),
+    )
+
+
+def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Whiteness:
+    """Test whether power and model (f,) differ as white innovations do."""
+    from scipy.stats import chi2, kstwobign
+
+    ratio = power / model
+    effective = float(np.sum(data.count))
+    cumulative = np.cumsum(ratio) / np.sum(ratio)
+    deviation = float(np.max(np.abs(cumulative - np.arange(1, ratio.size + 1) / ratio.size)))
+    # a periodogram of n frames has n / 2 values; bins count as they are independent
+    size = 2 * (ratio.size + 1)
+    whole = data.frequency_hz.size / data.frequency_hz[-1] * data.frame_rate_hz / 2
+    correlation, p_value = np.zeros(0), float("nan")
+    if ratio.size > 0.95 * whole:  # up to the Nyquist frequency
+        lags = min(_LAGS, ratio.size // 16)
+        filled = np.zeros(size // 2 + 1)  # from 0 to the Nyquist frequency
+        filled[1:-1] = ratio - np.mean(ratio[_LOWEST:])
+        filled[: 1 + _LOWEST] = 0
+        correlation = np.fft.irfft(filled, size)[1 : lags + 1] * size / (2 * np.sum(ratio))
+        p_value = float(chi2.sf(2 * effective * float(np.sum(correlation**2)), lags))
+    return Whiteness(
+        deviation=deviation,
+        p_value=float(kstwobign.sf(deviation * np.sqrt(effective))),
+        autocorrelation=frozen_copy(correlation),
+        correlation_p_value=p_value,
+        frequency_hz=data.frequency_hz,
+        cumulative=frozen_copy(cumulative),
+        effective=effective,
     )

@@ -145,8 +145,8 @@ def minimise(data: LoopPeriodogram, start: SpectrumModel, priors: Priors) -> Fit
     free, theta = priors.free, start.pack()
     centre, precision = priors.centre[free], 1 / priors.width[free] ** 2
 
-    @lru_cache(maxsize=1)
-    def expand(raw: bytes) -> tuple[float, FloatArray, FloatArray]:
+    @lru_cache(maxsize=1)  # scipy asks for value, gradient and Hessian one after the other
+    def evaluate(raw: bytes) -> tuple[float, FloatArray, FloatArray]:
         theta[free] = x = np.clip(np.frombuffer(raw), -_FARTHEST, _FARTHEST)
         value, gradient, information = derivatives(data, start.unpack(theta))
         away = x - centre
@@ -157,14 +157,14 @@ def minimise(data: LoopPeriodogram, start: SpectrumModel, priors: Priors) -> Fit
         )
 
     found = minimize(  # type: ignore[call-overload]
-        lambda x: expand(x.tobytes())[0],
+        lambda x: evaluate(x.tobytes())[0],
         theta[free],
-        jac=lambda x: expand(x.tobytes())[1],
-        hess=lambda x: expand(x.tobytes())[2],
+        jac=lambda x: evaluate(x.tobytes())[1],
+        hess=lambda x: evaluate(x.tobytes())[2],
         method="trust-exact",
         options=_OPTIONS,
     )
-    _, gradient, reduced = expand(found.x.tobytes())
+    _, gradient, reduced = evaluate(found.x.tobytes())
     # what a Newton step would still gain
     left = 0.5 * float(gradient @ np.linalg.lstsq(reduced, gradient, rcond=None)[0])
     if not (np.isfinite(found.fun) and np.isfinite(left)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -23,12 +22,7 @@ from lbt_synth.identification.prediction.residual import (
     prediction_data,
 )
 from lbt_synth.identification.prediction.residual_estimate import ResidualEstimate
-from lbt_synth.identification.stretches import (
-    Stretches,
-    StretchesLike,
-    checked_stretches,
-    split_halves,
-)
+from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
@@ -248,7 +242,7 @@ def prediction_against_data(
         require_instance(imaging, Imaging)
     hardware = plant.hardware
     series, usable = check_series(open_loop, hardware.modes, stretches)
-    fitted, tested = _split_frames(usable, fit, test, len(series))
+    fitted, tested = split_frames(usable, fit, test, len(series))
     data = prediction_data(
         series, hardware, plant.R, noise_error_nm=noise_error_nm, stretches=tested
     )
@@ -301,23 +295,6 @@ def _note_refuted(rows: Sequence[PredictionRow]) -> list[str]:
         "errors below zero, more than chance; the model has more noise than the data, or another "
         "sensor gain. Identify the noise again."
     ]
-
-
-def _split_frames(
-    usable: Stretches, fit: StretchesLike | None, test: StretchesLike | None, frames: int
-) -> tuple[Stretches, Stretches]:
-    if fit is None and test is None:
-        return split_halves(usable, frames)
-    if fit is None or test is None:
-        raise ProblemError("fit and test must both be given, or neither; got one of them.")
-    fitted, tested = checked_stretches(fit, frames), checked_stretches(test, frames)
-    for (a, b), (c, d) in product(fitted, tested):
-        if a < d and c < b:
-            raise ProblemError(
-                f"the test must have frames that the fit has not; got ({a}, {b}) to fit and "
-                f"({c}, {d}) to test."
-            )
-    return fitted, tested
 
 
 def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Design) -> ClosedLoop:

@@ -85,7 +85,7 @@ class _KeepFilterError(Exception):
 
 
 @contextmanager
-def _keeping_filter_if(step: str) -> Iterator[None]:
+def _keep_filter_if_fails(step: str) -> Iterator[None]:
     """Keep the running filter if a step fails, whatever stops it: the loop goes on."""
     try:
         yield
@@ -220,7 +220,7 @@ class TrackingController(SwitchedController):
             found = self._identify_window()
             clock.append(time.perf_counter())
             plant = self._extrapolate_lines(found, time_s)
-            with _keeping_filter_if("design"):
+            with _keep_filter_if_fails("design"):
                 designed = self._make_design(plant)
             clock.append(time.perf_counter())
             self.switch(designed)
@@ -249,7 +249,7 @@ class TrackingController(SwitchedController):
     def _identify_window(self) -> TipTiltPlant:
         """Return the plant of the last window."""
         window = self._clean_window()
-        with _keeping_filter_if("fit"):
+        with _keep_filter_if_fails("fit"):
             found = self._identify(*window)
         if found is None:
             raise _KeepFilterError("the fit found no plant")

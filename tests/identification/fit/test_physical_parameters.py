@@ -7,7 +7,7 @@ from support.recorded_loops import integrator_loop
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.whiteness import whiteness
+from lbt_synth.identification.fit.physical_parameters import whiteness
 
 RATE = 1000.0
 
