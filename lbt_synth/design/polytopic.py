@@ -100,40 +100,25 @@ class PolytopicDesign(EstimatorDesign):
         if not certificate.passed:
             return certificate
         bound, worst, limit = self.bound_guaranteed, self.worst_achieved, NORM_TOLERANCE
-        again = bound_worst_error(interval, predictor, norm)
         found, _ = search_worst_error(interval, predictor, norm)
         a1 = interval.coefficient(self.worst_frequency_hz)
         there = error_size(interval.error_system(a1, predictor), norm)
         beyond = abs(self.worst_frequency_hz - self.problem.vibrations[0].frequency_hz)
-        beyond -= interval.half_width_hz
-        difference = controller_difference(self.controller, _controller(self.problem, predictor))
-        search = "grid of frequencies, refined"
-        checks = (
-            Check("bound over the interval, recomputed", again, bound * (1 + limit), _NORMS[norm]),
-            Check("worst error found over the bound, less 1", found / bound - 1, limit, search),
-            Check(
-                "worst error found over the one stated, less 1", found / worst - 1, limit, search
-            ),
-            Check(
-                "worst error stated, against that at its frequency",
-                abs(there / worst - 1),
-                limit,
-                "relative, one error system",
-            ),
-            Check(
-                "distance of that frequency beyond the interval",
-                beyond,
-                1e-9 * interval.high_hz,
-                "Hz",
-            ),
-            Check(
-                "controller, against the one made of the filter",
-                difference,
-                limit,
-                "relative, largest entry",
-            ),
-            certify_loop(self.problem.hardware, self.controller),
+        beyond, high_hz = beyond - interval.half_width_hz, interval.high_hz
+        again = bound_worst_error(interval, predictor, norm)
+        apart = controller_difference(self.controller, _controller(self.problem, predictor))
+        search, one = "grid of frequencies, refined", "relative, one error system"
+        entry, change = "relative, largest entry", abs(there / worst - 1)
+        rows = (
+            ("bound over the interval, recomputed", again, bound * (1 + limit), _NORMS[norm]),
+            ("worst error found over the bound, less 1", found / bound - 1, limit, search),
+            ("worst error found over the one stated, less 1", found / worst - 1, limit, search),
+            ("worst error stated, against that at its frequency", change, limit, one),
+            ("distance of that frequency beyond the interval", beyond, 1e-9 * high_hz, "Hz"),
+            ("controller, against the one made of the filter", apart, limit, entry),
         )
+        loop = certify_loop(self.problem.hardware, self.controller)
+        checks = (*(Check(*row) for row in rows), loop)
         return replace(certificate, checks=(*certificate.checks, *checks))
 
 

@@ -38,29 +38,20 @@ from lbt_synth.validation import ComplexArray, FloatArray, IntArray, frozen_copy
 
 _STABLE = 1 - STABILITY_MARGIN
 _SQUARING = "relative, by squaring"
+_RECOMPUTED = "gain recomputed from the Lyapunov covariance"
+_TWICE, _SIZES = "relative, two Lyapunov equations", "relative, sizes of the terms of its variance"
 _CHECKS = (  # what is checked, its limit, how it is computed
     ("spectral radius of the filter", _STABLE, "eigenvalues"),
     ("spectral radius of the closed loop", _STABLE, "eigenvalues"),
     ("residual of the Riccati equation", RESIDUAL_TOLERANCE, "relative, in extended precision"),
     ("residual of the Lyapunov equation", RESIDUAL_TOLERANCE, _SQUARING),
     ("variance, against the Riccati equation", VARIANCE_TOLERANCE, "relative, Lyapunov equation"),
-    (
-        "distance from the least-variance gain",
-        GAIN_TOLERANCE,
-        "gain recomputed from the Lyapunov covariance",
-    ),
+    ("distance from the least-variance gain", GAIN_TOLERANCE, _RECOMPUTED),
     ("residual of the loop's Lyapunov equation", RESIDUAL_TOLERANCE, _SQUARING),
 )
-_APPLIED = (  # the residual is the estimation error
-    "residual of the closed loop, against the estimation error",
-    VARIANCE_TOLERANCE,
-    "relative, two Lyapunov equations",
-)
-_NOT_APPLIED = (
-    "rounding in the residual of the closed loop",
-    VARIANCE_TOLERANCE,
-    "relative, sizes of the terms of its variance",
-)
+# of a loop that applies the estimate, whose residual is the estimation error, and of any other
+_APPLIED = "residual of the closed loop, against the estimation error", VARIANCE_TOLERANCE, _TWICE
+_NOT_APPLIED = "rounding in the residual of the closed loop", VARIANCE_TOLERANCE, _SIZES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

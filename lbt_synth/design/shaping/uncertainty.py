@@ -70,16 +70,13 @@ class SensorGainRange(CheckedFields):
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        T, name = loop.complementary, "real part of the complementary sensitivity, "
-        return tuple(
-            Check(
-                name + ("largest" if sign > 0 else "least, negated"),
-                largest_real_part(replace(T, C=sign * T.C, D=sign * T.D)),
-                bound,
-                LEVEL_SETS,
-            )
-            for sign, bound in self._bounds()
-        )
+        T, checks = loop.complementary, []
+        for sign, bound in self._bounds():
+            which = "largest" if sign > 0 else "least, negated"
+            peak = largest_real_part(replace(T, C=sign * T.C, D=sign * T.D))
+            name = f"real part of the complementary sensitivity, {which}"
+            checks.append(Check(name, peak, bound, LEVEL_SETS))
+        return tuple(checks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,15 +141,12 @@ class DelayError(CheckedFields):
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        return tuple(
-            Check(
-                f"loop change by a delay of {other:g} frames",
-                hinf_norm(append_taps(loop.parameter, taps)).upper,
-                1.0,
-                LEVEL_SETS,
-            )
-            for other, taps in self._differences(loop.hardware)
-        )
+        checks = []
+        for other, taps in self._differences(loop.hardware):
+            change = hinf_norm(append_taps(loop.parameter, taps)).upper
+            name = f"loop change by a delay of {other:g} frames"
+            checks.append(Check(name, change, 1.0, LEVEL_SETS))
+        return tuple(checks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
