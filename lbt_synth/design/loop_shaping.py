@@ -124,15 +124,12 @@ def shape(
             solved[id(spec)] = long, chosen
     longs, modes = zip(*(solved[id(spec)] for spec in specifications), strict=True)
     parameters = tuple(mode.parameter for mode in modes)
+    status, rounds = modes[0].sequence.status, max(long.sequence.programmes for long in longs)
     design = ShapedDesign(
         method="shaped",
         controller=controller_from_parameters(hardware, parameters),
         certificate=UNCERTIFIED,
-        solver=SolverReport(
-            route="youla",
-            status=modes[0].sequence.status,
-            iterations=max(long.sequence.programmes for long in longs),
-        ),
+        solver=SolverReport(route="youla", status=status, iterations=rounds),
         loop_hardware=hardware,
         specifications=specifications,
         parameters=parameters,

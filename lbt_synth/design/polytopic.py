@@ -222,11 +222,9 @@ def _synthesise(interval: FrequencyInterval, norm: str) -> tuple[Controller, flo
     bounds = np.array([each.bound for each in filters])
     A, B, C = (block_diag(*(getattr(each, name) for each in filters)) for name in "ABC")
     predictor = Controller(A=A, B=B, C=C, D=np.zeros((len(C), B.shape[1])), dt_s=plant.dt_s)
-    report = SolverReport(
-        route="lmi",
-        status=next((each.status for each in filters if each.status != "optimal"), "optimal"),
-        iterations=sum(each.iterations for _, each in distinct),
-    )
+    status = next((each.status for each in filters if each.status != "optimal"), "optimal")
+    rounds = sum(each.iterations for _, each in distinct)
+    report = SolverReport(route="lmi", status=status, iterations=rounds)
     return predictor, float(np.max(bounds) if norm == "hinf" else np.linalg.norm(bounds)), report
 
 

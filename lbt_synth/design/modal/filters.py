@@ -238,8 +238,8 @@ def modal_filters(
     certificate = modal_certificate(errors, estimation_nm2, applied=applied).require(
         "Scale the noise or the turbulence of these modes to sizes that occur."
     )
-    joined = [_join_batches(batches, each) for each in zip(*parts, strict=True)]
-    gain_predictor, A, B, C, D, poles = joined
+    names = ("gain_predictor", "A", "B", "C", "D", "poles")
+    joined = (_join_batches(batches, each) for each in zip(*parts, strict=True))
     return ModalFilters(
         turbulence=models.turbulence,
         vibrations=models.lines,
@@ -249,12 +249,7 @@ def modal_filters(
         mirror=mirror,
         states=read_only(states),
         controller_states=read_only(states + response.n_states),
-        gain_predictor=gain_predictor,
-        A=A,
-        B=B,
-        C=C,
-        D=D,
-        poles=poles,
+        **dict(zip(names, joined, strict=True)),
         rms_nm=frozen_copy(np.sqrt(residual_nm2)),
         certificate=certificate,
     )

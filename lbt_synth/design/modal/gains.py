@@ -144,14 +144,14 @@ def modal_gains(
             out[mode] += model.psd(frequency)
         return out
 
-    return find_gains(
-        density,
-        np.concatenate([*edges, *(_model_edges(model) for _, model in models)]),
-        path,
+    inputs = LoopInputs(
+        path=path,
+        density=density,
+        edges=np.concatenate([*edges, *(_model_edges(model) for _, model in models)]),
         noise=number_per_mode(noise_nm, "noise_nm", count, zero=True),
         gain=number_per_mode(sensor_gain, "sensor_gain", count),
-        margin=margin,
     )
+    return find_gains(inputs, margin)
 
 
 def _spectra_per_mode(
@@ -201,22 +201,45 @@ def _distinct_poles(poles: Any) -> ComplexArray:
     return np.asarray(inside[kept], dtype=np.complex128)
 
 
-def find_gains(
-    density: Density,
-    own_edges: FloatArray,
-    path: LoopHardware,
-    *,
-    noise: FloatArray,
-    gain: FloatArray,
-    margin: float,
-    differenced: bool = False,
-) -> ModalGains:
-    """Find the gains on finer and finer panels, until residuals and gains no longer change.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopInputs:
+    """What reaches the integrator loops of n modes: phase and noise."""
 
-    Shapes: own_edges (e,), noise, gain (n,).
-    """
-    rate, taps = path.frame_rate_hz, path.mirror_taps
-    limit = hardware_gain_limit(path)
+    path: LoopHardware  # of one mode
+    density: Density  # of the phases, or of their differences of two frames
+    edges: FloatArray  # of panels for the spectra, over the Nyquist frequency
+    noise: FloatArray  # (n,)
+    gain: FloatArray  # of the sensor, (n,)
+    differenced: bool = False
+
+    def spectra(self, frequency_hz: FloatArray) -> FloatArray:
+        """Return the spectra (n, f); refuse what is not finite, or negative unless differenced."""
+        spectra = self.density(frequency_hz)
+        sound = np.isfinite(spectra) & ((spectra >= 0) | self.differenced)
+        wrong = np.flatnonzero(~sound.all(axis=1))
+        if wrong.size:
+            which = f"that of mode {wrong[0]} is not"
+            raise ProblemError(f"every spectrum must be finite and at least 0; {which}.")
+        return spectra
+
+    def transfers(self, frequency_hz: FloatArray, loop_gains: FloatArray) -> list[FloatArray]:
+        """Squared moduli (gains, f) of spectra and of noise over sensor gain to the residual."""
+        delay = np.exp(-2j * np.pi * (frequency_hz / self.path.frame_rate_hz))
+        mirror: ComplexArray = polyval(delay, self.path.mirror_taps)
+        difference = 1 - delay
+        power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
+        rejection = (1.0 if self.differenced else np.abs(difference) ** 2) / power
+        return [rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power]
+
+
+def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
+    """Find the gains on finer and finer panels, until residuals and gains no longer change."""
+    path, gain = inputs.path, inputs.gain
+    rate, limit, noise_nm2 = (
+        path.frame_rate_hz,
+        hardware_gain_limit(path),
+        (inputs.noise / gain) ** 2,
+    )
     least, most = TRIED_GAINS
     distance = number(margin, "margin", at_least=round(1 - most, 9), below=1)
     loop_gains = np.geomspace(least, _HIGHEST, _GRID) * limit
@@ -227,25 +250,25 @@ def find_gains(
             f"{np.min(highest / gain):.3g} at a sensor gain of {np.min(gain):.3g}."
         )
     # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
-    path_taps = np.append(0.0, taps)
+    path_taps = np.append(0.0, path.mirror_taps)
     poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
-    grid = [np.zeros(1), np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), own_edges]
+    grid = [np.zeros(1), np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), inputs.edges]
     edges = distinct_edges(np.concatenate(grid))
     last: tuple[FloatArray, FloatArray] | None = None
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
-        rejection, propagation = _transfers(nodes / rate, taps, loop_gains, differenced)
+        rejection, propagation = inputs.transfers(nodes, loop_gains)
         propagated = propagation @ weights * 2 / rate
-        variances = (_checked(density(nodes), differenced) * weights) @ rejection.T
-        variances += np.outer((noise / gain) ** 2, propagated)
+        variances = (inputs.spectra(nodes) * weights) @ rejection.T
+        variances += np.outer(noise_nm2, propagated)
         if np.any(variances[:, 0] == 0):
             raise ProblemError(
                 "every mode must have turbulence, vibration or noise; got none in mode "
                 f"{int(np.argmin(variances[:, 0]))}."
             )
         best, variance = _minimise(loop_gains, variances, limit, highest)
-        if differenced:
-            floor = (noise / gain) ** 2 * np.interp(best, loop_gains, propagated)
+        if inputs.differenced:
+            floor = noise_nm2 * np.interp(best, loop_gains, propagated)
             variance = np.maximum(variance, floor)
         if last is not None and _is_settled((best, variance), last):
             break
@@ -265,41 +288,16 @@ def find_gains(
         rms_nm=read_only(np.sqrt(variance)),
         limit=read_only(allowed),
         limited=read_only(gains > allowed * (1 - 1e-6)),
-        noise_nm=noise,
+        noise_nm=inputs.noise,
         delay_frames=path.delay_frames,
         mirror=path.mirror,
     )
-
-
-def _checked(spectra: FloatArray, differenced: bool) -> FloatArray:
-    """Return the spectra (n, f); refuse what is not finite, or negative unless differenced."""
-    sound = np.isfinite(spectra) & ((spectra >= 0) | differenced)
-    wrong = np.flatnonzero(~sound.all(axis=1))
-    if wrong.size:
-        which = f"that of mode {wrong[0]} is not"
-        raise ProblemError(f"every spectrum must be finite and at least 0; {which}.")
-    return spectra
 
 
 def _is_settled(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> bool:
     """Whether gains and variances no longer change."""
     variance = np.max(np.abs(one[1] / other[1] - 1))
     return bool(variance < _SETTLED and np.max(np.abs(one[0] / other[0] - 1)) < 1e-4)
-
-
-def _transfers(
-    turns: FloatArray, taps: FloatArray, loop_gains: FloatArray, differenced: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Squared moduli (gains, f) of phase and of noise over sensor gain to the residual.
-
-    ``differenced``: the phase is its difference of two frames.
-    """
-    delay = np.exp(-2j * np.pi * turns)
-    mirror: ComplexArray = polyval(delay, taps)
-    difference = 1 - delay
-    power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
-    rejection = (1.0 if differenced else np.abs(difference) ** 2) / power
-    return rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power
 
 
 def _minimise(

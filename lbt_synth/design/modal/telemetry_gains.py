@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design.modal.gains import ModalGains, find_gains
+from lbt_synth.design.modal.gains import LoopInputs, ModalGains, find_gains
 from lbt_synth.design.modal.plants import number_per_mode
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import LoopHardware, PositionLoop
@@ -145,5 +145,12 @@ def modal_gains_from_telemetry(
         part = np.clip((wanted - frequency[left]) / np.diff(frequency)[left], 0.0, 1.0)
         return np.asarray(table[:, left] * (1 - part) + table[:, left + 1] * part)
 
-    edges = 2 * frequency / rate
-    return find_gains(density, edges, path, noise=noise, gain=gain, margin=margin, differenced=True)
+    inputs = LoopInputs(
+        path=path,
+        density=density,
+        edges=2 * frequency / rate,
+        noise=noise,
+        gain=gain,
+        differenced=True,
+    )
+    return find_gains(inputs, margin)

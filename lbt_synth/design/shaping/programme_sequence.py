@@ -51,11 +51,7 @@ class SequenceSolution:
 
 
 def solve_sequence(
-    specification: Specification,
-    channel: Channel,
-    *,
-    start: FloatArray | None = None,
-    fineness: int = 1,
+    spec: Specification, channel: Channel, *, start: FloatArray | None = None, fineness: int = 1
 ) -> SequenceSolution:
     """Minimise the objective of a specification in a basis, from coefficients (n,) if given.
 
@@ -64,7 +60,7 @@ def solve_sequence(
     until the demands hold at all frequencies, and goes on with upper bounds that touch the
     objective; none of these steps makes it larger or leaves the demands.
     """
-    programme = _Programme(specification, channel, fineness)
+    programme = _Programme(spec, channel, fineness)
     convex, values = is_convex(programme.function), []
     # the upper bounds need coefficients whose loops are stable at all sensor gains
     if convex or start is None or not programme.is_stable(start):

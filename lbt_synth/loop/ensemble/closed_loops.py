@@ -25,7 +25,7 @@ _AT_ONCE = 256  # loops that share frequencies
 _PER_LOOP = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Subloop:
     """Some modes of a loop, and all that depends on them.
 
@@ -35,31 +35,26 @@ class Subloop:
 
     modes: IntArray  # indices in the whole loop
     measurements: IntArray
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
+    matrices: tuple[FloatArray, ...]  # of the controllers
     sensor: FloatArray  # (q, n)
     influence: FloatArray  # (n, m)
 
     @property
     def is_shared(self) -> bool:
         """Whether one controller serves all loops."""
-        return len(self.A) == 1
+        return len(self.matrices[0]) == 1
 
     def controllers(self, rows: IntArray) -> tuple[FloatArray, ...]:
         """Return the controllers ``A, B, C, D`` of some loops, or the one that serves all."""
-        matrices = self.A, self.B, self.C, self.D
-        return matrices if self.is_shared else tuple(matrix[rows] for matrix in matrices)
+        return self.matrices if self.is_shared else tuple(each[rows] for each in self.matrices)
 
     def equals(self, other: Subloop) -> bool:
         """Whether another subloop behaves the same, to rounding."""
-        names = ("A", "B", "C", "D", "sensor", "influence")
-        pairs = [(getattr(self, name), getattr(other, name)) for name in names]
+        own, others = ((*x.matrices, x.sensor, x.influence) for x in (self, other))
         return all(
             one.shape == two.shape
             and np.allclose(one, two, rtol=0, atol=_SAME * np.max(np.abs(one), initial=0.0))
-            for one, two in pairs
+            for one, two in zip(own, others, strict=True)
         )
 
 
@@ -92,21 +87,14 @@ def split_into_subloops(
         own = label == each
         states, modes = np.flatnonzero(own[x]), np.flatnonzero(own[r])
         inputs, commands = np.flatnonzero(own[y]), np.flatnonzero(own[u])
+        entry, leaving = states[:, None], commands[:, None]
         if modes.size == 0:
-            rest.append(A[:, states[:, None], states])
+            rest.append(A[:, entry, states])
             continue
-        subloops.append(
-            Subloop(
-                modes=modes,
-                measurements=inputs,
-                A=A[:, states[:, None], states],
-                B=B[:, states[:, None], inputs],
-                C=C[:, commands[:, None], states],
-                D=D[:, commands[:, None], inputs],
-                sensor=sensor[np.ix_(inputs, modes)],
-                influence=influence[np.ix_(modes, commands)],
-            )
-        )
+        dynamics = A[:, entry, states], B[:, entry, inputs]
+        output = C[:, leaving, states], D[:, leaving, inputs]
+        measure, act = sensor[np.ix_(inputs, modes)], influence[np.ix_(modes, commands)]
+        subloops.append(Subloop(modes, inputs, (*dynamics, *output), measure, act))
     return subloops, rest
 
 

@@ -71,8 +71,11 @@ def _sample(
     z = np.exp(1j * np.pi * frequency / nyquist)
     ends = (group.first,) if group.first is group.second else (group.first, group.second)
     mirrors = [_response(m.A, m.B[:, None], m.C[None], np.array([[m.D]]), z) for m in ends]
-    A, B, C, D = subloop.controllers(group.rows)
-    shared = subloop.is_shared
+    matrices = subloop.controllers(group.rows)
+    if subloop.is_shared:
+        controller = _response(*(matrix[0] for matrix in matrices), z)
+    else:
+        controller = batched_response(*matrices, z)
     densities = []
     for spectrum, modes in turbulence:
         density = spectrum.psd(frequency)
@@ -82,9 +85,7 @@ def _sample(
         delay=1 / z,
         first=mirrors[0][:, 0, 0],
         second=mirrors[-1][:, 0, 0],
-        controller=_response(A[0], B[0], C[0], D[0], z)
-        if shared
-        else batched_response(A, B, C, D, z),
+        controller=controller,
         white=2 / frame_rate_hz * weight,
         densities=densities,
     )
