@@ -7,26 +7,26 @@ import os
 import platform
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.storage.tables import Table
 
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
 _WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class SourceFile:
     """A file that a page was made from."""
 
-    name: str  # Its name, without directories
-    role: str  # What it is
-    sha256: str  # SHA-256 of its bytes, 64 hexadecimal digits
+    name: str = column("file", help="Its name, without directories")
+    role: str = column("what it is", help="What it is")
+    sha256: str = column("SHA-256", help="SHA-256 of its bytes, 64 hexadecimal digits")
 
 
 def read_source(path: str | os.PathLike[str], role: str) -> tuple[SourceFile, bytes]:
@@ -87,16 +87,6 @@ def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
         except PackageNotFoundError:
             found.append((name, "not installed"))
     return tuple(found)
-
-
-def files_table(files: Sequence[SourceFile]) -> Table:
-    """Digests of what was read."""
-    return Table(
-        caption="Files that were read",
-        headings=("file", "what it is", "SHA-256"),
-        rows=tuple((file.name, file.role, file.sha256) for file in files),
-        words=(1, 2),
-    )
 
 
 def versions_table(found: tuple[tuple[str, str], ...]) -> Table:

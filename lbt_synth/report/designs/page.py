@@ -25,11 +25,11 @@ from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import paragraph
 from lbt_synth.report.provenance import (
     creator_name,
-    files_table,
     require_letters,
     time_text,
     versions_table,
 )
+from lbt_synth.storage.rows import row_table
 
 
 def write_report(
@@ -100,7 +100,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
             key="sources",
             title="Configuration and versions",
             blocks=(
-                files_table(report.files),
+                row_table("Files that were read", report.files),
                 versions_table(report.versions),
                 Listing(caption=source, text=report.config_text),
             ),

@@ -6,6 +6,8 @@ import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,39 +18,22 @@ if TYPE_CHECKING:
 
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 
-_STYLE: dict[str, Any] = {
-    "font.size": 8.5,
-    "axes.labelsize": 8.5,
-    "axes.titlesize": 8.5,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "axes.formatter.useoffset": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "0.88",
-    "grid.linewidth": 0.6,
-    "legend.fontsize": 8,
-    "legend.frameon": True,
-    "legend.framealpha": 0.9,
-    "legend.edgecolor": "none",
-    "lines.linewidth": 1.5,
-    "figure.dpi": 150,
-    "savefig.dpi": 200,
-    "text.parse_math": False,  # names of files and designs are never read as mathematics
-    "svg.hashsalt": "lbt_synth",
-    "pdf.fonttype": 42,
-}
-
 
 @contextmanager
 def house_style() -> Iterator[None]:
     """Matplotlib settings of this package, for the time of the block."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(_style()):
         yield
+
+
+@cache
+def _style() -> dict[str, Any]:
+    import matplotlib as mpl
+
+    path = str(files("lbt_synth.report.figures") / "house.mplstyle")
+    return dict(mpl.rc_params_from_file(path, use_default_template=False))
 
 
 def require_figure_name(path: str | os.PathLike[str]) -> Path:

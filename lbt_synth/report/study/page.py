@@ -11,26 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.errors import ProblemError
 from lbt_synth.report.number_text import NO_BREAK
 from lbt_synth.report.page.blocks import Block, Page
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import creator_name, time_text
-from lbt_synth.report.study.sections import (
-    comparison_section,
-    controllers_section,
-    dependence_section,
-    origin_section,
-    reading_section,
-    samples_section,
-    summary_section,
-    worst_section,
-)
+from lbt_synth.report.study.sections import study_sections
 from lbt_synth.report.study.study_info import StudyInfo, study_info
 from lbt_synth.storage.tables import Table
 from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
-from lbt_synth.studies.study.controller_samples import read_column, read_controller_samples
-from lbt_synth.studies.study.summary import short_names
 
 
 def write_study_page(
@@ -102,37 +90,18 @@ def study_page(
     info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, ArrayLike]
 ) -> Page:
     """Return the page of a study's results; columns (n,) have one value per sample."""
-    found = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
-    if any(len(each.strehl) != statistics.samples for each in found):
-        raise ProblemError(
-            f"the columns must have the {statistics.samples} samples of the statistics; got "
-            f"{len(found[0].strehl)}."
-        )
-    values = {
-        name: read_column(columns, name, statistics.samples) for name in statistics.parameters
-    }
-    names = short_names(statistics.parameters)
-    varying = sum(np.ptp(column) > 0 for column in values.values())
+    sections = study_sections(info, statistics, columns)
+    varying = sum(np.ptp(np.asarray(columns[name])) > 0 for name in statistics.parameters)
+    count = len(statistics.controllers)
     return Page(
         title=f"Robustness study {info.name}",
         subtitle=(
             f"{statistics.samples} samples of {varying} parameters, "
-            f"{len(found)} {'controllers' if len(found) > 1 else 'controller'}. "
-            f"Made {time_text(info.made)}."
+            f"{count} {'controllers' if count > 1 else 'controller'}. Made {time_text(info.made)}."
         ),
         sections=tuple(
             replace(section, blocks=tuple(_keep_together(block) for block in section.blocks))
-            for section in (
-                summary_section(info, statistics, found),
-                samples_section(info, values, names),
-                controllers_section(info, statistics),
-                comparison_section(statistics, found),
-                dependence_section(statistics, found, values, names),
-                worst_section(info, statistics, names),
-                reading_section(),
-                origin_section(info, statistics),
-            )
-            if section.blocks
+            for section in sections
         ),
         creator=creator_name(),
     )

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from lbt_synth.errors import ProblemError
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Section
 from lbt_synth.report.page.words import paragraph
-from lbt_synth.report.provenance import files_table, versions_table
+from lbt_synth.report.provenance import versions_table
 from lbt_synth.report.study.charts import (
     conditional_chart,
     distribution_chart,
@@ -19,14 +21,20 @@ from lbt_synth.report.study.charts import (
     unstable_chart,
 )
 from lbt_synth.report.study.study_info import StudyInfo
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies import ControllerStatistics, StudyStatistics
-from lbt_synth.studies.study.controller_samples import ControllerSamples
+from lbt_synth.studies.study.controller_samples import (
+    ControllerSamples,
+    read_column,
+    read_controller_samples,
+)
 from lbt_synth.studies.study.summary import (
     comparison_table,
     percent,
     residual_table,
     sensitivity_table,
+    short_names,
     strehl_table,
     swing_table,
     varying_parameters,
@@ -38,7 +46,34 @@ _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
 
 
-def summary_section(
+def study_sections(
+    info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, ArrayLike]
+) -> list[Section]:
+    """Return the sections of a study's page; columns (n,) have one value per sample."""
+    found = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
+    if any(len(each.strehl) != statistics.samples for each in found):
+        raise ProblemError(
+            f"the columns must have the {statistics.samples} samples of the statistics; got "
+            f"{len(found[0].strehl)}."
+        )
+    values = {
+        name: read_column(columns, name, statistics.samples) for name in statistics.parameters
+    }
+    names = short_names(statistics.parameters)
+    sections = (
+        _summary_section(info, statistics, found),
+        _samples_section(info, values, names),
+        _controllers_section(info, statistics),
+        _comparison_section(statistics, found),
+        _dependence_section(statistics, found, values, names),
+        _worst_section(info, statistics, names),
+        _reading_section(),
+        _origin_section(info, statistics),
+    )
+    return [section for section in sections if section.blocks]
+
+
+def _summary_section(
     info: StudyInfo, statistics: StudyStatistics, found: Sequence[ControllerSamples]
 ) -> Section:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
@@ -88,7 +123,7 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     return f"{text} {paragraph('regret', name=least.controller, loss=percent(loss))}"
 
 
-def samples_section(
+def _samples_section(
     info: StudyInfo, values: Mapping[str, FloatArray], names: Mapping[str, str]
 ) -> Section:
     """Show the parameters and their histograms."""
@@ -120,7 +155,7 @@ def _rounded_texts(values: FloatArray) -> list[str]:
     return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
 
 
-def controllers_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
+def _controllers_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
     """List the controllers, and evaluations that failed."""
     blocks: list[Block] = [
         Table(
@@ -161,7 +196,7 @@ def _count_cell(count: int) -> Cell:
     return Cell(text=str(count), tone="bad" if count else "plain")
 
 
-def comparison_section(statistics: StudyStatistics, found: Sequence[ControllerSamples]) -> Section:
+def _comparison_section(statistics: StudyStatistics, found: Sequence[ControllerSamples]) -> Section:
     """Compare the controllers on the same samples."""
     table = comparison_table(statistics)
     blocks: tuple[Block, ...] = (
@@ -172,7 +207,7 @@ def comparison_section(statistics: StudyStatistics, found: Sequence[ControllerSa
     return Section(key="comparison", title="Comparison on the same samples", blocks=blocks)
 
 
-def dependence_section(
+def _dependence_section(
     statistics: StudyStatistics,
     found: Sequence[ControllerSamples],
     values: Mapping[str, FloatArray],
@@ -193,7 +228,7 @@ def dependence_section(
     return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)
 
 
-def worst_section(
+def _worst_section(
     info: StudyInfo, statistics: StudyStatistics, names: Mapping[str, str]
 ) -> Section:
     """List the worst samples, and the commands that replay them."""
@@ -216,13 +251,13 @@ def worst_section(
     return Section(key="worst", title="Worst samples", blocks=tuple(blocks))
 
 
-def reading_section() -> Section:
+def _reading_section() -> Section:
     """Explain how the figures are to be read."""
     blocks = tuple(Paragraph(text=paragraph(name)) for name in ("intervals", "indices"))
     return Section(key="reading", title="How to read the figures", blocks=blocks)
 
 
-def origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
+def _origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
     """Name the files and programs that the page was made from."""
     rows: list[tuple[str, str]] = [
         ("samples with results", f"{statistics.samples} of {info.samples}"),
@@ -235,7 +270,7 @@ def origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
         title="Files and versions",
         blocks=(
             Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,)),
-            files_table(info.files),
+            *([row_table("Files that were read", info.files)] if info.files else ()),
             versions_table(info.versions),
             *(Listing(caption=caption, text=text) for caption, text in info.texts.items()),
         ),
