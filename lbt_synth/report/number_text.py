@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 MINUS = "\u2212"  # as long as a plus
@@ -45,6 +46,11 @@ def signed_text(value: float, digits: int = 4) -> str:
 def interval_text(low: float, high: float, digits: int = 4) -> str:
     """Return an interval as a text: 0.24 to 1.82."""
     return f"{number_text(low, digits)} to {number_text(high, digits)}"
+
+
+def unbroken_text(text: str) -> str:
+    """Keep a number and its error, and the two ends of an interval, in one line."""
+    return re.sub(" (±|to) ", rf"{NO_BREAK}\1{NO_BREAK}", text)
 
 
 def listing_text(items: Sequence[str]) -> str:

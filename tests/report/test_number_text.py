@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
+from lbt_synth.report.number_text import (
+    fixed_text,
+    listing_text,
+    number_text,
+    signed_text,
+    unbroken_text,
+)
 
 
 def test_numbers_as_texts():
@@ -27,3 +33,8 @@ def test_numbers_as_texts():
     assert signed_text(0.0) == "0"
     assert listing_text([]) == ""
     assert listing_text(["a", "b", "c"]) == "a, b and c"
+
+
+def test_a_number_and_its_error_stay_in_one_line():
+    assert unbroken_text("1 ± 2 (3 to 4)") == "1\u00a0±\u00a02 (3\u00a0to\u00a04)"
+    assert unbroken_text("tomorrow is not together") == "tomorrow is not together"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from lbt_synth.report.charts.description import Chart, Map, Panel
 from lbt_synth.report.charts.matplotlib_charts import chart_png, chart_svg
 from lbt_synth.report.charts.paper_layout import lay_out
+from lbt_synth.report.number_text import unbroken_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.storage.tables import Cell, Table
 
@@ -215,14 +216,15 @@ def _write_table(pdf: FPDF, table: Table) -> None:
         for cells in (head, *rows):
             row = grid.row()
             group = len(cells) == 1 and len(widths) > 1
-            for cell in cells:
+            for i, cell in enumerate(cells):
+                text = cell.text if i in left else unbroken_text(cell.text)
                 tint = _TINTS["bad" if cell.tone == "bad" else "plain"]
                 style = FontFace(
                     emphasis="BOLD" if cells is head or group or cell.tone == "bad" else None,
                     color=_INKS[cell.tone],
                     fill_color=tint if group or cell.tone == "bad" else "#ffffff",
                 )
-                row.cell(cell.text, style=style, colspan=len(widths) if group else 1)
+                row.cell(text, style=style, colspan=len(widths) if group else 1)
     pdf.y += 0.2
 
 

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.report.number_text import NO_BREAK
-from lbt_synth.report.page.blocks import Block, Page
+from lbt_synth.report.page.blocks import Page
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import creator_name, time_text
 from lbt_synth.report.study.sections import study_sections
 from lbt_synth.report.study.study_info import StudyInfo, study_info
-from lbt_synth.storage.tables import Table
 from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
 
 
@@ -99,25 +95,6 @@ def study_page(
             f"{statistics.samples} samples of {varying} parameters, "
             f"{count} {'controllers' if count > 1 else 'controller'}. Made {time_text(info.made)}."
         ),
-        sections=tuple(
-            replace(section, blocks=tuple(_keep_together(block) for block in section.blocks))
-            for section in sections
-        ),
+        sections=tuple(sections),
         creator=creator_name(),
     )
-
-
-def _keep_together(block: Block) -> Block:
-    """Keep a number and its error, and the two ends of an interval, in one line of a table."""
-    if not isinstance(block, Table):
-        return block
-    rows = tuple(
-        tuple(
-            cell
-            if place == 0 or place in block.words
-            else replace(cell, text=re.sub(" (±|to) ", rf"{NO_BREAK}\1{NO_BREAK}", cell.text))
-            for place, cell in enumerate(row)
-        )
-        for row in block.cells()
-    )
-    return replace(block, rows=rows)
