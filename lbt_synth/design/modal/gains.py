@@ -234,13 +234,9 @@ class LoopInputs:
 
 def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
     """Find the gains on finer and finer panels, until residuals and gains no longer change."""
-    path, gain = inputs.path, inputs.gain
-    rate, limit, noise_nm2 = (
-        path.frame_rate_hz,
-        hardware_gain_limit(path),
-        (inputs.noise / gain) ** 2,
-    )
-    least, most = TRIED_GAINS
+    path, gain, (least, most) = inputs.path, inputs.gain, TRIED_GAINS
+    rate, limit = path.frame_rate_hz, hardware_gain_limit(path)
+    noise_nm2 = (inputs.noise / gain) ** 2
     distance = number(margin, "margin", at_least=round(1 - most, 9), below=1)
     loop_gains = np.geomspace(least, _HIGHEST, _GRID) * limit
     highest = (1 - distance) * limit * np.minimum(gain, 1.0)

@@ -71,11 +71,9 @@ def _sample(
     z = np.exp(1j * np.pi * frequency / nyquist)
     ends = (group.first,) if group.first is group.second else (group.first, group.second)
     mirrors = [_response(m.A, m.B[:, None], m.C[None], np.array([[m.D]]), z) for m in ends]
-    matrices = subloop.controllers(group.rows)
-    if subloop.is_shared:
-        controller = _response(*(matrix[0] for matrix in matrices), z)
-    else:
-        controller = batched_response(*matrices, z)
+    A, B, C, D = subloop.controllers(group.rows)
+    one = subloop.is_shared
+    controller = _response(A[0], B[0], C[0], D[0], z) if one else batched_response(A, B, C, D, z)
     densities = []
     for spectrum, modes in turbulence:
         density = spectrum.psd(frequency)
