@@ -93,7 +93,7 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
     Returns
     -------
     Design
-        The design, with the certificate that it was saved with; ``design.recertified()`` computes
+        The design, with the certificate that it was saved with; ``design.recertify()`` computes
         it again.
 
     Raises
