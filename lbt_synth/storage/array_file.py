@@ -10,17 +10,18 @@ import hashlib
 import io
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.storage import fits as fitsfile
 from lbt_synth.validation import FloatArray
 
 Cards = Mapping[str, tuple[Any, str]]
 TEXT = "META"
+_CARD = 80
+LONGEST_HEADER = 2880 * 36  # that is looked through
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
@@ -35,14 +36,41 @@ def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> s
 
 
 def fits_bytes(
-    arrays: Mapping[str, npt.NDArray[Any]],
-    text: str,
-    primary: Cards,
-    cards: Mapping[str, Cards] | None = None,
+    cards: Mapping[str, Any],
+    arrays: Mapping[str, Any],
+    text: str | None = None,
+    *,
+    headers: Mapping[str, Mapping[str, Any]] | None = None,
+    comments: Sequence[str] = (),
 ) -> bytes:
-    """Write a primary HDU without data, one image HDU per array in their order, then the text."""
-    everything: dict[str, Any] = {**arrays, TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
-    return fitsfile.fits_bytes(primary, everything, headers=cards)
+    """Return a primary HDU of cards, and one image HDU per array and for the text, with checksums.
+
+    The same content gives the same bytes: no date is written.
+
+    Examples
+    --------
+    >>> import io
+    >>> from astropy.io import fits
+    >>> from lbt_synth.storage.array_file import fits_bytes
+    >>> with fits.open(io.BytesIO(fits_bytes({"VERSION": 1}, {"A": [[1.0, 2.0]]}))) as units:
+    ...     units["A"].data.tolist()
+    [[1.0, 2.0]]
+    """
+    from astropy.io import fits
+
+    arrays = arrays if text is None else _with_text(arrays, text)
+    primary = fits.PrimaryHDU()
+    primary.header.update(cards)
+    for line in comments:
+        primary.header.add_comment(line)
+    units = [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
+    for unit in units:
+        unit.header.update((headers or {}).get(unit.name, {}))
+    for unit in (primary, *units):  # instead of the time, so that equal contents give equal files
+        unit.add_checksum(when="of this unit")
+    buffer = io.BytesIO()
+    fits.HDUList([primary, *units]).writeto(buffer)
+    return buffer.getvalue()
 
 
 def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
@@ -65,8 +93,7 @@ def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
 def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> bytes:
     """Write a NumPy archive; the text is an array of bytes, so nothing is pickled."""
     buffer = io.BytesIO()
-    everything: dict[str, Any] = {**arrays, TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
-    np.savez(buffer, **everything)
+    np.savez(buffer, **_with_text(arrays, text))
     return buffer.getvalue()
 
 
@@ -80,9 +107,25 @@ def read_npz(content: bytes) -> tuple[dict[str, FloatArray], str]:
     return _split_text(data)
 
 
+def _with_text(arrays: Mapping[str, Any], text: str) -> dict[str, Any]:
+    return {**arrays, TEXT: np.frombuffer(text.encode(), dtype=np.uint8)}
+
+
 def _split_text(data: dict[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], str]:
     text = data.pop(TEXT).astype(np.uint8).tobytes().decode()
     return {name: array.astype(np.float64) for name, array in data.items()}, text
+
+
+def has_card(content: bytes, keyword: str) -> bool:
+    """Whether the first header of a FITS file has a card of that keyword."""
+    mark = keyword.ljust(8).encode() + b"="
+    for start in range(0, min(len(content), LONGEST_HEADER), _CARD):
+        card = content[start : start + _CARD]
+        if card.startswith(mark):
+            return True
+        if card.startswith(b"END "):
+            return False
+    return False
 
 
 def error_reason(error: Exception) -> str:

@@ -36,4 +36,4 @@ def write_fits(arrays: Mapping[str, FloatArray], text: str, design: Design, meta
         cards["RMS"] = (design.rms, "estimation error, standard deviation")
         cards["GAMMA"] = (design.gamma, "estimation error, H-infinity norm")
     cards["SHA256"] = (meta["digest"], "")
-    return fits_bytes(arrays, text, cards)
+    return fits_bytes(cards, arrays, text)

@@ -23,8 +23,7 @@ from lbt_synth.files.telemetry.native_layout import check_taps
 from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.array_file import error_reason
-from lbt_synth.storage.fits import has_card
+from lbt_synth.storage.array_file import error_reason, has_card
 from lbt_synth.validation import FloatArray
 
 _OWN_CARD = "LBTSYNTH"  # one card with what the standard has no field for, JSON

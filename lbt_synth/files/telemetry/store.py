@@ -117,8 +117,8 @@ def save_telemetry(
     text = json.dumps(meta, allow_nan=False)
     if kind == "npz":
         return write_atomically(target, npz_bytes(arrays, text))
-    content = fits_bytes(arrays, text, primary_cards(telemetry, meta), layer_cards(telemetry))
-    return write_atomically(target, content)
+    cards, headers = primary_cards(telemetry, meta), layer_cards(telemetry)
+    return write_atomically(target, fits_bytes(cards, arrays, text, headers=headers))
 
 
 def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:

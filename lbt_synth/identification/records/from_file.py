@@ -18,7 +18,7 @@ from lbt_synth.identification.records.from_telemetry import record_from_telemetr
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.fits import LONGEST_HEADER, has_card
+from lbt_synth.storage.array_file import LONGEST_HEADER, has_card
 from lbt_synth.validation import choice
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of our own telemetry, and of the AOT standard

@@ -19,8 +19,8 @@ from lbt_synth.interop.export_checks import (
 )
 from lbt_synth.interop.iir.polynomials import axis_polynomials
 from lbt_synth.linear import Controller
+from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
-from lbt_synth.storage.fits import fits_bytes
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _LAYOUT_VERSION = 1  # of SPECULA's IirFilterData
