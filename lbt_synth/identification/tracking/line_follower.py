@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -114,8 +113,9 @@ class LineFollower:
                 bins = np.abs(grid - line.frequency_hz) <= self._span_hz
                 if np.count_nonzero(bins) < _LEAST_BINS:
                     return None
-                search = _LineSearch(
-                    line=line,
+                search = _Line(
+                    last=line,
+                    peak_hz=line.frequency_hz,
                     frequency_hz=grid[bins],
                     power=powers[bins, i],
                     rest=self._background(group, i, grid[bins]),
@@ -159,24 +159,19 @@ class LineFollower:
         return out
 
 
-class _Peak(NamedTuple):
-    """What is fitted of a line."""
-
-    frequency_hz: float
-    log_rms: float  # logarithm of its rms over that of the line as it was found last
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _LineSearch:
-    """The bins in which a line is searched for, and what they hold."""
+class _Line:
+    """A line, the bins in which it is searched for, and where the search is."""
 
-    line: Vibration  # as it was found last
+    last: Vibration  # as it was found last
     frequency_hz: FloatArray  # (k,): where it may be
     power: FloatArray  # (k,): periodogram along its direction [nm^2/Hz]
     rest: FloatArray  # (k,): spectrum without the lines that are fitted [nm^2/Hz]
     width_hz: float  # half width with which it is seen
     bin_hz: float
     frame_rate_hz: float
+    peak_hz: float
+    log_rms: float = 0.0  # logarithm of its rms over the last
 
     @property
     def bounds_hz(self) -> tuple[float, float]:
@@ -184,133 +179,131 @@ class _LineSearch:
         low, high = float(self.frequency_hz[0]), float(self.frequency_hz[-1])
         return max(low, 1.01 * self.width_hz), high
 
-    def spectrum(self, peak: _Peak, frequency_hz: FloatArray) -> FloatArray:
+    def spectrum(self, frequency_hz: FloatArray) -> FloatArray:
         """Return the spectrum of the line, (f,)."""
         there = Vibration(
-            frequency_hz=peak.frequency_hz,
-            damping=self.width_hz / peak.frequency_hz,
-            rms_nm=self.line.rms_nm * float(np.exp(peak.log_rms)),
+            frequency_hz=self.peak_hz,
+            damping=self.width_hz / self.peak_hz,
+            rms_nm=self.last.rms_nm * float(np.exp(self.log_rms)),
             direction=(1.0,),
         )
         return there.ar_model(self.frame_rate_hz).psd(frequency_hz)
 
-    def contrast(self, rest: FloatArray, peak: _Peak | None = None) -> float:
-        """Return minus the log likelihood of the rest, alone or with the line."""
-        model = rest if peak is None else rest + self.spectrum(peak, self.frequency_hz)
-        return float(np.sum(np.log(model) + self.power / model))
+    def contrast(self, rest: FloatArray) -> float:
+        """Return minus the log likelihood of the line over the rest of the spectrum."""
+        return _contrast(self.power, rest + self.spectrum(self.frequency_hz))
+
+    def is_there(self, rest: FloatArray) -> bool:
+        """Whether the line makes the data likelier by enough."""
+        return 2 * (_contrast(self.power, rest) - self.contrast(rest)) > _EVIDENCE
 
 
-def _fit_alone(search: _LineSearch) -> list[float] | None:
+def _contrast(power: FloatArray, model: FloatArray) -> float:
+    return float(np.sum(np.log(model) + power / model))
+
+
+def _fit_alone(line: _Line) -> list[float] | None:
     """Return the frequency of a line without neighbours [Hz]; None if it is not there."""
-    highest = float(search.frequency_hz[np.argmax(search.power / search.rest)])
-    found = _fit_peak(search, search.rest, _Peak(highest, 0.0))
-    return [found.frequency_hz] if found and _is_there(search, search.rest, found) else None
+    highest = float(line.frequency_hz[np.argmax(line.power / line.rest)])
+    found = _fit_line(replace(line, peak_hz=highest), line.rest)
+    return [found.peak_hz] if found is not None and found.is_there(line.rest) else None
 
 
-def _fit_neighbours(searches: Sequence[_LineSearch], shared: FloatArray) -> list[float] | None:
+def _fit_neighbours(lines: Sequence[_Line], shared: FloatArray) -> list[float] | None:
     """Return the frequencies of neighbouring lines, in the order that they had [Hz].
 
     Each is fitted beside the others in turn, from the highest peaks and from where they were last;
     the likelier end counts. ``shared`` (m, m) is the power that one line has along another.
     """
     ends = []
-    for frequencies in ([s.line.frequency_hz for s in searches], _highest_peaks(searches)):
-        start = [_start_at(s, f) for s, f in zip(searches, frequencies, strict=False)]
-        end = _fit_in_turn(searches, shared, start, 1) if len(start) == len(searches) else None
+    for places in ([line.last.frequency_hz for line in lines], _highest_peaks(lines)):
+        start = [_start_at(line, place) for line, place in zip(lines, places, strict=False)]
+        end = _fit_in_turn(start, shared, 1) if len(start) == len(lines) else None
         ends += [end] if end else []
 
-    def contrast(peaks: Sequence[_Peak]) -> float:
-        rests = (_rest_beside(searches, shared, peaks, i) for i in range(len(peaks)))
-        each = zip(searches, rests, peaks, strict=True)
-        return sum(search.contrast(rest, peak) for search, rest, peak in each)
+    def contrast(end: Sequence[_Line]) -> float:
+        return sum(line.contrast(_rest_beside(end, shared, i)) for i, line in enumerate(end))
 
-    if not ends:
+    found = _fit_in_turn(min(ends, key=contrast), shared, _MOST_ROUNDS) if ends else None
+    if found is None:
         return None
-    peaks = _fit_in_turn(searches, shared, min(ends, key=contrast), _MOST_ROUNDS)
-    if peaks is None:
+    if not all(line.is_there(_rest_beside(found, shared, i)) for i, line in enumerate(found)):
         return None
-    for i, search in enumerate(searches):
-        if not _is_there(search, _rest_beside(searches, shared, peaks, i), peaks[i]):
-            return None
-    found = [peak.frequency_hz for peak in peaks]
     for i, j in combinations(range(len(found)), 2):
-        if found[j] - found[i] < (_RESOLUTION * searches[i].bin_hz if shared[i, j] > 0 else 0):
+        least_hz = _RESOLUTION * found[i].bin_hz if shared[i, j] > 0 else 0.0
+        if found[j].peak_hz - found[i].peak_hz < least_hz:
             return None
-    return found
+    return [line.peak_hz for line in found]
 
 
-def _start_at(search: _LineSearch, frequency_hz: float) -> _Peak:
+def _start_at(line: _Line, frequency_hz: float) -> _Line:
     """Return the start of a fit: a line as high as the periodogram there."""
-    low, high = search.bounds_hz
-    frequency = float(np.clip(frequency_hz, low, max(low, high)))
-    nearest = [np.argmin(np.abs(search.frequency_hz - frequency))]
-    line = search.spectrum(_Peak(frequency, 0.0), search.frequency_hz[nearest])
-    ratio = float(search.power[nearest][0] / line[0])
-    return _Peak(frequency, float(np.clip(0.5 * np.log(max(ratio, 1e-6)), -9, 9)))
+    low, high = line.bounds_hz
+    start = replace(line, peak_hz=float(np.clip(frequency_hz, low, max(low, high))))
+    nearest = [np.argmin(np.abs(line.frequency_hz - start.peak_hz))]
+    ratio = float(line.power[nearest][0] / start.spectrum(line.frequency_hz[nearest])[0])
+    return replace(start, log_rms=float(np.clip(0.5 * np.log(max(ratio, 1e-6)), -9, 9)))
 
 
-def _highest_peaks(searches: Sequence[_LineSearch]) -> list[float]:
+def _highest_peaks(lines: Sequence[_Line]) -> list[float]:
     """Return the frequencies of as many peaks as there are lines, or fewer."""
-    frequency = np.concatenate([search.frequency_hz for search in searches])
-    ratio = np.concatenate([search.power / search.rest for search in searches])
+    frequency = np.concatenate([line.frequency_hz for line in lines])
+    ratio = np.concatenate([line.power / line.rest for line in lines])
     found: list[float] = []
-    while len(found) < len(searches) and frequency.size:
+    while len(found) < len(lines) and frequency.size:
         found.append(float(frequency[np.argmax(ratio)]))
-        far = np.abs(frequency - found[-1]) >= (_RESOLUTION + 0.5) * searches[0].bin_hz
+        far = np.abs(frequency - found[-1]) >= (_RESOLUTION + 0.5) * lines[0].bin_hz
         frequency, ratio = frequency[far], ratio[far]
     return sorted(found)
 
 
-def _rest_beside(
-    searches: Sequence[_LineSearch], shared: FloatArray, peaks: Sequence[_Peak], i: int
-) -> FloatArray:
+def _rest_beside(lines: Sequence[_Line], shared: FloatArray, i: int) -> FloatArray:
     """Return the spectrum of everything but line i, along it."""
-    rest = searches[i].rest
-    for j, other in enumerate(searches):
+    rest = lines[i].rest
+    for j, other in enumerate(lines):
         if j != i and shared[i, j] > 0:
-            rest = rest + shared[i, j] * other.spectrum(peaks[j], searches[i].frequency_hz)
+            rest = rest + shared[i, j] * other.spectrum(lines[i].frequency_hz)
     return rest
 
 
-def _fit_in_turn(
-    searches: Sequence[_LineSearch], shared: FloatArray, start: Sequence[_Peak], most: int
-) -> list[_Peak] | None:
+def _fit_in_turn(start: Sequence[_Line], shared: FloatArray, most: int) -> list[_Line] | None:
     """Fit each line beside the others until they stay; None if a fit does not settle."""
-    peaks = list(start)
+    lines = list(start)
     for _ in range(most):
-        before = list(peaks)
-        rms = [np.log(s.line.rms_nm) + p.log_rms for s, p in zip(searches, peaks, strict=True)]
+        before = [line.peak_hz for line in lines]
+        rms = [np.log(line.last.rms_nm) + line.log_rms for line in lines]
         for i in np.argsort(rms)[::-1].tolist():  # the strongest first
-            found = _fit_peak(searches[i], _rest_beside(searches, shared, peaks, i), peaks[i])
+            found = _fit_line(lines[i], _rest_beside(lines, shared, i))
             if found is None:
                 return None
-            peaks[i] = found
-        moves = [abs(p.frequency_hz - q.frequency_hz) for p, q in zip(peaks, before, strict=True)]
-        if max(moves) < _SETTLED_HZ:
+            lines[i] = found
+        if (
+            max(abs(line.peak_hz - hz) for line, hz in zip(lines, before, strict=True))
+            < _SETTLED_HZ
+        ):
             break
-    return peaks
+    return lines
 
 
-def _fit_peak(search: _LineSearch, rest: FloatArray, start: _Peak) -> _Peak | None:
+def _fit_line(start: _Line, rest: FloatArray) -> _Line | None:
     """Fit a line over the rest of the spectrum; None if the fit does not settle."""
-    low, high = search.bounds_hz
+    low, high = start.bounds_hz
+
+    def move(p: FloatArray) -> _Line:
+        peak_hz, log_rms = p.tolist()
+        return replace(start, peak_hz=peak_hz, log_rms=log_rms)
 
     def contrast(p: FloatArray) -> float:
-        peak = _Peak(*p.tolist())
-        inside = low <= peak.frequency_hz <= high and -10 < peak.log_rms < 10
-        return search.contrast(rest, peak) if inside else np.inf
+        inside = low <= p[0] <= high and -10 < p[1] < 10
+        return move(p).contrast(rest) if inside else np.inf
 
-    f, log_rms = float(np.clip(start.frequency_hz, low, max(low, high))), start.log_rms
-    simplex = np.array([[f, log_rms], [f + 0.25 * search.bin_hz, log_rms], [f, log_rms + 0.3]])
+    f = float(np.clip(start.peak_hz, low, max(low, high)))
+    steps = [[0, 0], [0.25 * start.bin_hz, 0], [0, 0.3]]
+    simplex = np.array([f, start.log_rms]) + np.array(steps)
     fit = minimize(
         contrast,
         simplex[0],
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 400},
     )
-    return _Peak(*fit.x.tolist()) if fit.success and np.isfinite(fit.fun) else None
-
-
-def _is_there(search: _LineSearch, rest: FloatArray, found: _Peak) -> bool:
-    """Whether a line makes the data likelier by enough."""
-    return 2 * (search.contrast(rest) - search.contrast(rest, found)) > _EVIDENCE
+    return move(fit.x) if fit.success and np.isfinite(fit.fun) else None

@@ -165,16 +165,8 @@ class TrackingController(SwitchedController):
         require_instance(plant, TipTiltPlant)
         if identifier is None:
             identifier = LoopIdentifier(plant)
-        if not callable(identifier):
-            raise ProblemError(
-                "identifier must be a callable (measurements, corrections) -> plant or None; "
-                f"got {type(identifier).__name__}."
-            )
-        if not callable(design):
-            raise ProblemError(
-                "design must be a callable plant -> FilterDesign, such as kalman; got "
-                f"{type(design).__name__}."
-            )
+        _require_callable(identifier, "identifier", "(measurements, corrections) -> plant or None")
+        _require_callable(design, "design", "plant -> FilterDesign, such as kalman")
         rate = plant.hardware.frame_rate_hz
         self._window_s = number(window_s, "window_s", at_least=_LEAST_FRAMES / rate)
         self._update_s = number(update_s, "update_s", at_least=1 / rate)
@@ -293,6 +285,11 @@ class TrackingController(SwitchedController):
         every = dict.fromkeys([*tracks, *self._tracks])
         self._tracks = [track for track in every if track.points[-1][0] >= recent_s]
         return with_vibrations(found, lines)
+
+
+def _require_callable(thing: object, name: str, kind: str) -> None:
+    if not callable(thing):
+        raise ProblemError(f"{name} must be a callable {kind}; got {type(thing).__name__}.")
 
 
 def _move_line(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:
