@@ -241,12 +241,12 @@ def _decoupled_axes(plant: TipTiltPlant) -> list[TipTiltPlant]:
     )
     if not decoupled:
         return [plant]
+    lines = [[x for x in plant.vibrations if x.direction[i] != 0] for i in range(n)]
     return [
         tip_tilt_plant(
             frame_rate_hz=hw.frame_rate_hz,
             turbulence=plant.turbulence[i],
-            vibrations=[replace(x, direction=(1.0,)) for x in plant.vibrations if x.direction[i]]
-            or None,
+            vibrations=[replace(line, direction=(1.0,)) for line in lines[i]] or None,
             noise_nm=plant.R[i : i + 1, i : i + 1],
             delay_frames=hw.delay_frames,
             sensor_matrix=hw.sensor[i : i + 1, i : i + 1],

@@ -144,13 +144,10 @@ def modal_gains(
             out[mode] += model.psd(frequency)
         return out
 
-    inputs = LoopInputs(
-        path=path,
-        density=density,
-        edges=np.concatenate([*edges, *(_model_edges(model) for _, model in models)]),
-        noise=number_per_mode(noise_nm, "noise_nm", count, zero=True),
-        gain=number_per_mode(sensor_gain, "sensor_gain", count),
-    )
+    edges += [_model_edges(model) for _, model in models]
+    noise = number_per_mode(noise_nm, "noise_nm", count, zero=True)
+    gain = number_per_mode(sensor_gain, "sensor_gain", count)
+    inputs = LoopInputs(path, density, np.concatenate(edges), noise, gain)
     return find_gains(inputs, margin)
 
 
@@ -201,7 +198,7 @@ def _distinct_poles(poles: Any) -> ComplexArray:
     return np.asarray(inside[kept], dtype=np.complex128)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class LoopInputs:
     """What reaches the integrator loops of n modes: phase and noise."""
 

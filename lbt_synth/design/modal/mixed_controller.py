@@ -98,8 +98,6 @@ class MixedController:
         self._modes, self._running = np.zeros(0, dtype=np.intp), None
         if self.filter is not None:
             self._modes = mode_indices(self.filtered, "filtered", n)
-            if self._modes.size == 0:
-                raise ProblemError("filtered must name at least one mode; got none.")
             self._running = _start_filter(self.filter, self._modes.size)
             self._gain[self._modes] = self._leak[self._modes] = 0.0
         self.filtered = tuple(int(i) for i in self._modes)
@@ -287,13 +285,9 @@ class MixedController:
         D = sum((chosen.T @ D @ chosen for chosen, *_, D in each), np.zeros((n, n)))
         if self.reconstructor is not None:
             B, D = B @ self.reconstructor.matrix, D @ self.reconstructor.matrix
-        return Controller(
-            A=block_diag(*(A for _, A, *_ in each)),
-            B=B,
-            C=np.hstack([chosen.T @ C for chosen, _, _, C, _ in each]),
-            D=D,
-            dt_s=1.0 if period is None else period,
-        )
+        A = block_diag(*(A for _, A, *_ in each))
+        C = np.hstack([chosen.T @ C for chosen, _, _, C, _ in each])
+        return Controller(A=A, B=B, C=C, D=D, dt_s=1.0 if period is None else period)
 
 
 def _start_filter(given: Any, modes: int) -> SteppedController:

@@ -193,8 +193,6 @@ def project_out(
     given = matrix(modes, "modes")
     n = given.shape[1]
     taken = mode_indices(removed, "removed", n)
-    if taken.size == 0:
-        raise ProblemError("removed must name at least one mode; got none.")
     phase = given
     if influence_matrix is not None:
         why = (len(given), f"to match modes {given.shape}, commands of as many actuators")
@@ -202,10 +200,8 @@ def project_out(
     if weights is not None:
         w = real_array(weights, "weights")
         if w.shape != (len(phase),):
-            raise DimensionError(
-                f"weights must have shape ({len(phase)},), one per point of the pupil; got "
-                f"{w.shape}."
-            )
+            wanted = f"({len(phase)},), one per point of the pupil"
+            raise DimensionError(f"weights must have shape {wanted}; got {w.shape}.")
         if np.any(w < 0) or not np.any(w):
             raise ProblemError(f"weights must be at least 0, and not all 0; got {np.min(w):.6g}.")
         phase = np.sqrt(w)[:, None] * phase
@@ -213,9 +209,8 @@ def project_out(
     base, rest = phase[:, taken], phase[:, others]
     parts, _, rank, _ = np.linalg.lstsq(base, rest, rcond=None)
     if rank < taken.size:
-        raise ProblemError(
-            f"the removed modes must be independent on the pupil; got {taken.size} of rank {rank}."
-        )
+        got = f"{taken.size} of rank {rank}"
+        raise ProblemError(f"the removed modes must be independent on the pupil; got {got}.")
     out = np.array(given)
     out[:, others] -= given[:, taken] @ parts
     left = rest - base @ parts
@@ -240,6 +235,8 @@ def mode_indices(indices: Any, name: str, n: int) -> np.ndarray:
     if isinstance(indices, str | bytes) or not np.iterable(indices):
         raise ProblemError(f"{name} must be a list of mode numbers; got {indices!r}.")
     out = [integer(index, name, at_least=0) for index in indices]
+    if not out:
+        raise ProblemError(f"{name} must name at least one mode; got none.")
     if len(set(out)) != len(out) or any(index >= n for index in out):
         raise ProblemError(f"{name} must be different mode numbers from 0 to {n - 1}; got {out}.")
     return np.array(out, dtype=np.intp)

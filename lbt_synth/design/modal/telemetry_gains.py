@@ -145,12 +145,5 @@ def modal_gains_from_telemetry(
         part = np.clip((wanted - frequency[left]) / np.diff(frequency)[left], 0.0, 1.0)
         return np.asarray(table[:, left] * (1 - part) + table[:, left + 1] * part)
 
-    inputs = LoopInputs(
-        path=path,
-        density=density,
-        edges=2 * frequency / rate,
-        noise=noise,
-        gain=gain,
-        differenced=True,
-    )
+    inputs = LoopInputs(path, density, 2 * frequency / rate, noise, gain, differenced=True)
     return find_gains(inputs, margin)

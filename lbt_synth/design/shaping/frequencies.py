@@ -66,12 +66,9 @@ class Band(CheckedFields):
 
 def discs(frequency_hz: FloatArray, rows: ComplexArray, centre: float, radius: float) -> Discs:
     """Return discs ``|centre + rows c| <= radius`` at frequencies."""
-    return Discs(
-        frequency_hz=frequency_hz,
-        rows=rows,
-        centres=np.full(frequency_hz.size, centre, dtype=np.complex128),
-        radii=np.full(frequency_hz.size, radius),
-    )
+    centres = np.full(frequency_hz.size, centre, dtype=np.complex128)
+    radii = np.full(frequency_hz.size, radius)
+    return Discs(frequency_hz=frequency_hz, rows=rows, centres=centres, radii=radii)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
