@@ -86,7 +86,24 @@ def run(arguments: Namespace) -> Report:
             settle_frames=settle,
         )
         strehls = simulation.strehl(config.imaging)
-    exact = _exact_answers(loop, config, truth)
+    report = _describe_simulation(simulation, strehls, _exact_answers(loop, config, truth), design)
+    report.data["sensor_gain"] = config.sensor_gain * truth.sensor_gain
+    report.notes += _simulation_notes(config, design, strehls, settle, drifts=truth.drifts)
+    if arguments.output is not None:
+        title = f"{design.method}: first run above, mean spectrum of all runs below"
+        figure = simulation_figure(simulation, title=title)
+        report.note_written(save_figure(figure, arguments.output))
+    if arguments.telemetry is not None:
+        recorded = _first_case(simulation, truth, config, design, arguments.gain)
+        write_telemetry(
+            report, arguments.telemetry, recorded, key="telemetry", what="telemetry of case 0"
+        )
+    return report
+
+
+def _describe_simulation(
+    simulation: Simulation, strehls: FloatArray, exact: ExactAnswers, design: Design
+) -> Report:
     command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
     cases, frames = simulation.residual_nm.shape[:2]
     report = Report(
@@ -99,9 +116,7 @@ def run(arguments: Namespace) -> Report:
             "frames": frames,
             "cases": cases,
             "seed": simulation.seed,
-            "sensor_gain": config.sensor_gain * truth.sensor_gain,
-        },
-        notes=_simulation_notes(config, design, strehls, settle, drifts=truth.drifts),
+        }
     )
     simulated = {
         "strehl_exact": 100 * float(np.mean(strehls)),
@@ -117,15 +132,6 @@ def run(arguments: Namespace) -> Report:
         ]
         + [("commands", command_rms, None, "nm rms")],
     )
-    if arguments.output is not None:
-        title = f"{design.method}: first run above, mean spectrum of all runs below"
-        figure = simulation_figure(simulation, title=title)
-        report.note_written(save_figure(figure, arguments.output))
-    if arguments.telemetry is not None:
-        recorded = _first_case(simulation, truth, config, design, arguments.gain)
-        write_telemetry(
-            report, arguments.telemetry, recorded, key="telemetry", what="telemetry of case 0"
-        )
     return report
 
 

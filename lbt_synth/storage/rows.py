@@ -117,10 +117,10 @@ def columns(kind: Any) -> tuple[Column, ...]:
 
 def fill_row(kind: type[Row], *sources: Any, **given: Any) -> Row:
     """Return a row of given values, the others attributes of the first source that has them."""
-    for each in dataclasses.fields(kind):  # type: ignore[arg-type]
-        for source in sources:
-            if each.init and each.name not in given and hasattr(source, each.name):
-                given[each.name] = getattr(source, each.name)
+    fields = dataclasses.fields(kind)  # type: ignore[arg-type]
+    names = [each.name for each in fields if each.init]
+    for source in sources:
+        given = {name: getattr(source, name) for name in names if hasattr(source, name)} | given
     return kind(**given)
 
 

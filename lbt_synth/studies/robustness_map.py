@@ -17,8 +17,8 @@ from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_v
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
-    frozen_copy,
     number,
+    read_only,
     real_array,
     require_instance,
 )
@@ -115,16 +115,7 @@ def robustness_map(
     """
     for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
         require_instance(value, kind)
-    hardware = design.hardware
-    if hardware is None:
-        raise ProblemError(
-            "a map needs a design for a loop; got one of a bare estimation problem. Design for a "
-            "plant of tip_tilt_plant."
-        )
-    if hardware.modes > 2:
-        raise DimensionError(
-            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
-        )
+    hardware = _checked_hardware(design)
     errors = _checked_axis(errors_hz, "errors_hz")
     gains = _checked_axis(sensor_gains, "sensor_gains", above=0)
     delays = _checked_axis(
@@ -136,38 +127,58 @@ def robustness_map(
         "lie between 1 and 100.",
     )
     lines = _shift_vibrations(truth, errors, hardware)
-    shape = (delays.size, gains.size, errors.size)
-    strehls, residuals = np.full(shape, np.nan), np.full(shape, np.nan)
-    stable = np.zeros(shape[:2], dtype=np.bool_)
-    for i, delay in enumerate(delays):
-        for start in range(0, gains.size, _GAINS_AT_ONCE):
-            rows = slice(start, start + _GAINS_AT_ONCE)
-            part = gains[rows]
-            ensemble = LoopEnsemble(
-                sensor_gain=np.repeat(part, errors.size),
-                delay_frames=hardware.delay_frames + delay,
-                noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
-                turbulence=truth.turbulence,
-                vibrations=tuple(
-                    replace(line, frequency_hz=np.tile(line.frequency_hz, part.size))
-                    for line in lines
-                ),
-            )
-            found = ensemble_residuals(design.controller, hardware, ensemble)
-            stable[i, rows] = found.stable.reshape(part.size, -1)[:, 0]
-            strehls[i, rows] = found.strehl(imaging).reshape(part.size, -1)
-            residuals[i, rows] = found.rms_nm.reshape(part.size, -1)
-            if advance is not None:
-                advance(part.size * errors.size)
-    stable.setflags(write=False)
+    noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
+
+    def evaluate(delay: float, some: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return Strehl ratio, residual and stability for some gains and all errors."""
+        ensemble = LoopEnsemble(
+            sensor_gain=np.repeat(some, errors.size),
+            delay_frames=hardware.delay_frames + delay,
+            noise_nm=noise_nm,
+            turbulence=truth.turbulence,
+            vibrations=tuple(
+                replace(line, frequency_hz=np.tile(line.frequency_hz, some.size)) for line in lines
+            ),
+        )
+        found = ensemble_residuals(design.controller, hardware, ensemble)
+        if advance is not None:
+            advance(some.size * errors.size)
+        shape = (some.size, errors.size)
+        return (
+            found.strehl(imaging).reshape(shape),
+            found.rms_nm.reshape(shape),
+            found.stable.reshape(shape),
+        )
+
+    parts = np.split(gains, range(_GAINS_AT_ONCE, gains.size, _GAINS_AT_ONCE))
+    found = [[evaluate(delay, some) for some in parts] for delay in delays]
+    strehls, residuals, stable = (
+        np.stack([np.concatenate([part[kind] for part in row]) for row in found])
+        for kind in range(3)
+    )
     return RobustnessMap(
         errors_hz=errors,
         sensor_gains=gains,
         delay_errors_frames=delays,
-        strehl=frozen_copy(strehls),
-        residual_nm=frozen_copy(residuals),
-        stable=stable,
+        strehl=read_only(strehls),
+        residual_nm=read_only(residuals),
+        stable=read_only(stable[..., 0]),
     )
+
+
+def _checked_hardware(design: Design) -> LoopHardware:
+    """Return the loop of a design, which has one or two axes."""
+    hardware = design.hardware
+    if hardware is None:
+        raise ProblemError(
+            "a map needs a design for a loop; got one of a bare estimation problem. Design for a "
+            "plant of tip_tilt_plant."
+        )
+    if hardware.modes > 2:
+        raise DimensionError(
+            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
+        )
+    return hardware
 
 
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
