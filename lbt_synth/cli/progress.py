@@ -7,16 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from rich import progress as bars
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
 
 
@@ -52,22 +44,22 @@ def count_progress(
         yield count
 
 
-class _RateColumn(ProgressColumn):
+class _RateColumn(bars.ProgressColumn):
     """Steps per second."""
 
-    def render(self, task: Task) -> Text:
+    def render(self, task: bars.Task) -> Text:
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:.4g}/s")
 
 
-def _progress_bar(*, quiet: bool, rate: bool = False) -> Progress:
+def _progress_bar(*, quiet: bool, rate: bool = False) -> bars.Progress:
     console = Console(stderr=True)
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
+    return bars.Progress(
+        bars.TextColumn("{task.description}"),
+        bars.BarColumn(),
+        bars.MofNCompleteColumn(),
         *([_RateColumn()] if rate else []),
-        TimeRemainingColumn(),
+        bars.TimeRemainingColumn(),
         console=console,
         disable=quiet or not console.is_terminal,
         transient=True,

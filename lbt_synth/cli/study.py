@@ -35,6 +35,7 @@ from lbt_synth.studies.study.run import FinishedStudy, output_paths
 from lbt_synth.studies.study.store import PAGE, PRINT
 from lbt_synth.studies.study.summary import worst_table
 
+_COUNTS = ("samples", "computed", "failures", "retry", "seconds")
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -69,13 +70,9 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     if found.retry:
         failed += " Those that ended their process are tried again if it is started again."
     return Report(
-        data={
-            "samples": found.samples,
-            "computed": found.computed,
-            "failures": found.failures,
-            "retry": found.retry,
+        data={name: getattr(found, name) for name in _COUNTS}
+        | {
             "computing_seconds": found.computing_s,
-            "seconds": found.seconds,
             "files": [str(path) for path in files],
             "statistics": asdict(statistics),
         },
@@ -223,13 +220,8 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         replay = replay_row(loaded, folder, arguments.row)
     stored, fresh = replay.stored, replay.fresh
     report = Report(
-        data={
-            "row": replay.row,
-            "parameters": replay.parameters,
-            "stored": stored,
-            "fresh": fresh,
-            "failures": [asdict(failure) for failure in replay.failures],
-        },
+        data={name: getattr(replay, name) for name in ("row", "parameters", "stored", "fresh")}
+        | {"failures": [asdict(failure) for failure in replay.failures]},
         notes=[
             *([] if stored else ["note: the study has no result of this row yet."]),
             *(f"failed: {failure.controller}: {failure.error}" for failure in replay.failures),

@@ -101,16 +101,11 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
             for name, array, layer in arrays
         ],
     )
-    loop = fact_table("Loop", facts)
-    report.add_table(
-        loop.caption,
-        loop.headings,
-        [
-            *loop.rows,
-            *((f"mirror, {name}", value, "") for name, value in (mirror_record or {}).items()),
-            *((key, value, "") for key, value in telemetry.metadata.items()),
-        ],
-    )
+    report.tables.append(fact_table("Loop", facts))
+    more = {f"mirror, {name}": value for name, value in (mirror_record or {}).items()}
+    more |= telemetry.metadata
+    if more:
+        report.add_table("What else the file says", ("name", "value"), more.items())
     return report
 
 
