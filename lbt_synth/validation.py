@@ -199,8 +199,9 @@ def one_or_each(value: Any, name: str, size: int | None = None, **bounds: Any) -
     out = real_array(value, name) if np.ndim(value) else np.asarray(number(value, name, **bounds))
     if out.ndim > 1 or out.size == 0 or (out.ndim == 1 and size not in (None, out.size)):
         wanted = "" if size is None else f" ({size})"
+        got = out.size if out.ndim == 1 and out.size else f"shape {out.shape}"
         raise DimensionError(
-            f"{name} must be one number, or one per measurement{wanted}; got shape {out.shape}."
+            f"{name} must be one number, or one per measurement{wanted}; got {got}."
         )
     for entry in out.ravel():
         number(entry, name, **bounds)

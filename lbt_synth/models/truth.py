@@ -129,9 +129,5 @@ class Truth:
 
         Deviations for another number of measurements are a DimensionError.
         """
-        if np.ndim(self.noise_nm) and np.size(self.noise_nm) != measurements:
-            raise DimensionError(
-                f"noise_nm must be one number, or one per measurement ({measurements}); "
-                f"got {np.size(self.noise_nm)}."
-            )
-        return frozen_copy(np.broadcast_to(self.noise_nm, (measurements,)))
+        noise = one_or_each(self.noise_nm, "noise_nm", measurements)
+        return frozen_copy(np.broadcast_to(noise, (measurements,)))

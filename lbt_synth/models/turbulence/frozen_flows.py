@@ -7,7 +7,7 @@ of the spectrum.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -32,6 +32,7 @@ from lbt_synth.validation import (
     set_fields,
 )
 
+_PER_LOOP = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
 _TERMS = 12  # of the polynomial over an octave of the outer scale
 _FEW_SCALES = 16  # up to this many outer scales have a table each
 
@@ -74,7 +75,7 @@ class FrozenFlows:
     def __post_init__(self) -> None:
         require_instance(self.atmosphere, Atmosphere)
         given = {}
-        for name in ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m"):
+        for name in _PER_LOOP:
             value = getattr(self, name)
             value = getattr(self.atmosphere, name) if value is None else value
             if value is None:  # Kolmogorov
@@ -97,13 +98,8 @@ class FrozenFlows:
 
     def take(self, rows: IntArray) -> FrozenFlows:
         """Return the flows of some loops."""
-        outer = None if self.outer_scale_m is None else self.outer_scale_m[rows]
-        return FrozenFlows(
-            atmosphere=self.atmosphere,
-            seeing_arcsec=self.seeing_arcsec[rows],
-            wind_speed_m_s=self.wind_speed_m_s[rows],
-            outer_scale_m=outer,
-        )
+        given = {name: getattr(self, name) for name in _PER_LOOP}
+        return replace(self, **{n: value[rows] for n, value in given.items() if value is not None})
 
     @property
     def tilt_rms_nm(self) -> FloatArray:
