@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
+from functools import cache, partial
+from types import NoneType
 from typing import Annotated, Any, TypeAlias, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
@@ -216,26 +218,38 @@ def integer(value: Any, name: str, **bounds: float) -> int:
     return int(value)
 
 
-def check_fields(target: Any) -> None:
-    """Check the fields of a frozen dataclass whose types hold bounds, such as ``Positive``."""
-    for name, kind, bounds, optional in _bounded_fields(target.__class__):
+def check_fields(target: Any, **values: Any) -> None:
+    """Set values of a frozen dataclass, and check the fields whose types say what they hold.
+
+    That is a bounded number, such as ``Positive``, or another dataclass; None passes where the
+    type allows it.
+    """
+    set_fields(target, **values)
+    for name, check, optional in _declared_checks(target.__class__):
         value = getattr(target, name)
         if not (optional and value is None):
-            check: Any = integer if kind is int else number
-            object.__setattr__(target, name, check(value, name, **bounds))
+            object.__setattr__(target, name, check(value, name))
 
 
 @cache
-def _bounded_fields(kind: Any) -> list[tuple[str, type, dict[str, Any], bool]]:
-    """Name, type, bounds of each bounded field, and whether it may be None."""
-    found = []
+def _declared_checks(kind: Any) -> list[tuple[str, Callable[[Any, str], Any], bool]]:
+    """Name and check of each field that declares one, and whether it may be None."""
+    found: list[tuple[str, Callable[[Any, str], Any], bool]] = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        options = (hint,) if hasattr(hint, "__metadata__") else get_args(hint)
-        for option in options:
-            if hasattr(option, "__metadata__"):
-                bounds = dict(option.__metadata__)
-                found.append((name, option.__origin__, bounds, type(None) in options))
+        optional = NoneType in get_args(hint)
+        options = [one for one in get_args(hint) if one is not NoneType] if optional else [hint]
+        one = options[0]
+        if hasattr(one, "__metadata__"):
+            bounded = integer if one.__origin__ is int else number
+            found.append((name, partial(bounded, **dict(one.__metadata__)), optional))
+        elif len(options) == 1 and is_dataclass(one):
+            found.append((name, partial(_instance, kind=one), optional))
     return found
+
+
+def _instance(value: object, _: str, kind: Any) -> object:
+    require_instance(value, kind)
+    return value
 
 
 def choice(value: Any, name: str, options: Sequence[str]) -> str:

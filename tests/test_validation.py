@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import pickle
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -92,3 +95,47 @@ def test_every_error_is_one_of_ours():
         assert issubclass(kind, ValueError)
     assert issubclass(errors.InfeasibleError, errors.SynthesisError)
     assert issubclass(errors.SchemaVersionError, errors.GainFileError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner:
+    size: validation.Positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outer:
+    inner: Inner | None = None
+    gain: validation.NotNegative | None = None
+    frames: validation.Count = 1
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        validation.check_fields(self, names=tuple(self.names))
+
+
+def test_fields_are_checked_by_their_types():
+    made = Outer(inner=Inner(size=2), gain=1, frames=np.int64(3), names=["a"])
+    assert (type(made.inner.size), type(made.gain), type(made.frames)) == (float, float, int)
+    assert (made.names, Outer().inner, Outer().gain) == (("a",), None, None)
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"inner": 3.0}, "expected an Inner; got float"),
+        ({"gain": -1}, "gain must be at least 0; got -1"),
+        ({"gain": "1"}, "gain must be a number"),
+        ({"frames": 0}, "frames must be at least 1; got 0"),
+        ({"frames": None}, "frames must be an integer"),
+    ],
+)
+def test_fields_of_other_types_are_refused(fields, text):
+    with pytest.raises(errors.ProblemError, match=text):
+        Outer(**fields)
+
+
+def test_an_error_keeps_its_data_and_knows_no_other():
+    error = pickle.loads(pickle.dumps(errors.InfeasibleError("no", gamma=2.0, conflict=("a",))))
+    assert (str(error), error.gamma, error.gamma_least, error.conflict) == ("no", 2.0, None, ("a",))
+    with pytest.raises(TypeError, match="no attribute 'size'"):
+        errors.InfeasibleError("no", size=1)

@@ -15,7 +15,6 @@ from lbt_synth.validation import (
     check_fields,
     frozen_copy,
     real_array,
-    set_fields,
 )
 
 
@@ -53,8 +52,7 @@ class ARModel:
             raise DimensionError(
                 f"coefficients must be a list of at least one number; got shape {a.shape}."
             )
-        check_fields(self)
-        set_fields(self, coefficients=frozen_copy(a))
+        check_fields(self, coefficients=frozen_copy(a))
         radius = float(np.max(np.abs(np.linalg.eigvals(self.companion))))
         if not radius < 1:
             raise ProblemError(

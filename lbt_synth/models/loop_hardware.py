@@ -16,8 +16,6 @@ from lbt_synth.validation import (
     check_fields,
     frozen_copy,
     matrix,
-    require_instance,
-    set_fields,
 )
 
 
@@ -87,7 +85,6 @@ class LoopHardware:
     mirror: PositionLoop | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self)
         sensor, influence, n = self.sensor_matrix, self.influence_matrix, self.modes
         if sensor is not None:
             sensor = matrix(sensor, "sensor_matrix")
@@ -102,10 +99,9 @@ class LoopHardware:
         for name, value in given.items():
             if value is not None and not np.any(value):
                 raise ProblemError(f"{name} must respond to something; got only zeros.")
-            set_fields(self, **{name: frozen_copy(np.eye(n)) if value is None else value})
-        set_fields(self, modes=n)
+            given[name] = frozen_copy(np.eye(n)) if value is None else value
+        check_fields(self, modes=n, **given)
         if self.mirror is not None:
-            require_instance(self.mirror, PositionLoop)
             _ = self.mirror_system  # refuses a mirror that does not fit the frame rate
 
     @property

@@ -17,7 +17,6 @@ from lbt_synth.validation import (
     check_fields,
     frozen_copy,
     one_or_each,
-    set_fields,
 )
 
 
@@ -70,7 +69,6 @@ class Truth:
     sensor_gain: Positive = 1.0
 
     def __post_init__(self) -> None:
-        check_fields(self)
         given = self.turbulence
         parts = tuple(given) if isinstance(given, Sequence) else (given,)
         if not parts:
@@ -85,7 +83,7 @@ class Truth:
                     f"of these, one per mode; got {type(part).__name__}."
                 )
         noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
-        set_fields(
+        check_fields(
             self,
             turbulence=parts if isinstance(given, Sequence) else given,
             vibrations=tuple(self.vibrations),

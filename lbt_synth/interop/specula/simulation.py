@@ -27,7 +27,6 @@ from lbt_synth.validation import (
     integer,
     number,
     require_instance,
-    set_fields,
 )
 
 RAMP_FRAMES = 200
@@ -78,9 +77,7 @@ class EndToEndSetup:
     leak_from_mode: Annotated[int, ("at_least", 2)] = 50
 
     def __post_init__(self) -> None:
-        require_instance(self.system, EndToEndSystem)
-        check_fields(self)
-        set_fields(self, vibrations=tuple(self.vibrations))
+        check_fields(self, vibrations=tuple(self.vibrations))
 
     @property
     def leaks(self) -> FloatArray:

@@ -16,7 +16,6 @@ from lbt_synth.validation import (
     Obstruction,
     Positive,
     check_fields,
-    require_instance,
 )
 
 _REFERENCE_UM = 0.5  # wavelength at which SPECULA takes the seeing
@@ -98,7 +97,7 @@ class EndToEndSystem:
     calibration_nm: Positive = 20.0
 
     def __post_init__(self) -> None:
-        require_instance(self.hardware, LoopHardware)
+        check_fields(self)
         for matrix, name in (
             (self.hardware.sensor, "sensor_matrix"),
             (self.hardware.influence, "influence_matrix"),
@@ -108,7 +107,6 @@ class EndToEndSystem:
                     f"the hardware of an end-to-end simulation must have two modes and the "
                     f"identity as its {name}, for the optics take its place; got {matrix.shape}."
                 )
-        check_fields(self)
         if self.pixels % 2 or self.pixels < self.subapertures_across or self.pixels > _MOST_PIXELS:
             raise ProblemError(
                 f"pixels must be even, at least subapertures_across ({self.subapertures_across}) "

@@ -26,10 +26,9 @@ from lbt_synth.models.turbulence.atmosphere import (
 from lbt_synth.validation import (
     FloatArray,
     IntArray,
+    check_fields,
     positive,
     real_array,
-    require_instance,
-    set_fields,
 )
 
 _PER_LOOP = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
@@ -73,7 +72,7 @@ class FrozenFlows:
     outer_scale_m: Any = None
 
     def __post_init__(self) -> None:
-        require_instance(self.atmosphere, Atmosphere)
+        check_fields(self)
         given = {}
         for name in _PER_LOOP:
             value = getattr(self, name)
@@ -90,7 +89,7 @@ class FrozenFlows:
             ) from error
         if arrays[0].ndim != 1:
             raise DimensionError(f"they must be lists, one number per loop; got {arrays[0].shape}.")
-        set_fields(self, **dict(zip(given, arrays, strict=True)))
+        check_fields(self, **dict(zip(given, arrays, strict=True)))
 
     def __len__(self) -> int:
         """Return the number of loops p."""

@@ -31,7 +31,6 @@ from lbt_synth.validation import (
     real_array,
     require_instance,
     sequence,
-    set_fields,
 )
 
 
@@ -73,14 +72,13 @@ class ModalTurbulence:
             raise DimensionError(
                 f"coefficients must be (modes, order) with at least one of each; got {a.shape}."
             )
-        check_fields(self)
         driving = positive(self.driving_rms_nm, "driving_rms_nm")
         if driving.shape != (len(a),):
             raise DimensionError(
                 f"driving_rms_nm must have shape ({len(a)},) to match coefficients {a.shape}; got "
                 f"{driving.shape}."
             )
-        set_fields(self, coefficients=a, driving_rms_nm=driving)
+        check_fields(self, coefficients=a, driving_rms_nm=driving)
         radii = np.abs(np.linalg.eigvals(self.companions)).max(axis=1)
         if not np.all(radii < 1):
             worst = int(np.argmax(radii))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar_model import variance_ratios
 from lbt_synth.models.vibration.resonance import Vibration, unit_direction
-from lbt_synth.validation import FloatArray, Positive, check_fields, real_array, set_fields
+from lbt_synth.validation import FloatArray, Positive, check_fields, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,8 +59,7 @@ class DriftingVibration:
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        set_fields(self, direction=unit_direction(self.direction))
+        check_fields(self, direction=unit_direction(self.direction))
         if self.damping is not None:
             start = Vibration(frequency_hz=self.start_hz, damping=self.damping, rms_nm=self.rms_nm)
             start.at_frequency(self.end_hz)

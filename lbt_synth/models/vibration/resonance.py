@@ -17,7 +17,6 @@ from lbt_synth.validation import (
     choice,
     number,
     real_array,
-    set_fields,
 )
 
 
@@ -55,8 +54,7 @@ class Vibration:
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        set_fields(self, direction=unit_direction(self.direction))
+        check_fields(self, direction=unit_direction(self.direction))
 
     def ar_model(self, frame_rate_hz: float) -> ARModel:
         """Return the AR2 process of this rms, sampled at a frame rate [Hz].

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.models.vibration.resonance import unit_direction
-from lbt_synth.validation import Positive, check_fields, set_fields
+from lbt_synth.validation import Positive, check_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,8 +40,7 @@ class SinusoidalVibration:
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        set_fields(self, direction=unit_direction(self.direction))
+        check_fields(self, direction=unit_direction(self.direction))
 
     @property
     def amplitude_nm(self) -> float:
