@@ -115,9 +115,6 @@ def _style_axis(axis: Any, own: Axis, ends: tuple[float, float]) -> None:
 
 def _draw(figure: Any, panel: Panel, mark: Mark) -> list[Any]:
     """Draw a mark, and return the models that a legend hides with it."""
-    from bokeh.models import BoxAnnotation
-    from bokeh.models import Span as Line
-
     match mark:
         case Curve():
             return _draw_curve(figure, panel, mark)
@@ -126,23 +123,16 @@ def _draw(figure: Any, panel: Panel, mark: Mark) -> list[Any]:
             shade = colour(mark.look)
             return [figure.varea(mark.x, mark.low, mark.high, color=shade, alpha=alpha)]
         case Rule():
-            line = Line(
-                location=mark.at,
-                dimension="height" if mark.axis == "x" else "width",
-                line_color=GREY,
-                line_width=1.2,
-                line_dash=[round(3 * s) for s in dashes(mark.dash)],
-            )
-            figure.add_layout(line)
-            return [line]
+            draw = figure.vspan if mark.axis == "x" else figure.hspan
+            # a list would be a column of the source
+            strokes = " ".join(f"{round(3 * s)}" for s in dashes(mark.dash)) or "solid"
+            style = {"line_color": GREY, "line_width": 1.2, "line_dash": strokes}
+            return [draw(**{mark.axis: [mark.at]}, **style)]
         case Span():
-            sides = ("left", "right") if mark.axis == "x" else ("bottom", "top")
-            ends = dict(zip(sides, (mark.low, mark.high), strict=True))
-            box = BoxAnnotation(
-                fill_color=colour(mark.look), fill_alpha=SHADE, line_color=None, **ends
-            )
-            figure.add_layout(box)
-            return [box]
+            draw = figure.vstrip if mark.axis == "x" else figure.hstrip
+            ends = {f"{mark.axis}0": [mark.low], f"{mark.axis}1": [mark.high]}
+            style = {"fill_color": colour(mark.look), "fill_alpha": SHADE, "line_color": None}
+            return [draw(**ends, **style)]
         case Bars():
             return _draw_bars(figure, panel, mark)
         case Flags():
@@ -198,18 +188,17 @@ def _draw_bars(figure: Any, panel: Panel, bars: Bars) -> list[Any]:
         (panel.y.label or "bar", "@category"),
         (bars.name or panel.x.label, _value_format("right", panel.x.unit)),
     ]
-    ranged = bars.low is not None and bars.high is not None
-    if bars.low is not None and bars.high is not None:
-        source |= {"low": bars.low[drawn], "high": bars.high[drawn]}
+    ends = {"low": bars.low, "high": bars.high}
+    source |= {name: values[drawn] for name, values in ends.items() if values is not None}
+    if bars.low is not None:
         tips.append(("interval", f"@low{{%.4g}} to {_value_format('high', panel.x.unit)}"))
     shade = colour(bars.look)
     box = figure.hbar(y="y", right="right", height=height, color=shade, source=source)
     _add_hover(figure, box, tips, ("right", "low", "high"))
-    if not ranged:
+    if bars.low is None:
         return [box]
-    ends = {"x0": "low", "x1": "high", "y0": "y", "y1": "y"}
-    line = figure.segment(**ends, source=box.data_source, line_color="black", line_width=1.5)
-    return [box, line]
+    line = {"x0": "low", "x1": "high", "y0": "y", "y1": "y", "line_color": "black"}
+    return [box, figure.segment(**line, source=box.data_source, line_width=1.5)]
 
 
 def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
@@ -222,25 +211,21 @@ def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
     rows, columns = np.nonzero(known)
     kind = LogColorMapper if found.log else LinearColorMapper
     mapper = kind(palette="Viridis256", low=found.low, high=found.high)
-    source = {
+    edges = {
         "left": x[columns],
         "right": x[columns + 1],
         "bottom": y[rows],
         "top": y[rows + 1],
-        "value": found.values[known],
-        "x": found.x[columns],
-        "y": found.y[rows],
     }
+    centres = {"x": found.x[columns], "y": found.y[rows], "value": found.values[known]}
     shade = {"field": "value", "transform": mapper}
     # lines in the same colours leave no seams between cells
-    sides = {side: side for side in ("left", "right", "bottom", "top")}
-    cells = figure.quad(**sides, fill_color=shade, line_color=shade, source=source)
-    blank = np.array(list(blank_cells(~known, x, y))).reshape(-1, 4)
+    sides = {side: side for side in edges}
+    style = {"fill_color": shade, "line_color": shade}
+    cells = figure.quad(**sides, **style, source=edges | centres)
+    blank = np.array(list(blank_cells(~known, x, y))).reshape(-1, 4).T
     figure.quad(
-        left=blank[:, 0],
-        right=blank[:, 1],
-        bottom=blank[:, 2],
-        top=blank[:, 3],
+        **dict(zip(edges, blank, strict=True)),
         fill_color=PALE,
         line_color=None,
         hatch_pattern="right_diagonal_line",
@@ -264,7 +249,7 @@ def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
     figure.add_layout(bar, "below")
     shown = (("x", panel.x), ("y", panel.y), ("value", found))
     tips = [(what.label, _value_format(column, what.unit)) for column, what in shown]
-    _add_hover(figure, cells, tips, ("x", "y", "value"))
+    _add_hover(figure, cells, tips, centres)
 
 
 def _draw_levels(figure: Any, found: Map) -> None:

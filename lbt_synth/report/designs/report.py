@@ -184,7 +184,7 @@ def design_report(
 
 
 def count_steps(designs: int) -> int:
-    """Return the number of steps that a report of so many designs counts at most."""
+    """Return the number of steps that a report of so many designs takes at most."""
     return 2 * designs + 1
 
 

@@ -1,4 +1,4 @@
-"""Designs in a simulated loop: the same weather for all, and spectra beside the exact ones."""
+"""Designs in a simulated loop: the same disturbances for all, and spectra with the exact ones."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class DesignSimulation:
     # (f,): residual's spectrum by the transfer functions, with the window's image of each sinusoid
     exact_nm2_hz: FloatArray
     step_time_s: FloatArray  # (s,): times after a step of the disturbance [s]
-    # (s,): answer of the first axis to a step of ``STEP_NM`` without other disturbances
+    # (s,): response of the first axis to a step of ``STEP_NM`` without other disturbances
     step_residual_nm: FloatArray
     step_command_nm: FloatArray
 
 
 def simulate_design(design: Design, config: Config, *, settle_frames: int) -> DesignSimulation:
-    """Run a design in the loop of a configuration, which settles for so many frames at least."""
+    """Run a design in the loop of a configuration, which settles for at least so many frames."""
     from scipy.signal import welch  # slow to import
 
     settings, hardware, truth = config.settings.simulation, config.hardware, config.truth

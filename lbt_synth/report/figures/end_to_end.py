@@ -107,7 +107,7 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
 
 
 def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
-    """Table III end to end, beside the paper and the modal prediction."""
+    """Draw Table III end to end, with the paper and the modal prediction."""
     rows = [e for e in entries if e.table == "III" and e.error_hz is not None]
     methods = list(dict.fromkeys(e.method for e in rows))
     y = Axis(label="Strehl ratio at 2.2 µm", unit="%", low=0, high=100)

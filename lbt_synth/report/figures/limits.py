@@ -1,4 +1,4 @@
-"""Figure of designs beside the limits of performance."""
+"""Figure of designs with the limits of performance."""
 
 from __future__ import annotations
 

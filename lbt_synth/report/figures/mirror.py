@@ -20,7 +20,7 @@ def mirror_figure(
     tolerance: float = 0.1,
     axes: OwnAxes = None,
 ) -> Figure:
-    """Draw the mirror's answer to a step of its command, and its taps.
+    """Draw the mirror's step response, and its taps.
 
     Parameters
     ----------
