@@ -65,7 +65,7 @@ def loop_norms(loop: ClosedLoop, lines_hz: Sequence[float] = ()) -> LoopNorms:
 
 
 def loop_panels(
-    norms: Mapping[str, LoopNorms], lines_hz: Sequence[float], names: list[str], *, title: str = ""
+    norms: Mapping[str, LoopNorms], rules: Sequence[Rule], names: list[str], *, title: str = ""
 ) -> tuple[Panel, Panel]:
     """Return the panels of rejection and noise transfer; looks follow the order of names."""
     first, second = (
@@ -74,16 +74,20 @@ def loop_panels(
     )
     unity = Rule(name="", at=1.0, axis="y")
     return (
-        frequency_panel("phase to residual", "-", (*first, unity), lines_hz, title=title),
-        frequency_panel("noise to residual", "-", second, lines_hz),
+        frequency_panel("phase to residual", "-", (*first, unity), rules, title=title),
+        frequency_panel("noise to residual", "-", second, rules),
     )
 
 
+def vibration_rules(lines_hz: Sequence[float], name: str = "vibration") -> list[Rule]:
+    """Return what marks the frequencies of vibrations."""
+    return [Rule(name=name, at=frequency, dash=3) for frequency in lines_hz]
+
+
 def frequency_panel(
-    label: str, unit: str, marks: Sequence[Mark], lines_hz: Sequence[float], *, title: str = ""
+    label: str, unit: str, marks: Sequence[Mark], rules: Sequence[Rule], *, title: str = ""
 ) -> Panel:
-    """Return a panel of transfer functions in which vibrations are marked."""
-    rules = [Rule(name="vibration", at=frequency, dash=3) for frequency in lines_hz]
+    """Return a panel of transfer functions over frequency."""
     y = Axis(label=f"\u03c3\u0304, {label}", unit=unit, log=True)
     return Panel(x=FREQUENCY, y=y, marks=(*marks, *rules), title=title)
 
