@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.records.columns import OF_AXES, ROLES, Column, rises
+from lbt_synth.identification.records.columns import OF_AXES, ROLES, Column
 from lbt_synth.identification.records.contents import Contents
 from lbt_synth.validation import choice, integer, sequence
 
@@ -52,7 +52,8 @@ def select_series(
     if role is None:
         needed = [role for role in (_SERIES[kind][0], _BESIDE.get(kind)) if role is not None]
         raise ProblemError(
-            f"a record of kind {kind} needs {' and '.join(needed)}{_how_to_choose(there, *needed)}"
+            f"a record of kind {kind} needs columns of {' and '.join(needed)}"
+            + _how_to_choose(there, *needed)
         )
     clocks = () if kind == "spectrum" else CLOCKS
     chosen = {
@@ -129,17 +130,9 @@ def _assign_by_kind(columns: Sequence[Column], kind: str | None, notes: list[str
     if kind == "spectrum" and len(columns) > 1:
         notes.append("the first column was taken for the frequencies, the others for densities")
         return {"frequency": [columns[0]], "density": number_axes(columns[1:])}
-    if kind != "open_loop":
-        return {}
-    for number, each in enumerate(columns):
-        if rises(each.values):
-            raise ProblemError(
-                f"column {number} ({join_names([each])}) rises from row to row, as a clock "
-                f"does: choose by columns={{'times': {number}, 'open_loop': ...}}, by names or "
-                "numbers from 0."
-            )
-    notes.append("all columns were taken for the open-loop series")
-    return {"open_loop": number_axes(columns)}
+    if kind == "open_loop" and len(columns) == 1:  # of several, one may be a clock
+        return {"open_loop": number_axes(columns)}
+    return {}
 
 
 def _find_kind(found: Roles, columns: Sequence[Column]) -> str:

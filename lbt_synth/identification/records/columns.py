@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-import numpy as np
-
 from lbt_synth.errors import TelemetryError
 from lbt_synth.identification.records.units import is_unit, same_unit
 from lbt_synth.validation import FloatArray
@@ -42,7 +40,6 @@ FACTS = {
 OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
 _AXES = {"0": 0, "1": 1, "2": 2, "tip": 0, "tilt": 1, "x": 0, "y": 1}
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*(?:\([^)]*\))?[^\])]*)[\])]\s*$")
-_CLOCK_ROWS = 8  # rows of noise all rise with a chance of 1 in 40 000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,11 +82,6 @@ def parse_column(name: str, values: FloatArray, *, unit: str | None = None) -> C
 def recognise_fact(key: str) -> str | None:
     """Return the fact that a header's keyword or a number's name stands for."""
     return _FACT_NAMES.get(_normalise(key))
-
-
-def rises(values: FloatArray) -> bool:
-    """Whether a series rises from row to row, as clocks and frequencies do."""
-    return len(values) >= _CLOCK_ROWS and bool(np.all(np.diff(values) > 0))
 
 
 def _normalise(name: str) -> str:

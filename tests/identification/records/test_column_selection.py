@@ -154,7 +154,8 @@ def test_a_clock_without_a_name_is_no_axis(tmp_path, series):
     path = tmp_path / "a.txt"
     np.savetxt(path, np.column_stack([np.arange(FRAMES) / RATE, series[0][:, 0]]))
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"column 0 .* rises from row to row, as a clock"
+        lbt.errors.ProblemError,
+        match=r"needs columns of open_loop; got a column.*\(--columns open_loop=\.\.\.\)",
     ):
         lbt.load_record(path, kind="open_loop", unit="nm", frame_rate_hz=RATE)
     seen = lbt.load_record(path, columns={"times": 0, "open_loop": 1}, unit="nm")

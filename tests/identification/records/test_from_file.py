@@ -276,7 +276,7 @@ def gapped(folder):
         (
             ["y_nm", "a", "b", "c"],
             {"kind": "closed_loop"},
-            "needs measurements and commands; got y",
+            "needs columns of measurements and commands; got y",
         ),
         (["y_nm", "meas_nm", "u_nm", "u_nm"], {}, "not each of an axis of its own"),
         (["y0_nm", "y1_nm", "u0_nm", "t"], {}, r"commands must match measurements \(60, 2\)"),
@@ -291,7 +291,7 @@ def gapped(folder):
             "a column was chosen twice",
         ),
         (["y_nm", "u_nm", "a", "b"], {"kind": "video"}, "kind must be one of closed_loop"),
-        (["y_nm", "u_nm", "a", "b"], {"kind": "spectrum"}, "needs density and frequency; got y_nm"),
+        (["y_nm", "u_nm", "a", "b"], {"kind": "spectrum"}, "needs columns of density and frequency; got y_nm"),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": 0}, "delay_frames must be at least 1; got 0"),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": "two"}, "delay_frames must be a number"),
         (["y_nm", "u_nm", "a", "b"], {"frame_rate_hz": None}, "frame rate is not known; give fra"),
