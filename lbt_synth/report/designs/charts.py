@@ -13,7 +13,12 @@ from lbt_synth.report.charts.scales import count_columns
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.simulation import STEP_NM
 from lbt_synth.report.figures.limits import limits_panel
-from lbt_synth.report.figures.loop import frequency_panel, loop_panels, stable_curve
+from lbt_synth.report.figures.loop import (
+    frequency_panel,
+    loop_panels,
+    stable_curve,
+    vibration_rules,
+)
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, map_panels, strehl_panel
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
@@ -28,18 +33,19 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
     norms = {one.name: one.error_norms for one in report.assessments if one.error_norms is not None}
     names, f = report.names, report.frequency_hz
     lines = sorted({line.frequency_hz for line in report.config.truth.vibrations})  # type: ignore[union-attr]
+    rules = vibration_rules(lines, "true vibration" if len(lines) == 1 else "true vibrations")
     charts = []
     if norms:
         curves = [stable_curve(name, names, f, values) for name, values in norms.items()]
         peaks = [f"{name} {number_text(float(np.max(n)), 3)} nm" for name, n in norms.items()]
-        panel = frequency_panel("disturbances to error", "nm", curves, lines)
+        panel = frequency_panel("disturbances to error", "nm", curves, rules)
         charts.append(chart("sigma", [panel], peaks=listing_text(peaks)))
     if report.stable:
         responses = {one.name: (f, one.rejection, one.noise_transfer) for one in report.assessments}
         charts.append(
             chart(
                 "loop",
-                loop_panels(responses, lines, names),
+                loop_panels(responses, rules, names),
                 gain=number_text(report.real_gain),
                 rejection=_largest_text(report, "rejection"),
                 noise=_largest_text(report, "noise_transfer"),

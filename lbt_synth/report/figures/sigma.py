@@ -17,6 +17,7 @@ from lbt_synth.report.figures.loop import (
     loop_norms,
     loop_panels,
     stable_curve,
+    vibration_rules,
 )
 
 
@@ -66,6 +67,7 @@ def sigma_figure(
     if not designs:
         raise ProblemError("a sigma plot needs at least one design; got none.")
     names, lines_hz = list(designs), _vibration_frequencies(designs.values())
+    rules = vibration_rules(lines_hz)
     estimators = {k: d for k, d in designs.items() if isinstance(d, EstimatorDesign)}
     loops = {
         name: close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
@@ -82,11 +84,11 @@ def sigma_figure(
             curves.append(stable_curve(name, names, grid, largest_singular_values(system, grid)))
         physical = all(design.hardware is not None for design in estimators.values())
         unit = "nm" if physical and not unit_weights else "-"
-        panels.append(frequency_panel("disturbances to error", unit, curves, lines_hz))
+        panels.append(frequency_panel("disturbances to error", unit, curves, rules))
     if loops:
         norms = {name: loop_norms(loop, lines_hz) for name, loop in loops.items()}
         title = f"closed loops at sensor gain {sensor_gain:g}"
-        panels += loop_panels(norms, lines_hz, names, title=title)
+        panels += loop_panels(norms, rules, names, title=title)
     return draw_figure(panels, axes=axes)
 
 
