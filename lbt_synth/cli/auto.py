@@ -23,7 +23,7 @@ from lbt_synth.identification import (
 )
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.loop import Imaging, close_loop, loop_margins
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import column, fill_row, nm_column, table_row
 
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
 
@@ -69,9 +69,9 @@ class HeldOutRow:
     """One controller on frames that nothing was fitted to, beside what the model promises."""
 
     name: str = column("controller")
-    replayed_nm: float = column("data", unit="nm", format=".2f", key="data_nm")
-    replayed_error_nm: float = column("+-", format=".2f", key="data_error_nm")
-    model_nm: float = column("model", unit="nm", format=".2f")
+    replayed_nm: float = nm_column("data", format=".2f", key="data_nm")
+    replayed_error_nm: float = nm_column("+-", format=".2f", key="data_error_nm")
+    model_nm: float = nm_column("model", format=".2f")
     ratio: float = column("data/model", format=".3f")
     strehl: float = column("Strehl, data", format=".3f")
     model_strehl: float = column("Strehl, model", format=".3f")

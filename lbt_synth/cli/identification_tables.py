@@ -13,7 +13,7 @@ from lbt_synth.identification import (
     SpectrumRecord,
 )
 from lbt_synth.identification.records.health import HEADINGS
-from lbt_synth.storage.rows import cell_text, column, fill_row, row_table, table_row
+from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 
 
 def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
@@ -76,11 +76,11 @@ class VibrationRow:
 
     axis: str = column("axis")
     frequency_hz: float = column("f", unit="Hz", format=".3f")
-    frequency_error_hz: float = column("+-", format=".2g")
+    frequency_error_hz: float = column("+-", unit="Hz", format=".2g")
     damping: str = column("damping")  # one that is not resolved has a bound, and no error
     damping_error: float | None = column("+-", format=".2g")
-    rms_nm: float = column("rms", unit="nm", format=".2f")
-    rms_error_nm: float = column("+-", format=".2g")
+    rms_nm: float = nm_column("rms", format=".2f")
+    rms_error_nm: float = column("+-", unit="nm", format=".2g")
     prominence: float = column("over the rest", format=".3g")
     origin: str = column("origin")
 
