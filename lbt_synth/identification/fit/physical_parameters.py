@@ -121,7 +121,7 @@ def _describe_line(
         damping_error=damping_error,
         resolved=resolved,
         rms_nm=rms,
-        rms_error_nm=rms * float(np.sqrt(variance)),
+        rms_error_nm=rms * float(np.sqrt(max(variance, 0.0))),
         prominence=own / rest if rest > 0 else float("inf"),
         evidence=model.evidence[i],
         announced=line.announced is not None,
