@@ -247,7 +247,7 @@ def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
     poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
     grid = [np.zeros(1), np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), inputs.edges]
     edges = distinct_edges(np.concatenate(grid))
-    last: tuple[FloatArray, FloatArray] | None = None
+    last = np.full((2, gain.size), np.inf)  # gains and variances
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
         rejection, propagation = inputs.transfers(nodes, loop_gains)
@@ -263,9 +263,10 @@ def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
         if inputs.differenced:
             floor = noise_nm2 * np.interp(best, loop_gains, propagated)
             variance = np.maximum(variance, floor)
-        if last is not None and _is_settled((best, variance), last):
+        change = np.max(np.abs(np.stack([best, variance]) / last - 1), axis=1)
+        if change[0] < 1e-4 and change[1] < _SETTLED:
             break
-        last = best, variance
+        last[:] = best, variance
         edges = np.union1d(edges, (edges[1:] + edges[:-1]) / 2)
     else:
         raise NumericalError(
@@ -285,12 +286,6 @@ def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
         delay_frames=path.delay_frames,
         mirror=path.mirror,
     )
-
-
-def _is_settled(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> bool:
-    """Whether gains and variances no longer change."""
-    variance = np.max(np.abs(one[1] / other[1] - 1))
-    return bool(variance < _SETTLED and np.max(np.abs(one[0] / other[0] - 1)) < 1e-4)
 
 
 def _minimise(

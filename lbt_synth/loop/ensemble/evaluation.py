@@ -148,8 +148,17 @@ def ensemble_residuals(
     """
     require_instance(hardware, LoopHardware)
     require_instance(ensemble, LoopEnsemble)
-    matrices = _controller_matrices(controller, hardware, ensemble.loops)
-    return residuals_from_matrices(matrices, hardware, ensemble)
+    each = [controller] if isinstance(controller, Controller) else list(controller)
+    for one in each:
+        require_instance(one, Controller)
+        require_matching_controller(hardware, one)
+    sizes, count = sorted({one.n_states for one in each}), ensemble.loops
+    if len(each) not in (1, count) or len(sizes) != 1:
+        raise DimensionError(
+            f"give one controller, or one per loop ({count}) with as many states each; got "
+            f"{len(each)} with {sizes} states."
+        )
+    return residuals_from_matrices(textbook_matrices(each), hardware, ensemble)
 
 
 def residuals_from_matrices(
@@ -172,22 +181,6 @@ def residuals_from_matrices(
         random_vibration_nm2=random_nm2,
         line_amplitudes_nm=amplitudes,
     )
-
-
-def _controller_matrices(
-    controller: Any, hardware: LoopHardware, count: int
-) -> tuple[FloatArray, ...]:
-    """Return controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
-    each = [controller] if isinstance(controller, Controller) else list(controller)
-    for one in each:
-        require_instance(one, Controller)
-        require_matching_controller(hardware, one)
-    if len(each) not in (1, count) or len({one.n_states for one in each}) != 1:
-        raise DimensionError(
-            f"give one controller, or one per loop ({count}) with as many states each; got "
-            f"{len(each)} with {sorted({one.n_states for one in each})} states."
-        )
-    return textbook_matrices(each)
 
 
 def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:

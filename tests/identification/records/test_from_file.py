@@ -291,7 +291,11 @@ def gapped(folder):
             "a column was chosen twice",
         ),
         (["y_nm", "u_nm", "a", "b"], {"kind": "video"}, "kind must be one of closed_loop"),
-        (["y_nm", "u_nm", "a", "b"], {"kind": "spectrum"}, "needs columns of density and frequency; got y_nm"),
+        (
+            ["y_nm", "u_nm", "a", "b"],
+            {"kind": "spectrum"},
+            "needs columns of density and frequency; got y_nm",
+        ),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": 0}, "delay_frames must be at least 1; got 0"),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": "two"}, "delay_frames must be a number"),
         (["y_nm", "u_nm", "a", "b"], {"frame_rate_hz": None}, "frame rate is not known; give fra"),
