@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import FileError, OutputError, TelemetryError
-from lbt_synth.files.telemetry.native_layout import check_taps
-from lbt_synth.files.telemetry.telemetry import Telemetry
+from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
 from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import error_reason, has_card

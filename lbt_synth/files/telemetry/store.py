@@ -1,35 +1,45 @@
-"""Saves telemetry to files, and loads and checks it."""
+"""Saves telemetry to files, in the package's own layout or another, and loads and checks it."""
 
 from __future__ import annotations
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from lbt_synth.errors import OutputError, TelemetryError
+import numpy as np
+import numpy.typing as npt
+
+import lbt_synth
+from lbt_synth.errors import OutputError, ProblemError, TelemetryError
 from lbt_synth.files.file_checks import FileKind
 from lbt_synth.files.telemetry import aot
-from lbt_synth.files.telemetry.native_layout import (
-    PRECISIONS,
-    SCHEMA,
-    SCHEMA_VERSION,
-    layer_cards,
-    pack,
-    primary_cards,
-    unpack,
+from lbt_synth.files.telemetry.fields import FACTS, LAYERS, REQUIRED
+from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
+from lbt_synth.linear import Controller
+from lbt_synth.models import PositionLoop
+from lbt_synth.storage.array_file import (
+    Cards,
+    digest,
+    fits_bytes,
+    npz_bytes,
+    read_fits,
+    read_npz,
 )
-from lbt_synth.files.telemetry.telemetry import Telemetry
-from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz
 from lbt_synth.storage.atomic_files import read_bytes, write_atomically
-from lbt_synth.validation import choice
+from lbt_synth.validation import FloatArray, choice
 
+PRECISIONS = ("float64", "float32")
+Meta = dict[str, Any]
+_LARGEST_CARD = 2**63 - 1
 FORMATS = ("fits", "npz", "aot")
 _ENDINGS = ".fits, .npz or .aot.fits"
 _KINDS = {".aot.fits": "aot", ".fits": "fits", ".npz": "npz"}  # the longer ending first
 _KIND = FileKind(
     name="telemetry file",
-    schema=SCHEMA,
-    version=SCHEMA_VERSION,
+    schema="lbt_synth telemetry",
+    version=1,
     error=TelemetryError,
     version_error=TelemetryError,
 )
@@ -157,3 +167,84 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
         if is_fits and aot.is_aot(content):
             return aot.from_bytes(content, source)
         return unpack(*_KIND.decode(content, read_fits if is_fits else read_npz, source))
+
+
+def pack(telemetry: Telemetry, precision: str) -> tuple[dict[str, npt.NDArray[Any]], Meta]:
+    """Return the arrays and the metadata; ``precision`` is that of the series."""
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    for name, layer in LAYERS.items():
+        if (value := getattr(telemetry, layer.field)) is None:
+            continue
+        arrays[name] = value
+        if precision == "float32" and layer.is_series and layer.field != "times_s":
+            with np.errstate(over="ignore"):
+                arrays[name] = value.astype(np.float32)
+            if not np.all(np.isfinite(arrays[name])):
+                raise ProblemError(
+                    f"{layer.field} has values beyond the range of float32; write float64."
+                )
+    meta: Meta = {
+        "schema": _KIND.schema,
+        "schema_version": _KIND.version,
+        "library_version": lbt_synth.__version__,
+        "convention": telemetry.convention,
+        **{name: getattr(telemetry, name) for name in FACTS},
+        "metadata": dict(telemetry.metadata),
+    }
+    if (k := telemetry.controller) is not None:
+        arrays |= {f"CTRL_{name}": getattr(k, name) for name in "ABCD"}
+        meta["controller_dt_s"] = k.dt_s
+    if telemetry.mirror is not None:
+        meta["mirror"] = asdict(telemetry.mirror)
+    return arrays, meta
+
+
+def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
+    """Rebuild telemetry; missing keys raise KeyError, what does not fit a ProblemError."""
+    left = dict(arrays)
+    fields: dict[str, Any] = {
+        layer.field: left.pop(name)
+        for name, layer in LAYERS.items()
+        if name in left or layer.field in REQUIRED
+    }
+    if "controller_dt_s" in meta:
+        fields["controller"] = Controller(
+            **{name: left.pop(f"CTRL_{name}") for name in "ABCD"}, dt_s=meta["controller_dt_s"]
+        )
+    if left:
+        raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(left))}")
+    taps = fields.pop("mirror_taps", None)
+    if "mirror" in meta:  # a mirror that settles at once is not in the file
+        fields["mirror"] = PositionLoop(**meta["mirror"])
+    fields |= {name: meta[name] for name in FACTS}
+    return check_taps(Telemetry(**fields, metadata=dict(meta["metadata"])), taps)
+
+
+def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]]:
+    """Cards for people who look at the header; META is what is read back."""
+    cards: dict[str, tuple[Any, str]] = {
+        "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
+        "LBTTELEM": (_KIND.version, "version of the lbt_synth telemetry layout"),
+    }
+    for name, fact in FACTS.items():
+        value = getattr(telemetry, name)
+        too_large = isinstance(value, int) and value > _LARGEST_CARD
+        if fact.card and value is not None and not too_large:
+            cards[fact.card] = (value, fact.comment)
+    cards["TIMING"] = (telemetry.convention, "")
+    cards["SHA256"] = (meta["digest"], "")
+    return cards
+
+
+def layer_cards(telemetry: Telemetry) -> dict[str, Cards]:
+    """Cards of each array: unit, meaning, axes."""
+    out: dict[str, Cards] = {}
+    for name, layer in LAYERS.items():
+        cards: dict[str, tuple[Any, str]] = {}
+        if unit := layer.unit_in(telemetry):
+            cards["BUNIT"] = (unit, "rms of wavefront" if unit == "nm" else "")
+        cards["CONTENT"] = (layer.meaning, "")
+        for number, axis in enumerate(reversed(layer.axes.split(", ")), start=1):
+            cards[f"CTYPE{number}"] = (axis.upper(), "")  # FITS counts axes from the fastest
+        out[name] = cards
+    return out

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+import numpy.typing as npt
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.files.telemetry.conventions import CONVENTION, MOVING_CONVENTION
@@ -14,6 +15,8 @@ from lbt_synth.files.telemetry.fields import ARRAYS, FACTS, REQUIRED, Scalar, ch
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.validation import FloatArray, frozen_copy, real_array, require_instance, set_fields
+
+_SAME_TAPS = 1e-9  # largest difference between the taps of a file and those of its mirror
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -277,3 +280,17 @@ class Telemetry:
             influence_matrix=np.eye(n) if influence is None else influence,
             mirror=self.mirror,
         )
+
+
+def check_taps(telemetry: Telemetry, taps: npt.ArrayLike | None) -> Telemetry:
+    """Return telemetry, or refuse it if its mirror does not have the taps of its file."""
+    own = telemetry.mirror_taps
+    if (own is None) != (taps is None):
+        raise ValueError("a mirror and its taps go together; it has one of them")
+    if own is not None and taps is not None:
+        found = np.asarray(taps, dtype=np.float64)
+        size = max(own.size, found.size)
+        one, other = (np.pad(each.ravel(), (0, size - each.size)) for each in (own, found))
+        if not np.allclose(one, other, rtol=0, atol=_SAME_TAPS):
+            raise ValueError("its taps are not those of its mirror")
+    return telemetry

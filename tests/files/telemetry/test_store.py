@@ -1,4 +1,4 @@
-"""Telemetry files: round trips, equations that hold in the file alone, damage."""
+"""Telemetry files: what stands in them, round trips, equations that hold in the file alone, damage."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from support.plants import lbt_axis_plant
 from support.telemetry import ENDINGS, SHELL, full, same, telemetries
 
 import lbt_synth as lbt
-from lbt_synth.files.telemetry import native_layout
+from lbt_synth.files.telemetry import store
 from lbt_synth.files.telemetry.aot import lost_fields
+from lbt_synth.files.telemetry.conventions import CONVENTION
 from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.storage import array_file as archive
 
@@ -201,7 +202,7 @@ def test_foreign_files_are_refused(tmp_path):
 
 def edited(tmp_path, change, *, resign=True):
     """Write a file whose arrays and metadata somebody changed."""
-    arrays, meta = native_layout.pack(full(), "float64")
+    arrays, meta = store.pack(full(), "float64")
     arrays = {name: np.array(array) for name, array in arrays.items()}
     meta["digest"] = archive.digest(arrays, meta)
     change(arrays, meta)
@@ -271,3 +272,62 @@ def test_nothing_half_written_stays(tmp_path, monkeypatch):
         lbt.files.save_telemetry(path, full(random=1))
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["t.fits"]
+
+
+def test_the_fits_file_explains_itself(tmp_path):
+    """Read with astropy alone: names, units, axes, timing."""
+    seen = full()
+    with fits.open(lbt.files.save_telemetry(tmp_path / "t.fits", seen)) as units:
+        header = units[0].header
+        assert units[0].data is None
+        assert header["LBTTELEM"] == 1
+        assert (header["RATE_HZ"], header["DELAY"], header["SENSGAIN"]) == (800, 2.25, 0.358)
+        assert (header["DIAMETER"], header["STREHL"], header["WAVELEN"]) == (8.22, 0.83, 2.2)
+        assert header["TIMING"] == seen.convention
+        assert np.array_equal(units["MIRROR_TAPS"].data, seen.mirror_taps)
+        assert np.array_equal(units["COMMANDS"].data, seen.commands)
+        assert np.array_equal(units["CTRL_A"].data, seen.controller.A)
+        assert units["COMMANDS"].header["BUNIT"] == "nm"
+        assert units["SLOPES"].header["BUNIT"] == "pixel"
+        axes = units["SLOPES"].header
+        assert (axes["CTYPE2"], axes["NAXIS2"]) == ("FRAME", 6)
+        assert (axes["CTYPE1"], axes["NAXIS1"]) == ("SLOPE", 8)
+        names = [unit.name for unit in units[1:]]
+        assert set(LAYERS) <= set(names)
+        assert names[-1] == "META"
+
+
+def test_the_taps_stand_in_the_file(tmp_path):
+    """For who reads it without this package: an array of FITS or NumPy, and the words."""
+    seen = full()
+    with fits.open(lbt.files.save_telemetry(tmp_path / "t.fits", seen)) as units:
+        assert np.array_equal(units["MIRROR_TAPS"].data, seen.hardware.mirror_taps)
+        assert "with the mirror taps c" in units[0].header["TIMING"]
+    with np.load(lbt.files.save_telemetry(tmp_path / "t.npz", seen)) as arrays:
+        assert np.array_equal(arrays["MIRROR_TAPS"], seen.hardware.mirror_taps)
+
+
+def test_a_settled_mirror_leaves_the_file_as_it_was(tmp_path):
+    seen = full(mirror=None)
+    assert seen.convention == CONVENTION
+    assert seen.mirror_taps is None
+    arrays, meta = store.pack(seen, "float64")
+    assert "MIRROR_TAPS" not in arrays
+    assert "mirror" not in meta  # what 0.1 wrote, and reads
+    assert store.unpack(arrays, meta).mirror is None
+
+
+@pytest.mark.parametrize(
+    ("edit", "text"),
+    [
+        (lambda a, m: a.pop("MIRROR_TAPS"), "go together"),
+        (lambda a, m: m.pop("mirror"), "go together"),
+        (lambda a, m: a.update(MIRROR_TAPS=a["MIRROR_TAPS"][::-1]), "not those of its mirror"),
+        (lambda a, m: m["mirror"].update(ramp_samples=2), "not those of its mirror"),
+    ],
+)
+def test_taps_and_mirror_must_agree(edit, text):
+    arrays, meta = store.pack(full(), "float64")
+    edit(arrays, meta)
+    with pytest.raises(ValueError, match=text):
+        store.unpack(arrays, meta)
