@@ -124,6 +124,7 @@ def _history_curves(
             if not update.switched:
                 kept.append((begin_s, frequency))
         fitted += [(update.middle_s - start_s, value) for value in update.fitted_hz]
+    fitted, kept = ([p for p in points if 0 < p[0] < last_s] for points in (fitted, kept))
     styles = (
         ("the filter's", held, {"look": 0}),
         ("window, at its middle", fitted, {"look": 1, "line": False, "marker": "circle"}),
