@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import asdict
 from typing import Any
 
 from lbt_synth.cli.loop_inputs import load_designs
@@ -113,6 +112,6 @@ def _design_record(one: DesignAssessment) -> dict[str, Any]:
     return {
         "checks": [json_record(check) for check in one.checks],
         "good_errors_hz": None if good is None else [good.low_hz, good.high_hz],
-        "margins": None if one.margins is None else asdict(one.margins),
+        "margins": None if one.margins is None else json_record(one.margins),
         "stable_sensor_gains": one.sensor_gains,
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import asdict
 from typing import Any
 
 from lbt_synth.cli.loop_inputs import load_designs
@@ -11,18 +10,10 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design, EstimatorDesign
-from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.report.figures import sigma_figure
 from lbt_synth.report.figures.style import save_figure
-
-_HEADINGS = {
-    "stable": "stable",
-    "modulus": "modulus",
-    "gain_low": "gain from",
-    "gain_high": "gain to",
-    "phase_deg": "phase [deg]",
-    "delay_frames": "delay [frames]",
-}
+from lbt_synth.storage.rows import columns, json_record, json_units
 
 
 def run(arguments: Namespace) -> Report:
@@ -33,14 +24,14 @@ def run(arguments: Namespace) -> Report:
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
     margins = {name: _margins(design, arguments.sensor_gain) for name, design in designs.items()}
     physical = all(design.hardware is not None for design in designs.values())
-    report = Report(data={"designs": margins, "sensor_gain": arguments.sensor_gain})
+    units = json_units(LoopMargins) | ({"gamma": "nm", "rms": "nm"} if physical else {})
+    report = Report(data={"designs": margins, "units": units, "sensor_gain": arguments.sensor_gain})
+    shown = [each for each in columns(LoopMargins) if each.heading]
+    keys = ("gamma", "stable", *(each.key for each in shown))
     report.add_table(
         f"Margins at sensor gain {arguments.sensor_gain:g}",
-        ("design", "norm [nm]" if physical else "norm", *_HEADINGS.values()),
-        [
-            (name, *(margin.get(key) for key in ("gamma", *_HEADINGS)))
-            for name, margin in margins.items()
-        ],
+        ("design", "norm [nm]" if physical else "norm", "stable", *(each.title for each in shown)),
+        [(name, *(known.get(key) for key in keys)) for name, known in margins.items()],
     )
     report.note_written(save_figure(figure, arguments.output))
     return report
@@ -55,5 +46,5 @@ def _margins(design: Design, sensor_gain: float) -> dict[str, Any]:
         loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
         known["stable"] = loop.is_stable
         if loop.is_stable:
-            known |= asdict(loop_margins(loop))
+            known |= json_record(loop_margins(loop))
     return known

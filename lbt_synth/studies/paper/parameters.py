@@ -129,11 +129,18 @@ class Parameter(NamedTuple):
 
 PARAMETERS = (
     Parameter("diameter, obstruction", f"{DIAMETER_M} m, {OBSTRUCTION} D", "paper, Table I"),
-    Parameter("seeing, outer scale, wind", "0.8 arcsec, 22 m, 20 m/s", "paper, Table I"),
-    Parameter("frame rate, delay", "800 Hz, 2 frames", "paper, Table I"),
-    Parameter("vibration", "20 Hz, 80 mas", "paper, section V-C"),
+    Parameter(
+        "seeing, outer scale, wind",
+        f"{ATMOSPHERE.seeing_arcsec:g} arcsec, {ATMOSPHERE.outer_scale_m:g} m, "
+        f"{ATMOSPHERE.wind_speed_m_s:g} m/s",
+        "paper, Table I",
+    ),
+    Parameter(
+        "frame rate, delay", f"{FRAME_RATE_HZ:g} Hz, {DELAY_FRAMES:g} frames", "paper, Table I"
+    ),
+    Parameter("vibration", f"{VIBRATION_HZ:g} Hz, {VIBRATION_MAS:g} mas", "paper, section V-C"),
     Parameter("turbulence pole, rms", "0.98860, 591.6 nm", "derived from Table I"),
-    Parameter("measurement noise", f"{NOISE_NM} nm a frame", "derived from Table I"),
+    Parameter("measurement noise", f"{NOISE_NM} nm per frame", "derived from Table I"),
     Parameter("80 mas as the rms of a sinusoid", f"{VIBRATION_NM:.1f} nm", "read so here"),
     Parameter("optical gain of the pyramid", f"{TRUTH_SENSOR_GAIN}", "fitted"),
     Parameter("Strehl of the other modes", f"{OTHER_MODES_STREHL}", "fitted"),
