@@ -173,13 +173,9 @@ def _require_agreement(
 
 def _is_kalman_for_sample(controller: StudyController) -> bool:
     """Whether a controller is a Kalman filter without options, designed for each sample."""
-    request = controller.request
-    return (
-        request is not None
-        and controller.design is None
-        and request.method.batched
-        and not request.given
-    )
+    if (request := controller.request) is None or not controller.for_sample:
+        return False
+    return request.method.batched and not request.given
 
 
 def _has_independent_axes(config: Config) -> bool:

@@ -55,7 +55,7 @@ class _Workers:
         self._study, self._jobs = study, jobs
         self._call = partial(evaluate_timed, evaluate, study)
         self._executor = executor or (WorkerPool(jobs) if jobs > 1 else _InlineExecutor())
-        self._is_own = executor is None
+        self._is_own = executor is None and jobs > 1
         self._broken: BrokenExecutor | None = None
         self._deaths = 0  # in a row
 

@@ -47,7 +47,4 @@ def read_parquet(path: Path) -> dict[str, FloatArray]:
         table: Any = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         raise OutputError(f"cannot read {path}: {error}.", path=path) from error
-    return {
-        name: np.asarray(table.column(name).to_numpy(), dtype=np.float64)
-        for name in table.column_names
-    }
+    return {name: table[name].to_numpy().astype(np.float64) for name in table.column_names}

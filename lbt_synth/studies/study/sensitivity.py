@@ -85,14 +85,12 @@ class ControllerSensitivity:
     @property
     def sum(self) -> float:
         """Sum of the indices; nan if there is none."""
-        values = [each.index.value for each in self.ranked]
-        return float(np.sum(values)) if values else np.nan
+        return float(np.sum([e.index.value for e in self.ranked] or [np.nan]))
 
     @property
     def sum_error(self) -> float:
         """Root of the sum of squares of their errors; nan if there is none."""
-        errors = [each.index.error for each in self.ranked]
-        return float(np.linalg.norm(errors)) if errors else np.nan
+        return float(np.linalg.norm([e.index.error for e in self.ranked] or [np.nan]))
 
     @property
     def interactions(self) -> float:
@@ -106,20 +104,17 @@ def sensitivities(
     """Return the sensitivity of each controller's Strehl ratio to each parameter, (n,) each."""
     # ties in the order of the samples
     orders = {name: np.argsort(values, kind="stable") for name, values in parameters.items()}
-    found = []
-    for each in controllers:
-        ranks = _rank(each)
-        sensitivity = tuple(
-            _sensitivity(name, values, each, orders[name], ranks)
-            for name, values in parameters.items()
+    return tuple(
+        ControllerSensitivity(
+            controller=each.controller,
+            samples=int(np.count_nonzero(each.evaluated)),
+            parameters=tuple(
+                _sensitivity(name, values, each, orders[name], ranks)
+                for name, values in parameters.items()
+            ),
         )
-        samples = int(np.count_nonzero(each.evaluated))
-        found.append(
-            ControllerSensitivity(
-                controller=each.controller, samples=samples, parameters=sensitivity
-            )
-        )
-    return tuple(found)
+        for each, ranks in zip(controllers, map(_rank, controllers), strict=True)
+    )
 
 
 def _sensitivity(

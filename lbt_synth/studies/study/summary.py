@@ -47,14 +47,8 @@ def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
     >>> first.headings, first.rows[4]
     (('of the Strehl ratio [%]', 'a'), ('50th percentile', '50.0 (46.5 to 53.5)'))
     """
-    tables = (
-        strehl_table(statistics),
-        residual_table(statistics),
-        comparison_table(statistics),
-        sensitivity_table(statistics),
-        swing_table(statistics),
-    )
-    return tuple(table for table in tables if table.rows)
+    kinds = (strehl_table, residual_table, comparison_table, sensitivity_table, swing_table)
+    return tuple(table for kind in kinds if (table := kind(statistics)).rows)
 
 
 def strehl_table(statistics: StudyStatistics) -> Table:
