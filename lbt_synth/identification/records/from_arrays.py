@@ -9,16 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError
+from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
-from lbt_synth.identification.records.faults import (
-    equal_runs,
-    fill,
-    find_outliers,
-    find_saturated,
-    find_stuck,
-    mark,
-    runs,
-)
 from lbt_synth.identification.records.health import Finding, RecordHealth, findings_in, merge_notes
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.units import nm_per
@@ -202,20 +194,20 @@ def _judge_series(
             found = finder(np.where(np.isfinite(column), column, 0.0), good)
             findings += findings_in(found, kind, name, axis)
             good &= ~found
-        out[:, axis] = fill(column, good)
+        out[:, axis] = faults.fill(column, good)
         all_good &= good
     return out, all_good
 
 
 def _find_clipped(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find commands at a limit; zeros are those of an open loop."""
-    return find_saturated(series, good & (series != 0))
+    return faults.find_saturated(series, good & (series != 0))
 
 
 _MEASURED: Finders = (
-    ("saturated", find_saturated),
-    ("stuck", find_stuck),
-    ("outlier", find_outliers),
+    ("saturated", faults.find_saturated),
+    ("stuck", faults.find_stuck),
+    ("outlier", faults.find_outliers),
 )
 _COMMANDED: Finders = (("saturated", _find_clipped),)
 
@@ -223,10 +215,10 @@ _COMMANDED: Finders = (("saturated", _find_clipped),)
 def _held_commands(commands: FloatArray, good: BoolArray) -> Iterator[Finding]:
     """Yield where the loop was open, and where its commands stood still."""
     frames, is_zero = len(commands), np.all(commands == 0, axis=1)
-    is_open = mark(_longest(runs(is_zero & good)), frames)
+    is_open = faults.mark(_longest(faults.runs(is_zero & good)), frames)
     yield from findings_in(is_open, "loop open", "commands", spoils=False)
     for axis, column in enumerate(commands.T):
-        held = mark(_longest(equal_runs(column, good)), frames) & ~is_open
+        held = faults.mark(_longest(faults.equal_runs(column, good)), frames) & ~is_open
         yield from findings_in(held, "held", "commands", axis, spoils=False)
 
 

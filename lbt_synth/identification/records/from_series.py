@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification.records import units
 from lbt_synth.identification.records.column_selection import Series, join_names
 from lbt_synth.identification.records.columns import Column
 from lbt_synth.identification.records.contents import Contents
@@ -15,13 +16,6 @@ from lbt_synth.identification.records.from_arrays import loop_record
 from lbt_synth.identification.records.health import merge_notes
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
-from lbt_synth.identification.records.units import (
-    density_unit,
-    hz_per,
-    nm_per,
-    same_unit,
-    seconds_per,
-)
 from lbt_synth.models import PositionLoop
 from lbt_synth.validation import FloatArray, number
 
@@ -59,7 +53,7 @@ def build_record(
         u_unit = _find_unit(u, command_unit or unit, contents, kind, "command_unit")
     (clock,) = series.columns.get("times", [None])
     (counter,) = series.columns.get("frame_numbers", [None])
-    times = None if clock is None else seconds_per(clock.unit) * clock.values
+    times = None if clock is None else units.seconds_per(clock.unit) * clock.values
     if clock is not None and not clock.unit:
         contents.notes.append(f"{clock.name} was taken for seconds")
     record = loop_record(
@@ -125,7 +119,7 @@ def _find_unit(
         raise ProblemError(
             f"nothing tells the unit of {join_names(chosen)}; give {option} ({_UNITS[kind]})."
         )
-    if own and given is not None and not same_unit(own, given):
+    if own and given is not None and not units.same_unit(own, given):
         raise ProblemError(f"{option} must be that of the data, {own!r}; got {given!r}.")
     return own or str(given)
 
@@ -144,7 +138,7 @@ def _build_spectrum(
     series: Series, contents: Contents, unit: str, *, diameter_m: float | None, **facts: Any
 ) -> SpectrumRecord:
     densities, (frequency,) = series.columns[series.role], series.columns["frequency"]
-    parted = density_unit(unit)
+    parted = units.density_unit(unit)
     if parted is None:
         raise ProblemError(
             f"the unit of a density is a square over Hz (nm^2/Hz, mas^2/Hz), or a length or angle "
@@ -163,14 +157,14 @@ def _build_spectrum(
     if not complete.all():
         contents.notes.append(f"{int(np.sum(~complete))} rows with gaps were left out")
     table = table[complete]
-    scaled = nm_per(name, diameter_m=diameter_m) ** power * table[:, 1:]
+    scaled = units.nm_per(name, diameter_m=diameter_m) ** power * table[:, 1:]
     if power == 1:
         if np.any(scaled < 0):
             raise ProblemError("an amplitude density must be at least 0; got a negative one.")
         contents.notes.append("amplitude densities were squared")
         scaled = scaled**2
     return SpectrumRecord(
-        frequency_hz=hz_per(frequency.unit) * table[:, 0],
+        frequency_hz=units.hz_per(frequency.unit) * table[:, 0],
         density_nm2_hz=scaled,
         diameter_m=diameter_m,
         notes=merge_notes(contents.notes),
