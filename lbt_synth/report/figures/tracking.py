@@ -120,7 +120,8 @@ def _history_curves(
     for update, end_s in zip(history, ends, strict=True):
         begin_s = update.time_s - start_s
         for frequency in update.frequencies_hz:  # lines that are not joined
-            held += [(begin_s, frequency), (end_s, frequency), (np.nan, np.nan)]
+            if begin_s < end_s:
+                held += [(begin_s, frequency), (end_s, frequency), (np.nan, np.nan)]
             if not update.switched:
                 kept.append((begin_s, frequency))
         fitted += [(update.middle_s - start_s, value) for value in update.fitted_hz]
