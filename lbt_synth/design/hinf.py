@@ -12,9 +12,9 @@ from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_level
 from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
 from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.linear.riccati.gamma import gamma_riccati, least_gamma
-from lbt_synth.linear.riccati.invisible_disturbance import worst_invisible_disturbance
 from lbt_synth.validation import FloatArray, choice, frozen_copy, number
 
 if TYPE_CHECKING:

@@ -61,9 +61,7 @@ class BalancedProblem:
         values, vectors = np.linalg.eigh((moments + moments.T) / 2)
         pairs = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
         n = self.basis.shape[1]
-        return Witness(
-            states=frozen_copy(self.basis @ pairs[:n]), disturbances=frozen_copy(pairs[n:])
-        )
+        return Witness(states=self.basis @ pairs[:n], disturbances=pairs[n:])
 
 
 def balance(
