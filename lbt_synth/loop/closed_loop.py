@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
@@ -215,32 +213,33 @@ def loop_matrices(
     (q, n), m = sensor.shape, influence.shape[1]
     each = np.eye(m)
     states = order + mirror.n_states * m + n
+    x, u = slice(0, order), slice(order, states - n)
+    r = slice(states - n, states)
     entry, through = np.kron(mirror.B[:, None], each), mirror.D * influence
 
-    def rows(*parts: FloatArray) -> FloatArray:
-        whole = [np.broadcast_to(part, (*lead, *part.shape[-2:])) for part in parts]
-        return np.concatenate(whole, axis=-2)
+    measured = np.zeros((q, states))  # y = g measured x + noise
+    measured[:, r] = sensor
+    command0 = np.zeros((*lead, m, states))  # u = (command0 + g command1) x + D noise
+    command0[..., x] = C
+    command1 = D @ measured
+    residual0 = -through @ command0  # phi_res = (...) x + phi_tot - through D noise
+    residual0[..., u] -= influence @ np.kron(mirror.C, each)
+    residual1 = -through @ command1
 
-    def place(part: npt.NDArray[Any], before: int, width: int) -> FloatArray:
-        """Put columns of zeros before and after a part."""
-        out = np.zeros((*part.shape[:-1], width))
-        out[..., before : before + part.shape[-1]] = part
-        return out
-
-    measured = place(sensor, states - n, states)  # y = g measured x + noise
-    command0, command1 = place(C, 0, states), D @ measured  # u = (command0 + g command1) x + ...
-    noise = place(D, n, n + q)  # ... D noise
-    moved = place(influence @ np.kron(mirror.C, each), order, states)
-    residual0, residual1 = -through @ command0 - moved, -through @ command1
-    direct = np.eye(n, n + q) - through @ noise  # phi_res = (...) x + phi_tot - through D noise
-    kept = place(np.kron(mirror.A, each), order, states)
-    A0 = rows(place(A, 0, states), entry @ command0 + kept, residual0)
-    A1 = rows(B @ measured, entry @ command1, residual1)
-    return (
-        A0,
-        A1,
-        rows(place(B, n, n + q), entry @ noise, direct),
-        rows(residual0, command0, np.zeros((q, states))),
-        rows(residual1, command1, measured),
-        rows(direct, noise, np.eye(q, n + q, k=n)),
-    )
+    A0, A1 = np.zeros((2, *lead, states, states))
+    inputs = np.zeros((*lead, states, n + q))
+    A0[..., x, x], A1[..., x, :], inputs[..., x, n:] = A, B @ measured, B
+    A0[..., u, :], A1[..., u, :] = entry @ command0, entry @ command1
+    inputs[..., u, n:] = entry @ D
+    A0[..., u, u] += np.kron(mirror.A, each)
+    A0[..., r, :], A1[..., r, :] = residual0, residual1
+    inputs[..., r, :n], inputs[..., r, n:] = np.eye(n), -through @ D
+    outputs0, outputs1 = np.zeros((2, *lead, n + m + q, states))
+    outputs0[..., :n, :], outputs0[..., n : n + m, :] = residual0, command0
+    outputs1[..., :n, :], outputs1[..., n : n + m, :] = residual1, command1
+    outputs1[..., n + m :, :] = measured
+    direct = np.zeros((*lead, n + m + q, n + q))
+    direct[..., :n, :] = inputs[..., r, :]
+    direct[..., n : n + m, n:] = D
+    direct[..., n + m :, n:] = np.eye(q)
+    return A0, A1, inputs, outputs0, outputs1, direct
