@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,13 +144,17 @@ def close_loop(
     return ClosedLoop(system=system, hardware=hardware, controller=controller, sensor_gain=gain)
 
 
-def spectral_radii(
-    hardware: LoopHardware, controller: Controller, sensor_gains: FloatArray
-) -> FloatArray:
-    """Spectral radius of the closed loop for many sensor gains at once, (g,)."""
+def radii_by_gain(
+    hardware: LoopHardware, controller: Controller
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
     A0, A1, *_ = _checked_loop_matrices(hardware, controller)
-    loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
-    return np.asarray(np.max(np.abs(np.linalg.eigvals(loops)), axis=1))
+
+    def radii(sensor_gains: FloatArray) -> FloatArray:
+        loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
+        return np.asarray(np.max(np.abs(np.linalg.eigvals(loops)), axis=1))
+
+    return radii
 
 
 def _checked_loop_matrices(

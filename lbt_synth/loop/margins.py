@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import resonance_edges
-from lbt_synth.loop.closed_loop import ClosedLoop, spectral_radii
+from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
@@ -135,23 +135,25 @@ def stable_sensor_gains(
     """
     centre = number(nominal, "nominal", above=0)
 
-    def excess(gain: float) -> float:
-        return float(spectral_radii(hardware, controller, np.array([gain]))[0]) - 1
+    radii = radii_by_gain(hardware, controller)
 
-    if not excess(centre) < 0:
+    def is_stable(gain: float) -> bool:
+        return float(radii(np.array([gain]))[0]) < 1
+
+    if not is_stable(centre):
         return float("nan"), float("nan")
     ends = []
     for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
         count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
         gains = np.asarray(centre * ratio ** np.arange(count + 1), dtype=np.float64)
-        outside = np.nonzero(spectral_radii(hardware, controller, gains) >= 1)[0]
+        outside = np.nonzero(radii(gains) >= 1)[0]
         if outside.size == 0:
             ends.append(open_end)
             continue
         inner, outer = gains[outside[0] - 1], gains[outside[0]]
         for _ in range(60):
             middle = (inner + outer) / 2
-            inner, outer = (middle, outer) if excess(middle) < 0 else (inner, middle)
+            inner, outer = (middle, outer) if is_stable(middle) else (inner, middle)
         ends.append(float(inner))
     return ends[0], ends[1]
 

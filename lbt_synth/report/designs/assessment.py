@@ -22,7 +22,7 @@ from lbt_synth.loop import (
     stable_sensor_gains,
     strehl,
 )
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, spectral_radii
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.studies import RobustnessMap, robustness_map
@@ -219,7 +219,7 @@ def stable_intervals(
     found = []
     if margins is not None:
         found.append((margins.gain_low * loop.sensor_gain, margins.gain_high * loop.sensor_gain))
-    radii = spectral_radii(hardware, controller, _GAINS)
+    radii = radii_by_gain(hardware, controller)(_GAINS)
     inside = np.nonzero(radii < 1 - STABILITY_MARGIN)[0]
     for run in np.split(inside, np.nonzero(np.diff(inside) > 1)[0] + 1):
         if not run.size:
