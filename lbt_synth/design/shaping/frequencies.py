@@ -35,13 +35,7 @@ class CheckedFields:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Band(CheckedFields):
-    """Band from ``low_hz`` to ``high_hz``, both included, from which terms and demands derive.
-
-    Raises
-    ------
-    ProblemError
-        If the ends are no numbers of at least 0 in increasing order.
-    """
+    """Band from ``low_hz`` to ``high_hz``, both included, from which terms and demands derive."""
 
     low_hz: NotNegative
     high_hz: Finite
