@@ -204,10 +204,8 @@ class BatchResult:
 def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) -> FloatArray:
     """Return points ``start`` to ``stop`` of a study's sampling, (., dimensions) in [0, 1).
 
-    The seed fixes every point, whichever are requested with it. Sobol's sequence does not depend
-    on the number of samples: a longer one begins with the same points. Each of its blocks of 2^k
-    points is balanced, so a power of two is the best number of samples; any other is allowed. A
-    Latin hypercube is made as a whole, once per process.
+    The seed fixes every point. A longer Sobol sequence begins with the same points, and is
+    balanced where it has 2^k of them. A Latin hypercube is made as a whole, once per process.
 
     Examples
     --------

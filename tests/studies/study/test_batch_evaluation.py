@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.plants import LBT_YAML
 from support.studies import BASE, LBT_TEXT, study_file
 
 import lbt_synth as lbt
@@ -13,6 +14,7 @@ from lbt_synth.studies.study import batch_evaluation
 from lbt_synth.studies.study import reference_evaluation as reference
 
 COUNT = 8
+NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
 GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
 
 
@@ -248,6 +250,41 @@ def test_a_filter_that_cannot_be_designed(tmp_path):
     found = lbt.studies.evaluate_samples(study, values, 0)
     assert {f.row for f in found.failures} == {3}
     assert np.isfinite(found.columns["own.strehl"]).sum() == COUNT - 1
+
+
+UNREAD = ("version", "design", "simulation", "robustness", "end_to_end")
+
+
+def numbers_of(section, path=""):
+    """Yield the path and the value of each number."""
+    if isinstance(section, dict):
+        for key, value in section.items():
+            yield from numbers_of(value, f"{path}.{key}" if path else key)
+    elif isinstance(section, list):
+        for i, value in enumerate(section):
+            yield from numbers_of(value, f"{path}[{i}]")
+    elif isinstance(section, int | float):
+        yield path, section
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        number
+        for number in numbers_of(lbt.load_config(LBT_YAML).settings.model_dump())
+        if not number[0].startswith(UNREAD) and number[0] != "loop.frame_rate_hz"
+    ],
+)
+def test_every_number_of_a_configuration(tmp_path, path, value):
+    """Whether it is one value for all or an array, the answers are those of each by itself."""
+    other = value + 1 if isinstance(value, int) else 0.96 * value
+    agree(
+        tmp_path,
+        base=LBT_TEXT,
+        controllers=BOTH,
+        parameters=f"{{'{path}': {{list: [{value!r}, {other!r}]}}, {NOISE}}}",
+        count=COUNT,
+    )
 
 
 class NewSensor(SensorSection):
