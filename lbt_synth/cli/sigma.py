@@ -27,11 +27,15 @@ def run(arguments: Namespace) -> Report:
     units = json_units(LoopMargins) | ({"gamma": "nm", "rms": "nm"} if physical else {})
     report = Report(data={"designs": margins, "units": units, "sensor_gain": arguments.sensor_gain})
     shown = [each for each in columns(LoopMargins) if each.heading]
-    keys = ("gamma", "stable", *(each.key for each in shown))
+    quantities = [("norm", "gamma", units.get("gamma", "")), ("stable", "stable", "")]
+    quantities += [(each.heading, each.key, each.unit) for each in shown]
     report.add_table(
         f"Margins at sensor gain {arguments.sensor_gain:g}",
-        ("design", "norm [nm]" if physical else "norm", "stable", *(each.title for each in shown)),
-        [(name, *(known.get(key) for key in keys)) for name, known in margins.items()],
+        ("quantity", *margins, "unit"),
+        [
+            (heading, *(known.get(key) for known in margins.values()), unit)
+            for heading, key, unit in quantities
+        ],
     )
     report.note_written(save_figure(figure, arguments.output))
     return report
