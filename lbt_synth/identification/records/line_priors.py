@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
-from lbt_synth.identification.records.column_selection import CLOCKS
+from lbt_synth.identification.records.column_selection import CLOCKS, join_names
 from lbt_synth.identification.records.columns import Column
 from lbt_synth.identification.records.contents import TEXTS, read_contents
 from lbt_synth.storage.atomic_files import require_ending
@@ -138,10 +138,6 @@ def _read_lines(path: Path) -> list[LinePrior]:
 
 def _frequency_rows(columns: list[Column]) -> FloatArray:
     """Return frequencies and, if there are any, errors, (lines, 1 or 2), NaN without an error."""
-    if len(columns) > 2:
-        raise ProblemError(
-            f"it must have one or two columns, frequency and error; got {len(columns)}."
-        )
     found = {
         "error" if _ERROR.match(each.name.strip()) else each.role: each.values
         for each in columns
@@ -151,8 +147,8 @@ def _frequency_rows(columns: list[Column]) -> FloatArray:
         found = dict(zip(_HEADINGS, (each.values for each in columns), strict=False))
     if "frequency" not in found or len(found) < len(columns) or not found.keys() <= {*_HEADINGS}:
         raise ProblemError(
-            "its columns must be frequency_hz, and frequency_error_hz or error_hz if there is "
-            f"one; got {', '.join(each.name for each in columns)}."
+            "its one or two columns must be frequency_hz, and frequency_error_hz or error_hz if "
+            f"there is one; got {join_names(columns)}."
         )
     gaps = np.flatnonzero(np.isnan(found["frequency"]))
     if gaps.size:

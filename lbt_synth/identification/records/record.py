@@ -29,6 +29,7 @@ _BRIDGED_FRAMES = 3
 _BRIDGED_FRACTION = 0.01
 _NOT_KNOWN = "correction not known"
 _LIMITS: dict[str, dict[str, Any]] = {
+    "frame_rate_hz": {"above": 0},
     "delay_frames": {"at_least": 1, "at_most": 100},
     "diameter_m": {"above": 0},
     "obstruction": {"at_least": 0, "below": 1},
@@ -118,9 +119,8 @@ class LoopRecord:
             why = f"to match measurements {y.shape}"
             u = matrix(self.commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
             set_fields(self, commands=u)
-        set_fields(self, frame_rate_hz=number(self.frame_rate_hz, "frame_rate_hz", above=0))
         for name, limits in _LIMITS.items():
-            if (value := getattr(self, name)) is not None:
+            if (value := getattr(self, name)) is not None or name == "frame_rate_hz":
                 set_fields(self, **{name: number(value, name, **limits)})
         for name in ("usable", "measured", "commanded"):
             if (given := getattr(self, name)) is not None:

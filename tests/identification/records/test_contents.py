@@ -106,6 +106,15 @@ def test_nulls_of_scaled_columns_and_images(tmp_path):
     assert lbt.load_record(scaled).measurements[11, 0] == pytest.approx(3 - 9.98)
 
 
+def test_nulls_of_ascii_columns(tmp_path):
+    column = fits.Column("POL", "F10.3", array=1.5 * np.arange(40), null="---", unit="nm")
+    path = hdus(tmp_path / "a.fits", fits.TableHDU.from_columns([column]), FPS=RATE)
+    path.write_bytes(path.read_bytes().replace(b"     4.500", b"       ---"))
+    seen = lbt.load_record(path)
+    assert np.flatnonzero(~seen.usable).tolist() == [3]
+    assert seen.measurements[4, 0] == 6.0
+
+
 def test_a_name_and_a_header_of_two_units(tmp_path, series):
     path = table(
         tmp_path / "a.fits", fits.Column("POL_mas", "D", array=series[0][:, 0], unit="nm"), FPS=RATE
