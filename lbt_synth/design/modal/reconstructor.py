@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.validation import FloatArray, frozen_copy, integer, matrix, number, real_array
+from lbt_synth.validation import FloatArray, integer, matrix, number, read_only, real_array
 
 _NAMED = 5  # modes that a message lists
 _EMPTY = 1e-8  # part of a mode that has to be left by a projection
@@ -62,7 +62,7 @@ class Reconstructor:
     @property
     def noise_amplification(self) -> FloatArray:
         """Standard deviation of each mode for slopes with independent noise of 1, (n,)."""
-        return frozen_copy(np.linalg.norm(self.matrix, axis=1))
+        return read_only(np.linalg.norm(self.matrix, axis=1))
 
 
 def reconstructor(
@@ -134,13 +134,9 @@ def reconstructor(
             f"do not and {count} to keep: some modes give the same slopes. Try "
             f"kept={rank} or less, or a condition below {values[0] / values[rank - 1]:.3g}."
         )
-    inverse = (right[:count].T / values[:count]) @ left[:, :count].T
-    return Reconstructor(
-        interaction_matrix=D,
-        matrix=frozen_copy(inverse),
-        singular_values=frozen_copy(values),
-        kept=count,
-    )
+    inverse = read_only((right[:count].T / values[:count]) @ left[:, :count].T)
+    sizes = read_only(values)
+    return Reconstructor(interaction_matrix=D, matrix=inverse, singular_values=sizes, kept=count)
 
 
 def project_out(
@@ -227,7 +223,7 @@ def project_out(
             status="projection",
             residual=float(overlap.max()),
         )
-    return frozen_copy(out)
+    return read_only(out)
 
 
 def mode_indices(indices: Any, name: str, n: int) -> np.ndarray:

@@ -33,7 +33,7 @@ _BETWEEN = 33
 _RELAXED = 1e-6  # relaxations below this are none
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class SequenceSolution:
     """Coefficients in one basis, and how they were found."""
 
@@ -70,14 +70,8 @@ def solve_sequence(
         c = start
     if not convex:
         c = _lower_objective(programme, c, values)
-    return SequenceSolution(
-        channel=channel,
-        grid=programme.grid,
-        coefficients=c,
-        objectives_nm2=tuple(values),
-        programmes=programme.solved,
-        status=programme.status,
-    )
+    solved, status = programme.solved, programme.status
+    return SequenceSolution(channel, programme.grid, c, tuple(values), solved, status)
 
 
 def _minimize_at_unit_gain(programme: _Programme) -> FloatArray:

@@ -70,10 +70,8 @@ class EnsembleVibration:
         direction = real_array(self.direction, "direction")
         size = np.linalg.norm(np.atleast_1d(direction), axis=-1, keepdims=True)
         if direction.ndim not in (1, 2) or not np.all(size > 0):
-            raise ProblemError(
-                "direction must be a vector over the modes, or one per loop, and not zero; got "
-                f"shape {direction.shape}."
-            )
+            wanted = "a vector over the modes, or one per loop, and not zero"
+            raise ProblemError(f"direction must be {wanted}; got shape {direction.shape}.")
         set_fields(self, direction=frozen_copy(direction / size))
 
 
@@ -223,15 +221,12 @@ class LoopEnsemble:
         out, p, nyquist = [], self.loops, hardware.frame_rate_hz / 2
         for line in self.vibrations:
             if line.direction.shape[-1] != hardware.modes:
-                raise DimensionError(
-                    f"the direction of a vibration must have {hardware.modes} components, one per "
-                    f"mode; got {line.direction.shape[-1]}."
-                )
+                wanted = f"{hardware.modes} components, one per mode"
+                got = line.direction.shape[-1]
+                raise DimensionError(f"the direction of a vibration must have {wanted}; got {got}.")
             if not np.max(line.frequency_hz) < nyquist:
-                raise ProblemError(
-                    f"a vibration must lie below the Nyquist frequency {nyquist:.6g} Hz; got "
-                    f"{np.max(line.frequency_hz):.6g} Hz."
-                )
+                limit, got = f"the Nyquist frequency {nyquist:.6g} Hz", np.max(line.frequency_hz)
+                raise ProblemError(f"a vibration must lie below {limit}; got {got:.6g} Hz.")
             given = {name: getattr(line, name) for name in ("frequency_hz", "rms_nm", "damping")}
             filled = {k: np.broadcast_to(v, (p,)) for k, v in given.items() if v is not None}
             direction = np.broadcast_to(line.direction, (p, hardware.modes))

@@ -32,7 +32,7 @@ _PROBES = 5  # frequencies at which partial fractions are checked by solving lin
 _AGREEMENT = 1e-9
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Samples:
     """A subloop's elements and the spectra at the f frequencies of a quadrature."""
 
@@ -79,14 +79,8 @@ def _sample(
         density = spectrum.psd(frequency)
         density = np.asarray(density[0] if len(density) == 1 else density) * weight
         densities.append((density, modes))
-    return _Samples(
-        delay=1 / z,
-        first=mirrors[0][:, 0, 0],
-        second=mirrors[-1][:, 0, 0],
-        controller=controller,
-        white=2 / frame_rate_hz * weight,
-        densities=densities,
-    )
+    first, second = mirrors[0][:, 0, 0], mirrors[-1][:, 0, 0]
+    return _Samples(1 / z, first, second, controller, 2 / frame_rate_hz * weight, densities)
 
 
 def graded_edges(poles: ComplexArray) -> FloatArray:

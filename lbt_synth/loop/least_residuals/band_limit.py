@@ -150,7 +150,7 @@ def _checked_band(band_hz: tuple[float, float], nyquist_hz: float) -> tuple[floa
     return low, high
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Band:
     """One mode with a band, prepared for many densities of the sinusoid."""
 
@@ -253,11 +253,5 @@ def _prepare_band(mode: ModeSpectrum, ends: tuple[float, float], total: float) -
     edges = np.unique(np.clip(np.concatenate(cuts), *ends))
     edges = edges[np.concatenate([[True], np.diff(edges) > 1e-4 * width / _PANELS])]
     x, q = gauss_panels(edges, _ORDER)
-    return _Band(
-        mode=mode,
-        reference=reference,
-        outside=panels.integrals[~inside].sum(axis=0),
-        x=x,
-        quadrature=q,
-        base=mode.power(x) + noise,
-    )
+    outside = panels.integrals[~inside].sum(axis=0)
+    return _Band(mode, reference, outside, x, q, mode.power(x) + noise)

@@ -77,7 +77,7 @@ def _gram(zeros: tuple[float, ...]) -> FloatArray:
     return np.asarray(1 / (1 - np.outer(a, a)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     """Best prediction of a process whose spectrum has given integrals of its logarithm."""
 
@@ -97,8 +97,7 @@ class Prediction:
                 tails[i] = (value - float(polyval(a, f[:whole]))) / a**whole
             else:
                 tails[i] = float(polyval(a, f[whole:]))
-        mean_log = float(moments[0])
-        return Prediction(inner=inner, mean_log=mean_log, coefficients=f[:whole], tails=tails)
+        return Prediction(inner, float(moments[0]), f[:whole], tails)
 
     @property
     def _kernels(self) -> FloatArray:
