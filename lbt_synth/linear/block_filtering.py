@@ -112,12 +112,7 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
 
 
 class BatchedSystems:
-    """Small systems of the same sizes that filter one series each.
-
-    Parameters
-    ----------
-    A, B, C, D : (N, n, n), (N, n, m), (N, p, n), (N, p, m) ndarray
-        The systems, ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
+    """Small systems (N, n, n), (N, n, m), (N, p, n), (N, p, m) that filter one series each.
 
     Examples
     --------

@@ -49,13 +49,6 @@ class GammaEquation:
 
     H1 is positive semidefinite and holds no difference of large numbers, so the
     doubling starts inside the stabilising solution's reach.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem.
-    start : FilterRiccati
-        The Kalman filter's solution.
     """
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
