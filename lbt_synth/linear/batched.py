@@ -24,7 +24,7 @@ def frobenius_norms(stack: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(squares), dtype=np.float64)
 
 
-def solve_stack(matrices: FloatArray, right: FloatArray) -> FloatArray:
+def solve_stack(matrices: npt.NDArray[Entry], right: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
     """Solve each system of a stack, (N, n, n) and (N, n, m); a singular one gives nan.
 
     Examples
@@ -35,9 +35,9 @@ def solve_stack(matrices: FloatArray, right: FloatArray) -> FloatArray:
     [0.5, nan]
     """
     try:
-        return np.asarray(np.linalg.solve(matrices, right), dtype=np.float64)
+        return np.asarray(np.linalg.solve(matrices, right))  # type: ignore[arg-type]
     except np.linalg.LinAlgError:
-        out = np.full(right.shape, np.nan)
+        out = np.full_like(right, np.nan)
         for i in range(len(matrices)):
             try:
                 out[i] = np.linalg.solve(matrices[i], right[i])

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import matrix_balance, schur
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear.batched import solve_stack
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -226,14 +227,9 @@ def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     """Transfer matrices at points z, by one linear system per point; inf at a pole."""
     n, m = system.B.shape
     pencil = z[:, None, None] * np.eye(n) - system.A
-    try:
-        states = np.linalg.solve(pencil, np.broadcast_to(system.B, (z.size, n, m)))
-    except np.linalg.LinAlgError:
-        out = np.full((z.size, len(system.C), m), np.inf, dtype=np.complex128)
-        for i in range(z.size if z.size > 1 else 0):
-            out[i] = pointwise_response(system, z[i : i + 1])[0]
-        return out
-    return np.asarray(system.C @ states + system.D, dtype=np.complex128)
+    entry = np.broadcast_to(system.B.astype(np.complex128), (z.size, n, m))
+    response = system.C @ solve_stack(pencil, entry) + system.D
+    return np.where(np.isnan(response), np.inf, response)
 
 
 def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
