@@ -4,14 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    wait,
-)
+from concurrent import futures
 from contextlib import nullcontext
 from functools import partial
 from typing import Any
@@ -34,11 +27,11 @@ _MOST_DEATHS = 40  # in a row, without a batch that comes back
 _IN_FLIGHT = 2  # batches per worker, so that none waits
 
 
-class _InlineExecutor(Executor):
+class _InlineExecutor(futures.Executor):
     """Executor that runs each call at once in this process."""
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
+        future: futures.Future[Any] = futures.Future()
         try:
             future.set_result(fn(*args, **kwargs))
         except Exception as error:
@@ -50,13 +43,13 @@ class _Workers:
     """What evaluates batches: the caller's executor, this process, or a pool of its own."""
 
     def __init__(
-        self, study: Study, evaluate: Evaluate, jobs: int, executor: Executor | None
+        self, study: Study, evaluate: Evaluate, jobs: int, executor: futures.Executor | None
     ) -> None:
         self._study, self._jobs = study, jobs
         self._call = partial(evaluate_timed, evaluate, study)
         self._executor = executor or (WorkerPool(jobs) if jobs > 1 else _InlineExecutor())
         self._is_own = executor is None and jobs > 1
-        self._broken: BrokenExecutor | None = None
+        self._broken: futures.BrokenExecutor | None = None
         self._deaths = 0  # in a row
 
     def __enter__(self) -> _Workers:
@@ -66,20 +59,20 @@ class _Workers:
         if self._is_own:
             self._executor.__exit__(*error)
 
-    def submit(self, rows: RowRange) -> Future[TimedBatch]:
+    def submit(self, rows: RowRange) -> futures.Future[TimedBatch]:
         """Begin to evaluate some rows."""
         try:
             return self._executor.submit(self._call, self._study.values(*rows), rows[0])
-        except BrokenExecutor as error:
-            lost: Future[TimedBatch] = Future()
+        except futures.BrokenExecutor as error:
+            lost: futures.Future[TimedBatch] = futures.Future()
             lost.set_exception(error)
             return lost
 
-    def receive(self, future: Future[TimedBatch], rows: RowRange) -> TimedBatch | None:
+    def receive(self, future: futures.Future[TimedBatch], rows: RowRange) -> TimedBatch | None:
         """Wait for a batch and return it, None if its process died."""
         try:
             batch = future.result()
-        except BrokenExecutor as error:
+        except futures.BrokenExecutor as error:
             self._broken = error
             return None
         except Exception as error:
@@ -135,7 +128,7 @@ def run_batches(
     *,
     evaluate: Evaluate,
     jobs: int = 1,
-    executor: Executor | None = None,
+    executor: futures.Executor | None = None,
     workers: int | None = None,
 ) -> Generator[TimedBatch, None, None]:
     """Yield the results of all rows of some ranges, in the order in which they arrive.
@@ -158,14 +151,14 @@ def _run_until_death(
     engine: _Workers, queue: BatchQueue, most: int
 ) -> Generator[TimedBatch, None, list[RowRange]]:
     """Yield the batches of a queue until a process dies, and return those that were lost."""
-    running: dict[Future[TimedBatch], RowRange] = {}
+    running: dict[futures.Future[TimedBatch], RowRange] = {}
     dead: list[RowRange] = []
     try:
         while running or (queue.left and not dead):
             while queue.left and not dead and len(running) < most:
                 rows = queue.take()
                 running[engine.submit(rows)] = rows
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
                 rows = running.pop(future)
                 batch = engine.receive(future, rows)
                 if batch is None:
@@ -200,7 +193,7 @@ def _run_alone(engine: _Workers, rows: RowRange) -> Iterator[TimedBatch]:
 def _describe_failure(error: Exception, rows: RowRange) -> str:
     """Return what to say where a batch as a whole failed."""
     kept = "What is finished is kept"
-    if isinstance(error, CancelledError):
+    if isinstance(error, futures.CancelledError):
         why = "the executor cancelled what was running: its scheduler is gone, perhaps"
         return f"{why}. {kept}: start again."
     text = f"{type(error).__name__}: {error}".rstrip(".")
