@@ -9,19 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from lbt_synth import models
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
 from lbt_synth.errors import ConfigError
-from lbt_synth.models import (
-    ModalTurbulence,
-    Vibration,
-    modal_turbulence,
-    noll_orders,
-    pyramid_modal_noise_nm,
-)
 from lbt_synth.report.figures import modal_figure
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, integer
@@ -58,7 +52,9 @@ def run(arguments: Namespace) -> Report:
     )
     noise, assumed = _noise_nm(config, count)
     with show_spinner("designing", quiet=arguments.json):
-        air = modal_turbulence(atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz)
+        air = models.modal_turbulence(
+            atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz
+        )
         uniform, gains, residuals = _design_controllers(config, air, noise)
     rows = _order_rows(air.rms_nm, noise, gains, *residuals.values())
     whole = {name: _total_rms(rms) for name, rms in residuals.items()}
@@ -95,7 +91,7 @@ def run(arguments: Namespace) -> Report:
 
 
 def _design_controllers(
-    config: Config, air: ModalTurbulence, noise: FloatArray
+    config: Config, air: models.ModalTurbulence, noise: FloatArray
 ) -> tuple[float, FloatArray, dict[str, FloatArray]]:
     """Return the best single gain, the best of each mode, and the residuals by controller [nm]."""
     hardware = config.hardware
@@ -150,16 +146,16 @@ def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
     if pyramid is None:
         return np.full(count, one), f"noise: {one:.6g} nm on every mode (assumed)."
     modulation = pyramid.modulation_lambda_over_d
-    noise = pyramid_modal_noise_nm(one, modes=count, modulation_lambda_over_d=modulation)
+    noise = models.pyramid_modal_noise_nm(one, modes=count, modulation_lambda_over_d=modulation)
     return noise, (
         f"noise: {one:.6g} nm on tip and tilt, less on modes of higher order, down to "
         f"{noise[-1]:.6g} nm (assumed, of a pyramid with a modulation of {modulation:g} lambda/D)."
     )
 
 
-def _axis_vibrations(config: Config, count: int) -> dict[int, list[Vibration]]:
+def _axis_vibrations(config: Config, count: int) -> dict[int, list[models.Vibration]]:
     """Return the vibrations of the model on tip and on tilt, each axis by itself."""
-    found: dict[int, list[Vibration]] = {}
+    found: dict[int, list[models.Vibration]] = {}
     for line in config.plant.vibrations:
         for axis, part in enumerate(line.direction):
             size = abs(part) * line.rms_nm
@@ -176,7 +172,7 @@ def _total_rms(rms: FloatArray) -> float:
 def _order_rows(
     turbulence: FloatArray, noise: FloatArray, gains: FloatArray, *residuals: FloatArray
 ) -> list[OrderRow]:
-    radial, _ = noll_orders(noise.size)
+    radial, _ = models.noll_orders(noise.size)
     rows = []
     for order in np.unique(radial):
         which = radial == order

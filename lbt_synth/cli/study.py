@@ -10,6 +10,7 @@ from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from lbt_synth import studies
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
@@ -17,18 +18,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.report import write_study_page
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.rows import column, fill_row, table_row
-from lbt_synth.studies import (
-    Failure,
-    Study,
-    StudyRun,
-    StudyStatistics,
-    estimate_study,
-    load_study,
-    replay_row,
-    run_study,
-    study_statistics,
-    summary_tables,
-)
 from lbt_synth.studies.study.cluster import connect_cluster
 from lbt_synth.studies.study.output_files import read_failures
 from lbt_synth.studies.study.run import FinishedStudy, output_paths
@@ -45,7 +34,7 @@ def run(arguments: Namespace) -> Report:
         raise ProblemError(f"--jobs must be at least 1; got {arguments.jobs}.")
     folder = Path(arguments.output)
     with show_spinner("reading the study, designing", quiet=arguments.json):
-        loaded = load_study(arguments.study, directory=folder)
+        loaded = studies.load_study(arguments.study, directory=folder)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:
         return _dry_run(loaded, arguments)
@@ -54,7 +43,7 @@ def run(arguments: Namespace) -> Report:
     return _run_study(loaded, folder, arguments)
 
 
-def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
+def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
     found, statistics, new = _compute(loaded, folder, pages, arguments)
     files = [found.results, found.failed, *pages]
@@ -77,7 +66,7 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             "statistics": asdict(statistics),
         },
         tables=[
-            *summary_tables(statistics),
+            *studies.summary_tables(statistics),
             *(replace(table, rows=table.rows[:_WORST]) for table in worst),
         ],
         notes=[
@@ -90,10 +79,10 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
 
 
 def _compute(
-    loaded: Study, folder: Path, files: Sequence[Path], arguments: Namespace
-) -> tuple[StudyRun, StudyStatistics, bool]:
+    loaded: studies.Study, folder: Path, files: Sequence[Path], arguments: Namespace
+) -> tuple[studies.StudyRun, studies.StudyStatistics, bool]:
     """Run a study and write its page; return also whether anything was left to compute."""
-    found: list[tuple[StudyStatistics, bool]] = []
+    found: list[tuple[studies.StudyStatistics, bool]] = []
 
     def summarise(results: FinishedStudy) -> None:
         found.append((_summarise(loaded, files, results), results.new))
@@ -104,7 +93,7 @@ def _compute(
             total=loaded.samples, what="samples", quiet=arguments.json, rate=True
         ) as count:
             try:
-                study_run = run_study(
+                study_run = studies.run_study(
                     loaded,
                     folder,
                     executor=executor,
@@ -133,10 +122,12 @@ def _engine(arguments: Namespace) -> Iterator[tuple[Executor | None, int | None]
         yield found
 
 
-def _summarise(loaded: Study, files: Sequence[Path], results: FinishedStudy) -> StudyStatistics:
+def _summarise(
+    loaded: studies.Study, files: Sequence[Path], results: FinishedStudy
+) -> studies.StudyStatistics:
     """Compute the statistics of a finished study, and write its page if it is missing."""
     page, *pdf = files
-    statistics = study_statistics(
+    statistics = studies.study_statistics(
         results.columns,
         loaded.parameter_names,
         [controller.name for controller in loaded.controllers],
@@ -148,7 +139,7 @@ def _summarise(loaded: Study, files: Sequence[Path], results: FinishedStudy) -> 
             page,
             statistics=statistics,
             failures=[
-                Failure(row=row, controller=name, error=error)
+                studies.Failure(row=row, controller=name, error=error)
                 for row, name, error in read_failures(page.parent)
             ],
             computing_s=results.computing_s,
@@ -166,7 +157,7 @@ def _duration(seconds: float) -> str:
     return f"{hours:.3g} h" if hours < 100 else f"{hours / 24:.3g} days"
 
 
-def _sampling_notes(loaded: Study) -> list[str]:
+def _sampling_notes(loaded: studies.Study) -> list[str]:
     if loaded.settings.sampling != "sobol" or loaded.samples & (loaded.samples - 1) == 0:
         return []
     return [
@@ -190,11 +181,11 @@ class StudyFacts:
     disk_bytes: float = column("space on the disk, about", unit="MB", scale=1e-6, format=".3g")
 
 
-def _dry_run(loaded: Study, arguments: Namespace) -> Report:
+def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     with _engine(arguments) as (_, workers):
         count = workers or arguments.jobs
     with show_spinner("measuring a batch", quiet=arguments.json):
-        cost = estimate_study(loaded, workers=count, local=workers is None)
+        cost = studies.estimate_study(loaded, workers=count, local=workers is None)
     where = f"{count} {'process' if count == 1 else 'processes'}"
     if workers is not None:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
@@ -213,11 +204,11 @@ def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     return report
 
 
-def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
+def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
     with show_spinner("replaying", quiet=arguments.json):
-        replay = replay_row(loaded, folder, arguments.row)
+        replay = studies.replay_row(loaded, folder, arguments.row)
     stored, fresh = replay.stored, replay.fresh
     report = Report(
         data={name: getattr(replay, name) for name in ("row", "parameters", "stored", "fresh")}
