@@ -43,7 +43,8 @@ def identification_figure(
         Rows: density of the pseudo-open-loop measurement, with the fit, its background and the
         lines' frequencies and rms; rms accumulated from low to high frequencies, of the
         disturbance, of the measurement that ran (its noise included) and of what the designs
-        would leave; cumulative periodogram of the innovations less that of white noise.
+        would leave; cumulative periodogram of the innovations less that of white noise. Titles
+        give the noise per frame and the sensor gain.
 
     Raises
     ------
@@ -192,10 +193,10 @@ def _cumulative_curves(axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -
         ("disturbance, fit", axis.fitted_nm2_hz - white, 0),
     ]
     if axis.data.closed:
-        densities.append(("measurement that ran", axis.data.measured / axis.sensor_gain**2, 1))
+        densities.append(("measurement that ran", axis.data.measured / axis.sensor_gain**2, 2))
     densities += [
         (f"residual, {name}", density, look)
-        for look, (name, density) in enumerate(residuals.items(), start=len(densities) - 1)
+        for look, (name, density) in enumerate(residuals.items(), start=3)
     ]
     step = np.gradient(f)
     return [

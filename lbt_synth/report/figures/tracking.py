@@ -127,7 +127,7 @@ def _history_curves(
         fitted += [(update.middle_s - start_s, value) for value in update.fitted_hz]
     fitted, kept = ([p for p in points if 0 < p[0] < last_s] for points in (fitted, kept))
     styles = (
-        ("the filter's", held, {"look": 0}),
+        ("the filter's", held, {"look": 5, "dash": 0}),  # no look of the first runs
         ("window, at its middle", fitted, {"look": 1, "line": False, "marker": "circle"}),
         ("kept", kept, {"look": 3, "line": False, "marker": "cross"}),
     )
