@@ -109,25 +109,19 @@ def _response_to_fit(spec: Specification, long: SequenceSolution) -> WeightedRes
     """Response of the long parameter at the nodes; the weight is spectra, and some everywhere."""
     f, w, nyquist = long.grid.nodes_hz, long.grid.weights_hz, long.channel.nyquist_hz
     cost = w * (frequency_costs(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
-    return WeightedResponse(
-        angles=2 * np.pi * f * long.channel.hardware.dt_s,
-        target=long.channel.command_rows(f) @ long.coefficients,
-        weight=np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist),
-    )
+    weight = np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist)
+    target = long.channel.command_rows(f) @ long.coefficients
+    z = np.exp(1j * (2 * np.pi * f * long.channel.hardware.dt_s))
+    return WeightedResponse(z, weight * target, weight)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class WeightedResponse:
     """A response over frequency, and the weight of an error of it."""
 
-    angles: FloatArray  # (f,) [radians per frame]
-    target: ComplexArray  # (f,)
+    z: ComplexArray  # (f,), on the unit circle
+    goal: ComplexArray  # the weighted response, (f,)
     weight: FloatArray  # (f,)
-
-    @property
-    def goal(self) -> ComplexArray:
-        """The weighted response, (f,)."""
-        return self.weight * self.target
 
     def coefficients(self, rows: ComplexArray) -> FloatArray:
         """Return the coefficients (n,) of functions (f, n) that fit the response best."""
@@ -136,7 +130,7 @@ class WeightedResponse:
 
     def residual(self, upper: ComplexArray, single: FloatArray) -> FloatArray:
         """Weighted error of the best fit with poles, real parts first, (2 f,)."""
-        functions = _basis_responses(np.exp(1j * self.angles), upper, single)
+        functions = _basis_responses(self.z, upper, single)
         q, _ = np.linalg.qr(_real_rows(self.weight[:, None] * functions))
         goal = _real_rows(self.goal)
         return np.asarray(goal - q @ (q.T @ goal))

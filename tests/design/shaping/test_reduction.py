@@ -11,7 +11,6 @@ def test_poles_of_a_response_are_found():
     z = np.exp(1j * angles)
     target = z**2 * (z + 0.3) * z / np.prod(z[:, None] - poles, axis=1)
     start = np.array([0.9 * np.exp(0.3j), 0.9 * np.exp(-0.3j), 0.1, 0.7])
-    response = WeightedResponse(angles=angles, target=target, weight=np.ones(400))
-    found, misfit = fit_poles(response, start)
+    found, misfit = fit_poles(WeightedResponse(z, target, np.ones(400)), start)
     assert misfit < 1e-6
     np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(poles), atol=1e-4)
