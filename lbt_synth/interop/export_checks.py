@@ -144,11 +144,6 @@ class Exported:
     error_single: float
 
 
-def plain_text(text: str) -> str:
-    """Replace every character that is not safe in a comment with an underscore."""
-    return _UNSAFE.sub("_", text)
-
-
 def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:
     """Join each label and its text."""
     return [f"{label}: {text}" if label else text for label, text in lines]
@@ -156,9 +151,7 @@ def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:
 
 def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
     """Return labelled lines on a file: version, method, gain file, loop, units, certificate."""
-    if gain_digest is not None and not (
-        isinstance(gain_digest, str) and _DIGEST.fullmatch(gain_digest)
-    ):
+    if gain_digest is not None and not _DIGEST.fullmatch(str(gain_digest)):
         raise ProblemError(
             "gain_digest must be the SHA-256 of a gain file, 64 hexadecimal digits; "
             f"got {gain_digest!r}."
@@ -169,10 +162,7 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
         ("gain file", "not named" if gain_digest is None else f"SHA-256 {gain_digest}"),
     ]
     if design.hardware is None:
-        lines += [
-            ("sampling", f"{design.controller.dt_s!r} s"),
-            ("units", "those of the problem"),
-        ]
+        lines += [("sampling", f"{design.controller.dt_s!r} s"), ("units", "those of the problem")]
     else:
         lines += [
             ("frame rate", f"{design.hardware.frame_rate_hz!r} Hz"),
@@ -183,4 +173,4 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
     checks = design.certificate.checks
     lines.append(("certificate", f"{len(checks)} checks passed"))
     lines += [("", f"{c.name}: {c.value:.6g} (limit {c.limit:.6g})") for c in checks]
-    return [(label, plain_text(text)) for label, text in lines]
+    return [(label, _UNSAFE.sub("_", text)) for label, text in lines]

@@ -47,7 +47,7 @@ def export_mat(
 
     The structures ``textbook`` and ``new_state`` each have A, B, C and D. In MATLAB,
     ``sys = ss(textbook.A, textbook.B, textbook.C, textbook.D, dt_s)``. Beside them: ``dt_s``
-    [s], ``convention``, ``provenance_lines`` (text), and for a loop ``frame_rate_hz`` and
+    [s], ``convention``, ``provenance`` (text), and for a loop ``frame_rate_hz`` and
     ``delay_frames``.
 
     Parameters
@@ -57,7 +57,7 @@ def export_mat(
     design : Design
         The design.
     gain_digest : str, optional
-        SHA-256 of the gain file, for ``provenance_lines`` (64 hexadecimal digits).
+        SHA-256 of the gain file, for ``provenance`` (64 hexadecimal digits).
 
     Returns
     -------
