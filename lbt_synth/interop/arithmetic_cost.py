@@ -40,10 +40,15 @@ class FrameCost:
     additions: int = column("additions per frame", help="Of the exported source")
     dense_additions: int = column("  with whole matrices", help="The same of A, B, C, D")
     coefficients: int = column(help="Numbers that the exported source stores")
-    dense_coefficients: int = column(help="Numbers of the whole matrices")
     states: int = column(help="Numbers that it keeps from one frame to the next")
     coefficient_bytes_double: int = column("coefficients, double", unit="bytes", init=False)
     coefficient_bytes_single: int = column("coefficients, single", unit="bytes", init=False)
+    dense_coefficients: int = column(
+        "  with whole matrices, double",
+        unit="bytes",
+        scale=8,
+        help="Numbers of the whole matrices",
+    )
     state_bytes_double: int = column("state, double", unit="bytes", init=False)
     state_bytes_single: int = column("state, single", unit="bytes", init=False)
 
