@@ -106,8 +106,8 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = 
     Returns
     -------
     matplotlib.figure.Figure
-        One column of panels per design, one row per delay error, one colour bar for all. Sensor
-        gains at which the loop is unstable are hatched.
+        One panel per delay error and design, up to three side by side, with one colour bar for
+        all. Sensor gains at which the loop is unstable are hatched.
 
     Raises
     ------

@@ -32,7 +32,7 @@ def tradeoff_figure(points: Sequence[TradeoffPoint], *, axes: OwnAxes = None) ->
     -------
     matplotlib.figure.Figure
         Above, the standard deviation; below, if there are loops, the interval of sensor
-        gains for which each is stable. Norms that no filter reaches are hatched.
+        gains for which each is stable. Norms that no filter reaches are shaded.
 
     Raises
     ------
