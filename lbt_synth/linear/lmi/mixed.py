@@ -83,8 +83,8 @@ class InnovationProgramme:
         """
         taps = cp.Variable(self.target.shape)
         bounds = self._bounds(taps, gamma / self.scale, frequency_hz)
-        found, status = self._solve(taps, cp.Minimize(self._distance(taps)), bounds)
-        return found, gamma, status
+        run = solve(cp.Minimize(self._distance(taps)), bounds)
+        return self._unscaled(taps, run), gamma, run[0]
 
     def minimize_level(
         self, variance: float, frequency_hz: FloatArray
@@ -93,25 +93,20 @@ class InnovationProgramme:
         taps, level = cp.Variable(self.target.shape), cp.Variable(nonneg=True)
         slack = float(np.sqrt(max(variance - self.floor, 0.0))) / self.scale
         bounds = self._bounds(taps, level, frequency_hz)
-        found, status = self._solve(
-            taps, cp.Minimize(level), [*bounds, self._distance(taps) <= slack]
-        )
-        return found, float(level.value) * self.scale, status
+        run = solve(cp.Minimize(level), [*bounds, self._distance(taps) <= slack])
+        return self._unscaled(taps, run), float(level.value) * self.scale, run[0]
 
     def _distance(self, taps: cp.Variable) -> cp.Expression:
         return cp.norm(taps @ self.root - self.target / self.scale, "fro")
 
-    def _solve(
-        self, taps: cp.Variable, objective: cp.Minimize, constraints: list[cp.Constraint]
-    ) -> tuple[FloatArray, str]:
-        run = solve(objective, constraints)
+    def _unscaled(self, taps: cp.Variable, run: tuple[str, int]) -> FloatArray:
         require_optimum(
             run,
             "the programme of the mixed filter",
             "Try a larger bound, or another number of taps.",
         )
         unscaled = taps.value * self.scale @ np.kron(np.eye(self.taps), self.whitening)
-        return np.asarray(unscaled, dtype=np.float64), run[0]
+        return np.asarray(unscaled, dtype=np.float64)
 
     def _bounds(
         self, taps: cp.Variable, level: float | cp.Variable, frequency_hz: FloatArray
