@@ -11,7 +11,6 @@ from scipy.special import ndtr, ndtri
 from lbt_synth.methods.section import Positive, Section
 from lbt_synth.validation import FloatArray
 
-KINDS = ("fixed", "uniform", "normal", "list")
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
 
 
@@ -97,7 +96,7 @@ class ParameterSection(Section):
     def _one_distribution(self) -> ParameterSection:
         given = [v is not None for v in (self.fixed, self.uniform, self.normal, self.list_)]
         if sum(given) != 1:
-            raise ValueError(f"expected a number or exactly one of {', '.join(KINDS)}")
+            raise ValueError("expected a number or exactly one of fixed, uniform, normal, list")
         if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
             low, high = self.uniform
             raise ValueError(f"uniform: must be [low, high]; got [{low:g}, {high:g}]")

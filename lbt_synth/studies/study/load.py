@@ -34,7 +34,6 @@ _OPTIONS_IN_DIGEST = {
 }
 _WORDING = Wording(method="design: {}")
 _SAME_RESULTS_SINCE = "0.1.0"
-_MOST_MODES = 2  # a Strehl ratio of jitter takes one or two axes
 
 
 def load_study(
@@ -83,7 +82,7 @@ def load_study(
     _require_names(settings, source)
     config_file = source.parent / settings.config
     config = load_config(config_file)
-    if config.hardware.modes > _MOST_MODES:
+    if config.hardware.modes > 2:  # a Strehl ratio of jitter takes one or two axes
         raise ConfigError(
             f"{config_file}: a study is of one or two axes; got a loop of {config.hardware.modes}."
         )

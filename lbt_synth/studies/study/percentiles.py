@@ -76,9 +76,7 @@ def _interpolate(ordered: FloatArray, fraction: float) -> float:
 
 
 def share(where: BoolArray) -> Share:
-    """Return the part of the samples (n,) for which something holds.
-
-    Its interval is that of Clopper and Pearson.
+    """Return the part of the samples (n,) of a mask, with the interval of Clopper and Pearson.
 
     Examples
     --------

@@ -24,9 +24,7 @@ from lbt_synth.studies.study.store import list_parts, read_manifest, require_unc
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Failure, Study
 from lbt_synth.validation import integer
 
-_NOISELESS = (
-    "row {row} has no noise, which no configuration takes: there is none to simulate it with."
-)
+_NOISELESS = "has no noise, which no configuration takes: there is none to simulate it with."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,7 +104,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
         stored = read_row(folder, study, row, list_parts(folder))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
-    sample, noiseless = make_sample(study, values), _NOISELESS.format(row=row)
+    sample = make_sample(study, values)
     has_noise = bool(np.all(np.asarray(sample.truth.noise_nm) > 0))
     return Replay(
         row=row,
@@ -115,7 +113,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
         fresh=fresh,
         failures=failures,
         files=_write_files(study, folder, row, sample, with_config=has_noise),
-        unwritten="" if has_noise else noiseless,
+        unwritten="" if has_noise else f"row {row} {_NOISELESS}",
     )
 
 

@@ -262,9 +262,8 @@ def _compute_missing(
     try:
         (folder / store.PARTS).mkdir(exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"cannot make the directory {folder / store.PARTS}: {error.strerror}.", path=folder
-        ) from error
+        why = f"cannot make the directory {folder / store.PARTS}: {error.strerror}."
+        raise OutputError(why, path=folder) from error
     if count < study.samples:
         progress(study.samples - count)
     with contextlib.closing(run_batches(study, missing, **options)) as batches:

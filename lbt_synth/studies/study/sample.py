@@ -122,10 +122,9 @@ def _describe(value: Any) -> str:
 def set_number(
     content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]
 ) -> None:
-    """Set the number at a place that :func:`find_number` finds in ``full``.
+    """Set a number that :func:`find_number` finds in ``full``, the content with its defaults.
 
-    ``full`` is the same configuration with its defaults. Missing sections on the way are added,
-    missing lists copied from ``full``. An integer there stays an integer if the value is whole.
+    Missing sections on the way are added, missing lists copied. An integer stays one if it can.
     """
     here: Any = content
     whole: Any = full

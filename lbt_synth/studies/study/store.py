@@ -1,8 +1,4 @@
-"""The directory of a study: its manifest, its designs, and a part for each finished batch.
-
-A part is written completely or not at all, and named by its rows, so that the names show which
-rows are missing.
-"""
+"""The directory of a study: its manifest, its designs, and a part for each finished batch."""
 
 from __future__ import annotations
 
@@ -39,7 +35,7 @@ RowRange = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """A file with a finished batch: rows from start up to stop, which is not included."""
+    """A file with a finished batch, named by its rows: start up to stop, which is not included."""
 
     start: int
     stop: int
@@ -114,9 +110,8 @@ def read_manifest(folder: Path, digest: str) -> Manifest | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:
-        raise OutputError(
-            f"cannot read {path}: {error}. Name another directory.", path=path
-        ) from error
+        why = f"cannot read {path}: {error}. Name another directory."
+        raise OutputError(why, path=path) from error
     try:
         manifest = Manifest.model_validate(content)
     except ValidationError as error:

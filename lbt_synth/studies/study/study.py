@@ -21,12 +21,8 @@ from lbt_synth.validation import FloatArray, integer
 DELAY_ERROR = "error.delay_frames"
 NOISE_FACTOR = "error.noise_factor"
 ERRORS = (DELAY_ERROR, NOISE_FACTOR)
-RESIDUALS = {  # columns, and the attributes of budgets with their values
-    "residual_nm": "rms_nm",
-    "turbulence_nm": "turbulence_nm",
-    "vibration_nm": "vibration_nm",
-    "noise_nm": "noise_nm",
-}
+_PARTS = ("turbulence_nm", "vibration_nm", "noise_nm")
+RESIDUALS = {"residual_nm": "rms_nm"} | {n: n for n in _PARTS}  # columns, attributes of budgets
 EXACT_COLUMNS = ("strehl", *RESIDUALS, "stable")
 SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
 
