@@ -85,7 +85,7 @@ class RunningBanks:
 
 
 class LoopVariances(NamedTuple):
-    """What the loops of a block leave, with what tells how far it can be trusted."""
+    """Variances that the loops of a block leave, and the errors of their computation."""
 
     variances: FloatArray  # (N, w), of each mode's residual
     residuals: FloatArray  # (N,), relative, of the Lyapunov equations

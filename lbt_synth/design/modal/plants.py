@@ -107,7 +107,7 @@ class ModalModels:
         *,
         modes: int | None = None,
     ) -> ModalModels:
-        """Check the models of all modes; for a given number of modes, noise may be 0."""
+        """Check the models; with the number of modes of a loop, the noise may be 0."""
         if not isinstance(turbulence, ModalTurbulence):
             turbulence = ModalTurbulence.of(turbulence)
         n = turbulence.n_modes

@@ -25,7 +25,7 @@ _MOST_EDGES = 400
 
 
 class CheckedFields:
-    """Base of dataclasses of which the types of fields hold the bounds of numbers."""
+    """Base of dataclasses whose field types hold the bounds of their numbers."""
 
     __slots__ = ()
 

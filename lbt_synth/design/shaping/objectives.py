@@ -103,8 +103,8 @@ class VibrationBand(Band):
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797).bands_hz
-    ((16.5, 23.5),)
+    >>> lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797).label
+    'vibration in 16.5-23.5 Hz at sensor gain 1'
     """
 
     rms_nm: Positive
@@ -114,11 +114,6 @@ class VibrationBand(Band):
     def label(self) -> str:
         """What a table calls it."""
         return f"vibration in {self.band_text} at sensor gain {self.sensor_gain:g}"
-
-    @property
-    def bands_hz(self) -> tuple[tuple[float, float], ...]:
-        """The band, as the one that the grid should resolve."""
-        return ((self.low_hz, self.high_hz),)
 
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""

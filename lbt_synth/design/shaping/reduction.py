@@ -76,7 +76,7 @@ def reduce_poles(
         candidates.append(fit_poles(response, fewer)[0])
 
     def attempt(poles: ComplexArray) -> tuple[ModeSolution | None, float]:
-        """Solve with given poles, from the fit of the response; return the relative loss, too."""
+        """Solve with given poles from the fit of the response, and return the relative loss."""
         channel = Channel(hardware=hardware, basis=orthonormal_basis(poles, dt_s=hardware.dt_s))
         start = response.coefficients(channel.command_rows(long.sequence.grid.nodes_hz))
         try:
@@ -106,7 +106,7 @@ def reduce_poles(
 
 
 def _response_to_fit(spec: Specification, long: SequenceSolution) -> WeightedResponse:
-    """Response of the long parameter at the nodes; the weight is spectra, and some everywhere."""
+    """Response of the long parameter at the nodes, weighted by the spectra and a constant."""
     f, w, nyquist = long.grid.nodes_hz, long.grid.weights_hz, long.channel.nyquist_hz
     cost = w * (frequency_costs(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
     weight = np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist)
@@ -137,7 +137,7 @@ class WeightedResponse:
 
 
 def fit_poles(response: WeightedResponse, start: ComplexArray) -> tuple[ComplexArray, float]:
-    """Fit the poles (n,) of functions ``z (z I - A)^-1 B`` to a response; return the misfit too."""
+    """Fit the poles (n,) of functions ``z (z I - A)^-1 B`` to a response, with the misfit."""
     pairs, real = start[start.imag > 0], start[start.imag == 0].real
     size = float(np.linalg.norm(response.goal))
     x0 = [np.log(np.abs(pairs) / (1 - np.abs(pairs))), np.angle(pairs), np.arctanh(real)]
@@ -188,7 +188,7 @@ def drop_cheapest_pair(response: WeightedResponse, poles: ComplexArray) -> Compl
 
 
 def _real_rows(rows: ComplexArray) -> FloatArray:
-    """Stack the real parts upon the imaginary parts."""
+    """Stack the real parts above the imaginary parts."""
     return np.concatenate([rows.real, rows.imag])
 
 
