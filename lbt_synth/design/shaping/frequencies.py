@@ -85,10 +85,9 @@ class Grid:
 
 def first_grid(
     channel: Channel,
-    bands_hz: Sequence[tuple[float, float]],
+    bands: Sequence[tuple[float, float]],
     spectra: Sequence[Spectrum],
-    *,
-    fineness: int = 1,
+    fineness: int,
 ) -> Grid:
     """Lay panels: geometric at low frequencies, finer in the bands and at slow poles."""
     rate, nyquist = channel.hardware.frame_rate_hz, channel.nyquist_hz
@@ -98,7 +97,7 @@ def first_grid(
         np.geomspace(0.0125, 0.5, 24 * fineness + 1) * rate,
         *(_thin_spectrum_edges(spectrum, nyquist) for spectrum in spectra),
     ]
-    for low, high in bands_hz:
+    for low, high in bands:
         width = high - low
         ends = max(low - width, 0), min(high + width, nyquist)
         edges.append(np.linspace(*ends, 12 * fineness + 1))

@@ -106,7 +106,7 @@ class Specification:
 
     def grid(self, channel: Channel, *, fineness: int = 1) -> Grid:
         """Return the first grid of frequencies for a channel."""
-        return first_grid(channel, self.bands_hz, self.spectra, fineness=fineness)
+        return first_grid(channel, self.bands_hz, self.spectra, fineness)
 
     def compile(
         self, channel: Channel, grid: Grid

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from lbt_synth.models import ARModel, ModalTurbulence
 from lbt_synth.models.vibration.resonance import sampled_lines
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
-PROCESSES = (ARModel, ModalTurbulence)
+Process: TypeAlias = ARModel | ModalTurbulence
 _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 _AT_ONCE = 1024  # loops with vibrations
 
@@ -36,12 +37,12 @@ def turbulence_and_noise_nm2(
     """
     hardware, stable = loops.hardware, loops.stable
     for spectrum, _ in turbulence:
-        if isinstance(spectrum, PROCESSES):
+        if isinstance(spectrum, Process):
             require_loop_rate(spectrum.frame_rate_hz, hardware)
     n, rate = hardware.modes, hardware.frame_rate_hz
     turbulence_nm2, noise_nm2 = np.full((2, stable.size, n, n), np.nan)
     turbulence_nm2[stable], noise_nm2[stable] = 0.0, 0.0
-    spectra = [pair for pair in turbulence if not isinstance(pair[0], PROCESSES)]
+    spectra = [pair for pair in turbulence if not isinstance(pair[0], Process)]
     for group in chain.from_iterable(loops.subloops):
         for batch in group.batches(stable):
             own = batch.subloop.modes
@@ -54,14 +55,14 @@ def turbulence_and_noise_nm2(
             noise = noise_nm[batch.rows][:, batch.subloop.measurements]
             turbulence_nm2[at], noise_nm2[at] = spectral_covariances(batch, smooth, noise, rate)
     for spectrum, modes in turbulence:
-        if not isinstance(spectrum, PROCESSES):
+        if not isinstance(spectrum, Process):
             continue
         for same_delay in zip(*loops.subloops, strict=True):
             found = np.flatnonzero(stable[same_delay[0].rows])
             if found.size:
                 chosen = [group.take(found) for group in same_delay]
                 process = turbulence_rows(spectrum, chosen[0].rows)
-                assert isinstance(process, PROCESSES)
+                assert isinstance(process, Process)
                 for mode in modes:
                     axis = np.eye(n)[mode]
                     _add_process(turbulence_nm2, chosen[0].rows, chosen, process, axis)
@@ -107,18 +108,18 @@ def _add_process(
     total: FloatArray,
     rows: IntArray,
     groups: Sequence[LoopGroup],
-    process: ARModel | ModalTurbulence,
-    direction: FloatArray,
+    process: Process,
+    along: FloatArray,
 ) -> None:
     """Add to ``total[rows]`` (p, n, n) what a process leaves in all subloops that it reaches.
 
-    ``direction`` is (n,), or (k, n) with one per loop.
+    The direction ``along`` is (n,), or (k, n) with one per loop.
     """
-    reached = [group for group in groups if np.any(direction[..., group.subloop.modes])]
+    reached = [group for group in groups if np.any(along[..., group.subloop.modes])]
     if reached:
         modes = np.concatenate([group.subloop.modes for group in reached])
         at = (rows[:, None, None], *np.ix_(modes, modes))
-        total[at] += _process_covariances(_join(reached), process, direction[..., modes])
+        total[at] += _process_covariances(_join(reached), process, along[..., modes])
 
 
 def _join(groups: list[LoopGroup]) -> tuple[FloatArray, ...]:
@@ -138,7 +139,7 @@ def _join(groups: list[LoopGroup]) -> tuple[FloatArray, ...]:
 
 
 def _process_covariances(
-    loops: tuple[FloatArray, ...], process: ARModel | ModalTurbulence, directions: FloatArray
+    loops: tuple[FloatArray, ...], process: Process, directions: FloatArray
 ) -> FloatArray:
     """Covariance (k, n, n) of the residual that a process, or one per loop, leaves.
 

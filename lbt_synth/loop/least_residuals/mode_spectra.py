@@ -137,11 +137,11 @@ def decoupled_modes(
     """
     n, rate = hardware.modes, hardware.frame_rate_hz
     noise = _noise_on_modes(hardware, noise_nm2)
-    if np.linalg.matrix_rank(hardware.influence) < n:
+    rank = np.linalg.matrix_rank(hardware.influence)
+    if rank < n:
         raise ProblemError(
             "the mirror must reach every mode: an influence matrix with full row rank; got rank "
-            f"{np.linalg.matrix_rank(hardware.influence)} for {n} modes. Leave out the modes that "
-            "it cannot correct."
+            f"{rank} for {n} modes. Leave out the modes that it cannot correct."
         )
     for model in turbulence:
         if isinstance(model, ARModel):
@@ -177,11 +177,11 @@ def _spectra_along(
 def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
     """Covariance (n, n) of the best unbiased estimate of the modes from one measurement."""
     sensor, n = hardware.sensor, hardware.modes
-    if np.linalg.matrix_rank(sensor) < n:
+    rank = np.linalg.matrix_rank(sensor)
+    if rank < n:
         raise ProblemError(
             "the sensor must see every mode: a sensor matrix with full column rank; got rank "
-            f"{np.linalg.matrix_rank(sensor)} for {n} modes. Leave out the modes that it does not "
-            "see."
+            f"{rank} for {n} modes. Leave out the modes that it does not see."
         )
     if not np.any(noise_nm2):
         return np.zeros((n, n))
