@@ -6,7 +6,6 @@ sinusoids through the loops' responses.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import chain
 from typing import TypeAlias
 
@@ -105,11 +104,7 @@ def vibration_residuals(
 
 
 def _add_process(
-    total: FloatArray,
-    rows: IntArray,
-    groups: Sequence[LoopGroup],
-    process: Process,
-    along: FloatArray,
+    total: FloatArray, rows: IntArray, groups: list[LoopGroup], process: Process, along: FloatArray
 ) -> None:
     """Add to ``total[rows]`` (p, n, n) what a process leaves in all subloops that it reaches.
 
