@@ -10,22 +10,15 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.errors import ProblemError
-from lbt_synth.report import DesignAssessment, DesignReport, design_report, write_report
+from lbt_synth.report import DesignAssessment, design_report, write_report
+from lbt_synth.report.designs.assessment_row import AssessmentRow, assessment_row
 from lbt_synth.report.designs.report import count_steps
 from lbt_synth.report.designs.verdict import good_range, verdict
 from lbt_synth.report.page.page_files import require_page_names
 from lbt_synth.report.provenance import require_letters, time_text
-from lbt_synth.storage.rows import (
-    column,
-    fill_row,
-    json_record,
-    json_units,
-    nm_column,
-    percent_column,
-    row_table,
-    table_row,
-)
-from lbt_synth.studies import LimitRow
+from lbt_synth.storage.rows import json_record, json_units, row_table
+
+_IN_MARGINS = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz")
 
 
 def run(arguments: Namespace) -> Report:
@@ -43,11 +36,11 @@ def run(arguments: Namespace) -> Report:
         found = design_report(config, designs, gain_files=files, advance=count)
         written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
         count(1)
-    rows = [_assessment_row(found, one, limits) for one, limits in found.rows]
+    rows = [assessment_row(found, one, limits) for one, limits in found.rows]
     report = Report(
         data={
             "designs": {
-                row.design: json_record(row, without=["design", "modulus"]) | _design_record(one)
+                row.design: json_record(row, without=_IN_MARGINS) | _design_record(one)
                 for row, one in zip(rows, found.assessments, strict=True)
             },
             "units": json_units(AssessmentRow),
@@ -65,45 +58,6 @@ def run(arguments: Namespace) -> Report:
     )
     report.note_files(written)
     return report
-
-
-@table_row
-class AssessmentRow:
-    """One design in the loop of the configuration."""
-
-    design: str = column("design")
-    method: str = column("method")
-    route: str = column()
-    n_states: int = column()
-    gamma: float = column(unit="nm")
-    estimation_rms: float = column(unit="nm")
-    stable: bool = column("stable")
-    spectral_radius: float = column()
-    certified: bool = column("certified")
-    residual_nm: float = nm_column("residual", format=".2f")
-    turbulence_nm: float | None = column(unit="nm", default=None)
-    vibration_nm: float | None = column(unit="nm", default=None)
-    noise_nm: float | None = column(unit="nm", default=None)
-    strehl: float = percent_column("Strehl")
-    strehl_simulated: float | None = column()
-    worst_strehl: float = percent_column("worst Strehl")
-    above_limit_percent: float = column(unit="%")
-    worst_nm: float = column(unit="nm")
-    above_band_limit_percent: float = column(unit="%")
-    modulus: float | None = column("modulus margin", format=".3f", default=None)
-    multiplications: int = column()
-
-
-def _assessment_row(found: DesignReport, one: DesignAssessment, limits: LimitRow) -> AssessmentRow:
-    design, simulation = one.design, found.simulations.get(one.name)
-    return fill_row(
-        AssessmentRow,
-        *(one, one.budget, one.margins, one.cost, limits, design.solver),
-        design=one.name,
-        n_states=design.controller.n_states,
-        strehl_simulated=None if simulation is None else simulation.strehl,
-        worst_strehl=float(one.curve.strehl.min()) if one.stable else float("nan"),
-    )
 
 
 def _design_record(one: DesignAssessment) -> dict[str, Any]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lbt_synth.loop import BandLimit, ResidualLimit
 from lbt_synth.report.designs.assessment import DesignAssessment
+from lbt_synth.report.designs.assessment_row import AssessmentRow, assessment_row
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.verdict import good_range
 from lbt_synth.report.number_text import (
@@ -20,90 +20,78 @@ from lbt_synth.report.number_text import (
     number_text,
     signed_text,
 )
+from lbt_synth.storage.rows import Column, columns
 from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.studies import LimitRow
 
-Value = Callable[[DesignAssessment, LimitRow], str | Cell]
-_one_decimal = partial(fixed_text, decimals=1)
-_two_decimals = partial(fixed_text, decimals=2)
-_three_digits = partial(number_text, digits=3)
+_OWN_CELLS: dict[str, Callable[[DesignReport, DesignAssessment], str | Cell]] = {
+    "certified": lambda _, one: _certificate_cell(one),
+    "stable": lambda _, one: _stability_cell(one),
+    "strehl_simulated": lambda report, one: _simulated_text(report, one),
+    "within 10 % of its best Strehl ratio [Hz]": lambda _, one: _good_text(one),
+    "gain margin, factors": lambda _, one: _gain_margin_text(one),
+    "stable real sensor gains": lambda _, one: _stable_gains_text(one),
+}
+_DESIGN = ("method", "route", "n_states", "multiplications", "gamma", "estimation_rms", "certified")
+_LOOP = (
+    *("stable", "spectral_radius", "residual_nm", "turbulence_nm", "vibration_nm", "noise_nm"),
+    *("strehl", "strehl_simulated"),
+)
+_RANGE = ("worst_nm", "worst_strehl", "within 10 % of its best Strehl ratio [Hz]")
+_MARGINS = (
+    *("modulus", "gain margin, factors", "phase_deg", "delay_frames", "crossover_hz"),
+    "stable real sensor gains",
+)
 
 
 def summary_table(report: DesignReport) -> Table:
-    """All designs side by side."""
-    rows: list[tuple[str, Value] | str] = [
-        "Design",
-        ("method", lambda one, _: one.design.method),
-        ("computed by", lambda one, _: one.design.solver.route),
-        ("states of the controller", lambda one, _: str(one.design.controller.n_states)),
-        ("multiplications per frame", lambda one, _: str(one.cost.multiplications)),
-        (
-            "achieved gamma, H-infinity norm of the error in its own model [nm]",
-            lambda one, _: number_text(one.gamma, 5),
-        ),
-        ("error in its own model [nm rms]", lambda one, _: _one_decimal(one.estimation_rms)),
-        ("certificate, recomputed", lambda one, _: _certificate_cell(one)),
-        "In the loop of the configuration",
-        ("closed loop", lambda one, _: _stability_cell(one)),
-        ("largest modulus of its poles", lambda one, _: number_text(one.spectral_radius, 6)),
-        ("residual, exact [nm rms]", lambda one, _: _one_decimal(one.residual_nm)),
-        ("of that turbulence [nm rms]", _part("budget", "turbulence_nm", _one_decimal)),
-        ("of that vibration [nm rms]", _part("budget", "vibration_nm", _one_decimal)),
-        ("of that noise [nm rms]", _part("budget", "noise_nm", _one_decimal)),
-        ("Strehl ratio, exact [%]", lambda one, _: _two_decimals(100 * one.strehl)),
-        ("Strehl ratio, simulated [%]", lambda one, _: _simulated_text(report, one)),
+    """All designs side by side: the columns of their rows, in groups."""
+    limits = report.limits
+    groups: list[tuple[str, Sequence[str]]] = [
+        ("Design", _DESIGN),
+        ("In the loop of the configuration", _LOOP),
     ]
-    above = _limit_rows(report.limits.limit, ", frequency known", "above_limit_percent")
-    if above:
-        rows += ["Distance to the limit of any linear controller", *above]
+    titles = _limit_title("above_limit_percent", limits.limit, ", frequency known")
+    if titles:
+        groups.append(("Distance to the limit of any linear controller", list(titles)))
     if report.errors_hz.size > 1:
         ends = interval_text(float(report.errors_hz[0]), float(report.errors_hz[-1]))
-        rows += [
-            f"Over frequency errors of {ends} Hz",
-            ("worst residual [nm rms]", lambda _, row: _one_decimal(row.worst_nm)),
-            ("worst Strehl ratio [%]", lambda one, _: _two_decimals(_worst_percent(one))),
-            ("within 10 % of its best Strehl ratio [Hz]", lambda one, _: _good_text(one)),
-            *_limit_rows(report.limits.band, " for this range", "above_band_limit_percent"),
-        ]
-    rows += [
-        "Margins at the real sensor gain",
-        ("modulus margin", _part("margins", "modulus", _three_digits)),
-        ("gain margin, factors", lambda one, _: _gain_margin_text(one)),
-        ("phase margin [deg]", _part("margins", "phase_deg", _three_digits)),
-        ("delay margin [frames]", _part("margins", "delay_frames", _three_digits)),
-        ("highest crossover [Hz]", _part("margins", "crossover_hz", _three_digits)),
-        ("stable real sensor gains", lambda one, _: _stable_gains_text(one)),
-    ]
+        band = _limit_title("above_band_limit_percent", limits.band, " for this range")
+        titles |= band
+        groups.append((f"Over frequency errors of {ends} Hz", [*_RANGE, *band]))
+    groups.append(("Margins at the real sensor gain", _MARGINS))
+    printed = {each.name: each for each in columns(AssessmentRow)}
+    found = [(one, assessment_row(report, one, row)) for one, row in report.rows]
+    lines: list[tuple[str | Cell, ...]] = []
+    for group, names in groups:
+        lines.append((group,))
+        for name in names:
+            each, own = printed.get(name), _OWN_CELLS.get(name)
+            title = titles.get(name) or (name if each is None else _title(each))
+            cells = (_text(each, row) if own is None else own(report, one) for one, row in found)
+            lines.append((title, *cells))
     return Table(
         caption=f"Summary at a real sensor gain of {number_text(report.real_gain)}",
         headings=("quantity", *report.names),
-        rows=tuple(
-            (entry,)
-            if isinstance(entry, str)
-            else (entry[0], *(entry[1](one, row) for one, row in report.rows))
-            for entry in rows
-        ),
+        rows=tuple(lines),
     )
 
 
-def _part(part: str, name: str, text: Callable[[float], str]) -> Value:
-    """Return what prints a number of the budget or the margins, which unstable loops lack."""
-
-    def value(one: DesignAssessment, _: Any) -> str:
-        found = getattr(one, part)
-        return DASH if found is None else text(getattr(found, name))
-
-    return value
+def _title(each: Column) -> str:
+    return f"{each.help} [{each.unit}]" if each.unit else each.help
 
 
-def _limit_rows(
-    limit: ResidualLimit | BandLimit | None, where: str, field: str
-) -> list[tuple[str, Value]]:
-    """Return the row of percents above a limit, or none where the limit says nothing."""
+def _text(each: Column | None, row: AssessmentRow) -> str:
+    """Return a number of a row with the signs of print."""
+    assert each is not None  # a cell that is no column has its own function
+    text = replace(each, missing=DASH).text(row)
+    return text if isinstance(getattr(row, each.name), str) else text.replace("-", MINUS)
+
+
+def _limit_title(name: str, limit: ResidualLimit | BandLimit | None, where: str) -> dict[str, str]:
+    """Return the title of percents above a limit, or none where the limit says nothing."""
     if limit is None or not limit.rms_nm > 0:
-        return []
-    title = f"above the limit of {fixed_text(limit.rms_nm, 1)} nm{where} [%]"
-    return [(title, lambda _, row: fixed_text(getattr(row, field), 0))]
+        return {}
+    return {name: f"above the limit of {fixed_text(limit.rms_nm, 1)} nm{where} [%]"}
 
 
 def certificate_table(one: DesignAssessment) -> Table:
@@ -151,12 +139,8 @@ def _simulated_text(report: DesignReport, one: DesignAssessment) -> str:
     run = report.simulations.get(one.name)
     if run is None:
         return DASH
-    scatter = "" if np.isnan(run.scatter) else f" ± {_two_decimals(100 * run.scatter)}"
-    return f"{_two_decimals(100 * run.strehl)}{scatter}"
-
-
-def _worst_percent(one: DesignAssessment) -> float:
-    return 100 * float(np.min(one.curve.strehl)) if one.stable else float("nan")
+    scatter = "" if np.isnan(run.scatter) else f" ± {fixed_text(100 * run.scatter, 2)}"
+    return f"{fixed_text(100 * run.strehl, 2)}{scatter}"
 
 
 def _good_text(one: DesignAssessment) -> str:
