@@ -37,8 +37,8 @@ def run(arguments: Namespace) -> Report:
             "parameters": [parameter._asdict() for parameter in PARAMETERS],
         },
         notes=[
-            f"Table III, rms difference: Kalman {columns['kalman']:.2f} points, "
-            f"H-infinity {columns['hinf']:.2f} points",
+            "Table III, rms difference: "
+            + ", ".join(f"{design_title(m)} {d:.2f} points" for m, d in columns.items()),
             f"H-infinity: bound at {_gamma_ratio(result):.3f} times the least at 20 Hz",
         ],
     )
