@@ -12,7 +12,7 @@ from lbt_synth.identification import (
     LoopRecord,
     SpectrumRecord,
 )
-from lbt_synth.identification.records.health import HEADINGS
+from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 
 

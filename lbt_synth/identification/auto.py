@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import CertificateError, ProblemError
+from lbt_synth.errors import CertificateError
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.comparison import PredictionTable, prediction_against_data
 from lbt_synth.identification.records.line_priors import LinePrior
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.required_length import require_length
+from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.plant_inputs import PlantInputs
@@ -135,11 +134,7 @@ def design_from_record(
         at_least=1,
         hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
     )
-    if record.delay_frames is None:
-        raise ProblemError(
-            "a design needs the delay of the loop; got a record without one. Try "
-            "record.with_delay(...)."
-        )
+    _ = record.hardware  # refuses a record without a delay
     require_length(record)
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}

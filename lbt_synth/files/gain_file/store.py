@@ -1,23 +1,87 @@
-"""Saves designs to gain files, and loads and checks them."""
+"""Gain files: a design as named arrays and metadata, saved as FITS, NPZ or JSON, and loaded."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lbt_synth.design import Design
-from lbt_synth.design.record import DesignRecord
+import lbt_synth
+from lbt_synth.design import Design, EstimatorDesign
+from lbt_synth.design.record import DesignRecord, Meta, record_common
 from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files.file_checks import FileKind
-from lbt_synth.files.gain_file.contents import SCHEMA, SCHEMA_VERSION, pack_design, unpack_design
-from lbt_synth.files.gain_file.fits_layout import write_fits
-from lbt_synth.files.gain_file.json_format import read_json, write_json
-from lbt_synth.storage.array_file import digest, npz_bytes, read_fits, read_npz
+from lbt_synth.methods.registry import method_of_design
+from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz
 from lbt_synth.storage.atomic_files import read_bytes, require_ending, write_atomically
-from lbt_synth.validation import frozen_copy
+from lbt_synth.validation import FloatArray, frozen_copy
+
+SCHEMA = "lbt_synth gain file"
+SCHEMA_VERSION = 1
+CONVENTION = (
+    "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
+    "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1), or the "
+    "mirror's exposure-averaged answer to these commands where META holds a mirror. "
+    "GAIN_PREDICTOR: x(k+1|k) = A x(k|k-1) + G (y - C x(k|k-1)); "
+    "GAIN_FILTER: x(k|k) = x(k|k-1) + G (y - C x(k|k-1)); A, B, C, D, L of the plant in PLANT_*."
+)
+FITS_LAYOUT_VERSION = 1  # of SPECULA's state-space filter file
+
+
+def write_fits(arrays: Mapping[str, FloatArray], text: str, design: Design, meta: Meta) -> bytes:
+    """Write the arrays and the metadata's text under a header for people.
+
+    The HDUs A, B, C, D come first, as SPECULA's ``SsrFilterData`` loads them; the other arrays
+    follow, and META, the text that :func:`load_gain` reads back.
+    """
+    cards: dict[str, tuple[Any, str]] = {
+        "VERSION": (FITS_LAYOUT_VERSION, "layout of the HDUs A, B, C, D"),
+        "NFILTER": (arrays["B"].shape[1], "inputs of the controller"),
+        "NSTATES": (arrays["A"].shape[0], "states of the controller"),
+        "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
+        "LBTSCHEM": (SCHEMA_VERSION, "version of the lbt_synth layout"),
+        "METHOD": (design.method, "synthesis"),
+        "NEWSTATE": (True, "u(k) = C x(k+1) + D y(k)"),
+    }
+    if design.hardware is not None:
+        cards["RATE_HZ"] = (design.hardware.frame_rate_hz, "[Hz] frame rate")
+        cards["DELAY"] = (design.hardware.delay_frames, "[frames] total delay")
+    if isinstance(design, EstimatorDesign):
+        cards["RMS"] = (design.rms, "estimation error, standard deviation")
+        cards["GAMMA"] = (design.gamma, "estimation error, H-infinity norm")
+    cards["SHA256"] = (meta["digest"], "")
+    return fits_bytes(cards, arrays, text)
+
+
+def write_json(arrays: Mapping[str, FloatArray], text: str) -> bytes:
+    """Write one JSON object; numbers keep all their digits."""
+    document = {"meta": json.loads(text), "arrays": {k: v.tolist() for k, v in arrays.items()}}
+    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+
+
+def read_json(content: bytes) -> tuple[dict[str, FloatArray], str]:
+    """Read the arrays and the text of :func:`write_json`; other bytes raise some exception."""
+    document = json.loads(content.decode())
+    if not isinstance(document, dict):
+        raise ValueError("the JSON is not an object")  # noqa: TRY004 - one kind of refusal
+    arrays = {k: np.array(v, dtype=np.float64) for k, v in document["arrays"].items()}
+    return arrays, json.dumps(document["meta"])
+
+
+def pack_design(design: Design) -> DesignRecord:
+    """Record a design whole: what all designs have, and what its method adds."""
+    said = DesignRecord(meta={"library_version": lbt_synth.__version__, "convention": CONVENTION})
+    return said | record_common(design) | method_of_design(design.method).pack(design)
+
+
+def unpack_design(record: DesignRecord) -> Design:
+    """Rebuild a design; missing keys raise KeyError, wrong sizes a ProblemError."""
+    return method_of_design(record.meta["method"]).unpack(record)
+
 
 _READERS = {".fits": read_fits, ".npz": read_npz, ".json": read_json}
 _KIND = FileKind(

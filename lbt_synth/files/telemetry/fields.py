@@ -94,9 +94,7 @@ _POSITIVE = partial(number, above=0)
 _DELAY = partial(number, at_least=0, at_most=1000)
 FACTS = {
     "frame_rate_hz": Fact(_POSITIVE, "RATE_HZ", "[Hz] frame rate"),
-    "delay_frames": Fact(
-        partial(number, at_least=0, at_most=1000), "DELAY", "[frames] total delay"
-    ),
+    "delay_frames": Fact(_DELAY, "DELAY", "[frames] total delay"),
     "sensor_gain": Fact(_POSITIVE, "SENSGAIN", "sensor gain over the interaction matrix"),
     "strehl": Fact(partial(number, at_least=0, at_most=1), "STREHL", "Strehl ratio"),
     "imaging_wavelength_um": Fact(_POSITIVE, "WAVELEN", "[um] of the image and the Strehl ratio"),
@@ -133,3 +131,25 @@ def check_metadata(metadata: Any) -> Mapping[str, Scalar]:
         if isinstance(value, float) and not math.isfinite(value):
             raise NonFiniteError(f"metadata must be finite; got {value} for {key!r}.")
     return MappingProxyType(out)
+
+
+_CONVENTION = (
+    "Row k of every series is frame k of 1/frame_rate_hz. "
+    "y(k) = sensor_gain S phi_res(k-1) + noise(k): the measurement of frame k is of the exposure "
+    "of frame k-1. u(k) is the command computed from y up to y(k). "
+    "phi_res(k) = phi_tot(k) - phi_cor(k), {correction}. S is the interaction matrix, N the "
+    "influence matrix, each the identity where it is not given. Where slopes are recorded, "
+    "slopes(k) = sensor_gain S phi_res(k-1) + noise(k), y(k) = reconstructor slopes(k). "
+    "Units: nm rms of wavefront, unless a unit is given."
+)
+CONVENTION = _CONVENTION.format(
+    correction="phi_cor(k) = N u(k-d+1), d = delay_frames from the "
+    "middle of an exposure to the middle of the command computed from it; for d = j+1+f, "
+    "phi_cor(k) = N ((1-f) u(k-j) + f u(k-j-1))"
+)
+MOVING_CONVENTION = _CONVENTION.format(
+    correction="phi_cor(k) = N (c0 u(k) + c1 u(k-1) + c2 u(k-2) + ...) with the mirror taps c "
+    "recorded here: the weights of the commands in the position of a mirror that does not settle "
+    "at once, averaged over exposure k. They hold the whole delay: d = delay_frames as it would be "
+    "with a mirror that settles at once, and the mirror's lag after it"
+)

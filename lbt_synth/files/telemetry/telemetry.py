@@ -10,8 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.files.telemetry.conventions import CONVENTION, MOVING_CONVENTION
-from lbt_synth.files.telemetry.fields import ARRAYS, FACTS, REQUIRED, Scalar, check_metadata
+from lbt_synth.files.telemetry.fields import (
+    ARRAYS,
+    CONVENTION,
+    FACTS,
+    MOVING_CONVENTION,
+    REQUIRED,
+    Scalar,
+    check_metadata,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.validation import FloatArray, frozen_copy, real_array, require_instance, set_fields
@@ -198,8 +205,7 @@ class Telemetry:
             )
 
     def _check_controller(self, controller: Controller) -> None:
-        if not isinstance(controller, Controller):
-            raise ProblemError(f"controller must be a Controller; got {type(controller).__name__}.")
+        require_instance(controller, Controller, "controller")
         m, q = self.commands.shape[1], self.measurements.shape[1]
         if controller.D.shape != (m, q):
             raise DimensionError(

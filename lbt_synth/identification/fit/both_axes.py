@@ -187,11 +187,7 @@ def _check_record(
             f"the record has a delay of {delay:g} frames; got {delay_frames!r}. Try "
             "record.with_delay(...)."
         )
-    if record.commands is not None and delay is None:
-        raise ProblemError(
-            "the delay of a closed loop is needed to know what the mirror did; got a record "
-            "without one. Try record.with_delay(...)."
-        )
+    record.corrections()  # refuses a closed loop without a delay
     if start is not None and len(start.axes) != record.axes:
         raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
     for i, series in enumerate(record.measurements[record.usable].T):

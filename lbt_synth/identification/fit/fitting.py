@@ -9,18 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.identification.fit.parameters import (
-    NO_CORNER,
-    Component,
-    Kind,
-    SpectrumModel,
-    damping_parameter,
-)
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import (
+    NO_CORNER,
+    Component,
     FittedModel,
+    Kind,
     Priors,
+    SpectrumModel,
     contrast,
+    damping_parameter,
     minimise,
     observe_information,
 )

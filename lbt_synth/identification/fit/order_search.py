@@ -18,9 +18,8 @@ import numpy as np
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.parameters import Kind, SpectrumModel
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whittle import FittedModel, density, minimise
+from lbt_synth.identification.fit.whittle import FittedModel, Kind, SpectrumModel, density, minimise
 from lbt_synth.validation import FloatArray
 
 _WIDEST = 0.3  # band, of its frequency

@@ -11,9 +11,8 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedTurbulence,
     Whiteness,
 )
-from lbt_synth.identification.fit.parameters import GAIN, SpectrumModel
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whittle import FittedModel, densities
+from lbt_synth.identification.fit.whittle import GAIN, FittedModel, SpectrumModel, densities
 from lbt_synth.models import ARModel
 from lbt_synth.models.resonance_spectrum import coefficients
 from lbt_synth.validation import FloatArray, frozen_copy

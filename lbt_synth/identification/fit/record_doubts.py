@@ -11,15 +11,15 @@ import numpy as np
 
 from lbt_synth.identification.fit.fitting import Search, refit
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.parameters import SpectrumModel
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
     half_angle_square,
     loop_periodogram,
+    tukey,
 )
 from lbt_synth.identification.fit.physical_parameters import WIDE_DAMPING
-from lbt_synth.identification.fit.taper import tukey
+from lbt_synth.identification.fit.whittle import SpectrumModel
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.validation import FloatArray, IntArray

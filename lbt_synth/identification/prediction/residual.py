@@ -23,6 +23,7 @@ from lbt_synth.validation import (
     float_array,
     integer,
     number,
+    one_or_each,
     real_array,
     require_instance,
 )
@@ -113,11 +114,11 @@ def replayed_residual(
     True
     """
     require_instance(hardware, LoopHardware)
-    deviation = _per_measurement(noise_nm, "noise_nm", hardware)
+    deviation = one_or_each(noise_nm, "noise_nm", hardware.n_measurements, at_least=0)
     data = prediction_data(
         open_loop,
         hardware,
-        np.diag(deviation**2),
+        deviation**2 * np.eye(hardware.n_measurements),
         noise_error_nm=noise_error_nm,
         sensor_gain=sensor_gain,
         stretches=stretches,
@@ -144,7 +145,8 @@ def prediction_data(
     gain = number(sensor_gain, "sensor_gain", above=0)
     series, parts = check_series(open_loop, hardware.modes, stretches)
     back = inverse_sensor(hardware) / gain
-    error = _per_measurement(noise_error_nm, "noise_error_nm", hardware)
+    q = hardware.n_measurements
+    error = one_or_each(noise_error_nm, "noise_error_nm", q, at_least=0)
     deviation = np.sqrt(np.diag(noise_nm2))
     # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2
     slope = 2 * back * (back @ noise_nm2) / np.where(deviation > 0, deviation, np.inf)
@@ -185,15 +187,6 @@ def invert(square: FloatArray, need: str) -> FloatArray:
     if square.shape[0] != square.shape[1] or rank < len(square):
         raise ProblemError(f"{need} that can be inverted; got {square.shape} of rank {rank}.")
     return np.asarray(np.linalg.inv(square))
-
-
-def _per_measurement(value: ArrayLike, name: str, hardware: LoopHardware) -> FloatArray:
-    out, count = real_array(value, name), hardware.n_measurements
-    if out.ndim > 1 or (out.ndim == 1 and out.size != count):
-        raise DimensionError(f"{name} must be a number or {count}, one per measurement; got {out}.")
-    if np.any(out < 0):
-        raise ProblemError(f"{name} must be at least 0; got {np.min(out):.6g}.")
-    return np.broadcast_to(out, (count,))
 
 
 def choose_settling(given: int | None, loops: Iterable[ClosedLoop]) -> int:

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError
 from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
-from lbt_synth.identification.records.health import Finding, RecordHealth, findings_in, merge_notes
+from lbt_synth.identification.records.columns import nm_per
+from lbt_synth.identification.records.faults import Finding, RecordHealth, findings_in, merge_notes
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.units import nm_per
 from lbt_synth.models import PositionLoop
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 

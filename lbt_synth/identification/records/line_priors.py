@@ -20,11 +20,13 @@ from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
+    NotNegative,
+    Positive,
+    check_fields,
     frozen_copy,
     integer,
     number,
     real_array,
-    set_fields,
 )
 
 _FEWEST_AVERAGES = 8
@@ -63,14 +65,12 @@ class LinePrior:
     0.0
     """
 
-    frequency_hz: float
-    frequency_error_hz: float = 0.0
+    frequency_hz: Positive
+    frequency_error_hz: NotNegative = 0.0
     source: str = ""
 
     def __post_init__(self) -> None:
-        frequency = number(self.frequency_hz, "frequency_hz", above=0)
-        error = number(self.frequency_error_hz, "frequency_error_hz", at_least=0)
-        set_fields(self, frequency_hz=frequency, frequency_error_hz=error)
+        check_fields(self)
         if not isinstance(self.source, str):
             raise ProblemError(f"source must be a text; got {self.source!r}.")
 

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.records.faults import runs
-from lbt_synth.identification.records.health import RecordHealth, findings_in, merge_notes
+from lbt_synth.identification.records.faults import RecordHealth, findings_in, merge_notes, runs
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
+    Obstruction,
+    Positive,
+    check_fields,
     integer,
     matrix,
     number,
+    one_or_each,
     read_only,
-    require_instance,
     set_fields,
 )
 
@@ -28,12 +30,7 @@ _MOST_AXES = 2
 _BRIDGED_FRAMES = 3
 _BRIDGED_FRACTION = 0.01
 _NOT_KNOWN = "correction not known"
-_LIMITS: dict[str, dict[str, Any]] = {
-    "frame_rate_hz": {"above": 0},
-    "delay_frames": {"at_least": 1, "at_most": 100},
-    "diameter_m": {"above": 0},
-    "obstruction": {"at_least": 0, "below": 1},
-}
+_Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,34 +91,30 @@ class LoopRecord:
     ((2, 4),)
     """
 
-    frame_rate_hz: float
+    frame_rate_hz: Positive
     measurements: FloatArray
     commands: FloatArray | None = None
-    delay_frames: float | None = None
+    delay_frames: _Delay | None = None
     mirror: PositionLoop | None = None
     usable: BoolArray
     health: RecordHealth
-    diameter_m: float | None = None
-    obstruction: float | None = None
+    diameter_m: Positive | None = None
+    obstruction: Obstruction | None = None
     source: str = ""
     measured: BoolArray | None = None
     commanded: BoolArray | None = None
 
     def __post_init__(self) -> None:
-        require_instance(self.health, RecordHealth)
         y = matrix(self.measurements, "measurements")
+        check_fields(self, measurements=y)
         if not 1 <= y.shape[1] <= _MOST_AXES or len(y) == 0:
             raise DimensionError(
                 f"measurements must be (frames, axes) of one or two axes; got {y.shape}."
             )
-        set_fields(self, measurements=y)
         if self.commands is not None:
             why = f"to match measurements {y.shape}"
             u = matrix(self.commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
             set_fields(self, commands=u)
-        for name, limits in _LIMITS.items():
-            if (value := getattr(self, name)) is not None or name == "frame_rate_hz":
-                set_fields(self, **{name: number(value, name, **limits)})
         for name in ("usable", "measured", "commanded"):
             if (given := getattr(self, name)) is not None:
                 flags = read_only(np.array(given))
@@ -131,8 +124,6 @@ class LoopRecord:
                         f"{flags.shape}."
                     )
                 set_fields(self, **{name: flags})
-        if self.mirror is not None:
-            require_instance(self.mirror, PositionLoop)
         if self.delay_frames is not None:
             _ = self.mirror_taps  # refuses a mirror that does not fit the rate
 
@@ -163,7 +154,8 @@ class LoopRecord:
         if self.delay_frames is None:
             raise ProblemError(
                 "the total delay of this loop is not known; give delay_frames, from the middle of "
-                "an exposure to the middle of the command that is computed from it."
+                "an exposure to the middle of the command that is computed from it. Of a record, "
+                "try record.with_delay(...)."
             )
         return LoopHardware(
             frame_rate_hz=self.frame_rate_hz,
@@ -215,14 +207,8 @@ class LoopRecord:
         """
         return np.asarray(self.measurements / self._gains(sensor_gain) + self.corrections())
 
-    def _gains(self, sensor_gain: Any) -> FloatArray:
-        given = np.atleast_1d(np.asarray(sensor_gain, dtype=object))
-        if given.shape not in {(1,), (self.axes,)}:
-            raise DimensionError(
-                f"sensor_gain must be a number, or {self.axes} of them, one per axis; got shape "
-                f"{given.shape}."
-            )
-        return np.array([number(value, "sensor_gain", above=0) for value in given])
+    def _gains(self, sensor_gain: ArrayLike) -> FloatArray:
+        return one_or_each(sensor_gain, "sensor_gain", self.axes, above=0)
 
     def stretches(self) -> tuple[tuple[int, int], ...]:
         """Return (start, stop) of each stretch of contiguous usable frames."""
@@ -344,3 +330,72 @@ def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: i
     powers = np.vander(known - start, increasing=True)
     inside = np.vander(np.arange(stop - start), known.size, increasing=True)
     return np.asarray(inside @ np.linalg.solve(powers, series[known]))
+
+
+_LEAST_FRAMES = 4096
+_LEAST_SECONDS = 4.0
+_SHORTEST_STRETCH = 256  # frames of a stretch that counts
+
+
+def require_length(
+    record: LoopRecord,
+    *,
+    frames: int = _LEAST_FRAMES,
+    seconds: float = _LEAST_SECONDS,
+    resolution_hz: float | None = None,
+) -> int:
+    """Refuse a record that is too short for a model to be found.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record.
+    frames : int, optional
+        Usable frames that are needed, in stretches of at least 256.
+    seconds : float, optional
+        The same as a time [s].
+    resolution_hz : float, optional
+        Distance of frequencies that must be resolved [Hz]: the longest stretch has to last
+        ``1 / resolution_hz``.
+
+    Returns
+    -------
+    int
+        Usable frames in stretches of at least 256.
+
+    Raises
+    ------
+    ProblemError
+        If there are too few frames; it says how many there are and are needed, and which faults
+        were found.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> brief = lbt.identification.loop_record([[1.0], [2.5], [2.0]], frame_rate_hz=800, unit="nm")
+    >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s) ...
+    """
+    rate = record.frame_rate_hz
+    needed = integer(frames, "frames", at_least=1)
+    needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
+    lengths = [stop - start for start, stop in record.stretches()]
+    count = sum(length for length in lengths if length >= _SHORTEST_STRETCH)
+    longest = max(lengths, default=0)
+    if count < needed:
+        raise ProblemError(
+            f"the record needs {needed} usable frames ({needed / rate:.3g} s) in stretches of at "
+            f"least {_SHORTEST_STRETCH}; got {count}, the longest stretch {longest}. "
+            f"{record.health.summary()} Record more, or bridge short holes (record.bridged())."
+        )
+    if resolution_hz is None:
+        return count
+    line = int(np.ceil(rate / number(resolution_hz, "resolution_hz", above=0) * (1 - 1e-12)))
+    if longest < line:
+        raise ProblemError(
+            f"to tell frequencies {resolution_hz:g} Hz apart a stretch of {line} frames "
+            f"({line / rate:.3g} s) is needed; the longest has {longest}."
+        )
+    return count

@@ -10,13 +10,13 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import TabulatedSpectrum
 from lbt_synth.validation import (
+    Count,
     FloatArray,
+    Positive,
+    check_fields,
     frozen_copy,
-    integer,
     matrix,
-    number,
     real_array,
-    set_fields,
 )
 
 
@@ -60,9 +60,9 @@ class SpectrumRecord:
 
     frequency_hz: FloatArray
     density_nm2_hz: FloatArray
-    frame_rate_hz: float | None = None
-    averages: int | None = None
-    diameter_m: float | None = None
+    frame_rate_hz: Positive | None = None
+    averages: Count | None = None
+    diameter_m: Positive | None = None
     source: str = ""
     notes: tuple[str, ...] = ()
 
@@ -77,12 +77,7 @@ class SpectrumRecord:
             )
         for column in density.T:
             TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=column)
-        set_fields(self, frequency_hz=frequency, density_nm2_hz=density)
-        for name in ("frame_rate_hz", "diameter_m"):
-            if (value := getattr(self, name)) is not None:
-                set_fields(self, **{name: number(value, name, above=0)})
-        if self.averages is not None:
-            set_fields(self, averages=integer(self.averages, "averages", at_least=1))
+        check_fields(self, frequency_hz=frequency, density_nm2_hz=density)
         half = np.inf if self.frame_rate_hz is None else self.frame_rate_hz / 2
         if frequency[-1] > half * (1 + 1e-9):
             raise ProblemError(

@@ -16,8 +16,7 @@ from support.telemetry import ENDINGS, SHELL, full, same, telemetries
 import lbt_synth as lbt
 from lbt_synth.files.telemetry import store
 from lbt_synth.files.telemetry.aot import lost_fields
-from lbt_synth.files.telemetry.conventions import CONVENTION
-from lbt_synth.files.telemetry.fields import LAYERS
+from lbt_synth.files.telemetry.fields import CONVENTION, LAYERS
 from lbt_synth.storage import array_file as archive
 
 

@@ -9,9 +9,15 @@ import pytest
 from scipy.optimize import approx_fprime
 from support.recorded_loops import integrator_loop
 
-from lbt_synth.identification.fit.parameters import GAIN, Component, SpectrumModel
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
-from lbt_synth.identification.fit.whittle import contrast, density, derivatives
+from lbt_synth.identification.fit.whittle import (
+    GAIN,
+    Component,
+    SpectrumModel,
+    contrast,
+    density,
+    derivatives,
+)
 
 RATE = 1000.0
 

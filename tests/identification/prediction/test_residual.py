@@ -121,7 +121,11 @@ def test_the_default_settling_is_long_enough():
         (SPOILT, {}, r"open_loop, frames 0 to 2000, must be finite; got nan at index \(77, 0\)"),
         (SPOILT, {"stretches": [(50, 900)]}, r"frames 50 to 900, .* index \(27, 0\)"),
         (GOOD, {"noise_nm": -1.0}, "noise_nm must be at least 0"),
-        (GOOD, {"noise_nm": [1.0, 2.0, 3.0]}, "noise_nm must be a number or 2"),
+        (
+            GOOD,
+            {"noise_nm": [1.0, 2.0, 3.0]},
+            r"noise_nm must be one number, or one per measurement \(2\); got 3",
+        ),
         (GOOD, {"noise_nm": np.nan}, "noise_nm must be finite"),
         (GOOD, {"noise_error_nm": -0.1}, "noise_error_nm must be at least 0"),
         (GOOD, {"sensor_gain": 0.0}, "sensor_gain must be above 0"),

@@ -9,6 +9,7 @@ import pytest
 from support.tracking import AIR, DRIFT, Oracle, axis, broken, disturbed, line, run, simulated
 
 import lbt_synth as lbt
+from lbt_synth.identification.tracking.tracker import find_glitches
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 
 
@@ -265,3 +266,16 @@ def test_tracking_is_within_two_points_of_knowing(damping):
             assert strehl["tracking"] > strehl["fixed at 20 Hz"]
             assert strehl["tracking"] > strehl["integrator"] + 0.1
             assert tracker.kept == 0
+
+
+@pytest.mark.parametrize("frames", [16, 100, 3200])
+def test_clean_windows_have_no_outliers(frames):
+    rng = np.random.default_rng(frames)
+    swing = 500 * np.sin(0.15 * np.arange(frames))[:, None]
+    for _ in range(100):
+        series = swing + 15 * rng.standard_normal((frames, 2))
+        assert not find_glitches(series).any()
+        series[frames // 2, 1] += 3000
+        assert np.flatnonzero(find_glitches(series)).tolist() == [frames // 2]
+    assert not find_glitches(swing).any()
+    assert not find_glitches(np.zeros((frames, 1))).any()
