@@ -13,8 +13,8 @@ from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .prediction.predictor import LeastSquaresPredictor as LeastSquaresPredictor
 from .prediction.predictor import least_squares_predictor as least_squares_predictor
+from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual
-from .prediction.residual_estimate import ResidualEstimate as ResidualEstimate
 from .records.faults import Finding as Finding
 from .records.faults import RecordHealth as RecordHealth
 from .records.from_arrays import loop_record as loop_record

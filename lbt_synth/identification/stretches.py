@@ -108,3 +108,15 @@ def split_frames(
                 f"({c}, {d}) to test."
             )
     return fitted, tested
+
+
+def drop_settling(stretches: Stretches, settle: int) -> Stretches:
+    """Return the stretches without the frames in which a loop settles."""
+    kept = tuple((start + settle, stop) for start, stop in stretches if stop - start > settle)
+    if not kept:
+        longest = max(stop - start for start, stop in stretches)
+        raise ProblemError(
+            f"a stretch must be longer than the {settle} frames in which the loop settles; the "
+            f"longest has {longest}. Give a longer record, or lower settle_frames."
+        )
+    return kept

@@ -72,17 +72,6 @@ def read_json(content: bytes) -> tuple[dict[str, FloatArray], str]:
     return arrays, json.dumps(document["meta"])
 
 
-def pack_design(design: Design) -> DesignRecord:
-    """Record a design whole: what all designs have, and what its method adds."""
-    said = DesignRecord(meta={"library_version": lbt_synth.__version__, "convention": CONVENTION})
-    return said | record_common(design) | method_of_design(design.method).pack(design)
-
-
-def unpack_design(record: DesignRecord) -> Design:
-    """Rebuild a design; missing keys raise KeyError, wrong sizes a ProblemError."""
-    return method_of_design(record.meta["method"]).unpack(record)
-
-
 _READERS = {".fits": read_fits, ".npz": read_npz, ".json": read_json}
 _KIND = FileKind(
     name="gain file",
@@ -134,9 +123,16 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     target = require_gain_name(path)
     if not isinstance(design, Design):
         raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
-    record = pack_design(design)
-    arrays = record.arrays
-    meta = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **record.meta}
+    said = DesignRecord(
+        meta={
+            "schema": SCHEMA,
+            "schema_version": SCHEMA_VERSION,
+            "library_version": lbt_synth.__version__,
+            "convention": CONVENTION,
+        }
+    )
+    record = said | record_common(design) | method_of_design(design.method).pack(design)
+    arrays, meta = record.arrays, record.meta
     meta["digest"] = digest(arrays, meta)
     text, ending = json.dumps(meta, allow_nan=False), target.suffix.lower()
     if ending == ".fits":
@@ -190,4 +186,4 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
             )
     record = DesignRecord({name: frozen_copy(array) for name, array in arrays.items()}, meta)
     with _KIND.rebuilding(source):
-        return unpack_design(record), str(meta["digest"])
+        return method_of_design(meta["method"]).unpack(record), str(meta["digest"])

@@ -14,15 +14,14 @@ from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.identification.prediction.predictor import least_squares_predictor
 from lbt_synth.identification.prediction.residual import (
     PredictionData,
+    ResidualEstimate,
     check_series,
     choose_settling,
-    drop_settling,
     inverse_sensor,
     predict_residual,
     prediction_data,
 )
-from lbt_synth.identification.prediction.residual_estimate import ResidualEstimate
-from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
+from lbt_synth.identification.stretches import Stretches, StretchesLike, drop_settling, split_frames
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual

@@ -26,7 +26,6 @@ from lbt_synth.validation import (
     set_fields,
 )
 
-_MOST_AXES = 2
 _BRIDGED_FRAMES = 3
 _BRIDGED_FRACTION = 0.01
 _NOT_KNOWN = "correction not known"
@@ -107,7 +106,7 @@ class LoopRecord:
     def __post_init__(self) -> None:
         y = matrix(self.measurements, "measurements")
         check_fields(self, measurements=y)
-        if not 1 <= y.shape[1] <= _MOST_AXES or len(y) == 0:
+        if not 1 <= y.shape[1] <= 2 or len(y) == 0:
             raise DimensionError(
                 f"measurements must be (frames, axes) of one or two axes; got {y.shape}."
             )

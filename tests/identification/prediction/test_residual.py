@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.predictions import (
+    CAMERA,
     CASES,
     FLAT,
     GOOD,
@@ -14,11 +15,152 @@ from support.predictions import (
     RATE,
     SPOILT,
     a_plant,
+    a_series,
     a_truth,
     pseudo_open_loop,
 )
 
 import lbt_synth as lbt
+from lbt_synth.identification.prediction.residual import estimate_residual
+
+
+def test_the_standard_errors_are_those_of_many_nights():
+    """Correlated axes, coloured residuals, two stretches: errors per axis, in total, and paired."""
+    rng = np.random.default_rng(7)
+    stretches = ((0, 700), (900, 1500))
+    rows = np.r_[0:700, 900:1500]
+    noise = np.diag([1.0, 4.0])
+    mixing = np.array([[1.0, 0.0], [0.8, 0.6]])
+    model = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    # of y = 0.4 x and of x itself, both with the same noise
+    exact = np.array([1, 0.16])[:, None, None] * mixing @ mixing.T * model.rms_nm**2
+    seen, errors, paired, paired_errors = [], [], [], []
+    for _ in range(300):
+        x = np.column_stack([a_series(model, 1500, rng, 200) for _ in range(2)]) @ mixing.T
+        w = rng.standard_normal((1500, 2)) @ np.sqrt(noise)
+        one, other = (
+            estimate_residual(
+                (part * x + w)[rows], stretches, noise_nm2=noise, noise_error_nm4=np.zeros((2, 2))
+            )
+            for part in (1.0, 0.4)
+        )
+        seen.append([*one.variance_nm2, one.total_nm2])
+        errors.append([*one.variance_error_nm2, one.total_error_nm2])
+        difference, error = one.above(other)
+        paired.append(difference)
+        paired_errors.append(error)
+    wanted = np.array([*np.diag(exact[0]), np.trace(exact[0])])
+    seen, errors = np.array(seen), np.sqrt(np.mean(np.square(errors), axis=0))
+    scatter = np.std(seen, axis=0)
+    # 300 nights know their scatter to 4 %, and their mean to scatter / 17
+    np.testing.assert_allclose(scatter, errors, rtol=0.15)
+    assert np.all(np.abs(np.mean(seen, axis=0) - wanted) < 4 * scatter / np.sqrt(300))
+    # without the correlation of the axes the error of the total would be too small
+    assert errors[2] > 1.1 * np.hypot(errors[0], errors[1])
+    rms = np.sqrt(np.mean(np.square(paired_errors)))
+    assert np.std(paired) == pytest.approx(rms, rel=0.15)
+    assert abs(np.mean(paired) - np.trace(exact[0] - exact[1])) < 4 * rms / np.sqrt(300)
+    backwards, error = other.above(one)
+    assert (backwards, error) == (-paired[-1], pytest.approx(paired_errors[-1], rel=1e-12))
+
+
+def test_the_errors_of_a_pure_sinusoid_are_far_too_large():
+    """They are those of Gaussian series; the mean square of a sinusoid hardly scatters."""
+    path, rng = lbt.LoopHardware(frame_rate_hz=RATE, modes=1), np.random.default_rng(7)
+    air = lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
+    new = lbt.integrator(path, gain=0.3).controller
+    seen, errors = [], []
+    for phase in rng.uniform(0, 2 * np.pi, 60):
+        line = np.sqrt(2) * 200 * np.sin(2 * np.pi * 20 * np.arange(6000) / RATE + phase)
+        z = (line + a_series(air, 6000, rng) + 15.5 * rng.standard_normal(6000))[:, None]
+        found = lbt.identification.replayed_residual(z, new, path, noise_nm=15.5)
+        seen.append(found.total_nm2)
+        errors.append(found.total_error_nm2)
+    assert 7 < np.sqrt(np.mean(np.square(errors))) / np.std(seen) < 14
+
+
+def test_the_noise_of_the_noise_is_added():
+    path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=0.5 * np.eye(2))
+    z = np.random.default_rng(0).standard_normal((1000, 2))
+    new = lbt.integrator(path, gain=0.3).controller
+    plain = lbt.identification.replayed_residual(z, new, path, noise_nm=[0.2, 0.3])
+    given_ = lbt.identification.replayed_residual(
+        z, new, path, noise_nm=[0.2, 0.3], noise_error_nm=[0.01, 0.02]
+    )
+    added = np.sqrt(given_.variance_error_nm2**2 - plain.variance_error_nm2**2)
+    np.testing.assert_allclose(added, [2 * 0.2 * 0.01 / 0.25, 2 * 0.3 * 0.02 / 0.25], rtol=1e-9)
+    np.testing.assert_allclose(np.diag(given_.noise_nm2), [0.04 / 0.25, 0.09 / 0.25], rtol=1e-12)
+
+
+def test_the_noise_of_coupled_sensors_has_common_errors():
+    """Against the noise subtracted with each deviation a little larger, one at a time."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[1, 0.9], [0.9, 1]])
+    z = 100 * np.random.default_rng(0).standard_normal((1000, 2))
+    new = lbt.integrator(path, gain=0.3).controller
+    noise, error = np.array([10.0, 8.0]), np.array([1.0, 0.5])
+
+    def estimate(noise_nm, error_nm):
+        return lbt.identification.replayed_residual(
+            z, new, path, noise_nm=noise_nm, noise_error_nm=error_nm
+        )
+
+    added = estimate(noise, error).error_nm4 - estimate(noise, 0.0).error_nm4
+    more = [estimate(noise + 0.01 * step, 0.0).variance_nm2 for step in np.eye(2)]
+    less = [estimate(noise - 0.01 * step, 0.0).variance_nm2 for step in np.eye(2)]
+    slope = (np.array(more) - np.array(less)).T / 0.02
+    np.testing.assert_allclose(added, slope @ np.diag(error**2) @ slope.T, rtol=1e-6)
+    # 2 s ds through the squares of the inverse, on both axes at once
+    squares = np.linalg.inv(path.sensor) ** 2
+    total = np.linalg.norm(np.sum(squares, axis=0) * 2 * noise * error)
+    assert np.sqrt(np.sum(added)) == pytest.approx(total, rel=1e-9)
+    assert total > 1.3 * np.sqrt(np.trace(added))
+
+
+def test_a_residual_far_below_zero_refutes_the_noise():
+    idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / RATE)
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    z = 10 * np.random.default_rng(0).standard_normal((4000, 1))
+    right, wrong = (
+        lbt.identification.replayed_residual(z, idle, path, noise_nm=s) for s in (10.0, 12.0)
+    )
+    assert not right.refuted
+    assert np.isfinite(right.upper_nm)
+    assert wrong.refuted
+    assert wrong.errors_below_zero == pytest.approx(44 * np.sqrt(4000 / 2) / 100, rel=0.1)
+    assert np.isnan([wrong.upper_nm, wrong.rms_nm, wrong.rms_error_nm]).all()
+    # one axis is enough
+    both = lbt.identification.replayed_residual(
+        np.column_stack([z, 10 * z]),
+        lbt.Controller(A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=np.zeros((2, 2)), dt_s=1 / RATE),
+        PATH,
+        noise_nm=12.0,
+    )
+    assert both.total_nm2 > 0
+    assert both.refuted
+
+
+def test_a_residual_below_its_noise_is_not_cut_off():
+    path = lbt.LoopHardware(frame_rate_hz=RATE)
+    idle = lbt.Controller(
+        A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=np.zeros((2, 2)), dt_s=1 / RATE
+    )
+    signs = []
+    for seed in range(40):
+        z = 10 * np.random.default_rng(seed).standard_normal((400, 2))
+        found = lbt.identification.replayed_residual(z, idle, path, noise_nm=10.0, settle_frames=0)
+        assert found.total_nm2 == pytest.approx(np.sum(np.mean(z**2, axis=0)) - 200, abs=1e-9)
+        assert abs(found.total_nm2) < 5 * found.total_error_nm2
+        negative = found.total_nm2 < 0
+        assert np.isnan(found.rms_nm) == np.isnan(found.rms_error_nm) == negative
+        assert found.upper_nm**2 == pytest.approx(
+            max(found.total_nm2 + 2 * found.total_error_nm2, 0)
+        )
+        if np.any(found.variance_nm2 < 0):
+            assert np.isnan(found.strehl(CAMERA))
+            assert np.isnan(found.axis_rms_nm).any()
+            assert np.isnan(found.axis_rms_error_nm).any()
+        signs.append(negative)
+    assert 10 < sum(signs) < 30  # there is nothing: either sign
 
 
 @pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
