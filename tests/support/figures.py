@@ -4,8 +4,12 @@ from __future__ import annotations
 
 
 def legend(axis):
-    """Names of what is drawn in a plot, in order, all of which the legend of the figure shows."""
-    names = list(dict.fromkeys(axis.get_legend_handles_labels()[1]))
+    """Names of what is drawn in a plot, in order; the figure's legend shows those of all plots."""
+
+    def names(one):
+        return one.get_legend_handles_labels()[1]
+
     (shown,) = axis.figure.legends
-    assert set(names) <= {text.get_text() for text in shown.get_texts()}
-    return names
+    everywhere = dict.fromkeys(name for one in axis.figure.axes for name in names(one))
+    assert sorted(text.get_text() for text in shown.get_texts()) == sorted(everywhere)
+    return list(dict.fromkeys(names(axis)))

@@ -122,7 +122,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
                         x=np.arange(6.0),
                         y=[0.2, 0.4, 0.7, 1.0, 1.4],
                         values=values,
-                        low=1,
+                        low=1 if title == "other" else 0,
                         high=30,
                         label="ratio",
                         unit="%",

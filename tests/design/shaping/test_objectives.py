@@ -57,3 +57,8 @@ def test_a_narrow_line_of_a_tabulated_spectrum_is_not_missed():
     rejecting = lbt.design.shape(ONE, spec(objective=seen), functions=30, states=None)
     left = 100 * abs(lbt.close_loop(ONE, rejecting.controller).sensitivity([f0])[0, 0, 0])
     assert left < rejecting.objective_nm[0]
+
+
+def test_a_specification_knows_the_bands_of_its_objective():
+    band = lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797)
+    assert lbt.design.shaping.Specification(objective=band, demands=()).bands_hz == ((16.5, 23.5),)

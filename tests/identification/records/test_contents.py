@@ -193,6 +193,9 @@ def test_gaps_and_comments_of_text_tables():
     names, values, _ = table_of("# mode: closed\ntime_s, y_nm\n0.000, 3.5\n0.001, \n")
     assert names == ["time_s", "y_nm"]
     assert np.array_equal(values, [[0.0, 3.5], [0.001, np.nan]], equal_nan=True)
+    found = parse_contents(Path("a.csv"), b"# mode: closed\n# frame_rate_hz: 500\ny_nm\n1.0\n2.0\n")
+    assert list(found.facts) == ["frame_rate_hz"]  # the other comment says nothing that is known
+    assert list(found.facts["frame_rate_hz"]) == ["the comment frame_rate_hz"]
 
 
 @settings(max_examples=40)

@@ -139,7 +139,8 @@ def test_rates_in_headers(tmp_path, series, card):
     assert seen.frame_rate_hz == RATE
     assert any(note.startswith("frame_rate_hz 500, by") for note in seen.health.notes)
     with pytest.raises(
-        lbt.errors.ProblemError, match="frame_rate_hz must be that of .*, 500; got 1000"
+        lbt.errors.ProblemError,
+        match=rf"frame_rate_hz must be that of .*{card.split()[-1]}.*, 500; got 1000",
     ):
         lbt.load_record(path, frame_rate_hz=1000)
 

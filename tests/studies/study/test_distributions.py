@@ -36,5 +36,8 @@ def test_distributions(tmp_path):
     assert found.tolist() == [10, 20, 30]
     assert counts.tolist() == [1024, 1024, 2048]
     weights = [1e308, 1e308, 1e308]  # their sum is infinite
+    cut = {"normal": {"mean": 20, "deviation": 0.5, "low": 20}}
+    edge = ParameterSection.model_validate(cut).quantile(np.array([0.0]))
+    assert edge.round(6).tolist() == [20.0]
     huge = ParameterSection.model_validate({"list": [1.0, 2.0, 3.0], "weights": weights})
     assert huge.quantile(np.array([0.1, 0.5, 0.9])).tolist() == [1, 2, 3]
