@@ -27,8 +27,8 @@ from .records.record import LoopRecord as LoopRecord
 from .records.record import require_length as require_length
 from .records.spectrum import SpectrumRecord as SpectrumRecord
 from .stretches import split_halves as split_halves
-from .tracking.line_follower import LineFollower as LineFollower
-from .tracking.loop_identifier import LoopIdentifier as LoopIdentifier
+from .tracking.identifiers import LineFollower as LineFollower
+from .tracking.identifiers import LoopIdentifier as LoopIdentifier
 from .tracking.switching import SwitchedController as SwitchedController
 from .tracking.switching import SwitchReport as SwitchReport
 from .tracking.tracker import Identifier as Identifier

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import FilterDesign, kalman
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.records.faults import fill, find_outliers, runs
-from lbt_synth.identification.tracking.loop_identifier import LoopIdentifier
+from lbt_synth.identification.tracking.identifiers import LoopIdentifier
 from lbt_synth.identification.tracking.switching import SwitchedController, require_same_loop
 from lbt_synth.identification.tracking.trend import LineTrack, match_tracks
 from lbt_synth.models import TipTiltPlant, Vibration
