@@ -16,11 +16,11 @@ from lbt_synth.linear.riccati.gamma import gamma_riccati
 from lbt_synth.studies.paper.parameters import (
     KALMAN_DAMPING,
     PAPER_TRUTH,
+    TABLE_III,
     TRUTH_SENSOR_GAIN,
     imaging,
     turbulence_model,
 )
-from lbt_synth.studies.paper.published import TABLE_III
 
 NOISE_NM = PAPER_TRUTH.noise_nm
 TARGET = np.array([row.hinf for row in TABLE_III])

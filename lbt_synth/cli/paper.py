@@ -10,8 +10,7 @@ from lbt_synth.cli.progress import track_progress
 from lbt_synth.methods.registry import design_title
 from lbt_synth.report.paper import PaperResult, write_paper
 from lbt_synth.storage.rows import json_record
-from lbt_synth.studies.paper.parameters import PARAMETERS
-from lbt_synth.studies.paper.published import TABLE_III
+from lbt_synth.studies.paper.parameters import PARAMETERS, TABLE_III
 from lbt_synth.studies.paper.tables import TableEntry, rms_difference, table_iii
 
 
@@ -34,7 +33,9 @@ def run(arguments: Namespace) -> Report:
             "table_iii": [json_record(entry) for entry in result.table_iii],
             "table_iii_rms_points": columns,
             "hinf_gamma_ratio": _gamma_ratio(result),
-            "parameters": [parameter._asdict() for parameter in PARAMETERS],
+            "parameters": [
+                dict(zip(("name", "value", "origin"), row, strict=True)) for row in PARAMETERS
+            ],
         },
         notes=[
             "Table III, rms difference: "

@@ -19,9 +19,8 @@ from lbt_synth.report import write_study_page
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.studies.study.cluster import connect_cluster
-from lbt_synth.studies.study.output_files import read_failures
 from lbt_synth.studies.study.run import FinishedStudy, output_paths
-from lbt_synth.studies.study.store import PAGE, PRINT
+from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
 from lbt_synth.studies.study.summary import worst_table
 
 _COUNTS = ("samples", "computed", "failures", "retry", "seconds")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from lbt_synth.config.plant_and_truth import require_atmosphere, require_telescope
 from lbt_synth.config.schema import FileSection
-from lbt_synth.config.telescope_and_atmosphere import require_atmosphere, require_telescope
 from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.interop import EndToEndSetup, EndToEndSystem
 from lbt_synth.models import LoopHardware, Truth

@@ -8,6 +8,7 @@ import numpy as np
 
 from lbt_synth.config.load import Config, build_config
 from lbt_synth.config.plant_and_truth import (
+    WEATHER,
     assumed_gains,
     measurement_noise_nm,
     relative_gain,
@@ -19,7 +20,6 @@ from lbt_synth.config.plant_and_truth import (
 )
 from lbt_synth.config.samples import Keys, Reads, accepted_by_schema, view_samples
 from lbt_synth.config.schema import Ar1Section, FileSection
-from lbt_synth.config.telescope_and_atmosphere import WEATHER
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
 from lbt_synth.models import ARModel, FrozenFlows, ModalTurbulence, Vibration

@@ -14,15 +14,15 @@ from ruamel.yaml.error import YAMLError
 
 from lbt_synth.config.end_to_end import build_end_to_end_setup
 from lbt_synth.config.plant_and_truth import (
+    build_atmosphere,
     build_plant,
     build_truth,
     measurement_noise_nm,
     reference_gain,
+    require_atmosphere,
     vibration_rms_nm,
 )
-from lbt_synth.config.schema import FileSection
-from lbt_synth.config.schema_errors import describe_error
-from lbt_synth.config.telescope_and_atmosphere import build_atmosphere, require_atmosphere
+from lbt_synth.config.schema import FileSection, describe_error
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, ProblemError, name_file
 from lbt_synth.interop import EndToEndSetup

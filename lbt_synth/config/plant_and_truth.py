@@ -17,14 +17,11 @@ from lbt_synth.config.schema import (
     Ar1Section,
     Ar2Section,
     ArSection,
+    AtmosphereSection,
     FileSection,
     LocalLoopSection,
+    TelescopeSection,
     VibrationSection,
-)
-from lbt_synth.config.telescope_and_atmosphere import (
-    convert_mas_to_nm,
-    require_atmosphere,
-    require_telescope,
 )
 from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.models import (
@@ -40,12 +37,49 @@ from lbt_synth.models import (
     ar1_turbulence,
     ar2_turbulence,
     illuminated_subapertures,
+    nm_per_mas,
     pyramid_tilt_noise_nm,
     tip_tilt_plant,
 )
 from lbt_synth.models.plant.frequency_prior import line_frequencies, spread_lines
 from lbt_synth.models.vibration.in_a_loop import TrueVibration
 from lbt_synth.validation import FloatArray, frozen_copy
+
+WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # keys of FrozenFlows
+
+
+def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
+    """Return the section ``telescope``; raise ConfigError with the reason if it is missing."""
+    if settings.telescope is None:
+        raise ConfigError(f"the key telescope is missing: {reason}.", path="telescope")
+    return settings.telescope
+
+
+def require_atmosphere(settings: FileSection, reason: str) -> AtmosphereSection:
+    """Return the section ``atmosphere``; raise ConfigError with the reason if it is missing."""
+    if settings.atmosphere is None:
+        raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
+    return settings.atmosphere
+
+
+def convert_mas_to_nm(settings: FileSection, mas: float, key: str) -> float:
+    """Convert an angle of the file [mas] to a wavefront [nm rms]."""
+    reason = f"{key} is in mas, and a wavefront in nm needs telescope.diameter_m"
+    telescope = require_telescope(settings, f"{reason}. Give it, or the value in nm")
+    return mas * nm_per_mas(telescope.diameter_m)
+
+
+def build_atmosphere(settings: FileSection) -> Atmosphere | None:
+    """Build the atmosphere of a configuration, None if it has none."""
+    air = settings.atmosphere
+    if air is None:
+        return None
+    telescope = require_telescope(
+        settings, "the turbulence of atmosphere is that over its diameter"
+    )
+    weather = {name: getattr(air.per_sample, name) for name in WEATHER}
+    rest = air.model_dump(exclude=set(WEATHER))
+    return Atmosphere(diameter_m=telescope.diameter_m, **rest, **weather)
 
 
 def measurement_noise_nm(settings: FileSection) -> float | FloatArray:

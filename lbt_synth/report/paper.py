@@ -16,8 +16,7 @@ from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.rows import csv_rows
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
-from lbt_synth.studies.paper.parameters import PARAMETERS, VIBRATION_HZ
-from lbt_synth.studies.paper.published import TABLE_III
+from lbt_synth.studies.paper.parameters import PARAMETERS, TABLE_III, VIBRATION_HZ
 from lbt_synth.studies.paper.tables import TableEntry, compare_with_paper, paper_filters, table_ii
 
 

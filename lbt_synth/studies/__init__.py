@@ -13,5 +13,4 @@ __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 from lbt_synth.studies.limits import limits as limits  # noqa: E402
 from lbt_synth.studies.mirror import mirror as mirror  # noqa: E402
 from lbt_synth.studies.robustness import robustness as robustness  # noqa: E402
-from lbt_synth.studies.robustness_map import robustness_map as robustness_map  # noqa: E402
 from lbt_synth.studies.tradeoff import tradeoff as tradeoff  # noqa: E402

@@ -5,10 +5,10 @@ from .mirror import MirrorRow as MirrorRow
 from .mirror import mirror as mirror
 from .paper.end_to_end import EndToEndEntry as EndToEndEntry
 from .paper.end_to_end import end_to_end_tables as end_to_end_tables
+from .robustness import RobustnessMap as RobustnessMap
 from .robustness import RobustnessRow as RobustnessRow
 from .robustness import robustness as robustness
-from .robustness_map import RobustnessMap as RobustnessMap
-from .robustness_map import robustness_map as robustness_map
+from .robustness import robustness_map as robustness_map
 from .study.batch_evaluation import evaluate_samples as evaluate_samples
 from .study.load import load_study as load_study
 from .study.replay import Replay as Replay
@@ -17,6 +17,7 @@ from .study.run import Estimate as Estimate
 from .study.run import StudyRun as StudyRun
 from .study.run import estimate_study as estimate_study
 from .study.run import run_study as run_study
+from .study.sensitivity import first_order_index as first_order_index
 from .study.statistics import ControllerStatistics as ControllerStatistics
 from .study.statistics import StudyStatistics as StudyStatistics
 from .study.statistics import study_statistics as study_statistics
@@ -24,6 +25,5 @@ from .study.study import BatchResult as BatchResult
 from .study.study import Failure as Failure
 from .study.study import Study as Study
 from .study.summary import summary_tables as summary_tables
-from .study.variance_index import first_order_index as first_order_index
 from .tradeoff import TradeoffPoint as TradeoffPoint
 from .tradeoff import tradeoff as tradeoff

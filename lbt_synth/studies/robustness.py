@@ -1,19 +1,39 @@
-"""Robustness of designs to an error in the vibration's frequency, as in the paper's Table III."""
+"""Robustness of designs: designed again at each frequency error, or fixed over a map of errors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
-from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.loop import (
+    EnsembleVibration,
+    Imaging,
+    LoopEnsemble,
+    close_loop,
+    ensemble_residuals,
+    residual_budget,
+    strehl,
+)
 from lbt_synth.methods.plant_inputs import reference_design
 from lbt_synth.methods.registry import record_methods, reference_methods
-from lbt_synth.models import TipTiltPlant, Truth, retuned_plant
+from lbt_synth.models import LoopHardware, TipTiltPlant, Truth, Vibration, retuned_plant
+from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.validation import choice, number
+from lbt_synth.validation import (
+    BoolArray,
+    FloatArray,
+    choice,
+    number,
+    read_only,
+    real_array,
+    require_instance,
+)
 
 
 @table_row
@@ -125,3 +145,204 @@ def _row(design: Design, truth: Truth, imaging: Imaging, error: float) -> Robust
         strehl=strehl(budget, imaging),
         residual_nm=budget.rms_nm,
     )
+
+
+_GAINS_AT_ONCE = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RobustnessMap:
+    """Strehl ratio of a fixed design over errors in what it assumes about the loop.
+
+    Attributes
+    ----------
+    errors_hz : (e,) ndarray
+        Frequency that the design assumes less the true one [Hz].
+    sensor_gains : (g,) ndarray
+        Real sensor gain relative to the design's sensor matrix.
+    delay_errors_frames : (d,) ndarray
+        Real delay less that of the design [frames].
+    strehl : (d, g, e) ndarray
+        Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by more
+        than 160 times its width.
+    residual_nm : (d, g, e) ndarray
+        Residual of the modes [nm rms]; nan where the loop is unstable.
+    stable : (d, g) bool ndarray
+        Whether the loop is stable, which a frequency error does not change.
+    """
+
+    errors_hz: FloatArray
+    sensor_gains: FloatArray
+    delay_errors_frames: FloatArray
+    strehl: FloatArray
+    residual_nm: FloatArray
+    stable: BoolArray
+
+
+def robustness_map(
+    design: Design,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    errors_hz: ArrayLike,
+    sensor_gains: ArrayLike,
+    delay_errors_frames: ArrayLike = (0.0,),
+    advance: Callable[[int], object] | None = None,
+) -> RobustnessMap:
+    """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
+
+    Parameters
+    ----------
+    design : Design
+        The design, with a loop of one or two modes; its controller stays as it is.
+    truth : Truth
+        What the loop meets without any error. Its own sensor gain plays no part.
+    imaging : Imaging
+        The camera.
+    errors_hz : (e,) array_like
+        Frequency that the design assumes less the true one [Hz]: every vibration of the truth
+        moves by minus the error and keeps its rms.
+    sensor_gains : (g,) array_like
+        Real sensor gains relative to the design's sensor matrix.
+    delay_errors_frames : (d,) array_like, optional
+        Real delay less that of the design [frames].
+    advance : callable, optional
+        Called with the number of points computed since its last call.
+
+    Returns
+    -------
+    RobustnessMap
+        Strehl ratio, residual and stability at all combinations.
+
+    Raises
+    ------
+    ProblemError
+        If the design has no loop, or a value is out of its range or given twice.
+    DimensionError
+        If the loop has more than two modes, or a vibration another number of them.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> found = lbt.studies.robustness_map(
+    ...     lbt.kalman(config.plant),
+    ...     config.truth,
+    ...     config.imaging,
+    ...     errors_hz=[0, 3],
+    ...     sensor_gains=[0.5, 1.0, 9.0],
+    ... )
+    >>> found.strehl.shape, found.stable[0].tolist()
+    ((1, 3, 2), [True, True, False])
+    >>> bool(found.strehl[0, 1, 0] > found.strehl[0, 1, 1])
+    True
+    """
+    for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
+        require_instance(value, kind)
+    hardware = _checked_hardware(design)
+    errors = _checked_axis(errors_hz, "errors_hz")
+    gains = _checked_axis(sensor_gains, "sensor_gains", above=0)
+    delays = _checked_axis(
+        delay_errors_frames,
+        "delay_errors_frames",
+        at_least=1 - hardware.delay_frames,
+        at_most=100 - hardware.delay_frames,
+        hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
+        "lie between 1 and 100.",
+    )
+    lines = _shift_vibrations(truth, errors, hardware)
+    noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
+
+    def evaluate(delay: float, some: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return Strehl ratio, residual and stability for some gains and all errors."""
+        ensemble = LoopEnsemble(
+            sensor_gain=np.repeat(some, errors.size),
+            delay_frames=hardware.delay_frames + delay,
+            noise_nm=noise_nm,
+            turbulence=truth.turbulence,
+            vibrations=tuple(
+                replace(line, frequency_hz=np.tile(line.frequency_hz, some.size)) for line in lines
+            ),
+        )
+        found = ensemble_residuals(design.controller, hardware, ensemble)
+        if advance is not None:
+            advance(some.size * errors.size)
+        shape = (some.size, errors.size)
+        return (
+            found.strehl(imaging).reshape(shape),
+            found.rms_nm.reshape(shape),
+            found.stable.reshape(shape),
+        )
+
+    parts = np.split(gains, range(_GAINS_AT_ONCE, gains.size, _GAINS_AT_ONCE))
+    found = [[evaluate(delay, some) for some in parts] for delay in delays]
+    strehls, residuals, stable = (
+        np.stack([np.concatenate([part[kind] for part in row]) for row in found])
+        for kind in range(3)
+    )
+    return RobustnessMap(
+        errors_hz=errors,
+        sensor_gains=gains,
+        delay_errors_frames=delays,
+        strehl=read_only(strehls),
+        residual_nm=read_only(residuals),
+        stable=read_only(stable[..., 0]),
+    )
+
+
+def _checked_hardware(design: Design) -> LoopHardware:
+    """Return the loop of a design, which has one or two axes."""
+    hardware = design.hardware
+    if hardware is None:
+        raise ProblemError(
+            "a map needs a design for a loop; got one of a bare estimation problem. Design for a "
+            "plant of tip_tilt_plant."
+        )
+    if hardware.modes > 2:
+        raise DimensionError(
+            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
+        )
+    return hardware
+
+
+def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
+    """Return the values of one axis of the map, each within its bounds and given once."""
+    axis = real_array(values, name)
+    if axis.ndim != 1 or axis.size == 0:
+        raise DimensionError(f"{name} must be a list of at least one number; got {axis.shape}.")
+    for value in axis:
+        number(value, name, **bounds)
+    if np.unique(axis).size != axis.size:
+        raise ProblemError(f"{name} must hold each value once; got {axis.tolist()}.")
+    return axis
+
+
+def _shift_vibrations(
+    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
+) -> list[EnsembleVibration]:
+    """Return the true vibrations, each at its frequency less every error."""
+    if not truth.vibrations and np.any(errors_hz != 0):
+        raise ProblemError(
+            "a frequency error needs a vibration in the truth; got a truth without any."
+        )
+    nyquist = hardware.frame_rate_hz / 2
+    moved = []
+    for vibration in stationary_vibrations(truth.vibrations):
+        checked_direction(vibration, hardware)
+        frequencies = vibration.frequency_hz - errors_hz
+        wrong = ~((frequencies > 0) & (frequencies < nyquist))
+        if np.any(wrong):
+            raise ProblemError(
+                f"errors_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
+                f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
+                f"{vibration.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
+            )
+        moved.append(
+            EnsembleVibration(
+                frequency_hz=frequencies,
+                rms_nm=vibration.rms_nm,
+                direction=vibration.direction,
+                damping=vibration.damping if isinstance(vibration, Vibration) else None,
+            )
+        )
+    return moved

@@ -1,11 +1,15 @@
-"""Robustness to frequency errors."""
+"""Robustness to frequency errors, and maps over errors of frequency, gain and delay."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from support import uneven_axes
 from support.drifting import drifting
-from support.plants import lbt_axis_plant
+from support.plants import LBT_YAML, lbt_axis_plant
+from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
 
@@ -76,3 +80,253 @@ def test_what_needs_a_stationary_truth_refuses_it(config):
     ):
         with pytest.raises(lbt.errors.ProblemError, match="drifts from 17 to 23 Hz. Simulate it"):
             refused()
+
+
+CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
+
+
+SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+
+
+DIAGONAL = (0.8, 0.6)
+
+
+def sinusoid(frequency_hz=20.0, rms_nm=797.0, direction=(1.0, 0.0)):
+    return lbt.models.SinusoidalVibration(
+        frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction
+    )
+
+
+def random_line(frequency_hz=20.0, rms_nm=500.0, damping=0.01, direction=(1.0, 0.0)):
+    return lbt.Vibration(
+        frequency_hz=frequency_hz, damping=damping, rms_nm=rms_nm, direction=direction
+    )
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return lbt.load_config(LBT_YAML)
+
+
+@pytest.fixture(scope="module")
+def kalman(settings):
+    return lbt.kalman(settings.plant)
+
+
+@pytest.fixture(scope="module")
+def robust(settings):
+    return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
+
+
+def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
+    found = lbt.studies.robustness_map(
+        design, truth, imaging, errors_hz=errors, sensor_gains=gains, delay_errors_frames=delays
+    )
+    assert found.stable.any()
+    for i, delay in enumerate(delays):
+        for j, gain in enumerate(gains):
+            for k, error in enumerate(errors):
+                if not found.stable[i, j]:
+                    with pytest.raises(lbt.errors.UnstableLoopError):
+                        evaluate_point(design, truth, imaging, error, gain, delay)
+                    continue
+                here = found.strehl[i, j, k], found.residual_nm[i, j, k]
+                expected = evaluate_point(design, truth, imaging, error, gain, delay)
+                assert here == pytest.approx(expected, rel=1e-6), (delay, gain, error)
+    return found
+
+
+TRUTHS = {
+    "sinusoid": ((sinusoid(),), "air"),
+    "two sinusoids": ((sinusoid(), sinusoid(33.0, 120, (0.0, 1.0))), "air"),
+    "diagonal": ((sinusoid(direction=DIAGONAL),), "air"),
+    "random": ((random_line(),), "none"),
+    "random and sinusoid": ((random_line(25.0, 90, 0.02, DIAGONAL), sinusoid()), "ar"),
+    "table": ((sinusoid(),), "table"),
+}
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_each_point_is_that_of_the_single_evaluator(kalman, air, name):
+    vibrations, turbulence = TRUTHS[name]
+    table = lbt.models.TabulatedSpectrum(
+        frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1]
+    )
+    spectra = {"air": air, "ar": SLOW, "none": None, "table": table}
+    truth = lbt.Truth(turbulence=spectra[turbulence], vibrations=vibrations, noise_nm=15.5)
+    assert_as_single(kalman, truth, CAMERA, [-2.5, 0.0, 1.0], [0.07, 0.6, 1.0, 1.9])
+
+
+def test_points_next_to_instability(robust, settings):
+    low, high = lbt.loop.stable_sensor_gains(robust.hardware, robust.controller)
+    gains = [low * 1.01, low * 1.0001, 1.0, high * 0.99, high * (1 - 1e-6)]
+    assert_as_single(robust, settings.truth, settings.imaging, [1.0], gains)
+
+
+def test_delay_errors_whole_and_fractional(air):
+    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(),), noise_nm=15.5)
+    lazy = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
+    found = assert_as_single(lazy, truth, CAMERA, [0.0, 2.0], [0.5, 1.0], [-1.0, 0.0, 0.25, 1.0])
+    assert np.all(np.diff(found.strehl[:, 1, 0]) < 0)  # a later loop is a worse one
+
+
+def test_one_axis(axis_plant, air):
+    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(direction=(1.0,)),), noise_nm=15.5)
+    assert_as_single(lbt.kalman(axis_plant), truth, CAMERA, [0.0, 1.5], [0.4, 1.0])
+
+
+def test_axes_that_the_sensor_mixes(air):
+    """A sensor and a mirror that turn and mix the axes."""
+    path = {
+        "sensor_matrix": [[1.1, 0.3], [-0.2, 0.8], [0.4, 0.1]],
+        "influence_matrix": [[1, 0.2], [0, 0.9]],
+    }
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800, turbulence=SLOW, vibrations=[random_line()], noise_nm=15.5, **path
+    )
+    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(direction=DIAGONAL),), noise_nm=15.5)
+    assert_as_single(lbt.kalman(plant), truth, CAMERA, [-1.0, 0.0], [0.5, 1.0, 1.3])
+
+
+def test_unstable_points_are_nan(robust, settings):
+    found = lbt.studies.robustness_map(
+        robust, settings.truth, settings.imaging, errors_hz=[-1, 0], sensor_gains=[0.3, 1.0, 3.0]
+    )
+    assert found.stable[0].tolist() == [False, True, False]
+    assert np.isnan(found.strehl[0, [0, 2]]).all()
+    assert np.isnan(found.residual_nm[0, [0, 2]]).all()
+    assert np.isfinite(found.strehl[0, 1]).all()
+    none = lbt.studies.robustness_map(
+        robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[0.1]
+    )
+    assert np.isnan(none.strehl).all()
+
+
+def test_an_image_that_is_gone_has_no_strehl(robust, settings):
+    _, high = lbt.loop.stable_sensor_gains(robust.hardware, robust.controller)
+    found = lbt.studies.robustness_map(
+        robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[high * (1 - 1e-8)]
+    )
+    assert found.stable.all()
+    assert found.residual_nm.min() > 9e4
+    assert found.strehl.max() == 0
+
+
+def test_order_and_neighbours_change_nothing(kalman, settings):
+    """A point is the same alone, among others, in any order, and more of them than fit at once."""
+
+    def mapped(errors, gains):
+        return lbt.studies.robustness_map(
+            kalman, settings.truth, settings.imaging, errors_hz=errors, sensor_gains=gains
+        )
+
+    many = np.linspace(0.3, 1.2, 91)
+    found = mapped([0, 2, -2], many)
+    turned = mapped([-2, 2, 0], many[::-1])
+    assert found.strehl[0] == pytest.approx(turned.strehl[0][::-1, ::-1], rel=1e-6)
+    assert found.strehl[0, 70, 1] == pytest.approx(
+        mapped([2], [many[70]]).strehl[0, 0, 0], rel=1e-6
+    )
+
+
+def test_turning_the_vibration_changes_nothing(kalman, air):
+    """Both axes are alike, so its direction does not count."""
+
+    def mapped(direction):
+        truth = lbt.Truth(
+            turbulence=air, vibrations=(sinusoid(direction=direction),), noise_nm=15.5
+        )
+        return lbt.studies.robustness_map(
+            kalman, truth, CAMERA, errors_hz=[0, 2], sensor_gains=[0.5, 1]
+        ).strehl
+
+    assert mapped((1.0, 0.0)) == pytest.approx(mapped((0.0, 1.0)), rel=1e-9)
+    assert mapped((1.0, 0.0)) == pytest.approx(mapped(DIAGONAL), rel=1e-6)
+
+
+def test_the_sign_of_the_error_is_that_of_the_robustness_study(kalman, settings):
+    """The design believes more than is true: the true line lies below."""
+    moved = replace(
+        settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
+    )
+    below = lbt.studies.robustness_map(
+        kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1]
+    )
+    above = lbt.studies.robustness_map(
+        kalman, settings.truth, settings.imaging, errors_hz=[1.5], sensor_gains=[1]
+    )
+    assert below.strehl == pytest.approx(above.strehl, rel=1e-12)
+
+
+def test_counts_points_as_they_are_done(kalman, settings):
+    counts = []
+    lbt.studies.robustness_map(
+        kalman,
+        settings.truth,
+        settings.imaging,
+        errors_hz=[0, 1],
+        sensor_gains=np.linspace(0.5, 1, 70),
+        delay_errors_frames=[0, 0.1],
+        advance=counts.append,
+    )
+    assert sum(counts) == 2 * 70 * 2
+
+
+WRONG = [
+    ({"errors_hz": []}, "at least one number"),
+    ({"errors_hz": [[0.0]]}, "at least one number"),
+    ({"errors_hz": [np.nan]}, "finite"),
+    ({"errors_hz": [1, 1]}, "each value once"),
+    ({"errors_hz": [20]}, "moves the one at 20 Hz to 0 Hz"),
+    ({"errors_hz": [-380]}, "between 0 and 400 Hz"),
+    ({"sensor_gains": [0.5, 0]}, "sensor_gains must be above 0"),
+    ({"sensor_gains": "wide"}, "sensor_gains must be an array of numbers"),
+    ({"delay_errors_frames": [-1.5]}, "delay_errors_frames must be at least -1"),
+    ({"delay_errors_frames": [99]}, "together must lie between 1 and 100"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "text"), WRONG)
+def test_wrong_axes_are_refused(kalman, settings, wrong, text):
+    axes = {"errors_hz": [0], "sensor_gains": [1]} | wrong
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.studies.robustness_map(kalman, settings.truth, settings.imaging, **axes)
+
+
+def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
+    axes = {"errors_hz": [0, 1], "sensor_gains": [1]}
+    walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    with pytest.raises(lbt.errors.ProblemError, match="needs a design for a loop"):
+        lbt.studies.robustness_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
+    with pytest.raises(lbt.errors.ProblemError, match="needs a vibration in the truth"):
+        lbt.studies.robustness_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)
+    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
+        lbt.studies.robustness_map(lbt.kalman(axis_plant), settings.truth, settings.imaging, **axes)
+    three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
+    with pytest.raises(lbt.errors.DimensionError, match="got a loop of 3 modes"):
+        lbt.studies.robustness_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
+
+
+def test_the_map_is_the_budget_at_each_point():
+    both, _ = uneven_axes.LOOPS
+    truth = lbt.Truth(
+        turbulence=[uneven_axes.SLOW, uneven_axes.TABLE],
+        noise_nm=[15.5, 6.0],
+        vibrations=uneven_axes.LINES,
+    )
+    design = lbt.integrator(both, gain=0.4)
+    camera = lbt.Imaging(diameter_m=8.22)
+    found = lbt.studies.robustness_map(
+        design, truth, camera, errors_hz=[0], sensor_gains=[0.6, 1.0]
+    )
+    for i, gain in enumerate([0.6, 1.0]):
+        loop = lbt.close_loop(both, design.controller, sensor_gain=gain)
+        real = lbt.Truth(
+            turbulence=truth.turbulence,
+            noise_nm=truth.noise_nm,
+            vibrations=uneven_axes.LINES,
+            sensor_gain=gain,
+        )
+        budget = lbt.residual_budget(loop, real)
+        assert found.residual_nm[0, i, 0] == pytest.approx(budget.rms_nm, rel=1e-8)
+        assert found.strehl[0, i, 0] == pytest.approx(lbt.strehl(budget, camera), rel=1e-8)

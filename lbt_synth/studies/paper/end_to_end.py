@@ -22,7 +22,7 @@ from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.studies.paper import parameters as given
-from lbt_synth.studies.paper.published import TABLE_II, TABLE_III, VIBRATION_HZ, PublishedRow
+from lbt_synth.studies.paper.parameters import TABLE_II, TABLE_III, VIBRATION_HZ, PublishedRow
 from lbt_synth.validation import choice, set_fields
 
 CLASSICAL_GAIN = 0.5

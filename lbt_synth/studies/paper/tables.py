@@ -12,7 +12,7 @@ from lbt_synth.loop import close_loop, residual_budget, strehl
 from lbt_synth.models import Truth
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.studies.paper import parameters as given
-from lbt_synth.studies.paper.published import TABLE_II, TABLE_III, VIBRATION_HZ
+from lbt_synth.studies.paper.parameters import TABLE_II, TABLE_III, VIBRATION_HZ
 from lbt_synth.studies.robustness import RobustnessRow, robustness
 from lbt_synth.validation import set_fields
 

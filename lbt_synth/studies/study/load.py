@@ -18,10 +18,9 @@ from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, re
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
 from lbt_synth.methods.request import Wording, design_request
-from lbt_synth.studies.study.distributions import ParameterSection
 from lbt_synth.studies.study.reference_evaluation import close_sample_loop
 from lbt_synth.studies.study.sample import Sample, find_number, make_sample, parse_path
-from lbt_synth.studies.study.schema import StudySection
+from lbt_synth.studies.study.schema import ParameterSection, StudySection
 from lbt_synth.studies.study.store import read_designs, read_manifest
 from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController, result_columns
 

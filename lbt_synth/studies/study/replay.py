@@ -17,10 +17,9 @@ from lbt_synth.config.schema import Ar2Section, FileSection
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.storage.atomic_files import refuse_replacing
-from lbt_synth.studies.study.output_files import read_row
 from lbt_synth.studies.study.reference_evaluation import design_for_sample, evaluate_row
 from lbt_synth.studies.study.sample import Sample, make_sample
-from lbt_synth.studies.study.store import list_parts, read_manifest, require_unchanged
+from lbt_synth.studies.study.store import list_parts, read_manifest, read_row, require_unchanged
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Failure, Study
 from lbt_synth.validation import integer
 

@@ -17,13 +17,13 @@ from lbt_synth.storage.worker_processes import exclusive_lock
 from lbt_synth.studies.study import store
 from lbt_synth.studies.study.batch_evaluation import evaluate_samples
 from lbt_synth.studies.study.engine import Evaluate, run_batches
-from lbt_synth.studies.study.output_files import (
+from lbt_synth.studies.study.parquet import require_parquet
+from lbt_synth.studies.study.store import (
     read_results,
     results_path,
     write_failures,
     write_results,
 )
-from lbt_synth.studies.study.parquet import require_parquet
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 

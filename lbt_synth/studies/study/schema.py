@@ -1,15 +1,163 @@
-"""Schema of a study file."""
+"""Schema of a study file, with the distributions of its parameters."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import ConfigDict, Field, model_validator
+from scipy.special import ndtr, ndtri
 
-from lbt_synth.methods.section import Section
-from lbt_synth.studies.study.distributions import ParameterSection
+from lbt_synth.methods.section import Positive, Section
+from lbt_synth.validation import FloatArray
 
+_EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
 _CONTROLLER_NAME = r"^[A-Za-z][A-Za-z0-9_-]*$"
+
+
+class NormalSection(Section):
+    """A normal distribution, cut at low and high if they are given."""
+
+    mean: float
+    deviation: Positive
+    low: float | None = None
+    high: float | None = None
+
+    @model_validator(mode="after")
+    def _has_room(self) -> NormalSection:
+        low, high = self.ends
+        if not low < high:
+            raise ValueError(f"low must be below high; got {low:g} and {high:g}")
+        start, stop, _ = self._cut
+        if not stop - start > 0:
+            raise ValueError(
+                f"a normal distribution of mean {self.mean:g} and deviation {self.deviation:g} "
+                f"has nothing between {low:g} and {high:g}"
+            )
+        return self
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Least and greatest value; infinite without a cut."""
+        low, high = self.low, self.high
+        return -np.inf if low is None else low, np.inf if high is None else high
+
+    @property
+    def _cut(self) -> tuple[float, float, float]:
+        """Probabilities of the ends, and +1, or -1 if both count from above.
+
+        Floating-point numbers resolve 1 - F above the mean, and F below.
+        """
+        low, high = ((end - self.mean) / self.deviation for end in self.ends)
+        if low > 0:
+            return float(ndtr(-high)), float(ndtr(-low)), -1.0
+        return float(ndtr(low)), float(ndtr(high)), 1.0
+
+    def quantile(self, level: FloatArray) -> FloatArray:
+        """Return the values at levels in [0, 1)."""
+        start, stop, sign = self._cut
+        share = np.clip(level, _EDGE, 1 - _EDGE)
+        share = share if sign > 0 else 1 - share
+        standard = sign * ndtri(start + share * (stop - start))
+        with np.errstate(over="ignore"):  # an infinite value is refused later
+            found = self.mean + self.deviation * standard
+        return np.clip(found, *self.ends)
+
+
+class ParameterSection(Section):
+    """The distribution of one parameter; a bare number is fixed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.studies.study.schema import ParameterSection
+    >>> level = np.array([0.2, 0.3, 0.5, 0.8413447460685429])
+    >>> for given in ({"list": [10, 20, 30], "weights": [1, 1, 2]}, {"uniform": [10, 20]}):
+    ...     ParameterSection.model_validate(given).quantile(level[:3])
+    array([10., 20., 30.])
+    array([12., 13., 15.])
+    >>> normal = ParameterSection.model_validate({"normal": {"mean": 20, "deviation": 0.5}})
+    >>> normal.quantile(level[2:]).round(6), normal.text
+    (array([20. , 20.5]), 'normal, 20 with deviation 0.5')
+    """
+
+    fixed: float | None = None
+    uniform: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    normal: NormalSection | None = None
+    list_: Annotated[list[float], Field(min_length=1)] | None = Field(default=None, alias="list")
+    weights: Annotated[list[Positive], Field(min_length=1)] | None = None
+    also: list[str] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bare_number(cls, value: Any) -> Any:
+        return {"fixed": value} if isinstance(value, int | float) else value
+
+    @model_validator(mode="after")
+    def _one_distribution(self) -> ParameterSection:
+        given = [v is not None for v in (self.fixed, self.uniform, self.normal, self.list_)]
+        if sum(given) != 1:
+            raise ValueError("expected a number or exactly one of fixed, uniform, normal, list")
+        if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
+            low, high = self.uniform
+            raise ValueError(f"uniform: must be [low, high]; got [{low:g}, {high:g}]")
+        if self.weights is not None and len(self.weights) != len(self.list_ or ()):
+            raise ValueError("weights goes with list, one for each of its values")
+        return self
+
+    @property
+    def values(self) -> list[float]:
+        """The values of a list, or the fixed one; none of a continuous distribution."""
+        return [self.fixed] if self.fixed is not None else self.list_ or []
+
+    @property
+    def varies(self) -> bool:
+        """Whether it takes a dimension of the sampling."""
+        return len(self.values) != 1
+
+    @property
+    def text(self) -> str:
+        """Description for people."""
+        if self.fixed is not None:
+            return f"fixed at {self.fixed:g}"
+        if self.uniform is not None:
+            return f"uniform from {self.uniform[0]:g} to {self.uniform[1]:g}"
+        if self.normal is not None:
+            out = f"normal, {self.normal.mean:g} with deviation {self.normal.deviation:g}"
+            ends = {"from": self.normal.low, "to": self.normal.high}
+            return out + "".join(f", {k} {v:g}" for k, v in ends.items() if v is not None)
+        shown = [f"{value:g}" for value in self.values]
+        if len(set(self.weights or ())) > 1:
+            shown = [f"{v} ({w:g})" for v, w in zip(shown, self.weights or (), strict=True)]
+        if len(shown) > 8:
+            shown[4:-3] = ["..."]
+        return f"one of {', '.join(shown)}"
+
+    def quantile(self, level: FloatArray) -> FloatArray:
+        """Return the values below which each share ``level``, in [0, 1), lies."""
+        if self.normal is not None:
+            return self.normal.quantile(level)
+        if self.uniform is not None:
+            low, high = self.uniform
+            return np.clip(low + level * (high - low), low, high)
+        weights = np.array(self.weights or [1.0] * len(self.values))
+        shares = weights / np.max(weights)  # so that their sum cannot overflow
+        bounds = np.cumsum(shares) / np.sum(shares)
+        return np.array(self.values)[np.searchsorted(bounds[:-1], level, side="right")]
+
+    def extremes(self, samples: int) -> tuple[float, float]:
+        """Return the ends, or values beyond which half a sample is expected."""
+        given = self.normal.ends if self.normal is not None else self.uniform or self.values
+        inside = self.quantile(np.array([0.5 / samples, 1 - 0.5 / samples])).tolist()
+        low, high = (
+            end if np.isfinite(end) else value
+            for end, value in zip((min(given), max(given)), inside, strict=True)
+        )
+        return low, high
+
+    def median(self) -> float:
+        """Return the median."""
+        return float(self.quantile(np.array([0.5]))[0])
 
 
 class ControllerSection(Section):

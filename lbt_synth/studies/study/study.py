@@ -14,8 +14,7 @@ from lbt_synth.config.samples import Keys
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.request import DesignRequest
-from lbt_synth.studies.study.distributions import ParameterSection
-from lbt_synth.studies.study.schema import StudySection
+from lbt_synth.studies.study.schema import ParameterSection, StudySection
 from lbt_synth.validation import FloatArray, integer
 
 DELAY_ERROR = "error.delay_frames"

@@ -16,7 +16,7 @@ from lbt_synth.studies.paper.end_to_end import (
     plan_tables,
     rms_modal_difference,
 )
-from lbt_synth.studies.paper.published import TABLE_III
+from lbt_synth.studies.paper.parameters import TABLE_III
 
 
 @pytest.fixture(scope="module")

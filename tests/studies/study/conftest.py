@@ -9,7 +9,7 @@ NAN = float("nan")
 @pytest.fixture
 def small_batches(monkeypatch):
     """As if every row took long: batches are shares of what is left."""
-    monkeypatch.setattr("lbt_synth.studies.study.batch_queue._CRUMB_SECONDS", 0.0)
+    monkeypatch.setattr("lbt_synth.studies.study.engine._CRUMB_SECONDS", 0.0)
 
 
 @pytest.fixture

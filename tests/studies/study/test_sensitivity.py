@@ -1,16 +1,138 @@
-"""Sensitivities of controllers to parameters."""
+"""Sensitivities of controllers to parameters, and first-order indices."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 from support.study_results import draw_points, make_columns
 
 import lbt_synth as lbt
+from lbt_synth.studies.study.sensitivity import conditional_curve
 from lbt_synth.studies.study.summary import (
     varying_parameters,
 )
+
+
+def index(parameter, result):
+    order = np.argsort(parameter, kind="stable")
+    return lbt.studies.first_order_index(parameter[order], result[order])
+
+
+def ishigami(u, a=7.0, b=0.1):
+    x = np.pi * (2 * u - 1)
+    return np.sin(x[:, 0]) + a * np.sin(x[:, 1]) ** 2 + b * x[:, 2] ** 4 * np.sin(x[:, 0])
+
+
+def ishigami_indices(a=7.0, b=0.1):
+    """T. Ishigami and T. Homma, Proc. ISUMA 1990, 398: the variances are integrals of powers."""
+    first = (1 + b * np.pi**4 / 5) ** 2 / 2
+    second = a**2 / 8
+    first_and_third = b**2 * np.pi**8 * (1 / 18 - 1 / 50)
+    return np.array([first, second, 0.0, 0.0]) / (first + second + first_and_third)
+
+
+def test_the_oracle_has_the_published_indices():
+    np.testing.assert_allclose(ishigami_indices()[:3], [0.3139, 0.4424, 0], atol=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "n", "limit"),
+    [
+        ("independent", 1000, 0.06),
+        ("independent", 20_000, 0.015),
+        ("latin", 4000, 0.03),
+        ("sobol", 1024, 0.02),
+        ("sobol", 4096, 0.006),
+        ("sobol", 2**16, 0.001),
+    ],
+)
+def test_ishigami(kind, n, limit):
+    u = draw_points(kind, n, 4, seed=5)
+    found = [index(column, ishigami(u)) for column in u.T]
+    np.testing.assert_allclose([each.value for each in found], ishigami_indices(), atol=limit)
+    for each, expected in zip(found, ishigami_indices(), strict=True):
+        assert abs(each.value - expected) < 4 * each.error
+
+
+def test_standard_errors_are_those_of_repeated_samples():
+    """Mean error, spread over 200 samples, and the mean of the standard errors."""
+    n = 1000
+    values, errors = np.empty((200, 4)), np.empty((200, 4))
+    for seed in range(200):
+        u = draw_points("independent", n, 4, seed)
+        found = [index(column, ishigami(u)) for column in u.T]
+        values[seed] = [each.value for each in found]
+        errors[seed] = [each.error for each in found]
+    spread = values.std(axis=0)
+    ratio = errors.mean(axis=0) / spread
+    assert np.all(ratio[:2] > 0.9)
+    assert np.all(ratio[:2] < 1.25)
+    assert np.all(ratio[2:] > 1)  # of no effect: on the safe side
+    assert np.all(ratio[2:] < 2)
+    bias = values.mean(axis=0) - ishigami_indices()
+    assert np.all(np.abs(bias) < 0.8 * errors.mean(axis=0))
+
+
+def test_even_samples_are_not_corrected_as_if_they_were_independent():
+    u = draw_points("sobol", 4096, 3, seed=3)
+    independent = draw_points("independent", 4096, 3, seed=3)
+    even, other = index(u[:, 2], ishigami(u)), index(independent[:, 2], ishigami(independent))
+    assert even.correction < 0.1 * other.correction
+    assert abs(even.value) < 1e-3
+
+
+def test_a_parameter_without_effect_has_no_index():
+    u = draw_points("independent", 3000, 2, seed=2)
+    found = index(u[:, 1], np.sin(7 * u[:, 0]))
+    assert abs(found.value) < 2.5 * found.error
+    assert found.error < 0.01
+
+
+def test_a_list_has_its_values_as_groups():
+    rng = np.random.default_rng(0)
+    values = rng.choice([10.0, 20.0, 30.0], size=6000, p=[0.5, 0.3, 0.2])
+    means = {10.0: 0.2, 20.0: 0.8, 30.0: 0.5}
+    exact = np.array([means[v] for v in values])
+    result = exact + rng.normal(scale=0.1, size=values.size)
+    found = index(values, result)
+    mean = 0.5 * 0.2 + 0.3 * 0.8 + 0.2 * 0.5
+    between = 0.5 * (0.2 - mean) ** 2 + 0.3 * (0.8 - mean) ** 2 + 0.2 * (0.5 - mean) ** 2
+    assert found.groups == 3
+    assert found.value == pytest.approx(between / (between + 0.01), abs=4 * found.error)
+    ordered = np.argsort(values, kind="stable")
+    curve = conditional_curve(values[ordered], exact[ordered], exact[ordered] < 0)
+    np.testing.assert_array_equal(curve.parameter, [10, 20, 30])
+    np.testing.assert_allclose(curve.mean, [0.2, 0.8, 0.5])
+    assert curve.discrete
+    assert curve.swing()[0] == pytest.approx(0.6)
+
+
+def test_the_index_of_a_list_is_epsilon_squared():
+    """Kelley's estimator, from scipy's analysis of variance."""
+    rng = np.random.default_rng(1)
+    values = rng.integers(0, 4, 400).astype(float)
+    result = values**2 + rng.normal(scale=5, size=400)
+    f = stats.f_oneway(*(result[values == v] for v in range(4))).statistic
+    between, within = 3, 400 - 4
+    epsilon = between * (f - 1) / (between * f + within)
+    assert index(values, result).value == pytest.approx(epsilon, rel=1e-9)
+
+
+@given(
+    shift=st.floats(-5, 5),
+    scale=st.sampled_from([-3.0, 0.01, 7.0]),
+    seed=st.integers(0, 1000),
+)
+def test_the_index_knows_no_units(shift, scale, seed):
+    u = draw_points("independent", 150, 2, seed)
+    result = u[:, 0] ** 2 + 0.3 * u[:, 1]
+    here = index(u[:, 0], result)
+    there = index(np.exp(3 * u[:, 0]), shift + scale * result)
+    assert there.value == pytest.approx(here.value, abs=1e-9)
+    assert there.error == pytest.approx(here.error, abs=1e-9)
 
 
 @pytest.mark.parametrize("weights", [(1.0, 2.0, 3.0), (5.0, 0.1, 1.0)])

@@ -1,4 +1,4 @@
-"""Distributions of parameters against scipy's."""
+"""Distributions of the parameters in a study file, against those of scipy."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 from support.studies import load_small_study
 
-from lbt_synth.studies.study.distributions import ParameterSection
+from lbt_synth.studies.study.schema import ParameterSection
 
 ONE = "truth.vibrations[0].rms_nm"
 
