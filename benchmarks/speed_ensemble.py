@@ -10,7 +10,7 @@ import numpy as np
 from harness import Row, paired, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.studies.study import reference_evaluation as point
+from lbt_synth.studies.study import sample as point
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 FEW = 16  # loops that the peer does; its time is scaled up

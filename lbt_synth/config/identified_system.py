@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from lbt_synth.config.schema import FileSection, describe_error
+from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
 from lbt_synth.validation import number
@@ -94,13 +95,7 @@ def identified_config(
     content["model"] = {"turbulence": []}
     for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
         turbulence = axis.turbulence
-        content["model"]["turbulence"].append(
-            {
-                "kind": "ar",
-                "coefficients": turbulence.coefficients.tolist(),
-                "driving_rms_nm": turbulence.driving_rms_nm,
-            }
-        )
+        content["model"]["turbulence"].append(turbulence_content(turbulence))
         comments[f"model.turbulence[{index}]"] = f"{name}, rms {turbulence.rms_nm:.4g} nm"
     content["truth"] = {"turbulence": "model"}
     if lines:

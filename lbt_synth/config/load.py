@@ -202,10 +202,8 @@ def build_config(settings: FileSection, source: Path) -> Config:
         noise_nm = measurement_noise_nm(settings)
         plant = build_plant(settings, atmosphere, noise_nm)
         truth = build_truth(settings, atmosphere, noise_nm, plant)
-    except ConfigError as error:
-        raise ConfigError(f"{source}: {error}", path=error.path) from error
     except ProblemError as error:
-        raise ConfigError(f"{source}: {error}") from error
+        raise ConfigError(f"{source}: {error}", path=getattr(error, "path", "")) from error
     except ArithmeticError as error:
         raise ConfigError(
             f"{source}: some value is far from any telescope: {error}. Check the units."

@@ -14,6 +14,7 @@ from ruamel.yaml.error import YAMLError
 
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ProblemError
+from lbt_synth.models import ARModel
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import require_instance
 
@@ -98,6 +99,12 @@ def save_config(
     True
     """
     return write_atomically(path, config_text(settings, comments).encode())
+
+
+def turbulence_content(model: ARModel) -> dict[str, Any]:
+    """Return an auto-regressive model as the section of a configuration."""
+    coefficients, driving_rms_nm = model.coefficients.tolist(), model.driving_rms_nm
+    return {"kind": "ar", "coefficients": coefficients, "driving_rms_nm": driving_rms_nm}
 
 
 def _commented(value: Any, path: str, comments: dict[str, str]) -> Any:

@@ -159,9 +159,9 @@ def _plan_line(
         gain = CLASSICAL_GAIN_VIBRATION if line.vibration else CLASSICAL_GAIN
         classical = integrator(setup.system.hardware, gain=gain).controller
         yield plan("classical", classical, moved_hz, paper=line.classical)
-    for method, (plant, gamma) in given.filter_problems().items():
+    for method, (plant, bound) in given.filter_problems().items():
         plant = retuned_plant(plant, line.model_hz - VIBRATION_HZ, hold="driving")
-        design = reference_design(method, plant, {} if gamma is None else {"gamma": gamma})
+        design = reference_design(method, plant, bound)
         name, paper = f"{method}-{line.model_hz:g}hz", getattr(line, method)
         yield plan(method, design.controller, true_hz, name=name, paper=paper)
     for method, fixed in designs.items():

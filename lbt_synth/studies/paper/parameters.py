@@ -146,12 +146,10 @@ def hinf_plant() -> TipTiltPlant:
     return _plant(turbulence, HINF_VIBRATION_WEIGHT * NOISE_NM / driving, HINF_DAMPING)
 
 
-def filter_problems() -> dict[str, tuple[TipTiltPlant, float | None]]:
-    """Plant of each of the paper's two filters, and its bound [nm] if it has one, by method."""
-    return {
-        KALMAN.name: (kalman_plant(), None),
-        HINF.name: (hinf_plant(), HINF_GAMMA * NOISE_NM),
-    }
+def filter_problems() -> dict[str, tuple[TipTiltPlant, dict[str, float]]]:
+    """Plant of each of the paper's two filters, and the bound [nm] that it takes, by method."""
+    bound = {"gamma": HINF_GAMMA * NOISE_NM}
+    return {KALMAN.name: (kalman_plant(), {}), HINF.name: (hinf_plant(), bound)}
 
 
 def _plant(turbulence: ARModel, vibration_nm: float, damping: float) -> TipTiltPlant:

@@ -15,7 +15,7 @@ from lbt_synth.errors import CertificateError
 from lbt_synth.loop import EnsembleResiduals
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.models import PositionLoop, Vibration
-from lbt_synth.studies.study import reference_evaluation as reference
+from lbt_synth.studies.study import sample as reference
 from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,

@@ -18,9 +18,9 @@ from lbt_synth.studies.study.store import RowRange
 from lbt_synth.studies.study.study import BatchResult, Failure, Study
 from lbt_synth.validation import FloatArray
 
-_FIRST_ROWS = 4
-_MOST_ROWS = 65_536
-_GROWTH = 4  # of a batch over a measured one, at most
+FIRST_ROWS = 4
+MOST_ROWS = 65_536
+GROWTH = 4  # of a batch over a measured one, at most
 _SECONDS = 1.5  # long compared with the milliseconds of a task, short enough to wait for
 _TRIAL_SECONDS = 6.0  # of the second size, before the cost of a row is known
 _OVER_FIXED = 19  # the time that does not grow with the rows is a twentieth of a batch
@@ -66,16 +66,16 @@ class BatchQueue:
     def _size(self) -> int:
         share = -(-self.left // (2 * self._workers))  # towards the end, some for every worker
         if self._small is None or self._best is None:
-            return max(1, min(_FIRST_ROWS, share))
+            return max(1, min(FIRST_ROWS, share))
         (few, short), (many, long) = self._small, self._best
         if few == many:
-            return max(1, min(int(many * min(_GROWTH, _TRIAL_SECONDS / long)), share))
+            return max(1, min(int(many * min(GROWTH, _TRIAL_SECONDS / long)), share))
         slope = max(long - short, 0.0) / (many - few)
         # the first batch includes the warm-up
         fixed_s = max(min(short - few * slope, self._least_s), 0.0)
         row_s = max(long - fixed_s, 1e-3 * long) / many
         target_s = max(_SECONDS, _OVER_FIXED * fixed_s, self.left * row_s / _MOST_PARTS)
-        most = min(int(target_s / row_s), _GROWTH * many, _MOST_ROWS)
+        most = min(int(target_s / row_s), GROWTH * many, MOST_ROWS)
         crumb = int(max(_CRUMB_SECONDS, 4 * fixed_s) / row_s) if _CRUMB_SECONDS else 0
         crumb = min(crumb, -(-self.left // self._workers))
         return max(1, min(most, max(share, crumb)))

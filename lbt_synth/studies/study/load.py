@@ -18,20 +18,25 @@ from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, re
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
 from lbt_synth.methods.request import Wording, design_request
-from lbt_synth.studies.study.reference_evaluation import close_sample_loop
-from lbt_synth.studies.study.sample import Sample, find_number, make_sample, parse_path
+from lbt_synth.studies.study.sample import (
+    Sample,
+    close_sample_loop,
+    find_number,
+    make_sample,
+    parse_path,
+)
 from lbt_synth.studies.study.schema import ParameterSection, StudySection
 from lbt_synth.studies.study.store import read_designs, read_manifest
 from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController, result_columns
 
-# The oldest version whose results this one repeats to rounding: studies that it began are read
-# and resumed. Raise it with any change that moves a result.
 # the digest names these options of a controller also where they are not given
 _OPTIONS_IN_DIGEST = {
     *("route", "horizon", "gamma", "gamma_ratio", "rms", "taps"),
     *("norm", "half_width_hz", "command_weight", "gain"),
 }
 _WORDING = Wording(method="design: {}")
+# The oldest version whose results this one repeats to rounding: studies that it began are read
+# and resumed. Raise it with any change that moves a result.
 _SAME_RESULTS_SINCE = "0.1.0"
 
 

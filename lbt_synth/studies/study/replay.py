@@ -14,11 +14,11 @@ from lbt_synth.config.ensemble import EXPECTED_ERRORS
 from lbt_synth.config.load import validate_sections
 from lbt_synth.config.plant_and_truth import turbulence_sections
 from lbt_synth.config.schema import Ar2Section, FileSection
+from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.storage.atomic_files import refuse_replacing
-from lbt_synth.studies.study.reference_evaluation import design_for_sample, evaluate_row
-from lbt_synth.studies.study.sample import Sample, make_sample
+from lbt_synth.studies.study.sample import Sample, design_for_sample, evaluate_row, make_sample
 from lbt_synth.studies.study.store import list_parts, read_manifest, read_row, require_unchanged
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Failure, Study
 from lbt_synth.validation import integer
@@ -150,14 +150,7 @@ def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, 
         comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
         if any(isinstance(section, Ar2Section) for section in turbulence_sections(config.settings)):
             # keep what was fitted above the noise that designs assume
-            sections = [
-                {
-                    "kind": "ar",
-                    "coefficients": model.coefficients.tolist(),
-                    "driving_rms_nm": model.driving_rms_nm,
-                }
-                for model in config.plant.turbulence
-            ]
+            sections = [turbulence_content(model) for model in config.plant.turbulence]
             same = all(section == sections[0] for section in sections)
             content["model"]["turbulence"] = sections[0] if same else sections
     content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)

@@ -16,7 +16,7 @@ from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.worker_processes import exclusive_lock
 from lbt_synth.studies.study import store
 from lbt_synth.studies.study.batch_evaluation import evaluate_samples
-from lbt_synth.studies.study.engine import Evaluate, run_batches
+from lbt_synth.studies.study.engine import FIRST_ROWS, GROWTH, MOST_ROWS, Evaluate, run_batches
 from lbt_synth.studies.study.parquet import require_parquet
 from lbt_synth.studies.study.store import (
     read_results,
@@ -28,8 +28,7 @@ from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
 _MOST_JOBS = 64
-_FIRST_ROWS, _GROWTH, _LONG_ENOUGH_S = 4, 4, 1.0
-_MOST_ROWS = 65_536
+_LONG_ENOUGH_S = 1.0
 _NUMBER_BYTES = {"csv": 13, "parquet": 8}  # of a result in the table
 _PART_BYTES = 8
 
@@ -337,14 +336,14 @@ def estimate_study(
     (True, 1974272)
     """
     workers = integer(workers, "workers", at_least=1)
-    start, size, rows, seconds = 0, _FIRST_ROWS, 1, 0.0
+    start, size, rows, seconds = 0, FIRST_ROWS, 1, 0.0
     evaluate(study, study.values(0, 1), 0)  # warms up
     while seconds < _LONG_ENOUGH_S and start < study.samples:
         values = study.values(start, min(start + size, study.samples))
         before = time.perf_counter()
         evaluate(study, values, start)
         seconds, rows = time.perf_counter() - before, len(values)
-        start, size = start + rows, min(_GROWTH * size, _MOST_ROWS)
+        start, size = start + rows, min(GROWTH * size, MOST_ROWS)
     at_once = min(workers, os.cpu_count() or 1) if local else workers
     numbers = len(study.columns)
     table = _NUMBER_BYTES[study.settings.results] * numbers

@@ -11,7 +11,7 @@ import lbt_synth as lbt
 from lbt_synth.config.plant_and_truth import measurement_noise_nm
 from lbt_synth.config.schema import FileSection, Positive, SensorSection
 from lbt_synth.studies.study import batch_evaluation
-from lbt_synth.studies.study import reference_evaluation as reference
+from lbt_synth.studies.study import sample as reference
 
 COUNT = 8
 NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
