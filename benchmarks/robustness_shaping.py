@@ -9,9 +9,14 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping.channel import Basis, Channel, laguerre_basis, orthonormal_basis
+from lbt_synth.design.shaping.channel import (
+    Basis,
+    Channel,
+    laguerre_basis,
+    mode_loop,
+    orthonormal_basis,
+)
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
-from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.linear import Controller
 
 RATE_HZ, NOISE_NM = 800.0, 15.5

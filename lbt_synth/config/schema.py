@@ -15,9 +15,9 @@ from pydantic import (
     model_validator,
 )
 
-from lbt_synth.methods import section
+from lbt_synth.methods.method import Count, Damping, Fraction, NonNegative, Positive
+from lbt_synth.methods.method import Section as MethodSection
 from lbt_synth.methods.registry import all_methods
-from lbt_synth.methods.section import Count, Damping, Fraction, NonNegative, Positive
 
 ONE, EACH = "one", "each"  # one value for all axes, or a list with one per axis
 
@@ -32,7 +32,7 @@ PositiveOrEach = Annotated[
 ]
 
 
-class Section(section.Section):
+class Section(MethodSection):
     """A section of a configuration, whose builders declare which numbers may vary."""
 
     @property

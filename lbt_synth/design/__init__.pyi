@@ -1,6 +1,5 @@
 from . import modal as modal
 from . import shaping as shaping
-from .central_filters import central_filter as central_filter
 from .certificate import Certificate as Certificate
 from .certificate import Check as Check
 from .certificate import certify_filter as certify_filter
@@ -16,6 +15,7 @@ from .loop_shaping import ShapedDesign as ShapedDesign
 from .loop_shaping import shape as shape
 from .lqg import lqg as lqg
 from .lqg_design import LqgDesign as LqgDesign
+from .mixed import central_filter as central_filter
 from .mixed import mixed as mixed
 from .polytopic import PolytopicDesign as PolytopicDesign
 from .polytopic import polytopic as polytopic

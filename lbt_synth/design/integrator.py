@@ -7,12 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.design.result import (
-    UNCERTIFIED,
-    IntegratorDesign,
-    SolverReport,
-    with_certificate,
-)
+from lbt_synth.design.result import UNCERTIFIED, IntegratorDesign, SolverReport, with_certificate
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
@@ -118,12 +113,7 @@ def hardware_gain_limit(hardware: LoopHardware) -> float:
     """Gain at which an integrator becomes unstable, with the dynamics of the mirror."""
     if hardware.mirror is None:
         return integrator_gain_limit(hardware.delay_frames)
-    single = LoopHardware(
-        frame_rate_hz=hardware.frame_rate_hz,
-        delay_frames=hardware.delay_frames,
-        modes=1,
-        mirror=hardware.mirror,
-    )
+    single = hardware.single_mode()
     taps = single.mirror_taps
     start = 0.5 / (1 + float(np.abs(np.arange(taps.size) @ taps)))  # half over the mean delay
     while not close_loop(single, _integrator_controller(single, start)).is_stable:

@@ -11,10 +11,14 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design.certificate import Certificate, Check, certify_loop, controller_difference
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
-from lbt_synth.design.shaping.channel import Channel, laguerre_basis
+from lbt_synth.design.shaping.channel import (
+    Channel,
+    SingleModeLoop,
+    laguerre_basis,
+    mode_loop,
+)
 from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
-from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, mode_hardware, mode_loop
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
@@ -109,7 +113,7 @@ def shape(
     common = number(pole, "pole", at_least=0, below=1)
     tolerance = number(loss, "loss", at_least=0)
     require_separable(hardware)
-    single = mode_hardware(hardware)
+    single = hardware.single_mode()
     stored = single.mirror_system.whole.n_states
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
     for spec in specifications:

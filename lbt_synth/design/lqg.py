@@ -145,13 +145,7 @@ def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regu
     F, G, h, d = core.A, core.B, core.C, core.D
     weight = d**2 + rho
     if core.n_states == 0:
-        return Regulator(
-            gain_state=d / weight * L,
-            gain_mirror=np.zeros(0),
-            weight=weight,
-            status="settled",
-            iterations=0,
-        )
+        return Regulator(d / weight * L, np.zeros(0), weight, "settled", 0)
     X, status, iterations = np.zeros_like(F), "inverted", 0
     zeros = np.abs(core.zeros)
     if rho == 0 and np.any(np.abs(zeros - 1) < _ON_CIRCLE):
@@ -168,13 +162,7 @@ def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regu
     closed = F - np.outer(G, gain_mirror)
     crossed = _solve_stein(closed.T, A, (gain_mirror * d - h)[None, :, None] * L[:, None, :])
     gain_state = (d * L - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
-    return Regulator(
-        gain_state=gain_state,
-        gain_mirror=gain_mirror,
-        weight=total,
-        status=status,
-        iterations=iterations,
-    )
+    return Regulator(gain_state, gain_mirror, total, status, iterations)
 
 
 def _solve_stein(left: FloatArray, right: FloatArray, drive: FloatArray) -> FloatArray:

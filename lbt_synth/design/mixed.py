@@ -1,14 +1,17 @@
-"""The mixed filter: least variance under a bound on the norm, and the reverse."""
+"""The mixed filter: least variance under a bound on the norm, and the reverse.
+
+It completes a central H-infinity filter, chosen by the norm or the variance that it achieves.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from scipy.optimize import brentq
 
-from lbt_synth.design.central_filters import CentralFilters
 from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
@@ -16,20 +19,24 @@ from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import (
     EstimationProblem,
     StateSpace,
-    Witness,
     hinf_norm,
     infeasible_level,
     largest_singular_values,
 )
 from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
+from lbt_synth.linear.riccati.gamma import gamma_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 if TYPE_CHECKING:
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
+
 _Answer: TypeAlias = tuple[FloatArray, float, str]  # taps, level, what the solver said
 
+_DECADES = 4.0  # of gamma, over which a central filter is searched
+_SLACK = 4e-7  # by which a central filter may miss its norm
 _ROUNDS = 20
 _FIRST_GRID = 48
 _FINE_GRID = 1024
@@ -147,25 +154,14 @@ def mixed(
             return programme.minimize_variance(bound * (1 - _ROOM), grid)
 
     base = CentralFilters(problem, least).member(measure)
-    response = _complete_base(problem, base, length, solve)
-    return _mixed_design(problem, base, response, least, gamma=gamma, rms=rms)
+    impulse, solver = _complete_base(problem, base, length, solve)
+    claims = {"solver": solver, "gamma_requested": gamma, "rms_requested": rms}
+    return _mixed_design(problem, base, impulse, least, **claims)
 
 
 def require_taps(taps: int) -> int:
     """Return the length of the impulse response, checked."""
-    length = integer(taps, "taps", at_least=1)
-    if length > _MOST_TAPS:
-        raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {length}.")
-    return length
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ImpulseResponse:
-    """Impulse response on the innovations of a base filter, and how it was found."""
-
-    taps: FloatArray
-    status: str
-    rounds: int
+    return integer(taps, "taps", at_least=1, at_most=_MOST_TAPS)
 
 
 def _complete_base(
@@ -173,8 +169,11 @@ def _complete_base(
     base: FilterDesign | FilterRiccati,
     length: int,
     solve: Callable[[InnovationProgramme, FloatArray], _Answer],
-) -> _ImpulseResponse:
-    """Solve on a set of frequencies, and add to it until the norm holds between them, too."""
+) -> tuple[FloatArray, SolverReport]:
+    """Find the taps on the innovations of a base filter, and say how.
+
+    Frequencies are added until the norm holds between them, too.
+    """
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
     programme = InnovationProgramme.from_predictor(problem, base.gain_predictor, taps=length)
@@ -187,7 +186,7 @@ def _complete_base(
         peak = hinf_norm(error)
         excess = peak.value / level - 1
         if excess <= _EXCESS:
-            return _ImpulseResponse(taps=taps, status=status, rounds=rounds)
+            return taps, SolverReport(route="youla", status=status, iterations=rounds)
         fine = np.linspace(0, 0.5 / error.dt_s, _FINE_GRID)
         fine = np.unique(np.concatenate([fine, _frequencies_near_poles(error)]))
         sigma = largest_singular_values(error, fine)
@@ -205,23 +204,19 @@ def _complete_base(
 def _mixed_design(
     problem: EstimationProblem,
     base: FilterDesign | FilterRiccati,
-    response: _ImpulseResponse,
+    taps: FloatArray,
     least: FilterDesign,
-    *,
-    gamma: float | None,
-    rms: float | None,
+    **claims: Any,
 ) -> FilterDesign:
     """Make the design of a completed base and certify it."""
-    extended = problem.with_memory(response.taps)
-    size, q = response.taps.shape[1], base.gain_predictor.shape[1]
+    extended = problem.with_memory(taps)
+    size, q = taps.shape[1], base.gain_predictor.shape[1]
     gain = _extend_gain(base.gain_predictor, size // q)
     assert least.witness is not None
     assert least.gamma_infeasible is not None
     padding = np.zeros((size, least.witness.states.shape[1]))
-    witness = Witness(
-        states=frozen_copy(np.vstack([least.witness.states, padding])),
-        disturbances=least.witness.disturbances,
-    )
+    states = frozen_copy(np.vstack([least.witness.states, padding]))
+    witness = replace(least.witness, states=states)
     proved = infeasible_level(extended, witness, kalman_riccati(extended).P)
     innovation_gain = np.vstack([base.gain_filter, np.zeros((size, q))])
     return filter_design(
@@ -229,12 +224,10 @@ def _mixed_design(
         gain,
         innovation_gain,
         method="mixed",
-        solver=SolverReport(route="youla", status=response.status, iterations=response.rounds),
-        gamma_requested=gamma,
-        rms_requested=rms,
         gamma_least=least.gamma_least,
         gamma_infeasible=min(least.gamma_infeasible, proved),
         witness=witness,
+        **claims,
     )
 
 
@@ -250,3 +243,87 @@ def _frequencies_near_poles(error: StateSpace) -> FloatArray:
     offsets = np.array([0.0, 0.3, 1.0, 3.0])
     angles = centres[:, None] + widths[:, None] * np.concatenate([-offsets[1:], offsets])
     return np.asarray(np.clip(angles.ravel(), 0, np.pi) / (2 * np.pi * error.dt_s))
+
+
+def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
+    """Design the central H-infinity filter that has a given norm.
+
+    The filter that :func:`hinf` makes for a bound stays below it; this one reaches it, and
+    has less variance.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; a plant gives a controller.
+    gamma : float
+        Norm to reach. From that of the Kalman filter up, the Kalman filter is returned.
+
+    Returns
+    -------
+    FilterDesign
+        Certified design.
+
+    Raises
+    ------
+    InfeasibleError
+        If the norm is below the least gamma.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> round(lbt.design.central_filter(walk, gamma=1.5).gamma, 6)
+    1.5
+    """
+    require_problem(problem)
+    bound = number(gamma, "gamma", above=0)
+    least = hinf(problem, route="riccati")
+    assert least.gamma_least is not None  # of an H-infinity design
+    require_reachable(bound, least.gamma_least)
+    gains = CentralFilters(problem, least).member(lambda norm, _: norm - bound)
+    return filter_design(
+        problem,
+        gains.gain_predictor,
+        gains.gain_filter,
+        method="hinf",
+        solver=SolverReport(route="riccati", status="norm reached", iterations=0),
+        gamma_requested=bound * (1 + _SLACK),
+        gamma_least=least.gamma_least,
+        gamma_infeasible=least.gamma_infeasible,
+        witness=least.witness,
+    )
+
+
+class CentralFilters:
+    """The central filters of a problem, from that of the least gamma to the Kalman filter."""
+
+    def __init__(self, problem: EstimationProblem, least: FilterDesign) -> None:
+        self.problem, self.least = problem, least
+        self.start = kalman_riccati(problem)
+
+    def member(self, measure: Callable[[float, float], float]) -> FilterDesign | FilterRiccati:
+        """Return the filter at which a rising measure of norm and deviation is zero.
+
+        Where the measure does not change its sign it is one end of the family.
+        """
+        gains: dict[float, FilterDesign | FilterRiccati] = {0.0: self.least}
+        found = {0.0: measure(self.least.gamma, self.least.rms)}
+
+        def value(decades: float) -> float:
+            level = self.least.gamma * 10**decades
+            solution = gamma_riccati(self.problem, level, start=self.start) if decades else None
+            if solution is not None:
+                error = self.problem.error_system(solution.gain_predictor)
+                covariance = stationary_covariance(error.A, error.B @ error.B.T)
+                variance = float(np.trace(error.C @ covariance @ error.C.T))
+                gains[decades] = solution
+                found[decades] = measure(float(hinf_norm(error)), float(np.sqrt(variance)))
+            return found.get(decades, found[0.0])
+
+        if found[0.0] >= 0:
+            return gains[0.0]
+        if value(_DECADES) <= 0:
+            return self.start
+        brentq(value, 0.0, _DECADES, xtol=1e-9)
+        # the closest on the side of smaller norms
+        return gains[max(decades for decades, size in found.items() if size <= 0)]

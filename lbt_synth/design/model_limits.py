@@ -11,8 +11,8 @@ import numpy as np
 from lbt_synth.design.loop_shaping import ShapedDesign
 from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.design.shaping import ResidualVariance, VibrationBand
+from lbt_synth.design.shaping.channel import mode_loop
 from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.single_mode_loop import mode_hardware, mode_loop
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.loop import BandLimit, ResidualLimit, least_residual, least_worst_residual
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
@@ -70,7 +70,7 @@ def shaped_limit(design: ShapedDesign) -> tuple[float, float]:
         bands = [leaf for leaf in at_unit if isinstance(leaf, VibrationBand)]
         if len(variances) != 1 or len(bands) > 1:
             return np.nan, np.nan
-        hardware = mode_hardware(design.loop_hardware)
+        hardware = design.loop_hardware.single_mode()
         truth = Truth(turbulence=variances[0].turbulence, noise_nm=variances[0].noise_nm)
         found = limit_or_nan(partial(_mode_limit, hardware, truth, bands))
         loop = mode_loop(design.loop_hardware, parameter)

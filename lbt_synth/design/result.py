@@ -208,8 +208,32 @@ class FilterDesign(EstimatorDesign):
         return self.error_system().poles
 
     def recertify(self) -> Certificate:
-        """Compute the certificate again from the matrices."""
-        return certify_design(self)
+        """Compute the certificate again: the filter, its claims, and its loop if it has one."""
+        problem = self.problem
+        certificate = certify_filter(
+            problem,
+            self.gain_predictor,
+            gamma=self.gamma_requested,
+            least_variance=not self.is_bounded,
+        )
+        checks = list(certificate.checks)
+        if self.rms_requested is not None:
+            limit = self.rms_requested * (1 + NORM_TOLERANCE)
+            name = "standard deviation of the estimation error"
+            checks.append(Check(name, certificate.rms, limit, "Lyapunov equation"))
+        if self.gamma_infeasible is not None:
+            name = "infeasible level over the norm achieved, less 1"
+            value = self.gamma_infeasible / certificate.gamma - 1
+            checks.append(Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS))
+            # a claim without a witness is not believed
+            proof = self.witness or Witness(
+                states=np.zeros((problem.n_states, 1)),
+                disturbances=np.zeros((problem.B.shape[1], 1)),
+            )
+            checks.append(certify_infeasible(problem, self.gamma_infeasible, proof))
+        if self.hardware is not None:
+            checks.append(certify_loop(self.hardware, self.controller))
+        return replace(certificate, checks=tuple(checks))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -249,35 +273,6 @@ AnyDesign = TypeVar("AnyDesign", bound=Design)
 def with_certificate(design: AnyDesign, hint: str) -> AnyDesign:
     """Return a design with its certificate; raise CertificateError with a hint if it fails."""
     return replace(design, certificate=design.recertify().require(hint))
-
-
-def certify_design(design: FilterDesign) -> Certificate:
-    """Certify a filter, its claims, and its closed loop where its problem is a plant."""
-    problem = design.problem
-    certificate = certify_filter(
-        problem,
-        design.gain_predictor,
-        gamma=design.gamma_requested,
-        least_variance=not design.is_bounded,
-    )
-    checks = list(certificate.checks)
-    if design.rms_requested is not None:
-        limit = design.rms_requested * (1 + NORM_TOLERANCE)
-        name = "standard deviation of the estimation error"
-        checks.append(Check(name, certificate.rms, limit, "Lyapunov equation"))
-    if design.gamma_infeasible is not None:
-        name = "infeasible level over the norm achieved, less 1"
-        value = design.gamma_infeasible / certificate.gamma - 1
-        checks.append(Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS))
-        # a claim without a witness is not believed
-        proof = design.witness or Witness(
-            states=np.zeros((problem.n_states, 1)),
-            disturbances=np.zeros((problem.B.shape[1], 1)),
-        )
-        checks.append(certify_infeasible(problem, design.gamma_infeasible, proof))
-    if design.hardware is not None:
-        checks.append(certify_loop(design.hardware, design.controller))
-    return replace(certificate, checks=tuple(checks))
 
 
 def filter_design(

@@ -18,9 +18,8 @@ from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.loop import Imaging, close_loop
-from lbt_synth.methods.plant_inputs import PlantInputs
 from lbt_synth.methods.registry import record_methods, reference_methods
-from lbt_synth.methods.request import DesignRequest, design_request
+from lbt_synth.methods.request import DesignRequest, PlantInputs, design_request
 from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2

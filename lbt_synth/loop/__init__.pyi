@@ -1,6 +1,7 @@
 from .budget import ResidualBudget as ResidualBudget
 from .budget import model_budget as model_budget
 from .budget import residual_budget as residual_budget
+from .budget import settling_error as settling_error
 from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
 from .ensemble.evaluation import EnsembleResiduals as EnsembleResiduals
@@ -14,7 +15,6 @@ from .least_residuals.residual_limit import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins
 from .margins import stable_sensor_gains as stable_sensor_gains
-from .mirror_settling import settling_error as settling_error
 from .simulation.run import Simulation as Simulation
 from .simulation.run import filter_series as filter_series
 from .simulation.run import simulate as simulate

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,9 +101,7 @@ class ClosedLoop:
 
     def _subsystem(self, outputs: slice, inputs: slice) -> StateSpace:
         s = self.system
-        return StateSpace(
-            A=s.A, B=s.B[:, inputs], C=s.C[outputs], D=s.D[outputs, inputs], dt_s=s.dt_s
-        )
+        return replace(s, B=s.B[:, inputs], C=s.C[outputs], D=s.D[outputs, inputs])
 
 
 def close_loop(
@@ -162,16 +160,9 @@ def _checked_loop_matrices(
 ) -> tuple[FloatArray, ...]:
     """Matrices of :func:`loop_matrices`, for a controller that matches the loop."""
     require_matching_controller(hardware, controller)
-    k = controller.to_statespace()
-    return loop_matrices(
-        k.A,
-        k.B,
-        k.C,
-        k.D,
-        mirror=hardware.mirror_system.whole,
-        sensor=hardware.sensor,
-        influence=hardware.influence,
-    )
+    k, mirror = controller.to_statespace(), hardware.mirror_system.whole
+    path = {"sensor": hardware.sensor, "influence": hardware.influence}
+    return loop_matrices(k.A, k.B, k.C, k.D, mirror=mirror, **path)
 
 
 def require_matching_controller(hardware: LoopHardware, controller: Controller) -> None:

@@ -2,7 +2,7 @@ from .method import Description as Description
 from .method import DesignInputs as DesignInputs
 from .method import Method as Method
 from .method import RowTable as RowTable
+from .method import Section as Section
 from .registry import method_named as method_named
 from .registry import register as register
 from .registry import unregister as unregister
-from .section import Section as Section

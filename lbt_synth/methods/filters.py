@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from lbt_synth.methods.method import Description, Method
-from lbt_synth.methods.section import Section
+from lbt_synth.methods.method import Description, Method, Section
 from lbt_synth.storage.rows import column, fill_row, table_row
 
 if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.result import EstimatorDesign, FilterDesign
 
-_CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
+_CLAIMS, _LATER_CLAIMS = ("gamma_requested", "gamma_least"), ("gamma_infeasible", "rms_requested")
 
 Horizon = Annotated[
     int,
@@ -85,7 +84,7 @@ def _pack_filter(design: FilterDesign) -> DesignRecord:
     arrays = {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
     if design.witness is not None:
         arrays |= {"WITNESS_X": design.witness.states, "WITNESS_W": design.witness.disturbances}
-    meta = {name: getattr(design, name) for name in _CLAIMS}
+    meta = {name: getattr(design, name) for name in _CLAIMS + _LATER_CLAIMS}
     return DesignRecord(arrays, meta) | record_problem(design.problem)
 
 
@@ -96,24 +95,16 @@ def _unpack_filter(record: DesignRecord) -> FilterDesign:
 
     problem, arrays = record.problem(), record.arrays
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
+    claims: dict[str, Any] = {name: record.meta[name] for name in _CLAIMS}
+    # files of 0.1 have no infeasible level, witness or rms
+    claims |= {name: record.meta.get(name) for name in _LATER_CLAIMS}
     for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
         if arrays[name].shape != rows_cols:
             raise ValueError(f"{name} must be {rows_cols} to match the plant")
-    return FilterDesign(
-        **record.common(),
-        problem=problem,
-        gain_predictor=arrays["GAIN_PREDICTOR"],
-        gain_filter=arrays["GAIN_FILTER"],
-        gamma_requested=record.meta["gamma_requested"],
-        gamma_least=record.meta["gamma_least"],
-        rms_requested=record.meta.get("rms_requested"),
-        gamma_infeasible=record.meta.get(
-            "gamma_infeasible"
-        ),  # files of 0.1 have none, nor a witness
-        witness=Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
-        if "WITNESS_X" in arrays
-        else None,
-    )
+        claims[name.lower()] = arrays[name]
+    if "WITNESS_X" in arrays:
+        claims["witness"] = Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
+    return FilterDesign(**record.common(), **claims, problem=problem)
 
 
 filter_method = partial(Method, pack=_pack_filter, unpack=_unpack_filter, describe=_describe_filter)

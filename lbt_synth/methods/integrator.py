@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from lbt_synth.methods.method import Description, DesignInputs, Method
-from lbt_synth.methods.section import Section
+from lbt_synth.methods.method import Description, DesignInputs, Method, Section
 from lbt_synth.storage.rows import column, table_row
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from lbt_synth.methods.filters import Horizon, filter_method
-from lbt_synth.methods.method import DesignInputs
-from lbt_synth.methods.section import Section
+from lbt_synth.methods.method import DesignInputs, Section
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import FilterDesign

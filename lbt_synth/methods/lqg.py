@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from lbt_synth.methods.filters import limit_facts
-from lbt_synth.methods.method import Description, DesignInputs, Method
-from lbt_synth.methods.section import Section
+from lbt_synth.methods.method import Description, DesignInputs, Method, Section
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import frozen_copy, number
 
@@ -24,9 +23,7 @@ class LqgOptions(Section):
     """Options of the LQG controller."""
 
     command_weight: float = Field(
-        default=0.0,
-        ge=0,
-        description="weight of the squared command beside the squared residual",
+        default=0.0, ge=0, description="weight of the squared command beside the squared residual"
     )
 
 

@@ -1,18 +1,45 @@
-"""What a method of synthesis is: its name, its options, and what it does with a design."""
+"""What a method of synthesis is: its name, its options, and what it does with a design.
+
+:class:`Section` is the base of all options and sections that people write: strict types, limits,
+no unknown keys.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
-from lbt_synth.methods.section import Section
+from pydantic import BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.result import Design
     from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
     from lbt_synth.validation import FloatArray
+
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+Damping = Annotated[float, Field(gt=0, lt=1)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Section(BaseModel):
+    """Options or a section of a file: strict types, no unknown keys, read-only.
+
+    Examples
+    --------
+    >>> from pydantic import Field
+    >>> from lbt_synth.methods import Section
+    >>> class Leak(Section):
+    ...     leak_per_s: float = Field(gt=0, description="part of the command lost [1/s]")
+    >>> Leak(leak_per_s=5).leak_per_s
+    5.0
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
 class DesignInputs(Protocol):

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from lbt_synth.methods.filters import Horizon, limit_facts
-from lbt_synth.methods.method import Description, DesignInputs, Method
-from lbt_synth.methods.section import Section
+from lbt_synth.methods.method import Description, DesignInputs, Method, Section
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, number
 

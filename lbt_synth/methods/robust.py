@@ -10,8 +10,16 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lbt_synth.errors import ConfigError, name_key
-from lbt_synth.methods.method import Description, DesignInputs, Method, RowTable
-from lbt_synth.methods.section import Count, NonNegative, Positive, Section
+from lbt_synth.methods.method import (
+    Count,
+    Description,
+    DesignInputs,
+    Method,
+    NonNegative,
+    Positive,
+    RowTable,
+    Section,
+)
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import number
 
@@ -183,12 +191,7 @@ def _build_entry(
 def _list_demands(
     inputs: DesignInputs, section: RobustSection, spectrum: Spectrum | None
 ) -> list[Demand]:
-    from lbt_synth.design.shaping import (
-        Attenuation,
-        DelayError,
-        MirrorUncertainty,
-        NoisePeak,
-    )
+    from lbt_synth.design.shaping import Attenuation, DelayError, MirrorUncertainty, NoisePeak
 
     out: list[Demand] = []
     if section.noise_peak is not None:
@@ -232,7 +235,7 @@ def _list_command_bounds(
 
 def _pack(design: ShapedDesign) -> DesignRecord:
     from lbt_synth.design.record import DesignRecord
-    from lbt_synth.design.shaping.metadata import to_metadata
+    from lbt_synth.design.shaping.specification import to_metadata
 
     arrays = {
         f"YOULA{mode + 1}_{name}": getattr(parameter, name)
@@ -251,7 +254,7 @@ def _pack(design: ShapedDesign) -> DesignRecord:
 def _unpack(record: DesignRecord) -> ShapedDesign:
     from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.shaping import Specification
-    from lbt_synth.design.shaping.metadata import from_metadata
+    from lbt_synth.design.shaping.specification import from_metadata
 
     hardware, shaped = record.hardware(), record.meta["shaped"]
     parameters = tuple(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -145,6 +145,10 @@ class LoopHardware:
     def mirror_taps(self) -> FloatArray:
         """Weights c of ``phi_cor(k) = N (c[0] u(k) + c[1] u(k-1) + ...)``, to rounding."""
         return self.mirror_system.taps
+
+    def single_mode(self) -> LoopHardware:
+        """Return the hardware of one mode: the same delay and mirror, unit sensor and influence."""
+        return replace(self, sensor_matrix=None, influence_matrix=None, modes=1)
 
 
 def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:

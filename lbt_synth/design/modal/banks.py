@@ -24,19 +24,27 @@ from lbt_synth.validation import FloatArray, float_array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bank:
-    """Controllers in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``."""
+class ModalSystems:
+    """A stack of N systems that share no mode."""
 
-    modes: np.ndarray  # (N, w), modes that each controller measures and commands
+    modes: np.ndarray  # (N, w), modes of each system
     A: FloatArray  # (N, s, s)
-    B: FloatArray  # (N, s, w)
-    C: FloatArray  # (N, w, s)
-    D: FloatArray  # (N, w, w)
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
 
     @property
     def width(self) -> int:
-        """Number of modes w of each controller."""
+        """Number of modes w of each system."""
         return int(self.modes.shape[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bank(ModalSystems):
+    """Controllers in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
+
+    B is (N, s, w), C (N, w, s) and D (N, w, w).
+    """
 
     def for_modes(self, modes: np.ndarray) -> Bank:
         """Return the same controllers for other modes: i becomes ``modes[i]``."""
@@ -93,19 +101,11 @@ class LoopVariances(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoopBlock:
-    """Closed loops of one bank, from ``[phi_tot, noise]`` to ``[phi_res, u]``."""
+class LoopBlock(ModalSystems):
+    """Closed loops of one bank, from ``[phi_tot, noise]`` to ``[phi_res, u]``, in textbook form.
 
-    modes: np.ndarray  # (N, w), modes of each loop
-    A: FloatArray  # (N, s, s)
-    B: FloatArray  # (N, s, 2 w)
-    C: FloatArray  # (N, 2 w, s)
-    D: FloatArray  # (N, 2 w, 2 w)
-
-    @property
-    def width(self) -> int:
-        """Number of modes w of each loop."""
-        return int(self.modes.shape[1])
+    B is (N, s, 2 w), C (N, 2 w, s) and D (N, 2 w, 2 w).
+    """
 
     @property
     def spectral_radii(self) -> FloatArray:

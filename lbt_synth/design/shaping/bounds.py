@@ -7,12 +7,12 @@ the real loop over all frequencies, which know nothing of the programme.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
 from lbt_synth.design.shaping.frequencies import (
     LEVEL_SETS,
     ROOM,
@@ -23,7 +23,6 @@ from lbt_synth.design.shaping.frequencies import (
     spectrum_edges,
 )
 from lbt_synth.design.shaping.objectives import ResidualVariance
-from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBound
@@ -54,12 +53,8 @@ class ModulusMargin(CheckedFields):
     'modulus margin of at least 0.45'
     """
 
+    _label: ClassVar = "modulus margin of at least {0.at_least:g}"
     at_least: Annotated[float, ("above", 0), ("below", 1)]
-
-    @property
-    def label(self) -> str:
-        """What a message calls it."""
-        return f"modulus margin of at least {self.at_least:g}"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
@@ -93,12 +88,8 @@ class NoisePeak(CheckedFields):
     2.0
     """
 
+    _label: ClassVar = "noise amplified by at most {0.at_most:g}"
     at_most: Positive
-
-    @property
-    def label(self) -> str:
-        """What a message calls it."""
-        return f"noise amplified by at most {self.at_most:g}"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
@@ -139,6 +130,9 @@ class Attenuation(Band):
     'attenuation to 0.01 in 0-2 Hz at sensor gain 1'
     """
 
+    _label: ClassVar = (
+        "attenuation to {0.at_most:g} in {0.band_text} at sensor gain {0.sensor_gain:g}"
+    )
     at_most: Positive
     sensor_gain: Positive = 1.0
 
@@ -149,12 +143,6 @@ class Attenuation(Band):
                 f"at_most must be below {1 / abs(1 - self.sensor_gain):.6g} at sensor gain "
                 f"{self.sensor_gain:g}, where it is no convex bound; got {self.at_most:g}."
             )
-
-    @property
-    def label(self) -> str:
-        """What a message calls it."""
-        band, gain = self.band_text, self.sensor_gain
-        return f"attenuation to {self.at_most:g} in {band} at sensor gain {gain:g}"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
@@ -205,6 +193,7 @@ class CommandRms(CheckedFields):
     'command step of at most 30 nm rms'
     """
 
+    _label: ClassVar = "command {0._what} of at most {0.at_most_nm:g} nm rms"
     at_most_nm: Positive
     turbulence: Spectrum | None
     noise_nm: float
@@ -217,11 +206,6 @@ class CommandRms(CheckedFields):
         # the same disturbances as those of a variance
         disturbance = ResidualVariance(turbulence=self.turbulence, noise_nm=self.noise_nm)
         set_fields(self, noise_nm=disturbance.noise_nm)
-
-    @property
-    def label(self) -> str:
-        """What a message calls it."""
-        return f"command {self._what} of at most {self.at_most_nm:g} nm rms"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints over the nodes of a grid."""

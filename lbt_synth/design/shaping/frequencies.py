@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,12 +26,18 @@ _MOST_EDGES = 400
 
 
 class CheckedFields:
-    """Base of dataclasses whose field types hold the bounds of their numbers."""
+    """Base of terms and demands, whose field types hold the bounds of their numbers."""
 
     __slots__ = ()
+    _label: ClassVar = ""  # format of the label, of the object
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    @property
+    def label(self) -> str:
+        """What tables and messages call it."""
+        return self._label.format(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

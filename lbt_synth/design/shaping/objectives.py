@@ -7,9 +7,8 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 
-from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
 from lbt_synth.design.shaping.frequencies import Band, CheckedFields, Grid
-from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function
 from lbt_synth.loop import residual_budget
@@ -44,6 +43,7 @@ class ResidualVariance(CheckedFields):
     1.0
     """
 
+    _label: ClassVar = "turbulence and noise at sensor gain {0.sensor_gain:g}"
     turbulence: Spectrum | None
     noise_nm: NotNegative
     sensor_gain: Positive = 1.0
@@ -57,11 +57,6 @@ class ResidualVariance(CheckedFields):
         CheckedFields.__post_init__(self)
         if self.turbulence is None and self.noise_nm == 0:
             raise ProblemError("a variance needs turbulence or noise; got neither.")
-
-    @property
-    def label(self) -> str:
-        """What a table calls it."""
-        return f"turbulence and noise at sensor gain {self.sensor_gain:g}"
 
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the variance over a grid as a function of the coefficients [nm^2]."""
@@ -107,13 +102,9 @@ class VibrationBand(Band):
     'vibration in 16.5-23.5 Hz at sensor gain 1'
     """
 
+    _label: ClassVar = "vibration in {0.band_text} at sensor gain {0.sensor_gain:g}"
     rms_nm: Positive
     sensor_gain: Positive = 1.0
-
-    @property
-    def label(self) -> str:
-        """What a table calls it."""
-        return f"vibration in {self.band_text} at sensor gain {self.sensor_gain:g}"
 
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""

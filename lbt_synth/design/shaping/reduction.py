@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from lbt_synth.design.shaping.channel import Channel, orthonormal_basis
+from lbt_synth.design.shaping.channel import Channel, mode_loop, orthonormal_basis
 from lbt_synth.design.shaping.objectives import frequency_costs, noise_level, vibration_bands
 from lbt_synth.design.shaping.programme_sequence import SequenceSolution, solve_sequence
-from lbt_synth.design.shaping.single_mode_loop import mode_loop
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear import Controller

@@ -1,21 +1,33 @@
-"""The specification of one mode of the loop: one objective and any number of demands."""
+"""The specification of one mode of the loop: one objective and any number of demands.
+
+A gain file holds it as plain metadata.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeAlias, get_args
+
+import numpy as np
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
-from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
 from lbt_synth.design.shaping.frequencies import Band, Grid, first_grid
-from lbt_synth.design.shaping.objectives import ResidualVariance, Term, leaves, require_term
-from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop
+from lbt_synth.design.shaping.objectives import (
+    ResidualVariance,
+    Term,
+    Total,
+    VibrationBand,
+    Worst,
+    leaves,
+    require_term,
+)
 from lbt_synth.design.shaping.uncertainty import SensorGainRange, Uncertainty
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, Function
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.models import ARModel, LoopHardware, Spectrum
+from lbt_synth.models import ARModel, Atmosphere, LoopHardware, Spectrum, TabulatedSpectrum
 from lbt_synth.validation import sequence, set_fields
 
 Demand: TypeAlias = Bound | Uncertainty
@@ -118,3 +130,37 @@ class Specification:
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check each demand on the real loop."""
         return tuple(check for demand in self.demands for check in demand.checks(loop))
+
+
+_KINDS: dict[str, type[Any]] = {
+    kind.__name__: kind
+    for kind in (
+        *get_args(Demand),
+        *(Specification, ResidualVariance, VibrationBand, Total, Worst),
+        *(Atmosphere, ARModel, TabulatedSpectrum),
+    )
+}
+
+
+def to_metadata(value: Any) -> Any:
+    """Return a specification, or a part of it, as plain values for JSON."""
+    name = type(value).__name__
+    if name in _KINDS:
+        named = {f.name: to_metadata(getattr(value, f.name)) for f in fields(value)}
+        return {"kind": name, **named}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [to_metadata(v) for v in value]
+    return value
+
+
+def from_metadata(data: Any) -> Any:
+    """Rebuild what :func:`to_metadata` wrote; an unknown kind raises KeyError."""
+    if isinstance(data, dict):
+        values = dict(data)
+        kind = _KINDS[values.pop("kind")]
+        return kind(**{key: from_metadata(v) for key, v in values.items()})
+    if isinstance(data, list):
+        return tuple(from_metadata(v) for v in data)
+    return data

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, append_taps
 from lbt_synth.design.shaping.frequencies import LEVEL_SETS, ROOM, Band, CheckedFields, Grid, discs
-from lbt_synth.design.shaping.single_mode_loop import SingleModeLoop, append_taps
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
@@ -46,13 +45,9 @@ class SensorGainRange(CheckedFields):
     'stability for sensor gains 0.25 to 1.3'
     """
 
+    _label: ClassVar = "stability for sensor gains {0.low:g} to {0.high:g}"
     low: Annotated[float, ("above", 0), ("at_most", 1), ("hint", _HOLDS_ONE)]
     high: Annotated[float, ("at_least", 1), ("hint", _HOLDS_ONE)]
-
-    @property
-    def label(self) -> str:
-        """What a message calls it."""
-        return f"stability for sensor gains {self.low:g} to {self.high:g}"
 
     def _bounds(self) -> tuple[tuple[float, float], ...]:
         """Return signs and bounds of the real part of T."""
@@ -106,12 +101,8 @@ class DelayError(CheckedFields):
     0.25
     """
 
+    _label: ClassVar = "stability for delay errors up to {0.frames:g} frames"
     frames: Annotated[float, ("above", 0), ("at_most", 1)]
-
-    @property
-    def label(self) -> str:
-        """What a message calls it."""
-        return f"stability for delay errors up to {self.frames:g} frames"
 
     def _differences(self, hardware: LoopHardware) -> list[tuple[float, FloatArray]]:
         """Return the delays that stand for all of them, each with the taps of ``M_(d+e) - M_d``."""
@@ -175,12 +166,8 @@ class MirrorUncertainty(Band):
     0.5
     """
 
+    _label: ClassVar = "stability for mirror errors of {0.relative:g} in {0.band_text}"
     relative: Positive
-
-    @property
-    def label(self) -> str:
-        """What a message calls it."""
-        return f"stability for mirror errors of {self.relative:g} in {self.band_text}"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lbt_synth.errors import ProblemError
@@ -86,9 +88,7 @@ def mirror_figure(
         height_in=2.4,
     )
     taps = hardware.mirror_taps
-    ideal = LoopHardware(
-        frame_rate_hz=hardware.frame_rate_hz, delay_frames=hardware.delay_frames, modes=1
-    ).mirror_taps
+    ideal = replace(hardware, mirror=None).mirror_taps
     count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN)[-1]) + 1, ideal.size)
     weights = Panel(
         x=Axis(label="frames after the command", low=-0.6, high=count - 0.4),

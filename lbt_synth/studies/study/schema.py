@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 from scipy.special import ndtr, ndtri
 
-from lbt_synth.methods.section import Positive, Section
+from lbt_synth.methods.method import Positive, Section
 from lbt_synth.validation import FloatArray
 
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite

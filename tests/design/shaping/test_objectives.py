@@ -14,7 +14,7 @@ from support.shaping import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping.single_mode_loop import mode_loop
+from lbt_synth.design.shaping.channel import mode_loop
 
 TERMS = [
     BASIC,

@@ -12,8 +12,8 @@ from support.shaping import (
 )
 
 import lbt_synth as lbt
+from lbt_synth.design.shaping.channel import mode_loop
 from lbt_synth.design.shaping.programme_sequence import solve_sequence
-from lbt_synth.design.shaping.single_mode_loop import mode_loop
 
 
 def test_terms_at_other_sensor_gains_are_lowered_step_by_step():
