@@ -13,8 +13,8 @@ from .integrator import optimal_integrator as optimal_integrator
 from .kalman import kalman as kalman
 from .loop_shaping import ShapedDesign as ShapedDesign
 from .loop_shaping import shape as shape
+from .lqg import LqgDesign as LqgDesign
 from .lqg import lqg as lqg
-from .lqg_design import LqgDesign as LqgDesign
 from .mixed import central_filter as central_filter
 from .mixed import mixed as mixed
 from .polytopic import PolytopicDesign as PolytopicDesign

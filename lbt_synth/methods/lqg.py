@@ -13,7 +13,7 @@ from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import frozen_copy, number
 
 if TYPE_CHECKING:
-    from lbt_synth.design.lqg_design import LqgDesign
+    from lbt_synth.design.lqg import LqgDesign
     from lbt_synth.design.record import DesignRecord
 
 _NUMBERS = ("command_weight", "objective_nm")
@@ -55,7 +55,7 @@ def _pack(design: LqgDesign) -> DesignRecord:
 
 
 def _unpack(record: DesignRecord) -> LqgDesign:
-    from lbt_synth.design.lqg_design import LqgDesign
+    from lbt_synth.design.lqg import LqgDesign
 
     problem = record.plant("a design that knows the mirror")
     numbers: dict[str, Any] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -63,6 +63,12 @@ class Band(CheckedFields):
     def check(self, name: str, peak: float, limit: float) -> Check:
         """Return the check of a peak in the band."""
         return Check(name, peak, limit, "level sets, all of the band")
+
+
+def distinct_bands(parts: Iterable[object]) -> tuple[tuple[float, float], ...]:
+    """Return the different bands (low, high) of terms and demands, in order [Hz]."""
+    bands = [part for part in parts if isinstance(part, Band)]
+    return tuple(dict.fromkeys((band.low_hz, band.high_hz) for band in bands))
 
 
 def discs(frequency_hz: FloatArray, rows: ComplexArray, centre: float, radius: float) -> Discs:

@@ -232,12 +232,6 @@ def leaves(term: Term) -> tuple[Leaf, ...]:
     return (term,)
 
 
-def vibration_bands(term: Term) -> tuple[tuple[float, float], ...]:
-    """Return the different bands (low, high) of an objective's vibrations, in order [Hz]."""
-    lines = [leaf for leaf in leaves(term) if isinstance(leaf, VibrationBand)]
-    return tuple(dict.fromkeys((line.low_hz, line.high_hz) for line in lines))
-
-
 def frequency_costs(term: Term, frequency_hz: FloatArray) -> FloatArray:
     """Cost of an error of T at each frequency, up to a factor: spectra and bands."""
     cost = np.zeros(frequency_hz.size)

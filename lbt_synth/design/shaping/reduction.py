@@ -13,7 +13,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lbt_synth.design.shaping.channel import Channel, mode_loop, orthonormal_basis
-from lbt_synth.design.shaping.objectives import frequency_costs, noise_level, vibration_bands
+from lbt_synth.design.shaping.frequencies import distinct_bands
+from lbt_synth.design.shaping.objectives import frequency_costs, leaves, noise_level
 from lbt_synth.design.shaping.programme_sequence import SequenceSolution, solve_sequence
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import InfeasibleError, NumericalError
@@ -66,7 +67,9 @@ def reduce_poles(
 ) -> ModeSolution:
     """Find the fewest poles whose programme keeps the objective within a tolerance."""
     hardware, response = long.sequence.channel.hardware, _response_to_fit(spec, long.sequence)
-    bands = 2 * np.pi * np.array(vibration_bands(spec.objective)).reshape(-1, 2) * hardware.dt_s
+    bands = (
+        2 * np.pi * np.array(distinct_bands(leaves(spec.objective))).reshape(-1, 2) * hardware.dt_s
+    )
     starts = [starting_poles(order, bands=bands, noise_rad=2 * np.pi * slow) for slow in _SLOW_HZ]
     fits = [fit_poles(response, start) for start in starts]
     candidates = [min(fits, key=lambda fit: fit[1])[0]]

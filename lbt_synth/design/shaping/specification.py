@@ -13,7 +13,7 @@ import numpy as np
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
-from lbt_synth.design.shaping.frequencies import Band, Grid, first_grid
+from lbt_synth.design.shaping.frequencies import Grid, distinct_bands, first_grid
 from lbt_synth.design.shaping.objectives import (
     ResidualVariance,
     Term,
@@ -89,8 +89,7 @@ class Specification:
     @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:
         """Bands of the objective and of the demands [Hz]."""
-        bands = [part for part in self._parts if isinstance(part, Band)]
-        return tuple(dict.fromkeys((band.low_hz, band.high_hz) for band in bands))
+        return distinct_bands(self._parts)
 
     @property
     def spectra(self) -> tuple[Spectrum, ...]:
