@@ -38,6 +38,10 @@ from lbt_synth.validation import (
     require_instance,
 )
 
+Process: TypeAlias = ARModel | ModalTurbulence
+_RESIDUAL = 1e-9  # of a Lyapunov equation, relative
+_AT_ONCE = 1024  # loops with vibrations
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleResiduals:
@@ -211,11 +215,6 @@ def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ..
     systems = [controller.to_statespace() for controller in controllers]
     systems = [system.balanced() if system.n_states else system for system in systems]
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
-
-
-Process: TypeAlias = ARModel | ModalTurbulence
-_RESIDUAL = 1e-9  # of a Lyapunov equation, relative
-_AT_ONCE = 1024  # loops with vibrations
 
 
 def turbulence_and_noise_nm2(
