@@ -9,7 +9,7 @@ second moments of the states. Then, whatever the filter,
     gamma^2 >= ||L (A states + B disturbances)||^2 / ||disturbances||^2      (Frobenius)
 
 by weak duality with the linear matrix inequality of the filter, of whose dual the moments are
-a point. If rounding breaks the "at least", the shortfall is subtracted from the bound.
+a point. If rounding breaks the "at least", the price of the shortfall is added to the denominator.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
 _SLOW = 0.999  # a pole of the backward recursion beyond this may belong to a sinusoid
+_SMALLEST_SCALE = 1e-7  # of a state, as a part of the largest standard deviation
 _STRAYED = 1e-9  # share of the successors that may lie where no filter has an error
 
 
@@ -86,16 +87,17 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
     w = w - problem.D.T @ np.linalg.solve(problem.R, problem.C @ x + problem.D @ w)
     after = problem.A @ x + problem.B @ w
     deviation = np.sqrt(np.diag(covariance))
-    units = np.maximum(deviation, 1e-7 * deviation.max(initial=0.0))[:, None]
-    units = np.where(units > 0, units, 1.0)
-    strayed = np.linalg.norm((after - basis @ (inverse @ after)) / units)
-    if strayed > _STRAYED * np.linalg.norm(after / units):
+    scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
+    scale = np.where(scale > 0, scale, 1.0)
+    strayed = np.linalg.norm((after - basis @ (inverse @ after)) / scale)
+    if strayed > _STRAYED * np.linalg.norm(after / scale):
         return 0.0
+    # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
     growth = inverse @ (after @ after.T - x @ x.T) @ inverse.T
     values, vectors = np.linalg.eigh((growth + growth.T) / 2)
-    gain = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+    growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
     shortfall = -float(values[values < 0].sum())
-    gained = float(np.sum((problem.L @ x) ** 2) + np.sum((problem.L @ gain) ** 2))
+    gained = float(np.sum((problem.L @ x) ** 2) + np.sum((problem.L @ growth_root) ** 2))
     spent = float(np.sum(w**2)) + shortfall
     return float(np.sqrt(gained / spent)) if spent > 0 else 0.0
 
@@ -139,7 +141,7 @@ def worst_invisible_disturbance(
 
 
 def _hide(problem: EstimationProblem, states: FloatArray, disturbances: FloatArray) -> Witness:
-    """Add the measurement noise that hides the states."""
+    """Return the witness whose added measurement noise hides the states."""
     hiding = -problem.D.T @ np.linalg.solve(problem.R, problem.C @ states)
     return Witness(states=states, disturbances=disturbances + hiding)
 
@@ -148,11 +150,12 @@ def _sinusoid(problem: EstimationProblem, angle: float) -> Witness:
     """Return the invisible sinusoid of one frequency that has the most z for its w."""
     A, B, C, D, L = problem.A, problem.B, problem.C, problem.D, problem.L
     n = len(A)
+    # e^(j angle) x = A x + B w and C x + D w = 0
     steady = np.block([[np.exp(1j * angle) * np.eye(n) - A, -B], [C, D]])
     pairs = null_space(steady)
     x, w = pairs[:n], pairs[n:]
     gained, spent = (L @ x).conj().T @ (L @ x), w.conj().T @ w
     floor = 1e-13 * np.trace(spent).real * np.eye(len(spent))
     best = pairs @ eigh(gained, spent + floor)[1][:, -1]
-    both = np.stack([best.real, best.imag], axis=1)
-    return Witness(states=both[:n], disturbances=both[n:])
+    parts = np.stack([best.real, best.imag], axis=1)
+    return Witness(states=parts[:n], disturbances=parts[n:])

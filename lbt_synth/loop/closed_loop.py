@@ -70,7 +70,7 @@ class ClosedLoop:
             )
 
     def sensitivity(self, frequency_hz: ArrayLike) -> ComplexArray:
-        """Transfer from the total phase to the residual, (f, n, n) (the rejection)."""
+        """Transfer from the total phase to the residual (the rejection), (f, n, n)."""
         n = self.hardware.modes
         return self.system.frequency_response(frequency_hz)[:, :n, :n]
 
@@ -205,36 +205,41 @@ def loop_matrices(
     sensor gain g as in ``A0 + g A1``. The state is that of the controller, of the mirror (its past
     commands, if it settles), and the last residual phi_res(k-1).
     """
-    lead, order = A.shape[:-2], A.shape[-1]
+    stack, order = A.shape[:-2], A.shape[-1]
     (q, n), m = sensor.shape, influence.shape[1]
-    each = np.eye(m)
     states = order + mirror.n_states * m + n
-    x, u = slice(0, order), slice(order, states - n)
-    r = slice(states - n, states)
-    entry, through = np.kron(mirror.B[:, None], each), mirror.D * influence
+    x = slice(order)  # state of the controller
+    v = slice(order, states - n)  # state of the mirror, one response per command
+    r = slice(states - n, states)  # phi_res(k-1)
+    identity = np.eye(m)
+    mirror_A, mirror_B = np.kron(mirror.A, identity), np.kron(mirror.B[:, None], identity)
+    direct_influence = mirror.D * influence  # from u(k) to phi_cor(k) without a delay
 
-    measured = np.zeros((q, states))  # y = g measured x + noise
+    # with s the whole state: y = g measured s + noise
+    measured = np.zeros((q, states))
     measured[:, r] = sensor
-    command0 = np.zeros((*lead, m, states))  # u = (command0 + g command1) x + D noise
+    # u = (command0 + g command1) s + D noise
+    command0 = np.zeros((*stack, m, states))
     command0[..., x] = C
     command1 = D @ measured
-    residual0 = -through @ command0  # phi_res = (...) x + phi_tot - through D noise
-    residual0[..., u] -= influence @ np.kron(mirror.C, each)
-    residual1 = -through @ command1
+    # phi_res = (residual0 + g residual1) s + phi_tot - direct_influence D noise
+    residual0 = -direct_influence @ command0
+    residual0[..., v] -= influence @ np.kron(mirror.C, identity)
+    residual1 = -direct_influence @ command1
 
-    A0, A1 = np.zeros((2, *lead, states, states))
-    inputs = np.zeros((*lead, states, n + q))
+    A0, A1 = np.zeros((2, *stack, states, states))
+    inputs = np.zeros((*stack, states, n + q))
     A0[..., x, x], A1[..., x, :], inputs[..., x, n:] = A, B @ measured, B
-    A0[..., u, :], A1[..., u, :] = entry @ command0, entry @ command1
-    inputs[..., u, n:] = entry @ D
-    A0[..., u, u] += np.kron(mirror.A, each)
+    A0[..., v, :], A1[..., v, :] = mirror_B @ command0, mirror_B @ command1
+    inputs[..., v, n:] = mirror_B @ D
+    A0[..., v, v] += mirror_A
     A0[..., r, :], A1[..., r, :] = residual0, residual1
-    inputs[..., r, :n], inputs[..., r, n:] = np.eye(n), -through @ D
-    outputs0, outputs1 = np.zeros((2, *lead, n + m + q, states))
+    inputs[..., r, :n], inputs[..., r, n:] = np.eye(n), -direct_influence @ D
+    outputs0, outputs1 = np.zeros((2, *stack, n + m + q, states))
     outputs0[..., :n, :], outputs0[..., n : n + m, :] = residual0, command0
     outputs1[..., :n, :], outputs1[..., n : n + m, :] = residual1, command1
     outputs1[..., n + m :, :] = measured
-    direct = np.zeros((*lead, n + m + q, n + q))
+    direct = np.zeros((*stack, n + m + q, n + q))
     direct[..., :n, :] = inputs[..., r, :]
     direct[..., n : n + m, n:] = D
     direct[..., n + m :, n:] = np.eye(q)
