@@ -31,7 +31,8 @@ RESIDUAL_TOLERANCE = 1e-8
 INFEASIBLE_TOLERANCE = 1e-9
 VARIANCE_TOLERANCE = 1e-6
 LEVEL_SETS = "level sets on the symplectic pencil"
-_GRID = 513
+_GRID = 513  # frequencies from 0 to the Nyquist frequency
+_TINY = 1e-300  # keeps a quotient finite where the denominator is zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,10 +122,10 @@ def certify_filter(
 ) -> Certificate:
     """Check a predictor gain against its problem.
 
-    The spectral radius by eigenvalues, the variance by a Lyapunov equation, the
-    norm by level sets and again on a frequency grid. With ``gamma``, the norm
-    has to stay below it. With ``least_variance``, the covariance of the Lyapunov
-    equation has to reproduce the gain, which proves that it is the Kalman gain.
+    Eigenvalues give the spectral radius, a Lyapunov equation and its adjoint the variance,
+    level sets and a frequency grid the norm. With ``gamma``, the norm must not exceed it.
+    With ``least_variance``, the covariance of the Lyapunov equation must reproduce the
+    gain, which proves that it is the Kalman gain.
 
     Parameters
     ----------
@@ -177,7 +178,11 @@ def certify_filter(
 def certify_error(
     error: StateSpace, *, stability: str = "spectral radius of the filter"
 ) -> Certificate:
-    """Certify an estimation error: stability, its variance both ways, its norm both ways."""
+    """Certify a system from disturbance to estimation error.
+
+    The checks are stability, the variance by a Lyapunov equation and its adjoint, and the norm by
+    level sets and on a frequency grid. ``stability`` names the first check.
+    """
     return _examine_error(error, stability)[0]
 
 
@@ -195,11 +200,14 @@ def _examine_error(
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     highest = float(np.max(largest_singular_values(error, grid)))
-    equation = "residual of the Lyapunov equation", lyapunov_residual(error.A, drive, P)
-    above, how = highest / max(norm.upper, 1e-300) - 1, f"{_GRID} frequencies against level sets"
+    residual = lyapunov_residual(error.A, drive, P)
+    above = highest / max(norm.upper, _TINY) - 1
+    how = f"{_GRID} frequencies against level sets"
     checks = (
         stable,
-        Check(*equation, RESIDUAL_TOLERANCE, "relative, 1-norm"),
+        Check(
+            "residual of the Lyapunov equation", residual, RESIDUAL_TOLERANCE, "relative, 1-norm"
+        ),
         _adjoint_variance_check(error, float(variances.sum())),
         Check("singular values above the norm", above, NORM_TOLERANCE, how),
     )
@@ -220,8 +228,8 @@ def _adjoint_variance_check(error: StateSpace, variance: float) -> Check:
 def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
     """Check that a witness proves what is claimed of it: no filter below a level of gamma.
 
-    The covariance of the Kalman filter, by the Riccati equation, enters only as the price of what
-    rounding took from the proof, and as the space in which an estimation error can lie.
+    The covariance of the Kalman filter, by the Riccati equation, enters in two places only: it
+    weighs what rounding took from the proof, and it spans the space of the estimation error.
 
     Parameters
     ----------
@@ -235,10 +243,13 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     Returns
     -------
     Check
-        Passed if the level does not exceed what the witness proves, but for 1e-9 of it.
+        Passed if the level exceeds the level that the witness proves by less than a relative
+        1e-9.
 
     Raises
     ------
+    ProblemError
+        If the witness is not a :class:`Witness`, or the level not a positive number.
     DimensionError
         If the witness does not fit the problem.
 
@@ -267,7 +278,8 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
         )
     claimed = number(level, "level", above=0)
     proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
-    above, how = claimed / max(proved, 1e-300) - 1, "disturbances that no measurement shows"
+    above = claimed / max(proved, _TINY) - 1
+    how = "disturbances that no measurement shows"
     name = "infeasible level over the level proved, less 1"
     return Check(name, above, INFEASIBLE_TOLERANCE, how)
 

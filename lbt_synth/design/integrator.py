@@ -22,11 +22,13 @@ from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.validation import frozen_copy, number, require_instance
 
 _TRIALS = 32
-TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as parts of the limit
+TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as fractions of the limit
 
 
 def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
-    """Integrator ``u(k) = u(k-1) + gain R y(k)``, R the generalised inverse of D N.
+    """Integrator ``u(k) = u(k-1) + gain R y(k)``.
+
+    R is the pseudoinverse of the sensor matrix times the influence matrix.
 
     Parameters
     ----------
@@ -105,20 +107,25 @@ def integrator_gain_limit(delay_frames: float) -> float:
     d = hardware.delay_frames
     if d == round(d):
         return float(2 * np.sin(np.pi / (2 * (2 * d - 1))))
-    start = 0.5 / d  # stable: well below the limit of the next whole delay
-    return start * stable_sensor_gains(hardware, _integrator_controller(hardware, start))[1]
+    return _limit_above(hardware, 0.5 / d)  # stable: well below the limit of the next whole delay
 
 
 def hardware_gain_limit(hardware: LoopHardware) -> float:
-    """Gain at which an integrator becomes unstable, with the dynamics of the mirror."""
+    """Gain at which an integrator loop becomes unstable, with the dynamics of the mirror."""
     if hardware.mirror is None:
         return integrator_gain_limit(hardware.delay_frames)
     single = hardware.single_mode()
     taps = single.mirror_taps
-    start = 0.5 / (1 + float(np.abs(np.arange(taps.size) @ taps)))  # half over the mean delay
-    while not close_loop(single, _integrator_controller(single, start)).is_stable:
-        start /= 2
-    return start * stable_sensor_gains(single, _integrator_controller(single, start))[1]
+    mean_delay_frames = 1 + float(np.abs(np.arange(taps.size) @ taps))
+    gain = 0.5 / mean_delay_frames
+    while not close_loop(single, _integrator_controller(single, gain)).is_stable:
+        gain /= 2
+    return _limit_above(single, gain)
+
+
+def _limit_above(hardware: LoopHardware, gain: float) -> float:
+    """Return the gain limit of a loop that is stable with a given gain."""
+    return gain * stable_sensor_gains(hardware, _integrator_controller(hardware, gain))[1]
 
 
 def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign:
@@ -134,7 +141,7 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     Returns
     -------
     IntegratorDesign
-        Certified design. The gain is within 1e-6 of the best among those that are
+        Certified design. The gain is within a relative 1e-6 of the best among those that are
         stable at unit sensor gain as well; ``solver.status`` says when that limit,
         not the truth, decided.
 
@@ -142,6 +149,8 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
     ------
     ProblemError
         If nothing disturbs the loop.
+    CertificateError
+        If the design does not pass its checks.
 
     Examples
     --------
@@ -195,7 +204,7 @@ def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
 def _least_residual(
     hardware: LoopHardware, budget: Callable[[ClosedLoop], ResidualBudget], sensor_gain: float
 ) -> IntegratorDesign:
-    """Return the design of least residual: trials on a grid of gains, the best of them refined."""
+    """Search a grid of gains for the least residual, refine the best, and design with it."""
     limit = hardware_gain_limit(hardware) / max(1.0, sensor_gain)
 
     def variance(log_gain: float) -> float:
@@ -211,12 +220,13 @@ def _least_residual(
     best = int(np.argmin(values))
     bracket = trials[max(best - 1, 0)], trials[min(best + 1, _TRIALS - 1)]
     found = minimize_scalar(variance, bounds=bracket, method="bounded", options={"xatol": 1e-7})
-    limited = best == _TRIALS - 1
+    limited = best == _TRIALS - 1  # the largest gain that was tried
     status = "limited by stability at unit sensor gain" if limited else "least residual"
     return _design_with_gain(hardware, float(np.exp(found.x)), route="search", status=status)
 
 
 def _integrator_controller(hardware: LoopHardware, gain: float) -> Controller:
+    """Return an integrator whose state x(k+1) is its command u(k)."""
     reconstructor = frozen_copy(np.linalg.pinv(hardware.sensor @ hardware.influence))
     m, q = reconstructor.shape
     return Controller(

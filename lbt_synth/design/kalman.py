@@ -10,7 +10,7 @@ from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
-from lbt_synth.validation import choice
+from lbt_synth.validation import FloatArray, choice
 
 if TYPE_CHECKING:
     from lbt_synth.linear.lmi.balanced_coordinates import LmiSolution
@@ -27,8 +27,8 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
         Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
         filter, 2 and more predict further, as ``problem.ahead``.
     route : {"riccati", "sdp"}, optional
-        The Riccati equation, or a semidefinite programme (independent of it but
-        for the coordinates it is solved in).
+        The Riccati equation, or a semidefinite programme, which takes from the Riccati
+        solution only the coordinates and the scale of its variables.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     )
 
 
-def error_scale(problem: EstimationProblem, P: np.ndarray) -> float:
-    """Deviation of the estimation error in its worst direction; 1 if the error is zero."""
+def error_scale(problem: EstimationProblem, P: FloatArray) -> float:
+    """Return the standard deviation of the error in its worst direction, or 1 if it is zero."""
     worst = float(np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[-1])
     return float(np.sqrt(worst)) if worst > 0 else 1.0
