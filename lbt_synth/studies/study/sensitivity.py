@@ -12,8 +12,9 @@ from lbt_synth.studies.study.percentiles import mean_and_error
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, frozen_copy
 
 FEWEST = 20  # samples for an index
-_VALUES = 32  # distinct values of a list, at most
-_COARSE = 8, 4096  # intervals, at most, with fewer than that many samples
+_MOST_VALUES = 32  # a parameter with more distinct values is continuous
+_MOST_INTERVALS = 8  # with fewer samples than _MANY_SAMPLES
+_MANY_SAMPLES = 4096
 _GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # samples, and groups if there are fewer
 _MOST_GROUPS = 32
 _MIDDLE = 0.05, 0.95
@@ -24,7 +25,7 @@ class VarianceIndex:
     """First-order index of one parameter."""
 
     value: float  # about 0 without an effect; nan if the result or the parameter is constant
-    error: float  # standard error for independent samples; too large for more even ones
+    error: float  # standard error for independent samples; an overestimate for stratified ones
     correction: float  # subtracted for the scatter of the fit
     groups: int  # values of a list, or intervals of a continuous parameter
 
@@ -33,9 +34,9 @@ NO_INDEX = VarianceIndex(value=np.nan, error=np.nan, correction=np.nan, groups=0
 
 
 def is_list(ordered: FloatArray) -> bool:
-    """Whether a parameter, given in rising order, takes few values only."""
+    """Whether a parameter, given in rising order, takes few values, as from a list of a study."""
     distinct = 1 + int(np.count_nonzero(np.diff(ordered)))
-    return distinct <= min(_VALUES, max(2, len(ordered) // 5))
+    return distinct <= min(_MOST_VALUES, max(2, len(ordered) // 5))
 
 
 def value_starts(ordered: FloatArray) -> IntArray:
@@ -90,23 +91,21 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
     scale = float(np.max(np.abs(result), initial=0.0))
     if n < FEWEST or ordered[0] == ordered[-1] or total <= n * (1e-12 * scale) ** 2:
         return NO_INDEX
+    jumps: FloatArray | None = None
     if is_list(ordered):
         starts = value_starts(ordered)
         coefficients = len(starts)
-        rest, ends = spread - _means(spread, starts), None
+        fit = _means(spread, starts)
     else:
         groups = round(n ** (1 / 3))
-        starts = group_starts(n, groups if n >= _COARSE[1] else min(groups, _COARSE[0]))
+        starts = group_starts(n, groups if n >= _MANY_SAMPLES else min(groups, _MOST_INTERVALS))
         coefficients = 2 * len(starts)
-        fit, ends = _lines(spread, starts)
-        rest = spread - fit
+        fit, jumps = _lines(spread, starts)
+    rest = spread - fit
     squares = rest * rest
     unexplained = float(np.sum(squares)) / total
-    if n <= coefficients:
-        return NO_INDEX
     scatter = float(np.sum(squares)) / (n - coefficients)
-    if ends is not None:
-        jumps = ends[0][1:] - ends[1][:-1]
+    if jumps is not None:
         scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
     correction = (coefficients - 1) * scatter / total
     # what a sample adds to the index, to first order; then the scatter of the fit
@@ -129,18 +128,18 @@ def _means(values: FloatArray, starts: IntArray) -> FloatArray:
     return means
 
 
-def _lines(
-    values: FloatArray, starts: IntArray
-) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
-    """Return a line fitted to each group, at every sample and at either end of the group."""
+def _lines(values: FloatArray, starts: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lines fitted to each group at every sample, and the jumps between neighbours."""
     n = len(values)
     counts = np.diff(np.append(starts, n))
     middle = starts + (counts - 1) / 2
+    # from -1 to 1 over the group
     place = (np.arange(n) - np.repeat(middle, counts)) / np.repeat(counts / 2, counts)
     means = np.add.reduceat(values, starts) / counts
     slopes = np.add.reduceat(place * values, starts) / np.add.reduceat(place * place, starts)
     fit = np.repeat(means, counts) + np.repeat(slopes, counts) * place
-    return fit, (means - slopes, means + slopes)
+    left, right = means - slopes, means + slopes
+    return fit, left[1:] - right[:-1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
