@@ -1,4 +1,4 @@
-"""Axes and measurements of a configuration: how many, and what a file gives for each."""
+"""Axes and measurements of a configuration: their numbers, and checks of values per axis."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def count_axes(settings: FileSection) -> int:
     for key, word, size in sizes:
         if size != axes:
             raise ConfigError(
-                f"{key} must have {axes} {word}, as loop.axes says; got {size}.", path=key
+                f"{key} must have {axes} {word} to match loop.axes; got {size}.", path=key
             )
     return axes
 

@@ -1,4 +1,4 @@
-"""The method of the filter for an interval of vibration frequencies."""
+"""The method "polytopic": a filter for an interval of vibration frequencies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
 
 _NORMS = ("hinf", "h2")
-_SIZES = ("bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme")
+_RESULTS = ("bound_guaranteed", "worst_achieved", "worst_frequency_hz", "bound_programme")
 
 
 class PolytopicOptions(Section):
@@ -62,7 +62,7 @@ def _pack(design: PolytopicDesign) -> DesignRecord:
     from lbt_synth.design.record import DesignRecord, record_problem
 
     arrays = {f"PREDICTOR_{name}": getattr(design.predictor, name) for name in "ABC"}
-    interval = {name: getattr(design, name) for name in ("half_width_hz", "norm", *_SIZES)}
+    interval = {name: getattr(design, name) for name in ("half_width_hz", "norm", *_RESULTS)}
     return DesignRecord(arrays, {"interval": interval}) | record_problem(design.problem)
 
 
@@ -72,26 +72,28 @@ def _unpack(record: DesignRecord) -> PolytopicDesign:
     problem = record.plant("an interval of frequencies")
     common, interval = record.common(), record.meta["interval"]
     if common["method"] != f"{METHOD.name}-{interval['norm']}":
-        raise ValueError(f"the method {common['method']} is not of the norm {interval['norm']}")
-    sizes: dict[str, Any] = {name: number(interval[name], name, above=0) for name in _SIZES}
+        raise ValueError(
+            f"the method {common['method']} does not minimise the norm {interval['norm']}"
+        )
+    results: dict[str, Any] = {name: number(interval[name], name, above=0) for name in _RESULTS}
     design = PolytopicDesign(
         **common,
-        **sizes,
+        **results,
         problem=problem,
         predictor=record.controller("PREDICTOR_", D=np.zeros((len(problem.L), len(problem.C)))),
         norm=choice(interval["norm"], "norm", _NORMS),
         half_width_hz=number(interval["half_width_hz"], "half_width_hz", at_least=0),
     )
-    # an interval that does not fit the plant is refused here, not when it is verified
+    # raises for an interval that does not fit the plant: refused here, not when it is verified
     design.interval.coefficient(design.worst_frequency_hz)
     return design
 
 
 def _describe(design: PolytopicDesign) -> Description:
     ratio = design.bound_guaranteed / design.worst_achieved
-    own = {**limit_facts(design), "guaranteed_over_found": ratio}
+    extra = {**limit_facts(design), "guaranteed_over_found": ratio}
     return Description(
-        facts=fill_row(PolytopicFacts, design, design.interval, **own),
+        facts=fill_row(PolytopicFacts, design, design.interval, **extra),
         matrices={f"predictor_{name}": getattr(design.predictor, name) for name in "ABC"},
     )
 

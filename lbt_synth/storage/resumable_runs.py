@@ -40,7 +40,7 @@ def run_cases(
     Parameters
     ----------
     function : callable
-        Maps a case to its result, a mapping that JSON can hold; importable by name where
+        Maps a case to its result, a mapping that JSON can hold; importable by name if
         other processes run it. Its result must depend on the case only.
     cases : mapping of str to mapping
         Arguments of each case, by its name, which is also that of its file.
@@ -64,7 +64,7 @@ def run_cases(
         If the directory holds results of other arguments under these names, is in use by
         another run, or cannot be written.
     ProblemError
-        If a name is no file name, or a case or a result does not fit into JSON.
+        If a name is not a valid file name, or a case or a result does not fit into JSON.
     NumericalError
         If a process ended without a result.
 
@@ -82,14 +82,14 @@ def run_cases(
     """
     folder = Path(directory)
     jobs = integer(jobs, "jobs", at_least=1)
-    digests = {name: _digest(name, case) for name, case in cases.items()}
+    digests = {name: _case_digest(name, case) for name, case in cases.items()}
     with exclusive_lock(folder, "computation"):
         found = {name: _read(folder / f"{name}.json", digests[name]) for name in cases}
         results = {name: result for name, result in found.items() if result is not None}
         if progress is not None and results:
             progress(len(results))
         missing = {name: case for name, case in cases.items() if name not in results}
-        with contextlib.closing(_run_cases(function, missing, jobs, executor)) as finished:
+        with contextlib.closing(_results(function, missing, jobs, executor)) as finished:
             for name, result in finished:
                 results[name] = _write(folder, name, digests[name], cases[name], result)
                 if progress is not None:
@@ -97,7 +97,7 @@ def run_cases(
     return {name: results[name] for name in cases}
 
 
-def _run_cases(
+def _results(
     function: Callable[[Case], Mapping[str, Any]],
     cases: Mapping[str, Case],
     jobs: int,
@@ -119,7 +119,7 @@ def _run_cases(
                     _cancel(futures)
         finally:
             _cancel(futures)
-        for future in futures:  # raise what failed first, in the order of the cases
+        for future in futures:  # raise the error of the first case that failed
             if not future.cancelled():
                 future.result()
 
@@ -137,38 +137,38 @@ def _processes(workers: int) -> Iterator[Executor]:
             yield pool
     except BrokenExecutor as error:
         raise NumericalError(
-            "a worker process ended without a word, perhaps for want of memory. "
-            "Finished results are kept: start again, with fewer jobs."
+            "a worker process died, perhaps out of memory. "
+            "Finished results are kept. Start again with fewer jobs."
         ) from error
 
 
-def _digest(name: str, case: Case) -> str:
+def _case_digest(name: str, case: Case) -> str:
     if not isinstance(name, str) or not _NAME.match(name):
         raise ProblemError(f"the name of a case must be letters, digits and . _ + -; got {name!r}.")
     try:
-        return _hash(case)
+        return _digest(case)
     except (TypeError, ValueError) as error:
         raise ProblemError(f"the case {name} must fit into JSON: {error}.") from error
 
 
-def _hash(content: Mapping[str, Any]) -> str:
+def _digest(content: Mapping[str, Any]) -> str:
     text = json.dumps(dict(content), sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read(path: Path, expected: str) -> dict[str, Any] | None:
-    """Return the result in a file, None without a file; refuse one that is not that of the case."""
+    """Return the result in a file, or None without a file; refuse a file of another case."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         asked, digest, result = content["asked"], content["digest"], dict(content["result"])
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        why = f"is no result of a run: {error}. Delete it, or name another directory."
+        why = f"is not the result of a run: {error}. Delete it, or name another directory."
         raise OutputError(f"{path} {why}", path=path) from error
-    if asked == expected and digest == _hash(result):
+    if asked == expected and digest == _digest(result):
         return result
-    why = "was changed after it was written. Delete it, and it is run again."
+    why = "was changed after it was written. Delete it to run its case again."
     if asked != expected:
         why = (
             "is the result of other settings. Name another directory, or delete the results of the "
@@ -181,7 +181,7 @@ def _write(
     folder: Path, name: str, asked: str, case: Case, result: Mapping[str, Any]
 ) -> dict[str, Any]:
     try:
-        written = {"asked": asked, "digest": _hash(result), "case": case, "result": dict(result)}
+        written = {"asked": asked, "digest": _digest(result), "case": case, "result": dict(result)}
         text = json.dumps(written, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ProblemError(f"the result of {name} must fit into JSON: {error}.") from error

@@ -220,7 +220,7 @@ def test_unreadable_files(tmp_path):
         (
             {"loop": {"axes": 1}, "sensor": {"matrix": [[1, 0], [0, 1]]}},
             "sensor.matrix",
-            "must have 1 columns, as loop.axes says; got 2",
+            "must have 1 columns to match loop.axes; got 2",
         ),
         (
             {

@@ -102,7 +102,7 @@ def test_results_of_other_settings_are_not_mixed_in(tmp_path):
 )
 def test_a_file_that_is_no_result_is_named(tmp_path, text):
     (tmp_path / "case-0.json").write_text(text)
-    with pytest.raises(OutputError, match="no result of a run"):
+    with pytest.raises(OutputError, match="not the result of a run"):
         run_cases(square, CASES, tmp_path)
 
 
@@ -224,7 +224,7 @@ def dies(case):
 
 
 def test_a_process_that_dies_is_reported(tmp_path):
-    with pytest.raises(NumericalError, match="ended without a word"):
+    with pytest.raises(NumericalError, match="worker process died"):
         run_cases(dies, CASES, tmp_path, jobs=2)
     assert run_cases(square, CASES, tmp_path) == EXPECTED
 

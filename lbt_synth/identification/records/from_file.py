@@ -27,7 +27,7 @@ from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import LONGEST_HEADER, has_card
 from lbt_synth.validation import FloatArray, choice, require_instance
 
-_TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of our own telemetry, and of the AOT standard
+_TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
 _TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
 
 
@@ -69,7 +69,7 @@ def load_record(
         Unit of the measurements (nm, um, m, mas, arcsec, urad, rad; of a spectrum nm^2/Hz or
         nm/sqrt(Hz) and so on), where the file does not tell it; a contradiction is refused.
     command_unit : str, optional
-        The same of the commands; by default ``unit``.
+        Unit of the commands; by default ``unit``.
     diameter_m, obstruction : float, optional
         Telescope diameter [m], and its central obstruction as a fraction of it.
     mirror : PositionLoop, optional
@@ -95,7 +95,7 @@ def load_record(
     TelemetryError
         If a file is missing, damaged, or of another kind.
     ProblemError
-        If something is needed that neither the file nor the call tells, or both differ.
+        If a fact is missing from both the file and the call, or the two contradict.
 
     Examples
     --------
@@ -124,11 +124,12 @@ def load_record(
         if _is_telemetry(source):
             if kind not in (None, "closed_loop") or columns is not None or commands is not None:
                 raise ProblemError(
-                    "telemetry holds measurements and commands: kind must be closed_loop, and "
-                    "neither columns nor commands be given. Choose its modes by axes."
+                    "telemetry holds measurements and commands: kind must be closed_loop "
+                    "or left out, and neither columns nor commands may be given. Choose its modes "
+                    "with axes."
                 )
             if averages is not None:
-                raise ProblemError("this is telemetry, and averages are of a spectrum.")
+                raise ProblemError("averages are only for a spectrum; this file is telemetry.")
             return record_from_telemetry(load_telemetry(source), modes=axes, **given)
         contents = read_contents(source)
         if commands is not None:
@@ -146,7 +147,7 @@ def _is_telemetry(path: Path) -> bool:
             return any(has_card(header, card) for card in _TELEMETRY_CARDS)
         names = ZipFile(path).namelist() if path.suffix.lower() == ".npz" else []
     except (BadZipFile, OSError, ValueError):
-        return False  # read_contents says so
+        return False  # read_contents reports the error
     return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
 
 

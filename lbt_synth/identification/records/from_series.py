@@ -56,7 +56,9 @@ def build_record(
     """Make a record; ``given`` are the facts of the call, None where the source has to tell."""
     kind = "spectrum" if series.kind == "spectrum" else "loop"
     if kind == "loop" and given.pop("averages", None) is not None:
-        raise ProblemError(f"averages are of a spectrum; the record is of kind {series.kind}.")
+        raise ProblemError(
+            f"averages are only for a spectrum; the record is of kind {series.kind}."
+        )
     facts = {name: _find_fact(contents, name, given[name]) for name in _FACTS[kind]}
     own_unit = _find_unit(series.columns[series.role], unit, contents, kind)
     if kind == "spectrum":

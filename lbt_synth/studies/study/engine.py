@@ -26,7 +26,7 @@ _TRIAL_SECONDS = 6.0  # of the second size, before the cost of a row is known
 _OVER_FIXED = 19  # the time that does not grow with the rows is a twentieth of a batch
 _CRUMB_SECONDS = 0.1  # towards the end, no batch is shorter
 _MOST_PARTS = 4000  # a long study has longer batches rather than more files
-DIED = "its process ended without a word: killed, or for want of memory"
+DIED = "its process died: killed, or out of memory"
 _DASK_DEATH = "KilledWorker"  # the error of Dask where every worker that tried a batch died
 _MOST_DEATHS = 40  # in a row, without a batch that comes back
 _IN_FLIGHT = 2  # batches per worker, so that none waits
@@ -168,8 +168,8 @@ class _Workers:
         self._deaths += 1
         if self._deaths > _MOST_DEATHS:
             raise NumericalError(
-                f"{self._deaths} times one after the other a process ended without a word, for "
-                "want of memory perhaps. What is finished is kept: start again, with fewer jobs."
+                f"{self._deaths} times in a row a process died, perhaps out of memory. What is "
+                "finished is kept. Start again with fewer jobs."
             )
 
 

@@ -122,7 +122,7 @@ def test_a_tampered_file_is_not_verified(tmp_path, made, capsys):
 @pytest.mark.parametrize(
     ("key", "value", "text"),
     [
-        ("norm", "h2", "not of the norm h2"),
+        ("norm", "h2", "does not minimise the norm h2"),
         ("worst_achieved", 0.0, "worst_achieved must be above 0"),
         ("bound_guaranteed", "low", "bound_guaranteed must be a number"),
         ("half_width_hz", 30.0, "decays at"),

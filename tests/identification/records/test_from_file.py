@@ -359,10 +359,10 @@ def test_telemetry_takes_an_obstruction_and_refuses_averages(tmp_path, series):
         tmp_path / "a.fits", lbt.files.telemetry_from_simulation(run, path)
     )
     assert lbt.load_record(file, obstruction=0.3).obstruction == 0.3
-    with pytest.raises(lbt.errors.ProblemError, match="averages are of a spectrum"):
+    with pytest.raises(lbt.errors.ProblemError, match="averages are only for a spectrum"):
         lbt.load_record(file, averages=3)
     plain = csv(tmp_path / "b.csv", pol_nm=series[0][:, 0])
-    with pytest.raises(lbt.errors.ProblemError, match="averages are of a spectrum"):
+    with pytest.raises(lbt.errors.ProblemError, match="averages are only for a spectrum"):
         lbt.load_record(plain, frame_rate_hz=RATE, averages=3)
 
 

@@ -187,5 +187,5 @@ def always_dies(study, values, start):
 def test_processes_that_die_without_end(tmp_path, monkeypatch):
     monkeypatch.setattr("lbt_synth.studies.study.engine._MOST_DEATHS", 0)
     study = load_small_study(tmp_path, samples="400")
-    with pytest.raises(NumericalError, match="1 times one after the other a process ended"):
+    with pytest.raises(NumericalError, match="1 times in a row a process died"):
         lbt.studies.run_study(study, make_folder(tmp_path), jobs=2, evaluate=always_dies)
