@@ -17,11 +17,11 @@ from lbt_synth.identification import SpectrumRecord, identify
 
 
 def run(arguments: Namespace) -> Report:
-    """Identify a loop from its record, and write a configuration and a figure."""
+    """Identify a loop from its record; write a configuration and, by default, a figure."""
     places = find_places(arguments, arguments.output)
     record = read_record(arguments)
     options = identification_options(arguments, record)
-    if isinstance(record, SpectrumRecord):
+    if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
     with show_spinner("identifying", quiet=arguments.json):
         model = identify(record, **options)

@@ -1,4 +1,4 @@
-"""Files that commands write: directories, tables (.csv), figures, telemetry."""
+"""Directories and files that commands write: tables (.csv), figures, telemetry."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def make_directory(path: str | Path) -> Path:
 
 
 def require_figure(output: str, *, inputs: Sequence[str]) -> None:
-    """Refuse an output that cannot become a figure."""
+    """Refuse an output that cannot become a figure, or would replace an input."""
     require_writable(require_figure_name(output), inputs=inputs)
 
 
@@ -51,7 +51,10 @@ def write_outputs(
     figure: Callable[[], Any],
     without: Collection[str] = (),
 ) -> None:
-    """Write each output as its ending says, rows or the figure, and note it in the report."""
+    """Write the rows to outputs in .csv and the figure to all others, and note them in the report.
+
+    ``without`` names the fields of the rows that a .csv leaves out.
+    """
     report.note_files(
         write_atomically(output, csv_rows(rows, without=without))
         if Path(output).suffix.lower() == ".csv"

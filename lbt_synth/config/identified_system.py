@@ -35,7 +35,7 @@ def identified_config(
     model : IdentifiedModel
         What was identified, of one or two axes.
     diameter_m : float, optional
-        Telescope diameter [m]. Nothing of the system depends on it.
+        Telescope diameter [m]; the identified values, in nm, do not depend on it.
     obstruction : float, optional
         Diameter of the central obstruction as a fraction of ``diameter_m``.
     wavelength_um : float, optional
@@ -43,7 +43,7 @@ def identified_config(
     other_modes_strehl : float, optional
         Strehl ratio that all other modes leave.
     title : str, optional
-        First lines of the file.
+        Comment at the top of the file.
 
     Returns
     -------
@@ -91,15 +91,15 @@ def identified_config(
         "frame_rate_hz": number(model.frame_rate_hz, "frame_rate_hz", above=0),
         "delay_frames": number(model.delay_frames, "delay_frames", at_least=1),
     }
-    lines = _vibration_sections(axes, comments)
+    vibrations = _vibration_sections(axes, comments)
     content["model"] = {"turbulence": []}
     for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
         turbulence = axis.turbulence
         content["model"]["turbulence"].append(turbulence_content(turbulence))
         comments[f"model.turbulence[{index}]"] = f"{name}, rms {turbulence.rms_nm:.4g} nm"
     content["truth"] = {"turbulence": "model"}
-    if lines:
-        content["model"]["vibrations"] = lines
+    if vibrations:
+        content["model"]["vibrations"] = vibrations
         content["truth"]["vibrations"] = "model"
     gains = [float(axis.sensor_gain) for axis in axes]
     if any(gain != 1 for gain in gains):
@@ -122,20 +122,20 @@ def identified_config(
 def _vibration_sections(
     axes: Sequence[IdentifiedAxis], comments: dict[str, str]
 ) -> list[dict[str, Any]]:
-    """Return the vibrations of all axes, tip first; add comments on their errors."""
-    out: list[dict[str, Any]] = []
+    """Return the vibrations of all axes, tip first, and add their errors to ``comments``."""
+    sections: list[dict[str, Any]] = []
     for name, axis in zip(_AXES, axes, strict=False):
-        for line in axis.parts:
-            path = f"model.vibrations[{len(out)}]"
-            frequency_error = _error_comment("Hz", [line.frequency_error_hz])
-            comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[line.kind] + frequency_error
-            comments[f"{path}.damping"] = _error_comment("", [line.damping_error])
-            comments[f"{path}.rms_nm"] = _error_comment("nm", [line.rms_error_nm])
+        for part in axis.parts:
+            path = f"model.vibrations[{len(sections)}]"
+            frequency_error = _error_comment("Hz", [part.frequency_error_hz])
+            comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[part.kind] + frequency_error
+            comments[f"{path}.damping"] = _error_comment("", [part.damping_error])
+            comments[f"{path}.rms_nm"] = _error_comment("nm", [part.rms_error_nm])
             entry: dict[str, Any] = {} if len(axes) == 1 else {"axis": name}
             for key in ("frequency_hz", "damping", "rms_nm"):
-                entry[key] = float(getattr(line, key))
-            out.append(entry)
-    return out
+                entry[key] = float(getattr(part, key))
+            sections.append(entry)
+    return sections
 
 
 def _error_comment(unit: str, errors: Sequence[float]) -> str:

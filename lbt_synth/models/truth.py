@@ -1,4 +1,4 @@
-"""The truth of a simulation: what the telescope really does, whatever the design assumes."""
+"""The truth of a simulation: the real disturbances and sensor, whatever the design assumes."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Truth:
         them, or one per measurement.
     sensor_gain : float, optional
         Real sensor (optical) gain relative to the sensor matrix:
-        ``y = sensor_gain D phi_res + noise``. Gains that differ between the axes belong into
-        the sensor matrix of the loop.
+        ``y = sensor_gain D phi_res + noise``. Put gains that differ between the axes
+        into the sensor matrix of the loop.
 
     Raises
     ------
@@ -97,7 +97,7 @@ class Truth:
 
     @property
     def is_uniform(self) -> bool:
-        """Whether one spectrum serves all modes."""
+        """Whether one spectrum, or None, was given for all modes."""
         return not isinstance(self.turbulence, tuple)
 
     def turbulence_per_mode(self, modes: int) -> tuple[Spectrum | None, ...]:

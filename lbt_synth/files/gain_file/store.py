@@ -123,7 +123,7 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     target = require_gain_name(path)
     if not isinstance(design, Design):
         raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
-    said = DesignRecord(
+    header = DesignRecord(
         meta={
             "schema": SCHEMA,
             "schema_version": SCHEMA_VERSION,
@@ -131,7 +131,7 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
             "convention": CONVENTION,
         }
     )
-    record = said | record_common(design) | method_of_design(design.method).pack(design)
+    record = header | record_common(design) | method_of_design(design.method).pack(design)
     arrays, meta = record.arrays, record.meta
     meta["digest"] = digest(arrays, meta)
     text, ending = json.dumps(meta, allow_nan=False), target.suffix.lower()

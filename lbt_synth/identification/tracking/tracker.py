@@ -21,8 +21,8 @@ from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.validation import BoolArray, FloatArray, number, require_instance
 
-_MOST_SPOILT = 0.01  # of a window, filled by interpolation
-_LEAST_FRAMES = 16
+_MOST_LEFT_OUT = 0.01  # of the frames of a window; with more there is no fit
+_LEAST_FRAMES = 16  # in a window
 _NARROW = 0.1  # damping ratio; wider resonances belong to the background and have no trend
 
 
@@ -40,7 +40,7 @@ class Identifier(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingUpdate:
-    """What was done at one update.
+    """What one update found and did.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class _KeepFilterError(Exception):
 
 @contextmanager
 def _keep_filter_if_fails(step: str) -> Iterator[None]:
-    """Keep the running filter if a step fails, whatever stops it: the loop goes on."""
+    """Turn any error of a step into the reason to keep the running filter: the loop goes on."""
     try:
         yield
     except Exception as error:
@@ -105,7 +105,8 @@ class TrackingController(SwitchedController):
     No update can stop the loop: if a window has too few good measurements, the fit fails or the
     design does not pass its certificate, the running filter stays, and :attr:`history` says why.
     Frames that are not finite are left out and the command held. Single outliers of the
-    pseudo-open-loop series count like them in the fit, though they move the mirror.
+    pseudo-open-loop series are left out of the fit in the same way, though the mirror has followed
+    them.
 
     Parameters
     ----------
@@ -120,7 +121,8 @@ class TrackingController(SwitchedController):
     extrapolate : bool, optional
         Whether the trend is followed; otherwise the frequencies are those of the window.
     trend_s : float, optional
-        How long fits count for the trend [s]; by default twice the window, at least 5 updates.
+        Time for which a fit counts for the trend [s]; by default twice the window, but at least
+        5 updates.
     design : callable, optional
         From plant to :class:`FilterDesign`; :func:`kalman` by default.
 
@@ -172,10 +174,11 @@ class TrackingController(SwitchedController):
         self._update_s = number(update_s, "update_s", at_least=1 / rate)
         longer = max(2 * self._window_s, 5 * self._update_s)
         self._trend_s = number(longer if trend_s is None else trend_s, "trend_s", at_least=0)
-        self._window, self._every = round(self._window_s * rate), round(self._update_s * rate)
+        self._window_frames = round(self._window_s * rate)
+        self._update_frames = round(self._update_s * rate)
         self._rate, self._extrapolate = rate, bool(extrapolate)
-        self._identify, self._make_design = identifier, design
-        super().__init__(design(plant), memory_s=self._window / rate)
+        self._identifier, self._design_filter = identifier, design
+        super().__init__(design(plant), memory_s=self._window_frames / rate)
 
     @property
     def history(self) -> tuple[TrackingUpdate, ...]:
@@ -192,35 +195,37 @@ class TrackingController(SwitchedController):
         super().reset()
         self._history: list[TrackingUpdate] = []
         self._tracks: list[LineTrack] = []
-        reset = getattr(self._identify, "reset", None)
+        reset = getattr(self._identifier, "reset", None)
         if callable(reset):
             reset()
 
     def step(self, y: ArrayLike) -> FloatArray:
         """Return the command as :meth:`SwitchedController.step` does, and update if it is time."""
         command = super().step(y)
-        if self.frames >= self._window and (self.frames - self._window) % self._every == 0:
+        since_full = self.frames - self._window_frames
+        if since_full >= 0 and since_full % self._update_frames == 0:
             self._update(self.frames / self._rate)
         return command
 
     def _update(self, time_s: float) -> None:
-        """Identify the last window, and take the filter that is designed for it."""
+        """Identify the last window, switch to the filter designed for it, and record the update."""
         found: TipTiltPlant | None = None
-        self._left_out = 0
-        reason, clock = "", [time.perf_counter()]
+        self._left_out = 0  # set by _clean_window
+        reason = ""
+        clock = [time.perf_counter()]  # before each step, and after the last
         try:
             found = self._identify_window()
             clock.append(time.perf_counter())
             plant = self._extrapolate_lines(found, time_s)
             with _keep_filter_if_fails("design"):
-                designed = self._make_design(plant)
+                designed = self._design_filter(plant)
             clock.append(time.perf_counter())
             self.switch(designed)
         except _KeepFilterError as kept:
             reason = str(kept)
         except LbtSynthError as error:
             reason = f"{type(error).__name__}: {error}"
-        clock += [time.perf_counter()] * (4 - len(clock))
+        clock += [time.perf_counter()] * (4 - len(clock))  # steps that were not reached take 0 s
         identify_s, design_s, switch_s = np.diff(clock).tolist()
         update = TrackingUpdate(
             time_s=time_s,
@@ -242,7 +247,7 @@ class TrackingController(SwitchedController):
         """Return the plant of the last window."""
         window = self._clean_window()
         with _keep_filter_if_fails("fit"):
-            found = self._identify(*window)
+            found = self._identifier(*window)
         if found is None:
             raise _KeepFilterError("the fit found no plant")
         if not isinstance(found, TipTiltPlant):
@@ -251,15 +256,18 @@ class TrackingController(SwitchedController):
         return found
 
     def _clean_window(self) -> tuple[FloatArray, FloatArray]:
-        """Return measurements and corrections of the last window, without outliers."""
-        measurements, corrections = self.window(self._window)
-        missing = ~self.usable(self._window)
+        """Return measurements and corrections of the last window, with single outliers bridged.
+
+        Too many frames to leave out, or outliers in groups, keep the running filter.
+        """
+        measurements, corrections = self.window(self._window_frames)
+        missing = ~self.usable(self._window_frames)
         seen = corrections @ self._plant.hardware.sensor.T  # with the sensor gain found last
         wrong = find_glitches(measurements + seen)
         self._left_out = int(np.count_nonzero(missing | wrong))
         share = 100 * self._left_out / len(missing)
         what = "not finite or outliers" if wrong.any() else "not finite"
-        if share > 100 * _MOST_SPOILT:
+        if share > 100 * _MOST_LEFT_OUT:
             raise _KeepFilterError(f"{share:.3g} % of the window's measurements are {what}")
         if wrong.any():
             if not stand_alone(wrong, self.hardware.delay_frames):
@@ -282,18 +290,18 @@ class TrackingController(SwitchedController):
             track.add(middle_s, line.frequency_hz, since_s=recent_s)
             expected = track.frequency_at(ahead_s, overlap=self._window_s / self._update_s)
             lines.append(_move_line(line, expected, self._rate))
-        every = dict.fromkeys([*tracks, *self._tracks])
-        self._tracks = [track for track in every if track.points[-1][0] >= recent_s]
+        distinct = dict.fromkeys([*tracks, *self._tracks])
+        self._tracks = [track for track in distinct if track.points[-1][0] >= recent_s]
         return with_vibrations(found, lines)
 
 
-def _require_callable(thing: object, name: str, kind: str) -> None:
-    if not callable(thing):
-        raise ProblemError(f"{name} must be a callable {kind}; got {type(thing).__name__}.")
+def _require_callable(value: object, name: str, kind: str) -> None:
+    if not callable(value):
+        raise ProblemError(f"{name} must be a callable {kind}; got {type(value).__name__}.")
 
 
 def _move_line(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vibration:
-    """Return a narrow vibration moved to a frequency, if it can be there; others unchanged."""
+    """Return a narrow vibration at a frequency that it can have; else the vibration unchanged."""
     possible = line.damping * line.frequency_hz < frequency_hz < frame_rate_hz / 2
     return line.at_frequency(frequency_hz) if possible and line.damping <= _NARROW else line
 

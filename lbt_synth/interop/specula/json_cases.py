@@ -1,4 +1,4 @@
-"""End-to-end runs described in JSON, so that a study of many can be interrupted and resumed."""
+"""End-to-end runs as JSON cases, so that a study of many runs can stop and resume."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ def make_case(
     vibrations: Sequence[TrueVibration] = (),
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Return what decides a run, in values that JSON can hold.
+    """Return all that a run depends on, in values that JSON can hold.
 
-    Vibrations and seed replace those of the set-up.
+    Vibrations and seed replace those of the set-up. Without a controller, integrators control tip
+    and tilt.
     """
-    case = asdict(replace(setup, vibrations=tuple(vibrations), seed=seed))
-    lines, system = list(case.pop("vibrations")), case.pop("system")
-    hardware = system.pop("hardware")
+    settings = asdict(replace(setup, vibrations=tuple(vibrations), seed=seed))
+    lines, system = list(settings.pop("vibrations")), settings.pop("system")
+    hardware = system.pop("hardware")  # its two matrices are the identity
     matrices = None
     if controller is not None:
         matrices = {name: getattr(controller, name).tolist() for name in "ABCD"}
@@ -45,7 +46,7 @@ def make_case(
         "versions": {name: _installed_version(name) for name in ("lbt-synth", "specula")},
         "system": system,
         "hardware": {name: hardware[name] for name in ("frame_rate_hz", "delay_frames", "mirror")},
-        "setup": case,
+        "setup": settings,
         "vibrations": lines,
         "controller": matrices,
     }
@@ -54,7 +55,10 @@ def make_case(
 def run_case(
     case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
 ) -> dict[str, Any]:
-    """Run a case made by :func:`make_case`, and summarise it."""
+    """Run a case made by :func:`make_case` and return its summary.
+
+    ``cache`` is the directory of calibrations and phase screens.
+    """
     system = EndToEndSystem(hardware=_build_hardware(case["hardware"]), **case["system"])
     lines = tuple(_build_vibration(line) for line in case["vibrations"])
     setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
@@ -64,7 +68,7 @@ def run_case(
 
 
 def summarise_run(run: EndToEndRun) -> dict[str, Any]:
-    """Return the main numbers of a run."""
+    """Return the main numbers of a run; None stands for NaN, which JSON does not have."""
     rms = run.rms_nm
     return {
         "strehl": run.strehl,
@@ -92,6 +96,7 @@ def _build_hardware(values: Mapping[str, Any]) -> LoopHardware:
 
 
 def _build_vibration(line: Mapping[str, Any]) -> TrueVibration:
+    """Rebuild a vibration; its fields tell which of the three types it has."""
     values = {**line, "direction": tuple(line["direction"])}
     if "start_hz" in line:
         return DriftingVibration(**values)

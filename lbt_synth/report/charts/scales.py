@@ -1,4 +1,4 @@
-"""Ends of scales and the texts of their ticks, the same on paper and on the screen."""
+"""Ends of scales, ticks, bars and labels of charts, the same on paper and on the screen."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def scale_ends(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ends of both scales of a panel."""
-    across: list[FloatArray] = []
-    up: list[FloatArray] = []
+    """Return the ends of the scales of x and y of a panel; categories go from top to bottom."""
+    x_values: list[FloatArray] = []
+    y_values: list[FloatArray] = []
     for mark in panel.marks:
         match mark:
             case Curve():
-                across.append(mark.x)
-                up.append(mark.y)
+                x_values.append(mark.x)
+                y_values.append(mark.y)
                 if mark.error is not None:
-                    up += [mark.y - mark.error, mark.y + mark.error]
+                    y_values += [mark.y - mark.error, mark.y + mark.error]
             case Area():
-                across.append(mark.x)
-                up += [mark.low, mark.high]
+                x_values.append(mark.x)
+                y_values += [mark.low, mark.high]
             case Bars():
                 ends = (mark.values, mark.low, mark.high)
-                across += [np.zeros(1), *(end for end in ends if end is not None)]
+                x_values += [np.zeros(1), *(end for end in ends if end is not None)]
             case Map():
-                across.append(cell_edges(mark.x))
-                up.append(cell_edges(mark.y))
+                x_values.append(cell_edges(mark.x))
+                y_values.append(cell_edges(mark.y))
             case Rule(axis="y"):
-                up.append(np.array([mark.at]))
+                y_values.append(np.array([mark.at]))
     curves, tight = panel.select(Curve), bool(panel.select(Map))
-    # plain lines may reach from end to end
+    # lines without markers need no room at the ends of x
     plain = not panel.categories and all(c.line and c.marker is None for c in curves)
-    # a shaded area stands on its end of the scale; equal scales stay equal
+    # areas and bars stand on an end of the scale, and equal scales stay equal: move no given end
     if panel.equal or any(isinstance(mark, Map | Area | Bars) for mark in panel.marks):
         curves = []
     x_room = 0.0 if tight or plain else _ROOM
-    x = _axis_ends(panel.x, across, x_room, [(c.x, c.marker is not None) for c in curves])
+    x = _axis_ends(panel.x, x_values, x_room, [(c.x, c.marker is not None) for c in curves])
     if panel.categories:
         return x, (len(panel.categories) - 0.4, -0.6)
     y_room = 0.0 if tight else _ROOM
-    return x, _axis_ends(panel.y, up, y_room, [(c.y, c.marker is not None) for c in curves])
+    return x, _axis_ends(panel.y, y_values, y_room, [(c.y, c.marker is not None) for c in curves])
 
 
 def _axis_ends(
@@ -56,12 +56,12 @@ def _axis_ends(
 ) -> tuple[float, float]:
     """Return the ends of a scale: those of the axis, else those of the values and some room.
 
-    An end of the axis moves out where it would cut a curve; each curve comes with whether it has
-    markers.
+    An end of the axis moves out where it would cut a curve. Each curve is a pair of its values
+    and whether it has markers.
     """
-    found = np.concatenate([np.zeros(0), *values])
-    found = found[np.isfinite(found) & ((found > 0) | (not axis.log))]
-    low, high = (float(found.min()), float(found.max())) if found.size else (1.0, 1.0)
+    shown = np.concatenate([np.zeros(0), *values])
+    shown = shown[np.isfinite(shown) & ((shown > 0) | (not axis.log))]
+    low, high = (float(shown.min()), float(shown.max())) if shown.size else (1.0, 1.0)
     if axis.log:
         low, high = math.log(low), math.log(high)
     if high - low <= 1e-12 * max(abs(low), abs(high)):
@@ -74,19 +74,19 @@ def _axis_ends(
         low, high = (low, low + 1.0) if given[1] is None else (high - 1.0, high)
     ends = []
     for end, own, sign in zip(given, (low, high), (-1, 1), strict=True):
-        away = room
+        margin = room
         if end is not None:
             exact = math.exp(end) if axis.log else end
-            away = _ROOM if any(_is_cut(v, exact, marked=m) for v, m in curves) else 0.0
-        place = own + sign * away * (high - low)
-        ends.append(math.exp(place) if axis.log else place)
+            margin = _ROOM if any(_is_cut(v, exact, marked=m) for v, m in curves) else 0.0
+        moved = own + sign * margin * (high - low)
+        ends.append(math.exp(moved) if axis.log else moved)
     return ends[0], ends[1]
 
 
 def _is_cut(values: FloatArray, end: float, *, marked: bool) -> bool:
     """Whether an end of a scale cuts a marker, or a line that runs along it."""
-    there = np.isclose(values, end, rtol=1e-9, atol=1e-12)
-    return bool(np.any(there) if marked else np.any(there[1:] & there[:-1]))
+    at_end = np.isclose(values, end, rtol=1e-9, atol=1e-12)
+    return bool(np.any(at_end) if marked else np.any(at_end[1:] & at_end[:-1]))
 
 
 def log_ticks(low: float, high: float) -> list[float]:
@@ -108,7 +108,7 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 
 def log_tick_texts(ticks: Sequence[float]) -> list[str]:
-    """Return ticks of a logarithmic scale as texts: 0.01, 5, 200; or all as powers: 10⁻⁶, 2·10⁵."""
+    """Return texts of logarithmic ticks: 0.01, 5, 200; beyond 0.001 to 10⁴ all as 10⁻⁶, 2·10⁵."""
     if all(1e-3 * 0.999 <= tick <= 1e4 * 1.001 for tick in ticks):
         return [f"{tick:g}" for tick in ticks]
     return [_power_text(tick) for tick in ticks]
@@ -130,7 +130,7 @@ def shorten(text: str, most: int) -> str:
 
 
 def bar_places(count: int) -> list[tuple[float, float]]:
-    """Offset of each series of bars from its category, and the height of its bars."""
+    """Return the offset of each series of bars from its category, and the height of its bars."""
     height = 0.8 / max(count, 1)
     return [((i - (count - 1) / 2) * height, 0.9 * height) for i in range(count)]
 

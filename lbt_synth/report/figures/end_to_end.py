@@ -14,8 +14,9 @@ from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figu
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
 from lbt_synth.studies import EndToEndEntry
 
-_SHOWN_MAS = 700.0
+_SHOWN_MAS = 700.0  # from the centre of the image to its edges
 _FAINTEST = 1e-5  # of the peak
+_MOST_WITH_LONG_LABEL = 2  # panels side by side that leave room for the long label of x
 
 
 def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
@@ -60,23 +61,23 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
     4
     """
     size = run.psf.shape[0]
-    place = (np.arange(size) - size // 2) * run.psf_pixel_mas
-    reach = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
+    position_mas = (np.arange(size) - size // 2) * run.psf_pixel_mas
+    reach_mas = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
     image = Map(
-        x=place,
-        y=place,
+        x=position_mas,
+        y=position_mas,
         values=np.maximum(run.psf / run.psf.max(), _FAINTEST),
         label="intensity / peak",
         low=_FAINTEST,
         log=True,
     )
     seconds = np.arange(run.frames) / run.system.frame_rate_hz
-    number = np.arange(1.0, run.system.modes + 1)
+    mode_numbers = np.arange(1.0, run.system.modes + 1)
     panels = (
         Panel(
             title=f"{run.system.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %",
-            x=Axis(label="x", unit="mas", low=-reach, high=reach),
-            y=Axis(label="y", unit="mas", low=-reach, high=reach),
+            x=Axis(label="x", unit="mas", low=-reach_mas, high=reach_mas),
+            y=Axis(label="y", unit="mas", low=-reach_mas, high=reach_mas),
             marks=(image,),
             equal=True,
         ),
@@ -84,7 +85,7 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
             title="all modes",
             x=Axis(label="mode (1 tip, 2 tilt)", log=True),
             y=Axis(label="residual", unit="nm rms", log=True),
-            marks=(Curve(name="", x=number, y=run.rms_nm, width=0.8),),
+            marks=(Curve(name="", x=mode_numbers, y=run.rms_nm, width=0.8),),
         ),
         Panel(
             title="tip and tilt",
@@ -107,14 +108,17 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
 
 
 def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
-    """Draw Table III end to end, with the paper and the modal prediction."""
+    """Strehl ratios of Table III by end-to-end simulation, the modal analysis and the paper."""
     rows = [e for e in entries if e.table == "III" and e.error_hz is not None]
     methods = list(dict.fromkeys(e.method for e in rows))
+    x = FREQUENCY_ERROR
+    if len(methods) > _MOST_WITH_LONG_LABEL:
+        x = Axis(label="frequency error", unit="Hz")
     y = Axis(label="Strehl ratio at 2.2 µm", unit="%", low=0, high=100)
     panels = [
         Panel(
             title=design_label(method),
-            x=FREQUENCY_ERROR if len(methods) < 3 else Axis(label="frequency error", unit="Hz"),
+            x=x,
             y=y,
             marks=_method_curves([e for e in rows if e.method == method]),
             height_in=2.3,
@@ -124,9 +128,10 @@ def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
     return draw_figure(panels, columns=len(methods))
 
 
-def _method_curves(mine: Sequence[EndToEndEntry]) -> tuple[Curve, ...]:
+def _method_curves(entries: Sequence[EndToEndEntry]) -> tuple[Curve, ...]:
+    """Return the curves of one method; the paper's is left out where it published none."""
     error, paper, modal, strehl, scatter = np.array(
-        [(e.error_hz, e.paper, e.modal, e.strehl, e.scatter) for e in mine], dtype=float
+        [(e.error_hz, e.paper, e.modal, e.strehl, e.scatter) for e in entries], dtype=float
     ).T
     style: dict[str, Any] = {"x": error, "marker": "own", "size": 4.0}
     ours = (

@@ -12,6 +12,7 @@ from lbt_synth.report.charts.description import Chart, Panel
 
 @cache
 def _all_words() -> dict[str, dict[str, str]]:
+    """Return the texts of ``words.toml`` by group and name, each on one line."""
     path = files("lbt_synth.report.page") / "words.toml"
     texts: dict[str, dict[str, str]] = tomllib.loads(path.read_text(encoding="utf-8"))
     return {
@@ -23,7 +24,7 @@ def _all_words() -> dict[str, dict[str, str]]:
 def chart(
     key: str, panels: Sequence[Panel], *, words: str = "", columns: int = 1, **facts: object
 ) -> Chart:
-    """Return a chart with the words of its key, or of another one, and facts filled in."""
+    """Return a chart with the words of its key, or of the key ``words``, and facts filled in."""
     own = {name: text.format(**facts) for name, text in _all_words()[words or key].items()}
     return Chart(key=key, panels=tuple(panels), columns=columns, **own)
 
