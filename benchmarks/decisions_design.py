@@ -9,11 +9,9 @@ from scipy.linalg import solve_discrete_are
 
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.linear.lmi.balanced_coordinates import balance
-from lbt_synth.linear.lmi.filters import hinf_lmi, kalman_sdp, least_gamma_lmi
+from lbt_synth.linear.lmi.filters import balance, hinf_lmi, kalman_sdp, least_gamma_lmi
 from lbt_synth.linear.lmi.solver import solve
-from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.linear.riccati.gamma import gamma_riccati
+from lbt_synth.linear.riccati.filtering import gamma_riccati, kalman_riccati
 
 RATE_HZ = 800.0
 AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)

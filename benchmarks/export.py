@@ -7,7 +7,7 @@ import numpy as np
 from speed_export import frame
 
 import lbt_synth as lbt
-from lbt_synth.interop.c import code as c_code
+from lbt_synth.interop.c import export as c_export
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
 
@@ -70,13 +70,13 @@ def forms() -> None:
             certificate=kalman.certificate,
             solver=kalman.solver,
         )
-    chosen = c_code.has_straight_line_form
+    chosen = c_export.has_straight_line_form
     for name, design in designs.items():
         times = []
         for written in (True, False):
-            c_code.has_straight_line_form = lambda _, w=written: w
+            c_export.has_straight_line_form = lambda _, w=written: w
             times.append(1e9 * frame(design, single=False)["ours_s"])
-        c_code.has_straight_line_form = chosen
+        c_export.has_straight_line_form = chosen
         print(f"{name}: written out {times[0]:.0f} ns, loops {times[1]:.0f} ns")
 
 

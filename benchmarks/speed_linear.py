@@ -10,8 +10,7 @@ import slycot
 from harness import Row, once, paired, seconds, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.linear.riccati.gamma import least_gamma
+from lbt_synth.linear.riccati.filtering import kalman_riccati, least_gamma
 
 RATE_HZ = 800.0
 POINTS = 10_000

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.linear.riccati.gamma import gamma_riccati
+from lbt_synth.linear.riccati.filtering import gamma_riccati
 from lbt_synth.studies.paper.parameters import (
     KALMAN_DAMPING,
     PAPER_TRUTH,

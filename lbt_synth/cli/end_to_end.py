@@ -16,8 +16,8 @@ from lbt_synth.config import load_config
 from lbt_synth.design import Design
 from lbt_synth.files import Telemetry, load_gain, save_telemetry
 from lbt_synth.interop import Calibration, EndToEndRun, EndToEndSetup, calibrate
-from lbt_synth.interop.specula.json_cases import summarise_run
 from lbt_synth.interop.specula.optics import specula_version
+from lbt_synth.interop.specula.simulation import summarise_run
 from lbt_synth.report.figures import end_to_end_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically

@@ -13,12 +13,16 @@ from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_level
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
-from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
-from lbt_synth.linear.riccati.gamma import gamma_riccati, least_gamma
+from lbt_synth.linear.riccati.filtering import (
+    FilterRiccati,
+    gamma_riccati,
+    kalman_riccati,
+    least_gamma,
+)
 from lbt_synth.validation import FloatArray, choice, frozen_copy, number
 
 if TYPE_CHECKING:
-    from lbt_synth.linear.lmi.balanced_coordinates import LmiSolution
+    from lbt_synth.linear.lmi.filters import LmiSolution
 
 SolvedGains: TypeAlias = "FilterRiccati | LmiSolution"
 

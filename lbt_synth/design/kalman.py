@@ -13,7 +13,7 @@ from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.validation import FloatArray, choice
 
 if TYPE_CHECKING:
-    from lbt_synth.linear.lmi.balanced_coordinates import LmiSolution
+    from lbt_synth.linear.lmi.filters import LmiSolution
 
 
 def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccati") -> FilterDesign:

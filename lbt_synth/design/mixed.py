@@ -25,8 +25,7 @@ from lbt_synth.linear import (
 )
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
-from lbt_synth.linear.riccati.gamma import gamma_riccati
+from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 if TYPE_CHECKING:

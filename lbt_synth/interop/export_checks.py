@@ -63,8 +63,13 @@ class MatrixForm:
         """Take y(k), return u(k)."""
         A, B, C, D = self._matrices
         measured = y.astype(self._dtype)
-        self._state = A @ self._state + B @ measured
-        return np.asarray(C @ self._state + D @ measured, dtype=np.float64)
+        self._state = self._combine(A, B, measured)
+        return np.asarray(self._combine(C, D, measured), dtype=np.float64)
+
+    def _combine(
+        self, on_state: npt.NDArray[Any], on_y: npt.NDArray[Any], y: npt.NDArray[Any]
+    ) -> npt.NDArray[Any]:
+        return np.asarray(on_state @ self._state + on_y @ y)
 
 
 class WrittenTerms(MatrixForm):
@@ -75,14 +80,7 @@ class WrittenTerms(MatrixForm):
     are zero change nothing.
     """
 
-    def step(self, y: FloatArray) -> FloatArray:
-        """Take y(k), return u(k)."""
-        A, B, C, D = self._matrices
-        measured = y.astype(self._dtype)
-        self._state = self._add(A, B, measured)
-        return np.asarray(self._add(C, D, measured), dtype=np.float64)
-
-    def _add(
+    def _combine(
         self, on_state: npt.NDArray[Any], on_y: npt.NDArray[Any], y: npt.NDArray[Any]
     ) -> npt.NDArray[Any]:
         terms = np.hstack([on_state * self._state, on_y * y])

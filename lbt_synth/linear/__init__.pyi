@@ -9,8 +9,8 @@ from .riccati.dare import Attempt as Attempt
 from .riccati.dare import DareSolution as DareSolution
 from .riccati.dare import solve_dare as solve_dare
 from .riccati.filtering import FilterRiccati as FilterRiccati
+from .riccati.filtering import gamma_riccati as gamma_riccati
 from .riccati.filtering import kalman_riccati as kalman_riccati
-from .riccati.gamma import gamma_riccati as gamma_riccati
 from .state_space import Controller as Controller
 from .state_space import RunningController as RunningController
 from .state_space import StateSpace as StateSpace

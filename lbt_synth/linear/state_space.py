@@ -7,7 +7,7 @@ output is read from the *new* state, ``u(k) = C x(k+1) + D y(k)``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -154,13 +154,8 @@ class StateSpace(LinearSystem):
         large, small = entry / units, leaving * units
         both = float(np.sqrt(max(float(np.max(large)), 1e-300) / max(float(np.max(small)), 1e-300)))
         units = units * np.exp2(np.round(np.log2(both))) if 0 < both < np.inf else units
-        return StateSpace(
-            A=self.A * units / units[:, None],
-            B=self.B / units[:, None],
-            C=self.C * units,
-            D=self.D,
-            dt_s=self.dt_s,
-        )
+        rows = units[:, None]
+        return replace(self, A=self.A * units / rows, B=self.B / rows, C=self.C * units)
 
     @property
     def poles(self) -> ComplexArray:

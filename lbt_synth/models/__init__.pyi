@@ -8,6 +8,7 @@ from .plant.tip_tilt import TipTiltPlant as TipTiltPlant
 from .plant.tip_tilt import retuned_plant as retuned_plant
 from .plant.tip_tilt import tip_tilt_plant as tip_tilt_plant
 from .sensor import illuminated_subapertures as illuminated_subapertures
+from .sensor import nm_per_mas as nm_per_mas
 from .sensor import pyramid_modal_noise_nm as pyramid_modal_noise_nm
 from .sensor import pyramid_tilt_noise_nm as pyramid_tilt_noise_nm
 from .spectra import Spectrum as Spectrum
@@ -22,7 +23,6 @@ from .turbulence.frozen_flows import FrozenFlows as FrozenFlows
 from .turbulence.modal import ModalTurbulence as ModalTurbulence
 from .turbulence.modal import modal_turbulence as modal_turbulence
 from .turbulence.zernike import noll_orders as noll_orders
-from .units import nm_per_mas as nm_per_mas
 from .vibration.drifting import DriftingVibration as DriftingVibration
 from .vibration.resonance import Vibration as Vibration
 from .vibration.sinusoid import SinusoidalVibration as SinusoidalVibration

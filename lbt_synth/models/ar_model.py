@@ -9,13 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.validation import (
-    FloatArray,
-    Positive,
-    check_fields,
-    frozen_copy,
-    real_array,
-)
+from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -10,13 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_system
 from lbt_synth.models.mirror.position_loop import PositionLoop
-from lbt_synth.validation import (
-    FloatArray,
-    Positive,
-    check_fields,
-    frozen_copy,
-    matrix,
-)
+from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -11,13 +11,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
 from lbt_synth.models.vibration.in_a_loop import TrueVibration
-from lbt_synth.validation import (
-    FloatArray,
-    Positive,
-    check_fields,
-    frozen_copy,
-    one_or_each,
-)
+from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, one_or_each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -35,9 +35,9 @@ class _Textbook(MatrixForm):
 
     def step(self, y: FloatArray) -> FloatArray:
         A, B, C, D = self._matrices
-        u = C @ self._state + D @ y
-        self._state = A @ self._state + B @ y
-        return np.asarray(u)
+        u = self._combine(C, D, y)
+        self._state = self._combine(A, B, y)
+        return u
 
 
 def export_mat(

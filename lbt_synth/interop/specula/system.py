@@ -10,13 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import (
-    Finite,
-    NotNegative,
-    Obstruction,
-    Positive,
-    check_fields,
-)
+from lbt_synth.validation import Finite, NotNegative, Obstruction, Positive, check_fields
 
 _REFERENCE_UM = 0.5  # wavelength at which SPECULA takes the seeing
 _MOST_PIXELS = 1024
@@ -98,11 +92,9 @@ class EndToEndSystem:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for matrix, name in (
-            (self.hardware.sensor, "sensor_matrix"),
-            (self.hardware.influence, "influence_matrix"),
-        ):
-            if matrix.shape != (2, 2) or not np.array_equal(matrix, np.eye(2)):
+        for name in ("sensor_matrix", "influence_matrix"):
+            matrix = getattr(self.hardware, name)
+            if not np.array_equal(matrix, np.eye(2)):
                 raise ProblemError(
                     f"the hardware of an end-to-end simulation must have two modes and the "
                     f"identity as its {name}, for the optics take its place; got {matrix.shape}."

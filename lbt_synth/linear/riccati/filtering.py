@@ -1,14 +1,22 @@
-"""Solve the Riccati equation of the Kalman predictor."""
+"""Solve the Riccati equations of the Kalman and the H-infinity predictor; find the least gamma.
+
+B. Hassibi, A. H. Sayed, T. Kailath, "Indefinite-Quadratic Estimation and
+Control", SIAM (1999), doi:10.1137/1.9781611970760, chapter 4 (a-priori filter).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import brentq
 
-from lbt_synth.errors import DetectabilityError
+from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
 from lbt_synth.linear.riccati.dare import solve_dare
+from lbt_synth.linear.riccati.equations import Equations
+from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
 from lbt_synth.validation import FloatArray, frozen_copy
 
@@ -100,3 +108,212 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
         iterations=dare.iterations,
         status=dare.route,
     )
+
+
+_RESIDUAL_LIMIT = 1e-9
+_GAMMA_TOLERANCE = 4e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LevelTrial:
+    """Whether one level can be met, and the solution of its equation if so."""
+
+    slack: float  # least eigenvalue of ``I - L P L' / gamma^2``; negative if it cannot be met
+    P: FloatArray | None = None  # (n, n)
+    iterations: int = 0  # doublings
+
+
+class GammaEquation:
+    """``P = A P (I + W P)^-1 A' + BB'``, ``W = C'R^-1 C - L'L / gamma^2``, for any gamma.
+
+    A predictor with an error norm below gamma exists if and only if the
+    stabilising P is positive semidefinite and ``gamma^2 I - L P L' > 0``; the gain
+    is ``A Pt C'(R + C Pt C')^-1`` with ``Pt = P + P L'(gamma^2 I - L P L')^-1 L P``.
+    Noise is decorrelated first.
+
+    The equation is solved for the excess over the Kalman filter's P0. With the
+    filtered covariance M, F = I - gain_filter C and
+    ``N = I + M L'(gamma^2 I - L M L')^-1 L``::
+
+        P = P0 + X,   X = A1 X (I + G1 X)^-1 A1' + H1
+        A1 = A N F,   G1 = W N F,   H1 = A M L'(gamma^2 I - L M L')^-1 L M A'
+
+    H1 is positive semidefinite and holds no difference of large numbers, so the
+    doubling starts inside the stabilising solution's reach.
+    """
+
+    def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
+        self.problem, self.start = problem, start
+        self.A, self.B, self.injection = decorrelate(problem)
+        self.identity = np.eye(len(self.A))
+        self.keep = self.identity - start.gain_filter @ problem.C
+        filtered = self.keep @ start.P
+        self.filtered = (filtered + filtered.T) / 2
+        self.information = problem.C.T @ np.linalg.solve(problem.R, problem.C)
+
+    def trial(self, gamma: float) -> LevelTrial:
+        """Solve at one level, to the accuracy of the doubling."""
+        L, P0 = self.problem.L, self.start.P
+        seen = L @ self.filtered
+        room = np.eye(L.shape[0]) - seen @ L.T / gamma**2
+        if np.linalg.eigvalsh(room)[0] <= 0:
+            return LevelTrial(slack=-1.0)
+        W = self.information - L.T @ L / gamma**2
+        spread = np.linalg.solve(room, L) / gamma**2
+        widened = (self.identity + seen.T @ spread) @ self.keep
+        A1, G1 = self.A @ widened, W @ widened
+        H1 = self.A @ (seen.T @ spread @ self.filtered) @ self.A.T
+        found, steps = doubling(A1.T[None], (G1 + G1.T)[None] / 2, (H1 + H1.T)[None] / 2)
+        X = found[0]
+        if not np.all(np.isfinite(X)):
+            return LevelTrial(slack=-1.0)
+        P = P0 + X
+        spectrum = np.linalg.eigvalsh(X)
+        slack = 1 - float(np.linalg.eigvalsh(L @ P @ L.T)[-1]) / gamma**2
+        transition = np.linalg.solve((self.identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
+        if spectrum[0] < -1e-9 * abs(spectrum[-1]) or not _stable(transition):
+            return LevelTrial(slack=-1.0)
+        return LevelTrial(slack=slack, P=P if slack > 0 else None, iterations=int(steps[0]))
+
+    def solution(self, gamma: float, trial: LevelTrial) -> FilterRiccati | None:
+        """Refine a trial by Newton steps and form its gains; None if it is no filter."""
+        if trial.P is None:
+            return None
+        problem, n, q = self.problem, len(self.A), len(self.problem.C)
+        outputs = np.vstack([problem.C, problem.L / gamma])
+        weight = block_diag(problem.R, -np.eye(len(problem.L)))
+        equation = Equations(
+            A=self.A.T[None],
+            B=outputs.T[None],
+            Q=(self.B @ self.B.T)[None],
+            R=weight[None],
+            S=np.zeros((1, n, len(outputs))),
+        )
+        refined = equation.refine(trial.P[None], np.array([trial.iterations]))
+        P, residual = refined.X[0], float(refined.residuals[0])
+        if residual > _RESIDUAL_LIMIT:
+            raise NumericalError(
+                f"the gamma-Riccati equation at gamma = {gamma:.9g} was solved only to a relative "
+                f"residual of {residual:.3g}; expected {_RESIDUAL_LIMIT:g}. Try route='lmi', or "
+                "scale the states to similar sizes.",
+                status="residual",
+                residual=residual,
+            )
+        # the first block column of P outputs' Re^-1, with Re the indefinite covariance of the
+        # innovations of y and of z / gamma: Pt itself may be unbounded
+        innovations = outputs @ P @ outputs.T + weight
+        gain_filter = np.linalg.solve(innovations, outputs @ P)[:q].T
+        gain = self.A @ gain_filter + self.injection
+        if not _stable(problem.A - gain @ problem.C):
+            return None
+        return FilterRiccati(
+            P=frozen_copy(P),
+            gain_predictor=frozen_copy(gain),
+            gain_filter=frozen_copy(gain_filter),
+            residual=residual,
+            iterations=trial.iterations,
+            status="doubling",
+        )
+
+
+def gamma_riccati(
+    problem: EstimationProblem, gamma: float, *, start: FilterRiccati | None = None
+) -> FilterRiccati | None:
+    """Central H-infinity predictor of a level of gamma, by the gamma-Riccati equation.
+
+    ``lbt_synth.design.hinf`` finds the least gamma and returns a certified design.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem.
+    gamma : float
+        The level of the norm that the filter has to meet.
+    start : FilterRiccati, optional
+        The Kalman filter's solution, if it is at hand.
+
+    Returns
+    -------
+    FilterRiccati or None
+        None where no such filter exists.
+
+    Raises
+    ------
+    DetectabilityError
+        If no stable filter exists at all.
+    NumericalError
+        If the equation has a solution that was not reached accurately.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> lbt.linear.gamma_riccati(p, 1.0) is None, lbt.linear.gamma_riccati(p, 2.5) is None
+    (True, False)
+    """
+    equation = GammaEquation(problem, kalman_riccati(problem) if start is None else start)
+    return equation.solution(gamma, equation.trial(gamma))
+
+
+def least_gamma(
+    problem: EstimationProblem, *, lower: float, upper: float, start: FilterRiccati | None = None
+) -> tuple[float, float, FilterRiccati]:
+    """Bracket the least gamma, at which ``gamma^2 I - L P L'`` stops being positive.
+
+    Returns the ends of the bracket, and the filter at the upper one.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.linear.riccati.filtering import least_gamma
+    >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    >>> round(least_gamma(p, lower=1.2, upper=2.0)[1], 9)
+    1.414213562
+    """
+    equation = GammaEquation(problem, kalman_riccati(problem) if start is None else start)
+    met: dict[float, LevelTrial] = {}
+
+    def slack(gamma: float) -> float:
+        nonlocal lower
+        trial = equation.trial(gamma)
+        if trial.P is not None:
+            met[gamma] = trial
+        else:
+            lower = max(lower, gamma)
+        return trial.slack
+
+    for _ in range(60):  # the upper level is feasible in exact arithmetic
+        if slack(upper) > 0:
+            break
+        upper *= 1.0001 if upper < 1.01 * lower else 1.01
+    if not met:
+        raise InfeasibleError(
+            f"no gamma up to {upper:.6g} has an H-infinity filter; expected one at the level of "
+            "the Kalman filter. Scale the states to similar sizes.",
+            gamma=upper,
+        )
+    root = lower
+    if lower < upper and slack(lower) <= 0:
+        root = brentq(slack, lower, upper, xtol=_GAMMA_TOLERANCE * upper, rtol=_GAMMA_TOLERANCE)
+    upper, width = min(met), _GAMMA_TOLERANCE
+    for _ in range(100):  # the search leaves one end of its bracket far away: bring it in
+        if upper - lower <= 2.5 * _GAMMA_TOLERANCE * upper:
+            break
+        above, below = root * (1 + width), root * (1 - width)
+        if above < upper:
+            slack(above)
+        else:
+            slack(below if below > lower and width < 1e-3 else (lower + upper) / 2)
+        upper, width = min(met), 4 * width
+    for gamma in sorted(met):  # a level too close to the edge may give no filter
+        solution = equation.solution(gamma, met[gamma])
+        if solution is not None:
+            return lower, gamma, solution
+    raise NumericalError(
+        f"the least gamma was not bracketed: it lies between {lower:.9g} and {upper:.9g}.",
+        status="search",
+    )
+
+
+def _stable(A: FloatArray) -> bool:
+    return bool(np.max(np.abs(np.linalg.eigvals(A))) < 1)

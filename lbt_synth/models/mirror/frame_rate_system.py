@@ -11,7 +11,7 @@ C. Kulcsar, J.-M. Conan, J. Opt. Soc. Am. A 27, 333 (2010), doi:10.1364/JOSAA.27
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -109,7 +109,7 @@ def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float)
     fraction = delay_frames - 1 - lead
     core = _one_frame(loop, samples, (1 - fraction) * samples)
     while abs(core.D) <= _NOTHING:  # the mirror has not moved yet: one more frame of delay
-        core = Response(A=core.A, B=core.B, C=core.C @ core.A, D=float(core.C @ core.B))
+        core = replace(core, C=core.C @ core.A, D=float(core.C @ core.B))
         lead += 1
     core = _balance(core)
     return MirrorSystem(

@@ -23,13 +23,7 @@ from lbt_synth.models.turbulence.atmosphere import (
     tilt_strength_nm2,
     tilt_variance,
 )
-from lbt_synth.validation import (
-    FloatArray,
-    IntArray,
-    check_fields,
-    positive,
-    real_array,
-)
+from lbt_synth.validation import FloatArray, IntArray, check_fields, positive, real_array
 
 _PER_LOOP = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
 _TERMS = 12  # of the polynomial over an octave of the outer scale

@@ -10,14 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.ar_model import ARModel, variance_ratios
 from lbt_synth.models.resonance_spectrum import coefficient_rows
-from lbt_synth.validation import (
-    FloatArray,
-    Positive,
-    check_fields,
-    choice,
-    number,
-    real_array,
-)
+from lbt_synth.validation import FloatArray, Positive, check_fields, choice, number, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

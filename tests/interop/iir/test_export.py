@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from support.plants import LBT_YAML, ROOT
 from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
+from lbt_synth.interop.iir.export import axis_polynomials
 
 
 @pytest.mark.parametrize(("name", "limit"), [("kalman", 1e-12), ("hinf", 1e-9), ("integrator", 0)])
@@ -217,3 +219,16 @@ def test_the_stated_error_of_a_transfer_function_is_what_specula_finds(
     found = relative(loop, own)
     claimed = (stated.error, stated.error_single)[precision]
     assert claimed / 10 < found < 10 * claimed
+
+
+def test_exact_coefficients_of_close_poles():
+    """(z - r)^8 with r = 1 - 2^-10: binomials, where floating-point routes lose half the digits."""
+    r, n = 1 - 2.0**-10, 8
+    A = r * np.eye(n) + np.eye(n, k=1)
+    C, B = np.eye(n)[:1], np.eye(n)[:, -1:]
+    ((num, den),) = axis_polynomials(lbt.Controller(A=A, B=B, C=C, D=[[0.0]]))
+    exact = [
+        comb(n, k) * (-1) ** (n - k) * (1023 ** (n - k)) / 1024 ** (n - k) for k in range(n + 1)
+    ]
+    assert den.tolist() == exact
+    assert num.tolist() == [0, 1] + [0] * (n - 1)

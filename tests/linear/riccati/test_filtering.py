@@ -1,13 +1,18 @@
-"""The Riccati equation of the Kalman predictor, against SLICOT and scipy."""
+"""The Riccati equations of the predictors, against SLICOT and scipy; the least gamma."""
 
 from __future__ import annotations
 
+import cvxpy as cp
 import numpy as np
+import pytest
 import scipy.linalg
 import slycot
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.plants import lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
-from lbt_synth.linear.riccati.filtering import kalman_riccati
+from lbt_synth.linear.riccati.filtering import gamma_riccati, kalman_riccati, least_gamma
 
 
 def test_an_ordinary_plant_that_scipy_refuses():
@@ -34,3 +39,139 @@ def test_kalman_riccati_against_slycot(axis_plant):
     p = axis_plant
     X = slycot.sb02od(4, 1, p.A.T, p.C.T, p.Q, p.R, "D")[0]
     assert np.allclose(kalman_riccati(p).P, X, rtol=1e-6, atol=1e-6 * np.abs(X).max())
+
+
+def test_gamma_riccati_tends_to_the_kalman_filter(axis_plant):
+    kalman = kalman_riccati(axis_plant)
+    near = gamma_riccati(axis_plant, 1e9)
+    assert np.allclose(near.gain_predictor, kalman.gain_predictor, rtol=1e-9)
+    assert np.allclose(near.P, kalman.P, rtol=1e-9)
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 5), q=st.integers(1, 2), l=st.integers(1, 2))
+def test_gamma_filters_keep_their_bound(seed, n, q, l):
+    """At any feasible level the recomputed norm stays below it, noise correlated or not."""
+    problem = random_problem(np.random.default_rng(seed), n, q, l=l)
+    kalman = kalman_riccati(problem)
+    upper = lbt.hinf_norm(problem.error_system(kalman.gain_predictor)).upper
+    lower = np.sqrt(np.linalg.eigvalsh(problem.L @ kalman.P @ problem.L.T)[-1])
+    low, high, best = least_gamma(problem, lower=lower, upper=upper)
+    assert low <= high <= upper * (1 + 1e-9)
+    assert float(lbt.hinf_norm(problem.error_system(best.gain_predictor))) <= high * (1 + 1e-7)
+    assert gamma_riccati(problem, low * (1 - 1e-6)) is None
+    solution = gamma_riccati(problem, 1.1 * high)
+    achieved = lbt.hinf_norm(problem.error_system(solution.gain_predictor))
+    assert achieved.upper < 1.1 * high
+
+
+def scalar(a, q, r):
+    return lbt.EstimationProblem(A=a, B=[[np.sqrt(q), 0.0]], C=1.0, D=[[0.0, np.sqrt(r)]], L=1.0)
+
+
+def closed_form(a, q, r, horizon):
+    """Least gamma of ``x+ = a x + v``, ``y = x + w``, ``z = x``, variances q and r.
+
+    With s = 1 / r and mu = s - 1 / gamma^2 the equation is mu P^2 + (1 - a^2 - q mu) P = q, and
+    its stabilising root has |a| < 1 + mu P. The filter needs 1 + mu P > 0 only: gamma falls
+    until both roots meet, at q mu = -(1 - |a|)^2; from |a| = 1 up mu cannot be negative. The
+    predictor needs P < gamma^2 too, which P = gamma^2 = q + a^2 r ends unless the roots have
+    met before. The roots meet in a constant that no measurement shows.
+    """
+    drift = max(1 - abs(a), 0.0)
+    steady = np.sqrt(q / (q / r + drift**2))
+    if horizon == 0 or (abs(a) < 1 and q / r <= abs(a) * drift):
+        return steady
+    return np.sqrt(q + a**2 * r)
+
+
+@pytest.mark.parametrize("horizon", [0, 1])
+@pytest.mark.parametrize("a", [0.0, 0.3, -0.7, 0.9, 0.99, 0.9999, 1.0, -1.0, 1.2, -1.5])
+def test_scalar_closed_forms(a, horizon):
+    for q in (1.0, 1e-4, 1e4):
+        for r in (1.0, 1e-4, 25.0):
+            exact = closed_form(a, q, r, horizon)
+            design = lbt.hinf(scalar(a, q, r), horizon=horizon, route="riccati")
+            assert design.gamma_least == pytest.approx(exact, rel=1e-8)
+            assert design.gamma_infeasible == pytest.approx(exact, rel=1e-8)
+
+
+@pytest.mark.parametrize("horizon", [0, 1])
+def test_scalar_closed_forms_by_lmi(horizon):
+    for a, q, r in ((0.3, 1, 25), (0.9, 1, 1), (1.0, 1, 1), (1.2, 1, 4)):
+        exact = closed_form(a, q, r, horizon)
+        design = lbt.hinf(scalar(a, q, r), horizon=horizon)
+        assert design.gamma_least == pytest.approx(exact, rel=1e-7)
+        assert design.gamma_infeasible == pytest.approx(exact, rel=1e-7)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 5), q=st.integers(1, 2), l=st.integers(1, 2))
+def test_the_bracket_is_closed(seed, n, q, l):
+    problem = random_problem(np.random.default_rng(seed), n, q, l=l)
+    riccati = lbt.hinf(problem, route="riccati")
+    assert riccati.gamma_infeasible <= riccati.gamma_least
+    assert riccati.gamma_least / riccati.gamma_infeasible - 1 < 1e-8
+    assert riccati.gamma <= riccati.gamma_least * (1 + 1e-12)
+    lmi = lbt.hinf(problem)
+    assert lmi.gamma_infeasible <= riccati.gamma_least * (1 + 1e-9)
+    assert riccati.gamma_infeasible <= lmi.gamma_least * (1 + 1e-9)
+    assert lmi.gamma_least == pytest.approx(riccati.gamma_least, rel=1e-6)
+
+
+def test_both_routes_agree_on_the_lbt():
+    for modes in (1, 2):
+        plant = lbt_axis_plant(modes=modes)
+        riccati, lmi = lbt.hinf(plant, route="riccati"), lbt.hinf(plant)
+        assert riccati.gamma_least / riccati.gamma_infeasible - 1 < 1e-10
+        assert lmi.gamma_least == pytest.approx(riccati.gamma_least, rel=1e-7)
+        assert lmi.gamma_infeasible == pytest.approx(riccati.gamma_least, rel=1e-7)
+
+
+def whole_lmi_is_feasible(problem, gamma):
+    """The textbook inequality with the gain as an unknown, nothing of this package in it."""
+    n, p = problem.B.shape
+    q, l = problem.C.shape[0], problem.L.shape[0]
+    P, Y = cp.Variable((n, n), symmetric=True), cp.Variable((n, q))
+    step = P @ problem.A - Y @ problem.C
+    push = P @ problem.B - Y @ problem.D
+    block = cp.bmat(
+        [
+            [P, np.zeros((n, p)), step.T, problem.L.T],
+            [np.zeros((p, n)), gamma**2 * np.eye(p), push.T, np.zeros((p, l))],
+            [step, push, P, np.zeros((n, l))],
+            [problem.L, np.zeros((l, p)), np.zeros((l, n)), np.eye(l)],
+        ]
+    )
+    margin = cp.Variable()
+    programme = cp.Problem(
+        cp.Maximize(margin),
+        [(block + block.T) / 2 >> margin * np.eye(2 * n + p + l), margin <= 1, cp.trace(P) <= 1e6],
+    )
+    programme.solve(solver=cp.CLARABEL)
+    return margin.value > 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_bracket_against_the_textbook_inequality(seed):
+    problem = random_problem(np.random.default_rng(seed), 3)
+    design = lbt.hinf(problem, route="riccati")
+    assert whole_lmi_is_feasible(problem, 1.01 * design.gamma_least)
+    assert not whole_lmi_is_feasible(problem, 0.99 * design.gamma_infeasible)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000))
+def test_the_bracket_does_not_depend_on_the_units_of_states(seed):
+    rng = np.random.default_rng(seed)
+    problem = random_problem(rng, 4)
+    units = 10.0 ** rng.uniform(-5, 5, 4)
+    scaled = lbt.EstimationProblem(
+        A=problem.A * units[:, None] / units,
+        B=problem.B * units[:, None],
+        C=problem.C / units,
+        D=problem.D,
+        L=problem.L / units,
+    )
+    one, other = (lbt.hinf(p, route="riccati") for p in (problem, scaled))
+    assert other.gamma_least == pytest.approx(one.gamma_least, rel=1e-8)
+    assert other.gamma_infeasible == pytest.approx(one.gamma_infeasible, rel=1e-8)
