@@ -7,20 +7,10 @@ from argparse import Namespace
 from lbt_synth.cli.identification_tables import add_model, add_record, marked_note
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
-from lbt_synth.cli.record_files import (
-    find_places,
-    identification_options,
-    read_record,
-    write_files,
-)
+from lbt_synth.cli.record_files import find_places, identification_options, read_record, write_files
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.gain_file.store import require_gain_name
-from lbt_synth.identification import (
-    LoopRecord,
-    RecordedDesign,
-    SpectrumRecord,
-    design_from_record,
-)
+from lbt_synth.identification import LoopRecord, RecordedDesign, SpectrumRecord, design_from_record
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.storage.rows import column, fill_row, nm_column, table_row

@@ -6,12 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from lbt_synth.cli.output import Report
-from lbt_synth.identification import (
-    IdentifiedAxis,
-    IdentifiedModel,
-    LoopRecord,
-    SpectrumRecord,
-)
+from lbt_synth.identification import IdentifiedAxis, IdentifiedModel, LoopRecord, SpectrumRecord
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 

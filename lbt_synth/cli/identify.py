@@ -7,12 +7,7 @@ from argparse import Namespace
 from lbt_synth.cli.identification_tables import add_model, add_record
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.cli.record_files import (
-    find_places,
-    identification_options,
-    read_record,
-    write_files,
-)
+from lbt_synth.cli.record_files import find_places, identification_options, read_record, write_files
 from lbt_synth.identification import SpectrumRecord, identify
 
 

@@ -48,11 +48,7 @@ def run(arguments: Namespace) -> Report:
         }
     report.notes += [*_limit_notes(study), *_design_notes(config, designs, study)]
     write_outputs(
-        report,
-        arguments.output,
-        study.rows,
-        figure=lambda: limits_figure(study),
-        without=no_band,
+        report, arguments.output, study.rows, figure=lambda: limits_figure(study), without=no_band
     )
     return report
 

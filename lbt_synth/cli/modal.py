@@ -60,12 +60,7 @@ def run(arguments: Namespace) -> Report:
     whole = {name: _total_rms(rms) for name, rms in residuals.items()}
     alone = _total_rms(air.rms_nm)
     report = Report(
-        data={
-            "modes": count,
-            "uniform_gain": uniform,
-            "residual_nm": whole,
-            "turbulence_nm": alone,
-        }
+        data={"modes": count, "uniform_gain": uniform, "residual_nm": whole, "turbulence_nm": alone}
     )
     report.add_table(
         "All modes",

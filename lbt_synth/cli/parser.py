@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 
 import lbt_synth
-from lbt_synth.cli.arguments import designs, loops, records, shared, studies
+from lbt_synth.cli import arguments
 
 # In the order of the help, each with the function that adds its arguments, whose docstring is its
 # help. A command runs in the module of its name, with underscores for dashes.
 COMMANDS = {
     add_arguments.__name__.replace("_", "-"): add_arguments
     for add_arguments in (
-        *(designs.design, designs.show, designs.verify, designs.export, designs.sigma),
-        *(loops.simulate, loops.telemetry, records.identify, records.auto),
-        *(studies.robustness, studies.tradeoff, studies.limits, designs.report),
-        *(loops.end_to_end, loops.end_to_end_table),
-        *(studies.mirror, studies.modal, studies.study, studies.paper),
+        *(arguments.design, arguments.show, arguments.verify, arguments.export, arguments.sigma),
+        *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
+        *(arguments.robustness, arguments.tradeoff, arguments.limits, arguments.report),
+        *(arguments.end_to_end, arguments.end_to_end_table),
+        *(arguments.mirror, arguments.modal, arguments.study, arguments.paper),
     )
 }
 
@@ -35,7 +35,7 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
         command = commands.add_parser(
             name, help=text.splitlines()[0].rstrip("."), description=" ".join(text.split())
         )
-        shared.add_switch(command, "--json", "print one JSON object instead")
+        arguments.add_switch(command, "--json", "print one JSON object instead")
         if name in named:
             add_arguments(command)
     return parser

@@ -34,14 +34,7 @@ from lbt_synth.models import Truth
 from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
-from lbt_synth.storage.rows import (
-    column,
-    columns,
-    fill_row,
-    json_record,
-    json_units,
-    table_row,
-)
+from lbt_synth.storage.rows import column, columns, fill_row, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
 
 

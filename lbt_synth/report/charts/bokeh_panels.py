@@ -211,12 +211,7 @@ def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
     rows, columns = np.nonzero(known)
     kind = LogColorMapper if found.log else LinearColorMapper
     mapper = kind(palette="Viridis256", low=found.low, high=found.high)
-    edges = {
-        "left": x[columns],
-        "right": x[columns + 1],
-        "bottom": y[rows],
-        "top": y[rows + 1],
-    }
+    edges = {"left": x[columns], "right": x[columns + 1], "bottom": y[rows], "top": y[rows + 1]}
     centres = {"x": found.x[columns], "y": found.y[rows], "value": found.values[known]}
     shade = {"field": "value", "transform": mapper}
     # lines in the same colours leave no seams between cells

@@ -61,12 +61,7 @@ _MARKERS = {
     "plus": "+",
 }
 _STEPS = {None: "default", "after": "steps-post", "center": "steps-mid"}
-_BLANK: dict[str, Any] = {
-    "facecolor": PALE,
-    "edgecolor": "0.55",
-    "hatch": "////",
-    "linewidth": 0,
-}
+_BLANK: dict[str, Any] = {"facecolor": PALE, "edgecolor": "0.55", "hatch": "////", "linewidth": 0}
 
 
 @contextmanager
@@ -113,11 +108,7 @@ def chart_png(chart: Chart) -> bytes:
 
 
 def draw_figure(
-    panels: Sequence[Panel],
-    *,
-    columns: int = 1,
-    title: str = "",
-    axes: OwnAxes = None,
+    panels: Sequence[Panel], *, columns: int = 1, title: str = "", axes: OwnAxes = None
 ) -> Figure:
     """Draw panels, row by row, on a new figure, or each on one of the user's own axes."""
     with _chart_style():

@@ -124,12 +124,7 @@ class DesignAssessment:
 
 
 def assess_design(
-    name: str,
-    design: Design,
-    config: Config,
-    *,
-    frequency_hz: FloatArray,
-    errors_hz: FloatArray,
+    name: str, design: Design, config: Config, *, frequency_hz: FloatArray, errors_hz: FloatArray
 ) -> DesignAssessment:
     """Assess a design; its transfer functions are taken at frequency_hz (f,)."""
     hardware, truth, assumed_gain = config.hardware, config.truth, config.sensor_gain
@@ -206,10 +201,7 @@ def require_compatible(name: str, design: Design, hardware: LoopHardware) -> Non
 
 
 def stable_intervals(
-    hardware: LoopHardware,
-    controller: Controller,
-    margins: LoopMargins | None,
-    loop: ClosedLoop,
+    hardware: LoopHardware, controller: Controller, margins: LoopMargins | None, loop: ClosedLoop
 ) -> list[tuple[float, float]]:
     """Intervals of sensor gains for which a loop is stable, in increasing order.
 

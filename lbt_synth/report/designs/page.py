@@ -23,12 +23,7 @@ from lbt_synth.report.number_text import listing_text, number_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import paragraph
-from lbt_synth.report.provenance import (
-    creator_name,
-    require_letters,
-    time_text,
-    versions_table,
-)
+from lbt_synth.report.provenance import creator_name, require_letters, time_text, versions_table
 from lbt_synth.storage.rows import row_table
 
 

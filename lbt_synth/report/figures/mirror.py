@@ -17,10 +17,7 @@ _SHOWN = 5e-3  # taps after the last one of this size are not drawn
 
 
 def mirror_figure(
-    hardware: LoopHardware,
-    *,
-    tolerance: float = 0.1,
-    axes: OwnAxes = None,
+    hardware: LoopHardware, *, tolerance: float = 0.1, axes: OwnAxes = None
 ) -> Figure:
     """Draw the mirror's step response, and its taps.
 

@@ -1,0 +1,308 @@
+"""The arguments of each command, declared apart from what runs it so that help stays quick.
+
+The docstring of a function that adds the arguments of a command is the help of the command.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, _ActionsContainer
+from collections.abc import Sequence
+from typing import Any
+
+GAIN_FILE = "gain file (.fits, .npz or .json)"
+FIGURE = "figure (.png, .pdf or .svg)"
+
+
+def add_option(
+    parser: _ActionsContainer,
+    name: str,
+    kind: type[Any] | Sequence[str],
+    text: str = "",
+    default: float | None = None,
+    **more: Any,
+) -> None:
+    """Add an option of a type or of some choices; its help ends with its default."""
+    if default is not None:
+        text += f" (default {default:g})"
+    more |= {"type": kind} if isinstance(kind, type) else {"choices": kind}
+    parser.add_argument(name, help=text, default=default, **more)
+
+
+def add_switch(parser: _ActionsContainer, name: str, text: str) -> None:
+    """Add an option without a value."""
+    parser.add_argument(name, action="store_true", help=text)
+
+
+def add_config(parser: ArgumentParser) -> None:
+    """Add a configuration."""
+    parser.add_argument("config", help="configuration file (YAML)")
+
+
+def add_gain(parser: ArgumentParser) -> None:
+    """Add one gain file."""
+    parser.add_argument("gain", help=GAIN_FILE)
+
+
+def add_gains(parser: ArgumentParser, nargs: str = "*", text: str = GAIN_FILE) -> None:
+    """Add gain files."""
+    parser.add_argument("gains", nargs=nargs, metavar="gain", help=text)
+
+
+def add_output(parser: ArgumentParser, text: str, *, required: bool = True) -> None:
+    """Add one output."""
+    parser.add_argument("-o", "--output", required=required, help=text)
+
+
+def add_outputs(parser: ArgumentParser) -> None:
+    """Add any number of tables and figures."""
+    text = "table (.csv) or figure (.png, .pdf, .svg); repeatable"
+    parser.add_argument("-o", "--output", action="append", default=[], help=text)
+
+
+def design(parser: ArgumentParser) -> None:
+    """Design a controller and write its gain file."""
+    from lbt_synth.cli.method_options import add_method_options
+
+    add_config(parser)
+    add_method_options(parser)
+    add_output(parser, GAIN_FILE)
+
+
+def show(parser: ArgumentParser) -> None:
+    """Show a gain file: design, loop, margins, certificate."""
+    add_gain(parser)
+    add_switch(parser, "--matrices", "print the gains and the controller")
+
+
+def verify(parser: ArgumentParser) -> None:
+    """Recompute the certificate of a gain file."""
+    add_gain(parser)
+
+
+def export(parser: ArgumentParser) -> None:
+    """Write the controller of a gain file for a real-time computer or another program."""
+    add_gain(parser)
+    add_option(
+        parser,
+        "--format",
+        ("c", "mat", "iir"),
+        "c: C99 source and header; mat: MATLAB; iir: transfer functions for SPECULA's IirFilter "
+        "(axes that decouple)",
+        required=True,
+    )
+    types = ("double", "single")
+    add_option(parser, "--precision", types, "c: type of all numbers (default double)")
+    text = "c: prefix of the C names (default: the output's name without its ending)"
+    add_option(parser, "--name", str, text)
+    add_output(parser, "file to write: .c (the .h goes beside it), .mat or .fits")
+
+
+def sigma(parser: ArgumentParser) -> None:
+    """Plot singular values of one or several designs."""
+    add_gains(parser, "+")
+    text = "real sensor gain, as a factor on the one that each design assumes"
+    add_option(parser, "--sensor-gain", float, text, 1.0)
+    add_output(parser, FIGURE)
+
+
+def report(parser: ArgumentParser) -> None:
+    """Write a page about designs in the loop of a configuration."""
+    add_config(parser)
+    add_gains(parser, "+")
+    add_option(parser, "--title", str, "heading of the page (default: names the configuration)")
+    add_option(parser, "--pdf", str, "write the same as a PDF, too (.pdf)", metavar="FILE")
+    add_output(parser, "page to write, one file that opens offline (.html)")
+
+
+def simulate(parser: ArgumentParser) -> None:
+    """Close the loop in the time domain, beside the exact answer."""
+    add_config(parser)
+    add_gain(parser)
+    add_option(parser, "--frames", int, "frames to keep")
+    add_option(parser, "--cases", int, "independent runs")
+    add_option(parser, "--seed", int, "seed of the random series")
+    add_option(parser, "--sensor-gain", float, "real sensor gain")
+    add_output(parser, FIGURE, required=False)
+    text = "write the series of the first run (.fits, .npz or .aot.fits)"
+    add_option(parser, "--telemetry", str, text, metavar="FILE")
+
+
+def telemetry(parser: ArgumentParser) -> None:
+    """Show what a telemetry file holds, and write it in another format."""
+    parser.add_argument("file", help="telemetry (.fits or .npz; FITS of the AOT standard, too)")
+    add_output(parser, "file to write (.fits, .npz or .aot.fits)", required=False)
+    endings = ("fits", "npz", "aot")
+    add_option(parser, "--format", endings, "of the file to write (default: its ending)")
+    types = ("float64", "float32")
+    add_option(parser, "--precision", types, "of the series written (default float64)")
+
+
+def end_to_end(parser: ArgumentParser) -> None:
+    """Close the loop end to end: pyramid, mirror and moving air."""
+    _add_simulator(parser)
+    add_gain(parser)
+
+
+def end_to_end_table(parser: ArgumentParser) -> None:
+    """Run Tables II and III of Agapito et al. 2008 end to end."""
+    _add_simulator(parser)
+    add_gains(parser, text="gain files to run beside the paper's filters")
+    add_option(parser, "--jobs", int, "processes", 1)
+    add_option(parser, "--seeds", int, "seeds of Table II and of 20 Hz", 3)
+    add_option(parser, "--row-seeds", int, "seeds of the other rows", 1)
+    parser.add_argument(
+        "--tables", nargs="+", choices=("II", "III"), default=["II", "III"], help="default both"
+    )
+
+
+def _add_simulator(parser: ArgumentParser) -> None:
+    add_config(parser)
+    add_option(parser, "--pixels", int, "pixels across the pupil, even")
+    add_option(parser, "--frames", int, "frames of an exposure")
+    add_option(parser, "--settle-frames", int, "frames to settle before, at least 200")
+    add_option(parser, "--seed", int, "seed of the random parts, the first of several")
+    add_option(parser, "--cache", str, "directory for calibrations and phase screens")
+    add_output(parser, "directory to write into")
+
+
+def identify(parser: ArgumentParser) -> None:
+    """Identify turbulence, vibrations, noise and sensor gain from a record."""
+    _add_record(parser)
+    add_output(parser, "configuration to write (.yaml)")
+
+
+def auto(parser: ArgumentParser) -> None:
+    """Go from a record to a gain file: identify, design, certify, test on unseen data."""
+    from lbt_synth.methods.registry import record_methods
+
+    _add_record(parser)
+    add_option(parser, "--method", record_methods(), "default: the Kalman filter")
+    text = "norm as a multiple of the least norm, for methods with a bound"
+    add_option(parser, "--gamma-ratio", float, text, 1.2)
+    add_option(parser, "--model", str, "configuration to write (default: the output's name, .yaml)")
+    add_output(parser, GAIN_FILE)
+
+
+def _add_record(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "file",
+        help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
+        "and commands, or an open-loop series (identify: or a spectrum)",
+    )
+    _add_missing_facts(parser)
+    _add_prior_knowledge(parser)
+    add_option(parser, "--wavelength-um", float, "of Strehl ratios", 2.2)
+    add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
+    add_switch(parser, "--no-figure", "write no figure")
+
+
+def _add_missing_facts(parser: ArgumentParser) -> None:
+    facts = parser.add_argument_group("what the file does not say")
+    add_option(facts, "--kind", ("closed-loop", "open-loop", "spectrum"))
+    add_option(facts, "--frame-rate-hz", float, "frame rate [Hz]")
+    add_option(facts, "--delay-frames", float, "total delay [frames]")
+    add_option(facts, "--unit", str, "of the measurements: nm, um, m, mas, arcsec, urad, rad")
+    add_option(facts, "--command-unit", str, "of the commands (default: --unit)")
+    add_option(facts, "--diameter-m", float, "telescope diameter [m], for angles")
+    add_option(facts, "--obstruction", float, "as a fraction of the diameter")
+    add_option(facts, "--averages", int, "periodograms that a spectrum is the mean of")
+    add_option(facts, "--commands", str, "another file, with the commands")
+    text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4"
+    add_option(facts, "--columns", str, text, nargs="+", metavar="ROLE=NAME")
+    add_option(facts, "--axes", int, "which of several columns or modes, from 0", nargs="+")
+
+
+def _add_prior_knowledge(parser: ArgumentParser) -> None:
+    known = parser.add_argument_group("what is known beforehand")
+    add_option(known, "--sensor-gain", float, "sensor gain, of both axes or of each", nargs="+")
+    text = "sensor gain where the data do not determine it"
+    add_option(known, "--assumed-gain", float, text, 1.0)
+    add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
+    add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
+    add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")
+    text = (
+        "NPY or CSV with one column per sensor and one row per frame of the record: what is "
+        "coherent with it is expected as a line"
+    )
+    add_option(known, "--accelerometers", str, text)
+    add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
+    add_option(known, "--most-lines", int, "most vibrations per axis", 20)
+
+
+def robustness(parser: ArgumentParser) -> None:
+    """Compute the Strehl ratio against an error of all vibration frequencies.
+
+    It is that of filters redesigned at each error, or of the designs of gain files at many sensor
+    gains.
+    """
+    add_config(parser)
+    add_gains(parser)
+    redesigned = parser.add_argument_group("without gain files")
+    add_option(redesigned, "--gamma-ratio", float, "H-infinity bound of each row")
+    add_option(redesigned, "--sensor-gain", float, "real sensor gain")
+    fixed = parser.add_argument_group("with gain files")
+    ends = ("LOW", "HIGH", "COUNT")
+    for name, text in (
+        ("--errors-hz", "frequency in the design less the true one [Hz]"),
+        ("--sensor-gains", "real sensor gain"),
+    ):
+        text += ": COUNT values (default: the configuration's)"
+        add_option(fixed, name, float, text, nargs=3, metavar=ends)
+    text = "real delay less that of the design [frames] (default: the configuration's, else 0)"
+    add_option(fixed, "--delay-errors", float, text, nargs="+", metavar="FRAMES")
+    add_outputs(parser)
+
+
+def tradeoff(parser: ArgumentParser) -> None:
+    """Design filters from the least norm to the least variance, and compare their sensor gains."""
+    add_config(parser)
+    text = "levels of the norm, from the least of any filter to that of the Kalman filter, 2 to 200"
+    add_option(parser, "--points", int, text, 9)
+    text = "past innovations that the mixed filters (least variance at each norm) weigh, 1 to 64"
+    add_option(parser, "--taps", int, text, 16)
+    add_outputs(parser)
+
+
+def limits(parser: ArgumentParser) -> None:
+    """Show how far designs are from the least residual of any linear controller."""
+    add_config(parser)
+    add_gains(
+        parser,
+        text="gain files to add to the integrator, the Kalman and the H-infinity filter of the "
+        "configuration",
+    )
+    add_outputs(parser)
+
+
+def mirror(parser: ArgumentParser) -> None:
+    """Show the step of the mirror's local loop, and what ignoring its dynamics costs."""
+    add_config(parser)
+    text = "half width of the band in which the mirror counts as settled"
+    add_option(parser, "--tolerance", float, text, 0.1)
+    add_outputs(parser)
+
+
+def modal(parser: ArgumentParser) -> None:
+    """Compare integrators, optimised gains and Kalman filters for all modes of the mirror."""
+    add_config(parser)
+    add_option(parser, "--modes", int, "number of modes, at least 2 (default: mirror.modes)")
+    add_outputs(parser)
+
+
+def study(parser: ArgumentParser) -> None:
+    """Try controllers on many samples of what the loop may meet; resumes if started again."""
+    parser.add_argument("study", metavar="file", help="study file (YAML)")
+    add_output(parser, "directory of the study")
+    engine = parser.add_mutually_exclusive_group()
+    add_option(engine, "--jobs", int, "processes", 1)
+    text = "Dask scheduler that runs it instead, as tcp://host:8786"
+    add_option(engine, "--dask", str, text, metavar="ADDRESS")
+    add_switch(parser, "--pdf", "write the page as a PDF, too (summary.pdf)")
+    instead = parser.add_mutually_exclusive_group()
+    add_switch(instead, "--dry-run", "say how many samples and how long, and write nothing")
+    add_option(instead, "--row", int, "recompute one row, and write it as a configuration")
+
+
+def paper(parser: ArgumentParser) -> None:
+    """Compute the tables and figures of Agapito et al. 2008, ours beside theirs."""
+    add_output(parser, "directory to write into")
