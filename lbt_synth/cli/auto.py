@@ -20,7 +20,8 @@ _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no wa
 
 def run(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
-    places = find_places(arguments, arguments.model, require_gain_name(arguments.output))
+    gain = require_gain_name(arguments.output)
+    places = find_places(arguments, arguments.model, gain=gain)
     record = read_record(arguments)
     if isinstance(record, SpectrumRecord):
         raise ProblemError(

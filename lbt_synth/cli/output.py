@@ -16,22 +16,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.text import Text
 
-from lbt_synth.storage import rows
-from lbt_synth.storage.rows import cell_text, json_record, json_units
+from lbt_synth.storage.rows import cell_text, fact_table, json_record, json_units, row_table
 from lbt_synth.storage.tables import Table
 
 _WIDTH = 200  # where the output is no terminal
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
-
-
-def text_table(caption: str, headings: Sequence[str], cells: Iterable[Sequence[Any]]) -> Table:
-    """Return a table of values of any kind."""
-    return Table(
-        caption=caption,
-        headings=tuple(headings),
-        rows=tuple(tuple(map(cell_text, row)) for row in cells),
-        words=tuple(i for i, heading in enumerate(headings) if i and heading in _WORDS),
-    )
 
 
 @dataclass(kw_only=True)
@@ -47,7 +36,9 @@ class Report:
         self, caption: str, headings: Sequence[str], cells: Iterable[Sequence[Any]]
     ) -> None:
         """Add a table of values of any kind, for people only."""
-        self.tables.append(text_table(caption, headings, cells))
+        rows = tuple(tuple(map(cell_text, row)) for row in cells)
+        words = tuple(i for i, heading in enumerate(headings) if i and heading in _WORDS)
+        self.tables.append(Table(caption=caption, headings=tuple(headings), rows=rows, words=words))
 
     def add_rows(
         self,
@@ -64,7 +55,7 @@ class Report:
         """
         self.data[key] = [json_record(row, without=without) for row in found]
         self._add_units(found[0])
-        self.tables.append(rows.row_table(caption, found, without=(*without, *hidden)))
+        self.tables.append(row_table(caption, found, without=(*without, *hidden)))
 
     def add_facts(self, caption: str, *facts: Any, key: str = "") -> None:
         """Add the values of rows to the data, or under a key of it, and as a table, one a line."""
@@ -72,7 +63,7 @@ class Report:
         for row in facts:
             data |= json_record(row)
             self._add_units(row)
-        self.tables.append(rows.fact_table(caption, *facts))
+        self.tables.append(fact_table(caption, *facts))
 
     def _add_units(self, row: Any) -> None:
         if units := self.data.get("units", {}) | json_units(row):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -109,28 +108,20 @@ def _expected_lines(
     return tuple(lines)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Places:
-    """Where the files go."""
+def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:
+    """Return where model, figure and others go, by default beside each other.
 
-    model: Path
-    figure: Path | None
-    gain: Path | None
-
-
-def find_places(arguments: Namespace, model: str | Path | None, gain: Path | None = None) -> Places:
-    """Return where the files go, by default beside each other, and refuse bad places."""
+    Refuse bad places.
+    """
     output = Path(arguments.output)
-    places = Places(
-        model=require_ending(model or output.with_suffix(".yaml"), "a model", (".yaml", ".yml")),
-        figure=None
-        if arguments.no_figure
-        else require_figure_name(arguments.figure or output.with_suffix(".png")),
-        gain=gain,
-    )
-    if arguments.no_figure and arguments.figure is not None:
+    model = require_ending(model or output.with_suffix(".yaml"), "a model", (".yaml", ".yml"))
+    places = {**others, "model": model}
+    if not arguments.no_figure:
+        figure = arguments.figure or output.with_suffix(".png")
+        places["figure"] = require_figure_name(figure)
+    elif arguments.figure is not None:
         raise ProblemError("give one of --figure and --no-figure, not both.")
-    outputs = [place for place in (places.gain, places.model, places.figure) if place is not None]
+    outputs = list(places.values())
     if len({place.resolve() for place in outputs}) < len(outputs):
         raise OutputError(f"each output needs a name of its own; got {outputs[0]} twice.")
     given = given_options(arguments, "file", "commands", "lines_file", "accelerometers")
@@ -140,7 +131,7 @@ def find_places(arguments: Namespace, model: str | Path | None, gain: Path | Non
 
 def write_files(
     report: Report,
-    places: Places,
+    places: dict[str, Path],
     arguments: Namespace,
     record: LoopRecord | SpectrumRecord,
     model: IdentifiedModel,
@@ -149,14 +140,14 @@ def write_files(
     """Write gain file, model and figure, once all of them are computed."""
     text = _model_text(model, arguments, record)
     figure = None
-    if places.figure is not None:
+    if "figure" in places:
         designs = None if made is None else {made.name: made.design}
         figure = identification_figure(model, designs=designs)
-    if made is not None and places.gain is not None:
-        report.note_written(save_gain(places.gain, made.design))
-    report.note_written(write_atomically(places.model, text), "model")
-    if figure is not None and places.figure is not None:
-        report.note_written(save_figure(figure, places.figure), "figure")
+    if made is not None:
+        report.note_written(save_gain(places["gain"], made.design))
+    report.note_written(write_atomically(places["model"], text), "model")
+    if figure is not None:
+        report.note_written(save_figure(figure, places["figure"]), "figure")
 
 
 def _model_text(

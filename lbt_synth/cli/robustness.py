@@ -17,6 +17,8 @@ from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import stable_sensor_gains
+from lbt_synth.report.designs.assessment import require_compatible
+from lbt_synth.report.designs.report import refine_values
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.storage.rows import column, percent_column, row_table, table_row
 from lbt_synth.studies import RobustnessMap, robustness_map
@@ -76,7 +78,7 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
 def _map_designs(config: Config, arguments: Namespace) -> Report:
     """Map the Strehl ratio of gain files over frequency error, sensor gain and delay error."""
     settings = config.settings.robustness
-    errors = _parse_range(arguments.errors_hz, "--errors-hz", _refine(settings.errors_hz))
+    errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(settings.errors_hz))
     gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
     delays = arguments.delay_errors or settings.delay_errors_frames
     for gain in gains:
@@ -112,13 +114,6 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     return report
 
 
-def _refine(values: Sequence[float]) -> FloatArray:
-    """Sort values, and add three between any two of them."""
-    known = np.unique(values)
-    places = np.arange(4 * known.size - 3) / 4
-    return np.asarray(np.interp(places, np.arange(known.size), known))
-
-
 def _parse_range(
     given: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
 ) -> FloatArray:
@@ -136,22 +131,11 @@ def _parse_range(
 
 def _assumed_gain(name: str, design: Design, config: Config) -> float:
     """Return the sensor gain that a design assumes, relative to ``sensor.matrix``."""
+    require_compatible(name, design, config.hardware)
     own, here = design.hardware, config.hardware
-    if own is None:
-        raise ProblemError(f"{name} is a filter of a bare estimation problem; a map needs a loop.")
-    if own.modes != here.modes:
-        raise ProblemError(
-            f"{name} must be for the configuration's {here.modes} modes; got {own.modes}."
-        )
-    if not np.isclose(own.frame_rate_hz, here.frame_rate_hz, rtol=1e-9):
-        raise ProblemError(
-            f"{name} must run at the configuration's {here.frame_rate_hz:g} Hz; got a design for "
-            f"{own.frame_rate_hz:g} Hz."
-        )
+    assert own is not None  # the others were refused
     unit = here.sensor / config.sensor_gain
-    gain = 0.0
-    if own.sensor.shape == unit.shape:
-        gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
+    gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
     if not (gain > 0 and _close(own.sensor, gain * unit) and _close(own.influence, here.influence)):
         raise ProblemError(
             f"{name} must have the configuration's sensor and influence matrices, up to a sensor "
@@ -161,8 +145,7 @@ def _assumed_gain(name: str, design: Design, config: Config) -> float:
 
 
 def _close(one: FloatArray, other: FloatArray) -> bool:
-    size = float(np.max(np.abs(other)))
-    return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, atol=1e-12 * size)
+    return np.allclose(one, other, rtol=1e-9, atol=1e-12 * float(np.max(np.abs(other))))
 
 
 def _stable_gains(
@@ -175,11 +158,8 @@ def _stable_gains(
         real = replace(design.hardware, delay_frames=design.hardware.delay_frames + delay)
         # around the gain that the design assumes, if the loop is stable there
         starts = [assumed, *found.sensor_gains[stable]]
-        low = high = float("nan")
-        for start in starts:
-            low, high = stable_sensor_gains(real, design.controller, nominal=start / assumed)
-            if not np.isnan(low):
-                break
+        tried = (stable_sensor_gains(real, design.controller, nominal=s / assumed) for s in starts)
+        low, high = next((ends for ends in tried if not np.isnan(ends[0])), (np.nan, np.nan))
         intervals.append((low * assumed, high * assumed))
     return intervals
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -102,23 +102,20 @@ def _compute(
                     whole=summarise,
                 )
             except KeyboardInterrupt:
-                note = (
-                    f"lbt-synth: what is finished is kept in {folder}; start it again to continue"
-                )
-                print(note, file=sys.stderr)
+                note = f"what is finished is kept in {folder}; start it again to continue"
+                print(f"lbt-synth: {note}", file=sys.stderr)
                 raise
     [(statistics, new)] = found
     return study_run, statistics, new
 
 
-@contextlib.contextmanager
-def _engine(arguments: Namespace) -> Iterator[tuple[Executor | None, int | None]]:
-    """Yield the executor of ``--dask`` and its workers, or None for both with ``--jobs``."""
+def _engine(
+    arguments: Namespace,
+) -> AbstractContextManager[tuple[Executor | None, int | None]]:
+    """Provide the executor of ``--dask`` and its workers, or None for both with ``--jobs``."""
     if arguments.dask is None:
-        yield None, None
-        return
-    with connect_cluster(arguments.dask) as found:
-        yield found
+        return nullcontext((None, None))
+    return connect_cluster(arguments.dask)
 
 
 def _summarise(

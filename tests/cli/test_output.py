@@ -10,7 +10,7 @@ import pytest
 from support.commands import run
 from support.plants import LBT_YAML, ROOT
 
-from lbt_synth.cli.output import Report, json_value, text_table
+from lbt_synth.cli.output import Report, json_value
 from lbt_synth.storage.rows import column, nm_column, table_row
 
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
@@ -88,7 +88,9 @@ def test_rows_and_facts_of_a_report(capsys):
 
 
 def test_tables_of_any_values():
-    table = text_table("Mixed", ("name", "unit", "value"), [("a", "nm", 1 / 3), ("b", "", None)])
+    report = Report()
+    report.add_table("Mixed", ("name", "unit", "value"), [("a", "nm", 1 / 3), ("b", "", None)])
+    (table,) = report.tables
     assert table.rows == (("a", "nm", "0.333333"), ("b", "", "-"))
     assert table.words == (1,)
 

@@ -169,7 +169,7 @@ BAD = [
     ((CONFIG, "KALMAN", "KALMAN"), "given once"),
     ((CONFIG, "none.fits"), "cannot read none.fits"),
     ((CONFIG, "WALK"), "walk is a filter of a bare estimation problem"),
-    ((CONFIG, "AXIS"), "axis must be for the configuration's 2 modes; got 1"),
+    ((CONFIG, "AXIS"), "axis must be for the configuration's 2 axes; got a design for 1"),
     ((CONFIG, "FAST"), "fast must run at the configuration's 800 Hz; got a design for 1000 Hz"),
     ((CONFIG, "MIXED"), "mixed must have the configuration's sensor and influence matrices"),
     ((CONFIG, "KALMAN", "--sensor-gain", "0.5"), "--sensor-gain is for redesigning"),

@@ -8,24 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from lbt_synth.report.charts.bokeh_panels import panel_figure
 from lbt_synth.report.charts.description import Chart
 
 _IDENTIFIER = re.compile(r"p\d+")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EmbeddedCharts:
-    """Charts as data for BokehJS."""
-
-    embedding: dict[str, Any]  # ``documents`` and ``items`` for ``Bokeh.embed.embed_items``
-    # For each chart, the identifiers of the elements that its panels are drawn in
-    places: dict[str, tuple[str, ...]]
-    # For each chart and each name of its legend, the models that it hides or shows
-    lines: dict[str, dict[str, tuple[str, ...]]]
 
 
 def bokeh_script() -> str:
@@ -36,49 +24,35 @@ def bokeh_script() -> str:
     return str(script).replace("</script", "<\\/script")
 
 
-def embed_charts(charts: Sequence[Chart]) -> EmbeddedCharts:
-    """Turn charts into data for BokehJS; the same charts give the same data."""
+def embed_charts(
+    charts: Sequence[Chart],
+) -> tuple[dict[str, Any], dict[str, dict[str, list[str]]]]:
+    """Return charts as data for BokehJS; the same charts give the same data.
+
+    The data have ``documents`` and ``items`` for ``Bokeh.embed.embed_items``; panel i of a chart is
+    drawn in the element ``key_panel-i``, counted from 1. Beside them, for each chart and each name
+    of its legend, the models that it hides or shows.
+    """
     from bokeh.document import Document
 
     document = Document()
-    roots: dict[str, str] = {}
-    places: dict[str, tuple[str, ...]] = {}
-    lines: dict[str, dict[str, tuple[str, ...]]] = {}
-    figures = []
+    elements: dict[Any, str] = {}  # of each figure, the place that it is drawn in
+    lines: dict[str, dict[str, list[str]]] = {}
     for chart in charts:
-        named: dict[str, list[str]] = {}
-        shared: dict[Any, Any] = {}
-        elements = []
-        for i, panel in enumerate(chart.panels):
-            figure = panel_figure(panel, shared, named)
-            figures.append(figure)
-            elements.append(f"{chart.key}_panel-{i + 1}")
-            roots[figure.id] = elements[-1]
-        places[chart.key] = tuple(elements)
-        lines[chart.key] = {name: tuple(ids) for name, ids in named.items()}
+        named, shared = lines.setdefault(chart.key, {}), dict[Any, Any]()
+        for number, panel in enumerate(chart.panels, start=1):
+            elements[panel_figure(panel, shared, named)] = f"{chart.key}_panel-{number}"
     with document.models.freeze():  # its models are looked up once
-        for figure in figures:
+        for figure in elements:
             document.add_root(figure)
-    data = document.to_json(deferred=False)
     numbers: dict[str, str] = {}
-    data = _renumber(data, numbers)
-    return EmbeddedCharts(
-        embedding={
-            "documents": {"page": data},
-            "items": [
-                {
-                    "docid": "page",
-                    "roots": {numbers[i]: element for i, element in roots.items()},
-                    "root_ids": [numbers[i] for i in roots],
-                }
-            ],
-        },
-        places=places,
-        lines={
-            key: {name: tuple(numbers[i] for i in ids) for name, ids in own.items()}
-            for key, own in lines.items()
-        },
-    )
+    data = _renumber(document.to_json(deferred=False), numbers)
+    roots = {numbers[figure.id]: element for figure, element in elements.items()}
+    items = [{"docid": "page", "roots": roots, "root_ids": list(roots)}]
+    for named in lines.values():
+        for ids in named.values():
+            ids[:] = [numbers[i] for i in ids]
+    return {"documents": {"page": data}, "items": items}, lines
 
 
 def _renumber(value: Any, numbers: dict[str, str]) -> Any:

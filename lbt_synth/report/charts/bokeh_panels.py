@@ -20,9 +20,12 @@ from lbt_synth.report.charts.description import (
     Span,
 )
 from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
-from lbt_synth.report.charts.map_cells import blank_cells, cell_edges, level_colour, levels_within
 from lbt_synth.report.charts.scales import (
     bar_places,
+    blank_cells,
+    cell_edges,
+    level_colour,
+    levels_within,
     log_tick_texts,
     log_ticks,
     scale_ends,

@@ -27,7 +27,6 @@ from lbt_synth.report.charts.description import (
     legend_entries,
 )
 from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
-from lbt_synth.report.charts.map_cells import blank_cells, cell_edges, level_colour, levels_within
 from lbt_synth.report.charts.paper_layout import (
     LETTER_IN,
     LONGEST_CATEGORY,
@@ -37,6 +36,10 @@ from lbt_synth.report.charts.paper_layout import (
 )
 from lbt_synth.report.charts.scales import (
     bar_places,
+    blank_cells,
+    cell_edges,
+    level_colour,
+    levels_within,
     log_tick_texts,
     log_ticks,
     scale_ends,

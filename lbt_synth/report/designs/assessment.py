@@ -180,7 +180,7 @@ def require_compatible(name: str, design: Design, hardware: LoopHardware) -> Non
     own = design.hardware
     if own is None:
         raise ProblemError(
-            f"{name} is a filter of a bare estimation problem; a report needs designs for a loop. "
+            f"{name} is a filter of a bare estimation problem; expected a design for a loop. "
             "Design it for the plant of a configuration."
         )
     for what, mine, theirs in (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -197,9 +197,14 @@ def frequency_errors(config: Config) -> FloatArray:
     lines = [line.frequency_hz for line in stationary_vibrations(config.truth.vibrations)]
     if not lines:
         return frozen_copy([0.0])
-    known = np.unique([*config.settings.robustness.errors_hz, 0.0])
-    places = np.arange(4 * known.size - 3) / 4
-    fine = np.interp(places, np.arange(known.size), known)
+    fine = refine_values([*config.settings.robustness.errors_hz, 0.0])
     nyquist = config.hardware.frame_rate_hz / 2
     kept = (min(lines) - fine > 0) & (max(lines) - fine < nyquist)
     return frozen_copy(fine[kept])
+
+
+def refine_values(values: Sequence[float]) -> FloatArray:
+    """Sort values, and add three between any two of them."""
+    known = np.unique(values)
+    places = np.arange(4 * known.size - 3) / 4
+    return np.asarray(np.interp(places, np.arange(known.size), known))

@@ -10,9 +10,8 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Map, Panel, Rule
-from lbt_synth.report.charts.map_cells import STREHL_LEVELS, strehl_scale
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
-from lbt_synth.report.charts.scales import count_columns
+from lbt_synth.report.charts.scales import STREHL_LEVELS, count_columns, strehl_scale
 from lbt_synth.studies import RobustnessMap, RobustnessRow
 
 FREQUENCY_ERROR = Axis(label="frequency error, design less truth", unit="Hz")

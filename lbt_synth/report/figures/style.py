@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -19,13 +18,11 @@ if TYPE_CHECKING:
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
-@contextmanager
-def house_style() -> Iterator[None]:
+def house_style() -> AbstractContextManager[None]:
     """Matplotlib settings of this package, for the time of the block."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_style()):
-        yield
+    return mpl.rc_context(_style())
 
 
 @cache

@@ -47,18 +47,17 @@ def page_html(page: Page) -> bytes:
         "shade": SHADE,
         "pale": PALE,
     }
-    drawn = embed_charts(page.charts)
+    embedding, lines = embed_charts(page.charts)
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
     text = template.render(
         page=page,
         style=(here / "page.css").read_text(encoding="utf-8"),
         script=(here / "page.js").read_text(encoding="utf-8"),
         library=bokeh_script() if page.charts else "",
-        data=_script_json(drawn.embedding),
-        places=drawn.places,
+        data=_script_json(embedding),
         legends={
             chart.key: [
-                (name, mark, " ".join(drawn.lines[chart.key].get(name, ())))
+                (name, mark, " ".join(lines[chart.key].get(name, ())))
                 for name, mark in legend_entries(chart.panels).items()
             ]
             for chart in page.charts

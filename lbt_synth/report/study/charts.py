@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from lbt_synth.report.page.words import chart
 from lbt_synth.studies import StudyStatistics
 from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
 from lbt_synth.studies.study.controller_samples import ControllerSamples
-from lbt_synth.studies.study.sensitivity import ConditionalCurve
 from lbt_synth.studies.study.statistics import sample_losses
 from lbt_synth.studies.study.summary import varying_parameters
 from lbt_synth.validation import FloatArray
@@ -145,49 +145,38 @@ def sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     return [chart("sensitivity", [panel], strongest="; ".join(strongest))]
 
 
-def conditional_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
-    """Mean and 10th percentile of the Strehl ratio over each parameter."""
-    panels = []
+def conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart]:
+    """Mean and 10th percentile of the Strehl ratio over each parameter, and unstable loops.
+
+    The latter are drawn over the parameters that their part changes most with.
+    """
+    panels, unstable = [], []
     for name in varying_parameters(statistics):
-        marks: list[Curve] = []
-        least = 100.0
-        for look, controller, curve in _conditional_curves(statistics, name):
-            x, mean, low = curve.parameter, 100 * curve.mean, 100 * curve.low
-            marks += [
-                Curve(name=controller, x=x, y=mean, look=look, marker="own", width=1.8),
-                Curve(name="", x=x, y=low, look=look, width=0.9, hover=False),
-            ]
+        marks, parts = [], []
+        least, span = 100.0, 0.0
+        for look, one in enumerate(statistics.sensitivities):
+            curve = next(each.curve for each in one.parameters if each.parameter == name)
+            if curve is None:
+                continue
+            style: dict[str, Any] = {"x": curve.parameter, "look": look}
+            own = style | {"name": one.controller, "marker": "own", "width": 1.8}
+            mean, low = 100 * curve.mean, 100 * curve.low
+            marks += [Curve(y=mean, **own), Curve(name="", y=low, width=0.9, hover=False, **style)]
             least = min(least, float(np.min(low)))
-        y = Axis(label="Strehl ratio", unit="%", low=0 if least < _HIGH else None)
-        panels.append(Panel(x=Axis(label=names[name]), y=y, marks=tuple(marks)))
-    return _parameter_chart("curves", panels, 2)
-
-
-def _conditional_curves(
-    statistics: StudyStatistics, parameter: str
-) -> Iterator[tuple[int, str, ConditionalCurve]]:
-    """Yield look, controller and curve of all controllers that have one over a parameter."""
-    for look, one in enumerate(statistics.sensitivities):
-        curve = next(each.curve for each in one.parameters if each.parameter == parameter)
-        if curve is not None:
-            yield look, one.controller, curve
-
-
-def unstable_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
-    """Part of the loops that are unstable, over the parameters that it changes most with."""
-    panels = []
-    for name in varying_parameters(statistics):
-        marks, span = [], 0.0
-        for look, controller, curve in _conditional_curves(statistics, name):
             if curve.unstable.any():
-                x, y = curve.parameter, 100 * curve.unstable
-                marks.append(Curve(name=controller, x=x, y=y, look=look, marker="own", width=1.8))
+                parts.append(Curve(y=100 * curve.unstable, **own))
                 span = max(span, float(np.ptp(curve.unstable)))
-        axis = Axis(label="unstable", unit="%", low=0)
-        if marks:
-            panels.append((span, Panel(x=Axis(label=names[name]), y=axis, marks=tuple(marks))))
-    most = sorted(panels, key=lambda pair: -pair[0])[:_UNSTABLE_PANELS]
-    return _parameter_chart("unstable", [panel for _, panel in most], 2)
+        x = Axis(label=names[name])
+        y = Axis(label="Strehl ratio", unit="%", low=0 if least < _HIGH else None)
+        panels.append(Panel(x=x, y=y, marks=tuple(marks)))
+        if parts:
+            y = Axis(label="unstable", unit="%", low=0)
+            unstable.append((span, Panel(x=x, y=y, marks=tuple(parts))))
+    most = sorted(unstable, key=lambda pair: -pair[0])[:_UNSTABLE_PANELS]
+    return [
+        *_parameter_chart("curves", panels, 2),
+        *_parameter_chart("unstable", [panel for _, panel in most], 2),
+    ]
 
 
 def map_charts(

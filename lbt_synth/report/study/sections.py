@@ -12,13 +12,12 @@ from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Sect
 from lbt_synth.report.page.words import paragraph
 from lbt_synth.report.provenance import versions_table
 from lbt_synth.report.study.charts import (
-    conditional_chart,
+    conditional_charts,
     distribution_chart,
     loss_chart,
     map_charts,
     parameter_chart,
     sensitivity_chart,
-    unstable_chart,
 )
 from lbt_synth.report.study.study_info import StudyInfo
 from lbt_synth.storage.rows import row_table
@@ -221,8 +220,7 @@ def _dependence_section(
         *sensitivity_chart(statistics, names),
         sensitivity_table(statistics, names=names),
         swing_table(statistics, names=names),
-        *conditional_chart(statistics, names),
-        *unstable_chart(statistics, names),
+        *conditional_charts(statistics, names),
         *map_charts(statistics, found, values, names),
     )
     return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)

@@ -17,14 +17,15 @@ from lbt_synth.report.charts.matplotlib_charts import draw_figure
 
 def test_the_data_of_charts_are_those_given():
     chart = every_mark()[0]
-    drawn = embed_charts([chart])
-    numbers = json.dumps(drawn.embedding)
-    assert set(drawn.lines["lines"]) == set(legend_entries(chart.panels)) - {"only named"}
-    for identifiers in drawn.lines["lines"].values():
+    embedding, lines = embed_charts([chart])
+    numbers = json.dumps(embedding)
+    assert set(lines["lines"]) == set(legend_entries(chart.panels)) - {"only named"}
+    for identifiers in lines["lines"].values():
         for identifier in identifiers:
             assert numbers.count(f'"{identifier}"') >= 1
-    assert len(drawn.lines["lines"]["first"]) == 2  # once a panel
-    assert drawn.places == {"lines": ("lines_panel-1", "lines_panel-2")}
+    assert len(lines["lines"]["first"]) == 2  # once a panel
+    places = embedding["items"][0]["roots"].values()
+    assert list(places) == ["lines_panel-1", "lines_panel-2"]
     assert '"x": "p' not in numbers
 
 
@@ -32,7 +33,7 @@ def test_both_renderers_leave_the_same_room():
     curve = Curve(name="a", x=[0.0, 1.0, 2.0], y=[0.0, 99.0, 100.0], marker="own")
     panel = Panel(x=Axis(label="x"), y=Axis(label="y", low=0.0), marks=(curve,))
     chart = Chart(key="room", title="t", caption="c", alt="a", panels=(panel,))
-    data = embed_charts([chart]).embedding["documents"]["page"]["roots"][0]["attributes"]
+    data = embed_charts([chart])[0]["documents"]["page"]["roots"][0]["attributes"]
     ends = data["y_range"]["attributes"]
     assert (ends["start"], ends["end"]) == pytest.approx((-4.0, 104.0))
     figure = draw_figure(chart.panels)
