@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from lbt_synth.cli.identification_tables import add_model, add_record, marked_note
+from lbt_synth.cli import loop_records
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
-from lbt_synth.cli.record_files import find_places, identification_options, read_record, write_files
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, RecordedDesign, SpectrumRecord, design_from_record
@@ -21,8 +20,8 @@ _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no wa
 def run(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
     gain = require_gain_name(arguments.output)
-    places = find_places(arguments, arguments.model, gain=gain)
-    record = read_record(arguments)
+    places = loop_records.find_places(arguments, arguments.model, gain=gain)
+    record = loop_records.read_record(arguments)
     if isinstance(record, SpectrumRecord):
         raise ProblemError(
             "auto tests its design on the recorded series; got a spectrum. Try lbt-synth identify "
@@ -39,11 +38,11 @@ def run(arguments: Namespace) -> Report:
                 wavelength_um=arguments.wavelength_um,
             ),
             progress=count,
-            **identification_options(arguments, record),
+            **loop_records.identification_options(arguments, record),
         )
     report = Report(data={"source": str(arguments.file)})
-    add_record(report, record)
-    add_model(report, found.model)
+    loop_records.add_record(report, record)
+    loop_records.add_model(report, found.model)
     _add_comparison(report, found, record)
     loop = close_loop(found.model.hardware, found.design.controller)
     report.data["certificate"] = found.design.certificate.passed
@@ -51,7 +50,7 @@ def run(arguments: Namespace) -> Report:
         f"certified: spectral radius of the loop {loop.spectral_radius:.6f}, modulus margin "
         f"{loop_margins(loop).modulus:.3f}."
     )
-    write_files(report, places, arguments, record, found.model, found)
+    loop_records.write_files(report, places, arguments, record, found.model, found)
     return report
 
 
@@ -97,4 +96,4 @@ def _add_comparison(report: Report, found: RecordedDesign, record: LoopRecord) -
             f"{abs(best.deviations):.1f} standard errors: the disturbance changed, or the model "
             "leaves something out."
         )
-    report.notes += [marked_note(note) for note in found.notes]
+    report.notes += [loop_records.marked_note(note) for note in found.notes]

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from lbt_synth.cli.identification_tables import add_model, add_record
+from lbt_synth.cli import loop_records
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.cli.record_files import find_places, identification_options, read_record, write_files
 from lbt_synth.identification import SpectrumRecord, identify
 
 
 def run(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
-    places = find_places(arguments, arguments.output)
-    record = read_record(arguments)
-    options = identification_options(arguments, record)
+    places = loop_records.find_places(arguments, arguments.output)
+    record = loop_records.read_record(arguments)
+    options = loop_records.identification_options(arguments, record)
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
     with show_spinner("identifying", quiet=arguments.json):
         model = identify(record, **options)
     report = Report(data={"source": str(arguments.file)})
-    add_record(report, record)
-    add_model(report, model)
-    write_files(report, places, arguments, record, model)
+    loop_records.add_record(report, record)
+    loop_records.add_model(report, model)
+    loop_records.write_files(report, places, arguments, record, model)
     return report

@@ -8,7 +8,7 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.report.study.page import study_page
-from lbt_synth.report.study.study_info import StudyInfo
+from lbt_synth.report.study.sections import StudyInfo
 
 PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")
 

@@ -292,17 +292,11 @@ def _hover_curves(figure: Any, panel: Panel) -> None:
     """Show the values of all curves of the same abscissae in one box."""
     from bokeh.models import ColumnDataSource
 
-    groups: list[list[Curve]] = []
+    groups: dict[object, list[Curve]] = {}
     for curve in panel.select(Curve):
-        if not curve.x.size or not curve.hover:
-            continue
-        for group in groups:
-            if curve.line and group[0].line and np.array_equal(group[0].x, curve.x):
-                group.append(curve)
-                break
-        else:
-            groups.append([curve])
-    for group in groups:
+        if curve.x.size and curve.hover:
+            groups.setdefault(curve.x.tobytes() if curve.line else curve, []).append(curve)
+    for group in groups.values():
         joined = group[0].line
         columns: dict[str, FloatArray] = {"x": np.array(group[0].x)}
         columns |= {f"y{i}": np.array(curve.y) for i, curve in enumerate(group)}

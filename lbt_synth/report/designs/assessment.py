@@ -25,6 +25,7 @@ from lbt_synth.loop import (
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.storage.rows import fill_row
 from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
@@ -134,13 +135,7 @@ def assess_design(
     margins = loop_margins(loop) if loop.is_stable else None
     checks, complaint = _recertify(design)
     own = design.hardware
-    carrier = LoopDesign(
-        method=design.method,
-        controller=design.controller,
-        certificate=design.certificate,
-        solver=design.solver,
-        loop_hardware=hardware,
-    )
+    carrier = fill_row(LoopDesign, design, loop_hardware=hardware)
     curve, found = (
         robustness_map(carrier, truth, config.imaging, errors_hz=errors_hz, sensor_gains=gains)
         for gains in ([truth.sensor_gain], sensor_gains / assumed_gain)

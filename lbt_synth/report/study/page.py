@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.report.page.blocks import Page
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import creator_name, time_text
-from lbt_synth.report.study.sections import study_sections
-from lbt_synth.report.study.study_info import StudyInfo, study_info
+from lbt_synth.report.study.sections import StudyInfo, study_info, study_sections
 from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
 
 

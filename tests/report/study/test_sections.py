@@ -8,7 +8,7 @@ import pytest
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.report.study.study_info import study_info
+from lbt_synth.report.study.sections import study_info
 
 
 @pytest.fixture(scope="module")
