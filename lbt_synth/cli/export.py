@@ -64,17 +64,11 @@ def run(arguments: Namespace) -> Report:
 
 
 def _export_as(arguments: Namespace, design: Design, digest: str) -> Exported:
-    if arguments.format == "mat":
-        return export_mat(arguments.output, design, gain_digest=digest)
-    if arguments.format == "iir":
-        return export_iir(arguments.output, design, gain_digest=digest)
-    return export_c(
-        arguments.output,
-        design,
-        precision=arguments.precision or "double",
-        name=arguments.name,
-        gain_digest=digest,
-    )
+    if arguments.format == "c":
+        options = {"precision": arguments.precision or "double", "name": arguments.name}
+        return export_c(arguments.output, design, gain_digest=digest, **options)
+    export = export_mat if arguments.format == "mat" else export_iir
+    return export(arguments.output, design, gain_digest=digest)
 
 
 def _precision_notes(arguments: Namespace, written: Exported) -> list[str]:

@@ -82,9 +82,26 @@ def _compute(
 ) -> tuple[studies.StudyRun, studies.StudyStatistics, bool]:
     """Run a study and write its page; return also whether anything was left to compute."""
     found: list[tuple[studies.StudyStatistics, bool]] = []
+    page, *pdf = files
+    names = [controller.name for controller in loaded.controllers]
 
     def summarise(results: FinishedStudy) -> None:
-        found.append((_summarise(loaded, files, results), results.new))
+        statistics = studies.study_statistics(results.columns, loaded.parameter_names, names)
+        found.append((statistics, results.new))
+        if results.new or not all(path.exists() for path in files):
+            failures = [
+                studies.Failure(row=row, controller=name, error=error)
+                for row, name, error in read_failures(folder)
+            ]
+            write_study_page(
+                loaded,
+                results.columns,
+                page,
+                statistics=statistics,
+                failures=failures,
+                computing_s=results.computing_s,
+                pdf=pdf[0] if pdf else None,
+            )
 
     with _engine(arguments) as (executor, workers):
         make_directory(folder)
@@ -116,32 +133,6 @@ def _engine(
     if arguments.dask is None:
         return nullcontext((None, None))
     return connect_cluster(arguments.dask)
-
-
-def _summarise(
-    loaded: studies.Study, files: Sequence[Path], results: FinishedStudy
-) -> studies.StudyStatistics:
-    """Compute the statistics of a finished study, and write its page if it is missing."""
-    page, *pdf = files
-    statistics = studies.study_statistics(
-        results.columns,
-        loaded.parameter_names,
-        [controller.name for controller in loaded.controllers],
-    )
-    if results.new or not all(path.exists() for path in files):
-        write_study_page(
-            loaded,
-            results.columns,
-            page,
-            statistics=statistics,
-            failures=[
-                studies.Failure(row=row, controller=name, error=error)
-                for row, name, error in read_failures(page.parent)
-            ],
-            computing_s=results.computing_s,
-            pdf=pdf[0] if pdf else None,
-        )
-    return statistics
 
 
 def _duration(seconds: float) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.report.charts import scales
 from lbt_synth.report.charts.description import (
     Area,
     Axis,
@@ -20,17 +21,6 @@ from lbt_synth.report.charts.description import (
     Span,
 )
 from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
-from lbt_synth.report.charts.scales import (
-    bar_places,
-    blank_cells,
-    cell_edges,
-    level_colour,
-    levels_within,
-    log_tick_texts,
-    log_ticks,
-    scale_ends,
-    shorten,
-)
 from lbt_synth.validation import FloatArray
 
 _FONT = "system-ui, sans-serif"
@@ -61,7 +51,7 @@ def panel_figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str
     from bokeh.plotting import figure as new_figure
 
     zoom = BoxZoomTool(match_aspect=panel.equal)
-    across, up = scale_ends(panel)
+    across, up = scales.scale_ends(panel)
     size: dict[str, Any] = {"height": _height(panel)}
     if panel.equal:  # the borders are as wide as the toolbar and the labels are high
         (x0, x1), (y0, y1) = across, up
@@ -88,7 +78,7 @@ def panel_figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str
         if mark.name and models:
             named.setdefault(mark.name, []).extend(model.id for model in models)
     if panel.categories:
-        names = {i: shorten(name, 24) for i, name in enumerate(panel.categories)}
+        names = {i: scales.shorten(name, 24) for i, name in enumerate(panel.categories)}
         figure.yaxis[0].update(ticker=list(names), major_label_overrides=names, axis_label=None)
         figure.ygrid.grid_line_color = None
     _hover_curves(figure, panel)
@@ -108,12 +98,12 @@ def _style_axis(axis: Any, own: Axis, ends: tuple[float, float]) -> None:
 
     axis.update(axis_label=PlainText(text=own.text), **_AXIS)
     if own.log:
-        ticks = log_ticks(*ends)
+        ticks = scales.log_ticks(*ends)
         powers = range(*(int(np.floor(np.log10(end))) + i for i, end in enumerate(ends)))
         # finer ones for readers who zoom in
         fine = [f * 10.0**n for n in powers for f in range(1, 10)]
         axis.ticker = FixedTicker(ticks=ticks, minor_ticks=[t for t in fine if t not in ticks])
-        axis.major_label_overrides = dict(zip(ticks, log_tick_texts(ticks), strict=True))
+        axis.major_label_overrides = dict(zip(ticks, scales.log_tick_texts(ticks), strict=True))
 
 
 def _draw(figure: Any, panel: Panel, mark: Mark) -> list[Any]:
@@ -180,7 +170,7 @@ def _draw_curve(figure: Any, panel: Panel, curve: Curve) -> list[Any]:
 
 def _draw_bars(figure: Any, panel: Panel, bars: Bars) -> list[Any]:
     series = panel.select(Bars)
-    offset, height = bar_places(len(series))[series.index(bars)]
+    offset, height = scales.bar_places(len(series))[series.index(bars)]
     drawn = np.flatnonzero(np.isfinite(bars.values))
     source = {
         "y": drawn + offset,
@@ -209,7 +199,7 @@ def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
     from bokeh.models import ColorBar, LinearColorMapper, LogColorMapper, PlainText
 
     figure.grid.grid_line_color = None
-    x, y = cell_edges(found.x), cell_edges(found.y)
+    x, y = scales.cell_edges(found.x), scales.cell_edges(found.y)
     known = np.isfinite(found.values)
     rows, columns = np.nonzero(known)
     kind = LogColorMapper if found.log else LinearColorMapper
@@ -221,7 +211,7 @@ def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
     sides = {side: side for side in edges}
     style = {"fill_color": shade, "line_color": shade}
     cells = figure.quad(**sides, **style, source=edges | centres)
-    blank = np.array(list(blank_cells(~known, x, y))).reshape(-1, 4).T
+    blank = np.array(list(scales.blank_cells(~known, x, y))).reshape(-1, 4).T
     figure.quad(
         **dict(zip(edges, blank, strict=True)),
         fill_color=PALE,
@@ -253,7 +243,7 @@ def _draw_map(figure: Any, panel: Panel, found: Map) -> None:
 def _draw_levels(figure: Any, found: Map) -> None:
     from contourpy import contour_generator
 
-    levels = levels_within(found.values, found.levels)
+    levels = scales.levels_within(found.values, found.levels)
     if not levels:
         return
     generator = contour_generator(found.x, found.y, np.ma.masked_invalid(found.values))
@@ -261,7 +251,7 @@ def _draw_levels(figure: Any, found: Map) -> None:
     figure.multi_line(
         [path[:, 0] for path, _ in lines],
         [path[:, 1] for path, _ in lines],
-        line_color=[level_colour(level, found.low, found.high) for _, level in lines],
+        line_color=[scales.level_colour(level, found.low, found.high) for _, level in lines],
         line_width=1.0,
     )
 

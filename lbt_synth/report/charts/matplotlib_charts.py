@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.report.charts import paper_layout, scales
 from lbt_synth.report.charts.description import (
     Area,
     Bars,
@@ -27,25 +28,6 @@ from lbt_synth.report.charts.description import (
     legend_entries,
 )
 from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
-from lbt_synth.report.charts.paper_layout import (
-    LETTER_IN,
-    LONGEST_CATEGORY,
-    LONGEST_NAME,
-    WIDTH_IN,
-    lay_out,
-)
-from lbt_synth.report.charts.scales import (
-    bar_places,
-    blank_cells,
-    cell_edges,
-    level_colour,
-    levels_within,
-    log_tick_texts,
-    log_ticks,
-    scale_ends,
-    shorten,
-    spread_labels,
-)
 from lbt_synth.report.figures.style import house_style
 
 if TYPE_CHECKING:
@@ -149,16 +131,16 @@ def _new_places(panels: Sequence[Panel], columns: int, title: str) -> tuple[Figu
     """Return a new figure with its title, its legend and the axes of its panels."""
     from matplotlib.figure import Figure
 
-    layout = lay_out(panels, columns, title)
-    height = layout.height
-    figure = Figure(figsize=(WIDTH_IN, height))
+    layout = paper_layout.lay_out(panels, columns, title)
+    width, height = paper_layout.WIDTH_IN, layout.height
+    figure = Figure(figsize=(width, height))
     if title:
         figure.text(0.5, 1 - 0.05 / height, title, ha="center", va="top", fontsize=10)
     anchor = (0.5, 1 - layout.legend_top / height)
     ncols = layout.legend_columns
     _draw_legend(figure, panels, loc="upper center", bbox_to_anchor=anchor, ncols=ncols)
     return figure, [
-        figure.add_axes((x / WIDTH_IN, 1 - (top + high) / height, wide / WIDTH_IN, high / height))
+        figure.add_axes((x / width, 1 - (top + high) / height, wide / width, high / height))
         for x, top, wide, high in layout.boxes
     ]
 
@@ -172,7 +154,7 @@ def _draw_legend(owner: Figure | Axes, panels: Sequence[Panel], **options: Any) 
     names = [f" {name}" if name.startswith("_") else name for name in entries]
     owner.legend(
         [_legend_handle(mark) for mark in entries.values()],
-        [shorten(name, LONGEST_NAME) for name in names],
+        [scales.shorten(name, paper_layout.LONGEST_NAME) for name in names],
         borderaxespad=0.0,
         handlelength=3.2,
         **options,
@@ -225,7 +207,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> Any:
     """Draw a panel, and return the image of its map if it has one."""
     image = None
     width_in = axes.get_window_extent().width / axes.figure.dpi
-    title = shorten(panel.title, max(8, int(width_in / LETTER_IN)))
+    title = scales.shorten(panel.title, max(8, int(width_in / paper_layout.LETTER_IN)))
     axes.set_title(title, loc="left", parse_math=False)
     for mark in panel.marks:
         match mark:
@@ -255,16 +237,16 @@ def _draw_panel(axes: Axes, panel: Panel) -> Any:
 
 def _set_scales(axes: Axes, panel: Panel) -> None:
     for end, own, scale in (("x", panel.x, axes.xaxis), ("y", panel.y, axes.yaxis)):
-        low, high = scale_ends(panel)[end == "y"]
+        low, high = scales.scale_ends(panel)[end == "y"]
         if own.log:
             getattr(axes, f"set_{end}scale")("log")
-            ticks = log_ticks(low, high)
-            scale.set_ticks(ticks, log_tick_texts(ticks))
+            ticks = scales.log_ticks(low, high)
+            scale.set_ticks(ticks, scales.log_tick_texts(ticks))
             scale.set_ticks([], minor=True)
         getattr(axes, f"set_{end}lim")(low, high)
         scale.set_label_text(own.text, parse_math=False)
     if panel.categories:
-        names = [shorten(name, LONGEST_CATEGORY) for name in panel.categories]
+        names = [scales.shorten(name, paper_layout.LONGEST_CATEGORY) for name in panel.categories]
         axes.set_yticks(range(len(names)), names)
         axes.set_ylabel("")
         axes.tick_params(axis="y", length=0)
@@ -275,7 +257,7 @@ def _set_scales(axes: Axes, panel: Panel) -> None:
 
 def _draw_bars(axes: Axes, panel: Panel) -> None:
     series = panel.select(Bars)
-    for bars, (offset, height) in zip(series, bar_places(len(series)), strict=True):
+    for bars, (offset, height) in zip(series, scales.bar_places(len(series)), strict=True):
         places = np.arange(len(panel.categories)) + offset
         drawn = np.isfinite(bars.values)
         axes.barh(places[drawn], bars.values[drawn], height=height, color=colour(bars.look))
@@ -287,7 +269,7 @@ def _draw_flags(axes: Axes, flags: Flags, width: float) -> None:
     """Draw upright texts of a width, a part of that of the panel, without overlaps."""
     points = np.column_stack((flags.x, flags.y))
     across = axes.transAxes.inverted().transform(axes.transData.transform(points))[:, 0]
-    places = spread_labels(across, width)
+    places = scales.spread_labels(across, width)
     for text, point, place in zip(flags.texts, points, places, strict=True):
         axes.annotate(
             text,
@@ -315,16 +297,16 @@ def _draw_map(axes: Axes, found: Map) -> Any:
     from matplotlib.colors import LogNorm, Normalize
 
     axes.grid(visible=False)
-    x, y = cell_edges(found.x), cell_edges(found.y)
+    x, y = scales.cell_edges(found.x), scales.cell_edges(found.y)
     shown = np.ma.masked_invalid(found.values)
     norm = (LogNorm if found.log else Normalize)(found.low, found.high)
     image = axes.pcolormesh(x, y, shown, cmap="viridis", norm=norm, rasterized=True)
-    inner = levels_within(found.values, found.levels)
+    inner = scales.levels_within(found.values, found.levels)
     if inner:
-        shades = [level_colour(level, found.low, found.high) for level in inner]
+        shades = [scales.level_colour(level, found.low, found.high) for level in inner]
         lines = axes.contour(found.x, found.y, shown, levels=inner, linewidths=0.8, colors=shades)
         axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
-    for left, right, low, high in blank_cells(np.isnan(found.values), x, y):
+    for left, right, low, high in scales.blank_cells(np.isnan(found.values), x, y):
         axes.fill_between([left, right], low, high, **_BLANK)
     return image
 
@@ -345,7 +327,7 @@ def _draw_colour_bar(
     else:
         bar = figure.colorbar(image, ax=mapped)
     if isinstance(image.norm, LogNorm):
-        ticks = log_ticks(image.norm.vmin, image.norm.vmax)
-        bar.set_ticks(ticks, labels=log_tick_texts(ticks))
+        ticks = scales.log_ticks(image.norm.vmin, image.norm.vmax)
+        bar.set_ticks(ticks, labels=scales.log_tick_texts(ticks))
     bar.set_label(text)
     bar.outline.set_visible(False)

@@ -133,6 +133,10 @@ def assess_design(
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     budget = residual_budget(loop, truth) if loop.is_stable else None
     margins = loop_margins(loop) if loop.is_stable else None
+    rejection, noise_transfer = (
+        frozen_copy(spectral_norms(response(frequency_hz))) if loop.is_stable else None
+        for response in (loop.sensitivity, loop.noise_transfer)
+    )
     checks, complaint = _recertify(design)
     own = design.hardware
     carrier = fill_row(LoopDesign, design, loop_hardware=hardware)
@@ -155,7 +159,7 @@ def assess_design(
         margins=margins,
         sensor_gains=tuple(
             (low * assumed_gain, high * assumed_gain)
-            for low, high in stable_intervals(hardware, design.controller, margins, loop)
+            for low, high in stable_intervals(loop, design.controller, margins)
         ),
         checks=checks,
         certificate_error=complaint,
@@ -163,8 +167,8 @@ def assess_design(
         error_norms=largest_singular_values(design.error_system(), frequency_hz)
         if isinstance(design, EstimatorDesign)
         else None,
-        rejection=_response_norms(loop, frequency_hz, noise=False),
-        noise_transfer=_response_norms(loop, frequency_hz, noise=True),
+        rejection=rejection,
+        noise_transfer=noise_transfer,
         curve=curve,
         map=replace(found, sensor_gains=frozen_copy(sensor_gains)),  # the real ones again
     )
@@ -196,7 +200,7 @@ def require_compatible(name: str, design: Design, hardware: LoopHardware) -> Non
 
 
 def stable_intervals(
-    hardware: LoopHardware, controller: Controller, margins: LoopMargins | None, loop: ClosedLoop
+    loop: ClosedLoop, controller: Controller, margins: LoopMargins | None
 ) -> list[tuple[float, float]]:
     """Intervals of sensor gains for which a loop is stable, in increasing order.
 
@@ -206,14 +210,14 @@ def stable_intervals(
     found = []
     if margins is not None:
         found.append((margins.gain_low * loop.sensor_gain, margins.gain_high * loop.sensor_gain))
-    radii = radii_by_gain(hardware, controller)(_GAINS)
+    radii = radii_by_gain(loop.hardware, controller)(_GAINS)
     inside = np.nonzero(radii < 1 - STABILITY_MARGIN)[0]
     for run in np.split(inside, np.nonzero(np.diff(inside) > 1)[0] + 1):
         if not run.size:
             continue
         nominal = float(_GAINS[run[np.argmin(radii[run])]])
         if not any(low < nominal < high for low, high in found):
-            found.append(stable_sensor_gains(hardware, controller, nominal=nominal))
+            found.append(stable_sensor_gains(loop.hardware, controller, nominal=nominal))
     return sorted(found)
 
 
@@ -223,12 +227,3 @@ def _recertify(design: Design) -> tuple[tuple[Check, ...], str]:
         return design.recertify().checks, ""
     except (LbtSynthError, ArithmeticError) as error:
         return (), str(error)
-
-
-def _response_norms(
-    loop: ClosedLoop, frequency_hz: FloatArray, *, noise: bool
-) -> FloatArray | None:
-    if not loop.is_stable:
-        return None
-    response = loop.noise_transfer(frequency_hz) if noise else loop.sensitivity(frequency_hz)
-    return frozen_copy(spectral_norms(response))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +23,6 @@ from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, map_panels, str
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
 from lbt_synth.report.page.words import chart
-from lbt_synth.validation import FloatArray
 
 _PANELS = 6  # of one chart that has a panel per design: they fit a sheet
 
@@ -147,33 +146,18 @@ def pole_and_step_charts(report: DesignReport) -> list[Chart]:
         Axis(label=f"{part} part", unit="-", low=-reach, high=reach)
         for part in ("real", "imaginary")
     )
-    ring: dict[str, Any] = {
-        "line": False,
-        "marker": "circle",
-        "filled": False,
-        "size": 6.0,
-        "look": 1,
-    }
-    cross: dict[str, Any] = {"line": False, "marker": "cross", "look": 0}
-    panels = tuple(
-        Panel(
-            title=one.name if one.stable else f"{one.name}: unstable",
-            x=real,
-            y=imaginary,
-            equal=True,
-            marks=(
-                circle,
-                *(
-                    Curve(name=name, x=values.real, y=values.imag, **style)
-                    for name, values, style in (
-                        ("controller alone", one.controller_poles, ring),
-                        ("closed loop", one.loop_poles, cross),
-                    )
-                ),
-            ),
-        )
-        for one in report.assessments
-    )
+    ring: dict[str, Any] = {"marker": "circle", "filled": False, "size": 6.0, "look": 1}
+    cross: dict[str, Any] = {"marker": "cross", "look": 0}
+    panels = []
+    for one in report.assessments:
+        marks = [circle]
+        for name, values, style in (
+            ("controller alone", one.controller_poles, ring),
+            ("closed loop", one.loop_poles, cross),
+        ):
+            marks.append(Curve(name=name, x=values.real, y=values.imag, line=False, **style))
+        title = one.name if one.stable else f"{one.name}: unstable"
+        panels.append(Panel(title=title, x=real, y=imaginary, equal=True, marks=tuple(marks)))
     radii = [f"{one.name} {number_text(one.spectral_radius, 6)}" for one in report.assessments]
     columns = count_columns(len(panels))
     found = chart("poles", panels, columns=columns, radii=listing_text(radii))
@@ -186,23 +170,18 @@ def _step_chart(report: DesignReport) -> Chart:
         f"{name} {fixed_text(float(np.max(np.abs(run.step_residual_nm[5:]))), 0)} nm"
         for name, run in runs.items()
     ]
-
-    def panel(label: str, values: Callable[[Any], FloatArray]) -> Panel:
-        return Panel(
-            x=Axis(label="time after the step", unit="ms"),
-            y=Axis(label=label, unit="nm"),
-            marks=tuple(
-                stable_curve(name, report.names, 1e3 * run.step_time_s, values(run), step="after")
-                for name, run in runs.items()
-            ),
-        )
-
+    panels = []
+    for label in ("residual", "command"):
+        series = {name: getattr(run, f"step_{label}_nm") for name, run in runs.items()}
+        curves = [
+            stable_curve(name, report.names, 1e3 * runs[name].step_time_s, y, step="after")
+            for name, y in series.items()
+        ]
+        x = Axis(label="time after the step", unit="ms")
+        panels.append(Panel(x=x, y=Axis(label=label, unit="nm"), marks=tuple(curves)))
     return chart(
         "step",
-        (
-            panel("residual", lambda run: run.step_residual_nm),
-            panel("command", lambda run: run.step_command_nm),
-        ),
+        panels,
         step=f"{STEP_NM:g}",
         frame=number_text(1e3 / report.config.hardware.frame_rate_hz),
         peaks=listing_text(peaks),

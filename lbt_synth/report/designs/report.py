@@ -16,16 +16,10 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
+from lbt_synth.report import provenance
 from lbt_synth.report.designs.assessment import DesignAssessment, assess_design, require_compatible
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
 from lbt_synth.report.figures.loop import frequency_grid
-from lbt_synth.report.provenance import (
-    SourceFile,
-    creation_time,
-    program_versions,
-    read_source,
-    require_letters,
-)
 from lbt_synth.studies import LimitRow, LimitStudy
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
@@ -68,7 +62,7 @@ class DesignReport:
     limits: LimitStudy
     frequency_hz: FloatArray
     errors_hz: FloatArray
-    files: tuple[SourceFile, ...]
+    files: tuple[provenance.SourceFile, ...]
     versions: tuple[tuple[str, str], ...]
     made: datetime
 
@@ -144,13 +138,13 @@ def design_report(
         raise ProblemError(f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}.")
     for name, design in designs.items():
         require_instance(design, Design)
-        require_letters(name, "name of a design")
+        provenance.require_letters(name, "name of a design")
         require_compatible(name, design, config.hardware)
-    made = creation_time()
-    source, content = read_source(config.source, "configuration")
+    made = provenance.creation_time()
+    source, content = provenance.read_source(config.source, "configuration")
     files = [source]
     for name, path in (gain_files or {}).items():
-        files.append(read_source(Path(path), f"gain file of {name}")[0])
+        files.append(provenance.read_source(Path(path), f"gain file of {name}")[0])
     count = advance or (lambda _: None)
     truth, hardware = config.truth, config.hardware
     errors = frequency_errors(config)
@@ -178,7 +172,7 @@ def design_report(
         frequency_hz=grid,
         errors_hz=errors,
         files=tuple(files),
-        versions=program_versions(("cvxpy", "clarabel") if solved else ()),
+        versions=provenance.program_versions(("cvxpy", "clarabel") if solved else ()),
         made=made,
     )
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -18,11 +19,13 @@ if TYPE_CHECKING:
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
-def house_style() -> AbstractContextManager[None]:
+@contextmanager
+def house_style() -> Iterator[None]:
     """Matplotlib settings of this package, for the time of the block."""
     import matplotlib as mpl
 
-    return mpl.rc_context(_style())
+    with mpl.rc_context(_style()):
+        yield
 
 
 @cache

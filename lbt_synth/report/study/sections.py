@@ -12,42 +12,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.report import provenance
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Section
 from lbt_synth.report.page.words import paragraph
-from lbt_synth.report.provenance import (
-    SourceFile,
-    creation_time,
-    program_versions,
-    read_source,
-    versions_table,
-)
-from lbt_synth.report.study.charts import (
-    conditional_charts,
-    distribution_chart,
-    loss_chart,
-    map_charts,
-    parameter_chart,
-    sensitivity_chart,
-)
+from lbt_synth.report.study import charts
 from lbt_synth.storage.array_file import digest
 from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies import ControllerStatistics, Failure, Study, StudyStatistics
+from lbt_synth.studies.study import summary
 from lbt_synth.studies.study.controller_samples import (
     ControllerSamples,
     read_column,
     read_controller_samples,
-)
-from lbt_synth.studies.study.summary import (
-    comparison_table,
-    percent,
-    residual_table,
-    sensitivity_table,
-    short_names,
-    strehl_table,
-    swing_table,
-    varying_parameters,
-    worst_table,
 )
 from lbt_synth.validation import FloatArray
 
@@ -77,7 +54,7 @@ class StudyInfo:
     digests: dict[str, str]
     digest: str  # Digest of the study
     failures: tuple[Failure, ...]  # Evaluations that failed
-    files: tuple[SourceFile, ...]  # Files that it was read from
+    files: tuple[provenance.SourceFile, ...]  # Files that it was read from
     texts: dict[str, str]  # The study file and the configuration, by their names
     versions: tuple[tuple[str, str], ...]  # Programs and their versions
     made: datetime  # When the page was made
@@ -98,7 +75,7 @@ def study_info(
     files, texts = [], {}
     for place, path in enumerate(study.inputs):
         role = roles[place] if place < len(roles) else "gain file"
-        source, content = read_source(path, role)
+        source, content = provenance.read_source(path, role)
         files.append(source)
         if place < len(roles):
             texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8", "replace")
@@ -118,8 +95,8 @@ def study_info(
         failures=tuple(failures),
         files=tuple(files),
         texts=texts,
-        versions=program_versions(),
-        made=creation_time(),
+        versions=provenance.program_versions(),
+        made=provenance.creation_time(),
         computing_s=computing_s,
         replay=shlex.join(["lbt-synth", "study", os.fspath(study.source)])
         + f" -o {shlex.quote(os.fspath(directory))} --row {{row}}",
@@ -139,7 +116,7 @@ def study_sections(
     values = {
         name: read_column(columns, name, statistics.samples) for name in statistics.parameters
     }
-    names = short_names(statistics.parameters)
+    names = summary.short_names(statistics.parameters)
     sections = (
         _summary_section(info, statistics, found),
         _samples_section(info, values, names),
@@ -147,7 +124,11 @@ def study_sections(
         _comparison_section(statistics, found),
         _dependence_section(statistics, found, values, names),
         _worst_section(info, statistics, names),
-        _reading_section(),
+        Section(
+            key="reading",
+            title="How to read the figures",
+            blocks=tuple(Paragraph(text=paragraph(name)) for name in ("intervals", "indices")),
+        ),
         _origin_section(info, statistics),
     )
     return [section for section in sections if section.blocks]
@@ -165,7 +146,7 @@ def _summary_section(
     if unstable:
         parts = ", ".join(
             f"{each.controller} in {each.unstable.count} of {each.samples} "
-            f"({percent(each.unstable.value, 2)} %)"
+            f"({summary.percent(each.unstable.value, 2)} %)"
             for each in unstable
         )
         warnings.append(f"Unstable loops: {parts}.")
@@ -176,8 +157,13 @@ def _summary_section(
     if not unstable and not failed and statistics.samples:
         text = "Every controller is stable in every sample, and none failed."
         blocks.append(Notice(text=text, tone="good"))
-    blocks += [Paragraph(text=_verdict_text(statistics.controllers)), strehl_table(statistics)]
-    return Section(key="summary", title="Summary", blocks=(*blocks, *distribution_chart(found)))
+    blocks += [
+        Paragraph(text=_verdict_text(statistics.controllers)),
+        summary.strehl_table(statistics),
+    ]
+    return Section(
+        key="summary", title="Summary", blocks=(*blocks, *charts.distribution_chart(found))
+    )
 
 
 def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
@@ -188,7 +174,7 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
 
     def leader(value: Callable[[ControllerStatistics], float]) -> str:
         best = max(with_data, key=value)
-        return f"{best.controller}, {percent(value(best))} %"
+        return f"{best.controller}, {summary.percent(value(best))} %"
 
     text = paragraph(
         "leaders",
@@ -200,7 +186,7 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     loss = least.loss.loss[1].value
     if len(with_data) == 1 or not np.isfinite(loss):
         return text
-    return f"{text} {paragraph('regret', name=least.controller, loss=percent(loss))}"
+    return f"{text} {paragraph('regret', name=least.controller, loss=summary.percent(loss))}"
 
 
 def _samples_section(
@@ -224,7 +210,11 @@ def _samples_section(
         words=(1, 2),
     )
     opening = f"{info.samples} samples, {info.sampling}; {info.evaluation}."
-    blocks = (Paragraph(text=opening), table, *(parameter_chart(values, names) if rows else ()))
+    blocks = (
+        Paragraph(text=opening),
+        table,
+        *(charts.parameter_chart(values, names) if rows else ()),
+    )
     return Section(key="samples", title="What was sampled", blocks=blocks)
 
 
@@ -278,11 +268,11 @@ def _count_cell(count: int) -> Cell:
 
 def _comparison_section(statistics: StudyStatistics, found: Sequence[ControllerSamples]) -> Section:
     """Compare the controllers on the same samples."""
-    table = comparison_table(statistics)
+    table = summary.comparison_table(statistics)
     blocks: tuple[Block, ...] = (
         *([table] if table.rows else []),
-        *loss_chart(found),
-        residual_table(statistics),
+        *charts.loss_chart(found),
+        summary.residual_table(statistics),
     )
     return Section(key="comparison", title="Comparison on the same samples", blocks=blocks)
 
@@ -294,15 +284,15 @@ def _dependence_section(
     names: Mapping[str, str],
 ) -> Section:
     """Show what the Strehl ratio depends on."""
-    if not varying_parameters(statistics):
+    if not summary.varying_parameters(statistics):
         blocks: tuple[Block, ...] = (Notice(text=paragraph("no-index")),)
         return Section(key="dependence", title="Dependence", blocks=blocks)
     blocks = (
-        *sensitivity_chart(statistics, names),
-        sensitivity_table(statistics, names=names),
-        swing_table(statistics, names=names),
-        *conditional_charts(statistics, names),
-        *map_charts(statistics, found, values, names),
+        *charts.sensitivity_chart(statistics, names),
+        summary.sensitivity_table(statistics, names=names),
+        summary.swing_table(statistics, names=names),
+        *charts.conditional_charts(statistics, names),
+        *charts.map_charts(statistics, found, values, names),
     )
     return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)
 
@@ -320,7 +310,7 @@ def _worst_section(
             others = tuple(name for name in statistics.parameters if name not in ranked)
             shown = (ranked or others)[:_PARAMETERS]
             most = max(most, len(ranked) - len(shown))
-            blocks.append(worst_table(each, shown, names=names))
+            blocks.append(summary.worst_table(each, shown, names=names))
             commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
     if most:
         blocks.insert(0, Paragraph(text=paragraph("worst", count=_PARAMETERS)))
@@ -328,12 +318,6 @@ def _worst_section(
         caption = "Commands that replay the first of each table; any other row likewise"
         blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
     return Section(key="worst", title="Worst samples", blocks=tuple(blocks))
-
-
-def _reading_section() -> Section:
-    """Explain how the figures are to be read."""
-    blocks = tuple(Paragraph(text=paragraph(name)) for name in ("intervals", "indices"))
-    return Section(key="reading", title="How to read the figures", blocks=blocks)
 
 
 def _origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
@@ -350,7 +334,7 @@ def _origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
         blocks=(
             Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,)),
             *([row_table("Files that were read", info.files)] if info.files else ()),
-            versions_table(info.versions),
+            provenance.versions_table(info.versions),
             *(Listing(caption=caption, text=text) for caption, text in info.texts.items()),
         ),
     )
