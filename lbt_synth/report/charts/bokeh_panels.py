@@ -146,6 +146,7 @@ def _draw_curve(figure: Any, panel: Panel, curve: Curve) -> list[Any]:
         number = curve.look if curve.dash is None else curve.dash
         strokes = [max(1, round(2.4 * s)) for s in dashes(number)]
         style = {"line_color": shade, "line_width": 1.25 * curve.width, "line_dash": strokes}
+        style["line_alpha"] = curve.opacity
         if curve.step:
             drawn.append(figure.step(x, y, mode=curve.step, **style))
         else:

@@ -57,6 +57,7 @@ class Curve:
     filled: bool = True  # Whether markers are filled
     size: float = 5.0  # Size of a marker [points]
     width: float = 1.6  # Width of the line [points]
+    opacity: float = 1.0  # Below 1 a line shows what is under it
     dash: int | None = None  # Number of its dashes, 0 is solid; None is that of its look
     hover: bool = True  # Whether its values are shown under the pointer
 

@@ -180,6 +180,7 @@ def _curve_style(curve: Curve) -> dict[str, Any]:
     style: dict[str, Any] = {
         "color": colour(curve.look),
         "linewidth": curve.width,
+        "alpha": curve.opacity if curve.opacity < 1 else None,
         "linestyle": ((0, strokes) if strokes else "-") if curve.line else "none",
     }
     if curve.marker is not None:

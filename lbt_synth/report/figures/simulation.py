@@ -53,7 +53,7 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
     series, spectra = [], []
     for i in range(n):
         y = run.residual_nm[0, :, i]
-        series.append(Curve(name=names[i], x=time, y=y, look=i, width=0.5, dash=0))
+        series.append(Curve(name=names[i], x=time, y=y, look=i, width=0.5, opacity=0.8, dash=0))
         # the residual is solid, what there was before it is dotted
         for data, word, dash in ((run.total_nm, "open loop", 3), (run.residual_nm, "residual", 0)):
             f, s = welch(data[:, :, i], fs=run.frame_rate_hz, nperseg=min(frames, 2048), axis=1)
