@@ -173,10 +173,10 @@ def identify(parser: ArgumentParser) -> None:
 
 def auto(parser: ArgumentParser) -> None:
     """Go from a record to a gain file: identify, design, certify, test on unseen data."""
-    from lbt_synth.methods.registry import record_methods
+    from lbt_synth.methods.registry import default_method, record_methods
 
     _add_record(parser)
-    add_option(parser, "--method", record_methods(), "default: the Kalman filter")
+    add_option(parser, "--method", record_methods(), f"default {default_method()}")
     text = "norm as a multiple of the least norm, for methods with a bound"
     add_option(parser, "--gamma-ratio", float, text, 1.2)
     add_option(parser, "--model", str, "configuration to write (default: the output's name, .yaml)")

@@ -11,6 +11,8 @@ from pydantic_core import PydanticUndefined
 from lbt_synth.methods.method import Method
 from lbt_synth.methods.registry import all_methods, option_names
 
+_LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+
 
 def add_method_options(parser: ArgumentParser) -> None:
     """Add ``--method`` and the options of all methods; each method checks its own."""
@@ -19,7 +21,10 @@ def add_method_options(parser: ArgumentParser) -> None:
         "--method",
         choices=tuple(methods),
         required=True,
-        help="; ".join(f"{name}: {method.title}" for name, method in methods.items()),
+        help="; ".join(
+            name if name == method.title else f"{name}: {method.title}"
+            for name, method in methods.items()
+        ),
     )
     for name in option_names():
         owners = [method for method in methods.values() if name in method.options.model_fields]
@@ -27,12 +32,20 @@ def add_method_options(parser: ArgumentParser) -> None:
         for method in owners:
             helps.setdefault(_help_text(method, name), []).append(method.name)
         text = "; ".join(f"{', '.join(names)}: {text}" for text, names in helps.items())
+        if others := sorted({o for m in owners if name in m.exclusive for o in m.exclusive}):
+            text += f"; at most one of {', '.join(map(_flag, others))}"
         kinds = _kinds(owners[0].options.model_fields[name])
+        words = dict.fromkeys(c for m in owners for c in _choices(m.options.model_fields[name]))
         parser.add_argument(
-            f"--{name.replace('_', '-')}",
+            _flag(name),
             type=next((kind for kind in (int, float) if kind in kinds), str),
+            metavar=f"{{{','.join(words)}}}" if words else None,
             help=text.replace("%", "%%"),
         )
+
+
+def _flag(option: str) -> str:
+    return f"--{option.replace('_', '-')}"
 
 
 def _kinds(option: FieldInfo) -> tuple[Any, ...]:
@@ -42,19 +55,25 @@ def _kinds(option: FieldInfo) -> tuple[Any, ...]:
     return get_args(option.annotation) or (option.annotation,)
 
 
+def _choices(option: FieldInfo) -> list[str]:
+    return [c for kind in _kinds(option) if get_origin(kind) is Literal for c in get_args(kind)]
+
+
 def _help_text(method: Method, name: str) -> str:
     """Return the description of an option with its choices or its range, and its default."""
     option = method.options.model_fields[name]
-    choices = [c for kind in _kinds(option) if get_origin(kind) is Literal for c in get_args(kind)]
-    low, high = (
-        next((getattr(limit, end) for limit in option.metadata if hasattr(limit, end)), None)
-        for end in ("ge", "le")
-    )
+    choices = _choices(option)
+    limits = {
+        end: getattr(limit, end)
+        for limit in option.metadata
+        for end in _LIMITS
+        if getattr(limit, end, None) is not None
+    }
     text = option.description or ""
-    if choices:
+    if choices and not all(choice in text for choice in choices):
         text += f", {' or '.join(choices)}"
-    elif low is not None and high is not None:
-        text += f", {low} to {high}"
+    if limits:
+        text += f", {' and '.join(f'{_LIMITS[end]} {limit:g}' for end, limit in limits.items())}"
     if option.default in (None, PydanticUndefined):
         return text
     if name in method.configurable:

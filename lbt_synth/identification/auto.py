@@ -18,7 +18,7 @@ from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.loop import Imaging, close_loop
-from lbt_synth.methods.registry import record_methods, reference_methods
+from lbt_synth.methods.registry import default_method, record_methods
 from lbt_synth.methods.request import DesignRequest, PlantInputs, design_request
 from lbt_synth.validation import choice, number, require_instance
 
@@ -125,7 +125,7 @@ def design_from_record(
     True
     """
     require_instance(record, LoopRecord)
-    chosen = reference_methods(estimators_only=True)[0].name if method is None else method
+    chosen = default_method() if method is None else method
     choice(chosen, "method", record_methods())
     number(
         gamma_ratio,

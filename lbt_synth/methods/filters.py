@@ -32,7 +32,12 @@ class BoundOptions(Section):
 
     gamma: float | None = Field(default=None, gt=0, description="bound of the H-infinity norm [nm]")
     gamma_ratio: float = Field(
-        default=1.2, ge=1, description="bound of the norm as a multiple of the least norm"
+        default=1.2,
+        ge=1,
+        description="bound of the norm as a multiple of the least norm",
+        json_schema_extra={
+            "hint": "At 1 the bound is the least one; far above it the filter is the Kalman filter."
+        },
     )
     horizon: Horizon = 1
 
@@ -48,7 +53,7 @@ class FilterFacts:
     rms: float = column("estimation error, rms", unit="nm")
     gamma: float = column("estimation error, H-infinity norm", unit="nm")
     limit_nm: float | None = column("least residual of any linear controller", unit="nm")
-    above_limit_percent: float | None = column("estimation error above it", unit="%")
+    above_limit_percent: float | None = column("estimation error above it", unit="%", format=".5f")
     rms_requested: float | None = column("rms asked for", unit="nm")
     gamma_requested: float | None = column("bound asked for", unit="nm")
     gamma_least: float | None = column(
@@ -66,7 +71,7 @@ def limit_facts(design: EstimatorDesign) -> dict[str, Any]:
     if design.hardware is None:
         return {"limit_nm": None, "above_limit_percent": None}
     limit_nm, above = model_limit(design)
-    return {"limit_nm": limit_nm, "above_limit_percent": round(above, 6) + 0.0}
+    return {"limit_nm": limit_nm, "above_limit_percent": above}
 
 
 def _describe_filter(design: FilterDesign) -> Description:

@@ -34,7 +34,7 @@ class LqgFacts:
     rms: float = column("residual, rms", unit="nm")
     gamma: float = column("residual, H-infinity norm", unit="nm")
     limit_nm: float | None = column("least residual of any linear controller", unit="nm")
-    above_limit_percent: float | None = column("residual above it", unit="%")
+    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
     command_weight: float = column("weight of the command")
 
 

@@ -24,11 +24,11 @@ class PolytopicOptions(Section):
     """Options of the filter for an interval."""
 
     half_width_hz: float = Field(
-        gt=0, description="half width of the interval of vibration frequencies [Hz]", examples=[1]
+        ge=0, description="half width of the interval of vibration frequencies [Hz]", examples=[1]
     )
     norm: Literal["hinf", "h2"] = Field(
         default="hinf",
-        description="what is minimised over the interval, the H-infinity norm or the rms",
+        description="what is minimised over the interval: hinf (H-infinity norm) or h2 (rms)",
     )
     horizon: Horizon = 1
 
@@ -40,7 +40,7 @@ class PolytopicFacts:
     rms: float = column("estimation error at the centre, rms", unit="nm")
     gamma: float = column("estimation error at the centre, H-infinity norm", unit="nm")
     limit_nm: float | None = column("least residual of any linear controller", unit="nm")
-    above_limit_percent: float | None = column("estimation error above it", unit="%")
+    above_limit_percent: float | None = column("estimation error above it", unit="%", format=".5f")
     half_width_hz: float = column("half width of the interval of frequencies", unit="Hz")
     low_hz: float = column("interval of frequencies, from", unit="Hz")
     high_hz: float = column("interval of frequencies, to", unit="Hz")

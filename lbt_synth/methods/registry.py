@@ -159,6 +159,11 @@ def record_methods() -> list[str]:
     return [n for n, m in all_methods().items() if m.estimator and not m.needs_options]
 
 
+def default_method() -> str:
+    """Return the name of the method that is designed unless another is named."""
+    return reference_methods(estimators_only=True)[0].name
+
+
 def reference_methods(*, estimators_only: bool = False) -> list[Method]:
     """Return the methods that studies compare designs with, in their order."""
     found = [m for m in all_methods().values() if m.reference is not None]

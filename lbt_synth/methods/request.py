@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -31,10 +32,15 @@ _SHORT_WORDS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wording:
-    """How a surface writes a method and an option."""
+    """How a surface writes a method and an option, and the place in a file that has them."""
 
     method: str = "method {}"
     option: str = "{}"
+    place: str = ""
+
+    def place_of(self, option: str) -> str:
+        """Return where an option stands."""
+        return f"{self.place}.{option}" if self.place else self.name(option)
 
     def name(self, option: str) -> str:
         """Return the name of an option as people write it."""
@@ -79,28 +85,22 @@ def design_request(
     """Check the options of a method; ProblemError in the words of the surface they came from."""
     method, words = method_named(name), wording or Wording()
     called = words.method.format(name)
+    where = f"{words.place}: {called}" if words.place else called
     for option in given:
         if option not in method.options.model_fields:
-            owners = option_owners(option)
-            if not owners:
-                raise ProblemError(f"{called} has no option {words.name(option)}.")
-            extra = method_named(owners[0]).options.model_fields[option].json_schema_extra
-            raise ProblemError(
-                f"{words.name(option)} goes with {words.method.format(' or '.join(owners))}; got "
-                f"{called}." + (f" {extra['instead']}" if isinstance(extra, dict) else "")
-            )
+            raise ProblemError(_describe_stranger(option, method, called, words))
     both = [option for option in given if option in method.exclusive]
     if len(both) > 1:
         names = ", ".join(
             map(words.name, sorted(method.exclusive & method.options.model_fields.keys()))
         )
         raise ProblemError(
-            f"{called} takes at most one of {names}; got {' and '.join(map(words.name, both))}."
+            f"{where} takes at most one of {names}; got {' and '.join(map(words.name, both))}."
         )
     try:
         options = method.options.model_validate(dict(given))
     except ValidationError as error:
-        raise ProblemError(_describe_error(error, method, called, words)) from None
+        raise ProblemError(_describe_error(error, method, where, words)) from None
     return DesignRequest(method=method, given=dict(given), options=options)
 
 
@@ -109,20 +109,42 @@ def option_owners(option: str) -> list[str]:
     return [m.name for m in all_methods().values() if option in m.options.model_fields]
 
 
-def _describe_error(error: ValidationError, method: Method, called: str, words: Wording) -> str:
+def _describe_stranger(option: str, method: Method, called: str, words: Wording) -> str:
+    """Describe an option that a method does not have."""
+    place, owners = words.place_of(option), option_owners(option)
+    if owners:
+        extra = _extra(method_named(owners[0]), option).get("instead", "")
+        others = words.method.format(" or ".join(owners))
+        return f"{place} goes with {others}; got {called}. {extra}".rstrip()
+    known = sorted(method.options.model_fields)
+    close = difflib.get_close_matches(option, known, n=1)
+    hint = f"did you mean {words.name(close[0])}?" if close else f"known are {', '.join(known)}."
+    return f"{place} is no option of {called}; {hint}"
+
+
+def _extra(method: Method, option: str) -> dict[str, Any]:
+    """Return what an option says beyond its type: advice where it is refused."""
+    extra = method.options.model_fields[option].json_schema_extra
+    return extra if isinstance(extra, dict) else {}
+
+
+def _describe_error(error: ValidationError, method: Method, where: str, words: Wording) -> str:
     first = error.errors()[0]
     option = str(first["loc"][0])
     name, field = words.name(option), method.options.model_fields[option]
     if first["type"] == "missing":
         example = f"; try {name} {field.examples[0]}" if field.examples else ""
-        return f"{called} needs {name}, the {field.description}{example}."
+        return f"{where} needs {name}, the {field.description}{example}."
     if first["type"] == "literal_error":
         expected = first["ctx"]["expected"].replace("'", "")
-        return f"{called} takes {name} {expected}; got {name} {first['input']}."
+        return f"{where} takes {name} {expected}; got {name} {first['input']}."
     text = first["msg"].removeprefix("Input should be ")
     for long, short in _SHORT_WORDS.items():
         text = text.replace(long, short)
-    return f"{name} must be {text}; got {first['input']!r}."
+    got = first["input"]
+    shown = f"{got:g}" if isinstance(got, float) else repr(got)
+    hint = _extra(method, option).get("hint", "")
+    return f"{words.place_of(option)} must be {text}; got {shown}. {hint}".rstrip()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

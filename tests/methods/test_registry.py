@@ -68,13 +68,13 @@ def test_every_command_takes_a_method_that_is_registered(leaky, tmp_path, capsys
     help_text = " ".join(text.split())
     assert "leaky: leaky integrator" in help_text
     assert "--leak-per-s LEAK_PER_S leaky: part of the command lost [1/s]" in help_text
-    assert "leaky: its gain (default: the configuration's, else 0.3)" in help_text
+    assert "leaky: its gain, above 0 (default: the configuration's, else 0.3)" in help_text
     design = ("design", CONFIG, "--method", "leaky", "-o", gain)
     status, _, error = run(capsys, *design)
     assert (status, "--leak-per-s, the part of the command lost" in error) == (2, True)
     assert "try --leak-per-s 5" in error
     status, _, error = run(capsys, *design, "--leak-per-s", "-1")
-    assert (status, error) == (2, "lbt-synth: error: --leak-per-s must be above 0; got -1.0.\n")
+    assert (status, error) == (2, "lbt-synth: error: --leak-per-s must be above 0; got -1.\n")
     status, out, error = run(capsys, *design, "--leak-per-s", "5")
     assert (status, error) == (0, "")
     assert "What is left" in out
@@ -116,7 +116,7 @@ def test_a_study_takes_a_method_that_is_registered(leaky, tmp_path, capsys):
     study.write_text(STUDY.format(config=CONFIG, leak=-1.0))
     status, _, error = run(capsys, "study", study, "-o", tmp_path / "out2")
     assert status == 2
-    assert "controllers.own: leak_per_s must be above 0; got -1.0" in error
+    assert "controllers.own.leak_per_s must be above 0; got -1." in error
 
 
 def test_a_package_adds_a_method_by_its_entry_point(tmp_path):
@@ -151,3 +151,16 @@ def method_names_in(path):
     tree = ast.parse(path.read_text(encoding="utf-8"))
     strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
     return strings & {*BUILT_IN, "polytopic-hinf", "polytopic-h2", "shaped"}
+
+
+def test_an_option_that_no_method_has(tmp_path, capsys):
+    study = tmp_path / "study.yaml"
+    text = STUDY.format(config=CONFIG, leak=5.0).replace("leaky", "hinf")
+    study.write_text(text.replace("leak_per_s: 5.0", "gama_ratio: 1.2"))
+    status, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
+    assert status == 2
+    assert "controllers.forgetful.gama_ratio is no option of design: hinf; did you mean " in error
+    assert "gamma_ratio?" in error
+    study.write_text(text.replace("leak_per_s: 5.0", "weird: 1.2"))
+    _, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
+    assert "known are gamma, gamma_ratio, horizon, route." in error

@@ -34,7 +34,6 @@ _OPTIONS_IN_DIGEST = {
     *("route", "horizon", "gamma", "gamma_ratio", "rms", "taps"),
     *("norm", "half_width_hz", "command_weight", "gain"),
 }
-_WORDING = Wording(method="design: {}")
 # The oldest version whose results this one repeats to rounding: studies that it began are read
 # and resumed. Raise it with any change that moves a result.
 _SAME_RESULTS_SINCE = "0.1.0"
@@ -149,8 +148,10 @@ def _designed_controller(study: Study, name: str, stored: Design | None) -> Stud
     assert section.design is not None  # the schema requires a file or a design
     with name_file(study.source), name_key(f"controllers.{name}.design"):
         method_named(section.design)
-    with name_file(study.source), name_key(f"controllers.{name}"):
-        request = design_request(section.design, section.options, _WORDING)
+    place = f"controllers.{name}"
+    with refuse_config(f"{study.source}", place):
+        words = Wording(method="design: {}", place=place)
+        request = design_request(section.design, section.options, words)
     if section.for_ == "sample":
         origin = f"{request.text} for each sample"
         return StudyController(name=name, request=request, design=None, origin=origin)
