@@ -203,8 +203,8 @@ def record_from_telemetry(
     Raises
     ------
     ProblemError
-        If tip and tilt cannot be told among the modes, slopes come without what makes modes of
-        them, or a unit or rate is unknown or contradicted.
+        If it is not known which modes are tip and tilt, slopes come without a reconstructor, or a
+        unit or rate is unknown or contradicted.
 
     Examples
     --------
