@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from support import leaky_method
 from support.commands import run
+from support.design_reports import SMALL
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
@@ -62,14 +63,15 @@ def config():
 
 def test_every_command_takes_a_method_that_is_registered(leaky, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    gain = "leaky.fits"
+    Path("small.yaml").write_text(SMALL)
+    gain, small = "leaky.fits", "small.yaml"
     status, text, _ = run(capsys, "design", "--help")
     assert status == 0
     help_text = " ".join(text.split())
     assert "leaky: leaky integrator" in help_text
     assert "--leak-per-s LEAK_PER_S leaky: part of the command lost [1/s]" in help_text
     assert "leaky: its gain, above 0 (default: the configuration's, else 0.3)" in help_text
-    design = ("design", CONFIG, "--method", "leaky", "-o", gain)
+    design = ("design", small, "--method", "leaky", "-o", gain)
     status, _, error = run(capsys, *design)
     assert (status, "--leak-per-s, the part of the command lost" in error) == (2, True)
     assert "try --leak-per-s 5" in error
@@ -87,9 +89,9 @@ def test_every_command_takes_a_method_that_is_registered(leaky, tmp_path, capsys
     assert shown["matrices"]["forgets"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))
     assert run(capsys, "verify", gain)[0] == 0
     assert run(capsys, "sigma", gain, "-o", "sigma.png")[0] == 0
-    status, out, _ = run(capsys, "simulate", CONFIG, gain, "--frames", "400", "--cases", "1")
+    status, out, _ = run(capsys, "simulate", small, gain, "--frames", "400", "--cases", "1")
     assert (status, "Strehl ratio" in out) == (0, True)
-    assert run(capsys, "report", CONFIG, gain, "-o", "report.html")[0] == 0
+    assert run(capsys, "report", small, gain, "-o", "report.html")[0] == 0
     assert "leaky" in Path("report.html").read_text()
 
 
