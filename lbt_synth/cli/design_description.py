@@ -12,8 +12,7 @@ from lbt_synth.design import Design
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage import rows
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
 from lbt_synth.storage.tables import Table
 
 _SMALL_MODULUS = 0.3
@@ -52,11 +51,16 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
             "controller_spectral_radius": design.controller.to_statespace().spectral_radius,
         }
     )
-    if design.hardware is None:
-        report.add_facts("Design", said, described.facts)
-        report.tables[0] = _without_units(report.tables[0])
-    else:
-        _add_loop(report, design, design.hardware, said, described.facts)
+    facts: list[Any] = [said, described.facts]
+    margins = None
+    if design.hardware is not None:
+        facts.append(_loop_facts(report, design.hardware))
+        margins = loop_margins(close_loop(design.hardware, design.controller))
+        report.data["margins"] = json_record(margins)
+        report.notes += _loop_notes(design, design.hardware, report.data)
+    report.add_records(*facts)
+    printed = fact_table("Design", *facts, *([] if margins is None else [margins]))
+    report.tables.append(_without_units(printed) if margins is None else printed)
     report.notes += described.notes
     for table in described.tables:
         report.add_rows(table.key, table.title, table.rows)
@@ -75,20 +79,14 @@ def _without_units(table: Table) -> Table:
     return replace(table, rows=tuple((*row[:2], "") for row in table.rows))
 
 
-def _add_loop(report: Report, design: Design, hardware: LoopHardware, *facts: Any) -> None:
-    """Add the facts of a design with those of its loop, and what to note of it."""
-    margins = loop_margins(close_loop(hardware, design.controller))
-    settling_s = None
+def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
+    """Return the facts of a loop; the data get its mirror, if that has dynamics."""
+    settling_ms = None
     if hardware.mirror is not None:
         settling_s = hardware.mirror.step_response().settling_s
         report.data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
-    loop = fill_row(
-        LoopFacts, hardware, settling_ms=None if settling_s is None else 1e3 * settling_s
-    )
-    report.add_facts("Design", *facts, loop)
-    report.tables[0] = rows.fact_table("Design", *facts, loop, margins)
-    report.data["margins"] = rows.json_record(margins)
-    report.notes += _loop_notes(design, hardware, report.data)
+        settling_ms = 1e3 * settling_s
+    return fill_row(LoopFacts, hardware, settling_ms=settling_ms)
 
 
 def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:

@@ -55,9 +55,8 @@ def run(arguments: Namespace) -> Report:
 
 def _config_designs(config: Config) -> dict[str, Design]:
     return {
-        method.name: config.design(method.name, **method.reference[1])
+        method.name: config.design(method.name, **method.reference_options)
         for method in reference_methods()
-        if method.reference is not None
     }
 
 

@@ -57,12 +57,16 @@ class Report:
         self._add_units(found[0])
         self.tables.append(row_table(caption, found, without=(*without, *hidden)))
 
-    def add_facts(self, caption: str, *facts: Any, key: str = "") -> None:
-        """Add the values of rows to the data, or under a key of it, and as a table, one a line."""
+    def add_records(self, *rows: Any, key: str = "") -> None:
+        """Add the values of rows, with their units, to the data or under a key of it."""
         data = self.data.setdefault(key, {}) if key else self.data
-        for row in facts:
+        for row in rows:
             data |= json_record(row)
             self._add_units(row)
+
+    def add_facts(self, caption: str, *facts: Any, key: str = "") -> None:
+        """Add the values of rows to the data, or under a key of it, and as a table, one a line."""
+        self.add_records(*facts, key=key)
         self.tables.append(fact_table(caption, *facts))
 
     def _add_units(self, row: Any) -> None:

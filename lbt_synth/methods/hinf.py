@@ -35,5 +35,6 @@ METHOD = filter_method(
     build=_build,
     exclusive=BOUNDS,
     configurable=frozenset({"gamma_ratio"}),
-    reference=(2, {"route": "riccati"}),
+    reference_rank=2,
+    reference_options={"route": "riccati"},
 )

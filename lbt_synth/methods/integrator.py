@@ -64,5 +64,5 @@ METHOD = Method(
     unpack=_unpack,
     describe=_describe,
     estimator=False,
-    reference=(0, {}),
+    reference_rank=0,
 )

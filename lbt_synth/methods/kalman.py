@@ -33,5 +33,5 @@ METHOD = filter_method(
     options=KalmanOptions,
     build=_build,
     batched=True,
-    reference=(1, {}),
+    reference_rank=1,
 )

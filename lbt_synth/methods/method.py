@@ -169,8 +169,10 @@ class Method:
         Whether the design depends on the vibrations of the plant.
     batched : bool
         Whether a study designs it for many samples at once.
-    reference : tuple or None
-        Rank among the methods that studies compare designs with, and the options it has there.
+    reference_rank : int or None
+        Rank among the methods that studies compare designs with; None if it is not one.
+    reference_options : mapping
+        Options that it has in such a comparison.
 
     Examples
     --------
@@ -193,7 +195,8 @@ class Method:
     configurable: frozenset[str] = frozenset()
     estimator: bool = True
     batched: bool = False
-    reference: tuple[int, Mapping[str, Any]] | None = None
+    reference_rank: int | None = None
+    reference_options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def needs_options(self) -> bool:

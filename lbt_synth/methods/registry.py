@@ -127,10 +127,15 @@ def method_named(name: str) -> Method:
 
 def method_of_design(name: str) -> Method:
     """Return the method whose designs carry a name in ``Design.method``."""
-    for method in all_methods().values():
-        if name in (method.design_names or (method.name,)):
-            return method
-    raise ProblemError(f"no method of synthesis makes designs of the name {name!r}.")
+    method = _find_method_of_design(name)
+    if method is None:
+        raise ProblemError(f"no method of synthesis makes designs of the name {name!r}.")
+    return method
+
+
+def _find_method_of_design(name: str) -> Method | None:
+    found = (m for m in all_methods().values() if name in (m.design_names or (m.name,)))
+    return next(found, None)
 
 
 def option_names() -> list[str]:
@@ -140,18 +145,14 @@ def option_names() -> list[str]:
 
 def design_title(name: str) -> str:
     """Return what sentences call a design with a name in ``Design.method``, else the name."""
-    try:
-        return method_of_design(name).title
-    except ProblemError:
-        return name
+    method = _find_method_of_design(name)
+    return name if method is None else method.title
 
 
 def design_label(name: str) -> str:
     """Return what figures call a design with a name in ``Design.method``, else the name."""
-    try:
-        return method_of_design(name).label
-    except ProblemError:
-        return name
+    method = _find_method_of_design(name)
+    return name if method is None else method.label
 
 
 def record_methods() -> list[str]:
@@ -166,8 +167,9 @@ def default_method() -> str:
 
 def reference_methods(*, estimators_only: bool = False) -> list[Method]:
     """Return the methods that studies compare designs with, in their order."""
-    found = [m for m in all_methods().values() if m.reference is not None]
-    return sorted(
-        (m for m in found if m.estimator or not estimators_only),
-        key=lambda method: method.reference[0] if method.reference else 0,
-    )
+    ranked = [
+        (method.reference_rank, method.name, method)
+        for method in all_methods().values()
+        if method.reference_rank is not None and (method.estimator or not estimators_only)
+    ]
+    return [method for *_, method in sorted(ranked, key=lambda entry: entry[:2])]

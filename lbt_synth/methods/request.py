@@ -180,5 +180,5 @@ def reference_design(name: str, plant: TipTiltPlant, options: Mapping[str, Any])
     """Design a method for a plant as studies do that compare with it; it takes what it knows."""
     method = method_named(name)
     own = {key: value for key, value in options.items() if key in method.options.model_fields}
-    reference = {} if method.reference is None else method.reference[1]
-    return design_request(name, {**reference, **own}).build(PlantInputs(plant=plant))
+    request = design_request(name, {**method.reference_options, **own})
+    return request.build(PlantInputs(plant=plant))

@@ -23,24 +23,24 @@ from lbt_synth.report.number_text import (
 from lbt_synth.storage.rows import Column, columns
 from lbt_synth.storage.tables import Cell, Table
 
+# titles of what is an interval, not a column of the row
+_GOOD = "within 10 % of its best Strehl ratio [Hz]"
+_GAIN_MARGIN, _STABLE_GAINS = "gain margin, factors", "stable real sensor gains"
 _OWN_CELLS: dict[str, Callable[[DesignReport, DesignAssessment], str | Cell]] = {
     "certified": lambda _, one: _certificate_cell(one),
     "stable": lambda _, one: _stability_cell(one),
     "strehl_simulated": lambda report, one: _simulated_text(report, one),
-    "within 10 % of its best Strehl ratio [Hz]": lambda _, one: _good_text(one),
-    "gain margin, factors": lambda _, one: _gain_margin_text(one),
-    "stable real sensor gains": lambda _, one: _stable_gains_text(one),
+    _GOOD: lambda _, one: _good_text(one),
+    _GAIN_MARGIN: lambda _, one: _gain_margin_text(one),
+    _STABLE_GAINS: lambda _, one: _stable_gains_text(one),
 }
 _DESIGN = ("method", "route", "n_states", "multiplications", "gamma", "estimation_rms", "certified")
 _LOOP = (
     *("stable", "spectral_radius", "residual_nm", "turbulence_nm", "vibration_nm", "noise_nm"),
     *("strehl", "strehl_simulated"),
 )
-_RANGE = ("worst_nm", "worst_strehl", "within 10 % of its best Strehl ratio [Hz]")
-_MARGINS = (
-    *("modulus", "gain margin, factors", "phase_deg", "delay_frames", "crossover_hz"),
-    "stable real sensor gains",
-)
+_RANGE = ("worst_nm", "worst_strehl", _GOOD)
+_MARGINS = ("modulus", _GAIN_MARGIN, "phase_deg", "delay_frames", "crossover_hz", _STABLE_GAINS)
 
 
 def summary_table(report: DesignReport) -> Table:
