@@ -11,6 +11,11 @@ from .fit.identified_model import Whiteness as Whiteness
 from .prediction.comparison import PredictionRow as PredictionRow
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
+from .prediction.forward_chaining import ForwardChain as ForwardChain
+from .prediction.forward_chaining import ForwardSplit as ForwardSplit
+from .prediction.forward_chaining import forward_chain as forward_chain
+from .prediction.forward_chaining import forward_splits as forward_splits
+from .prediction.paired_residuals import PairedResiduals as PairedResiduals
 from .prediction.predictor import LeastSquaresPredictor as LeastSquaresPredictor
 from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import ResidualEstimate as ResidualEstimate

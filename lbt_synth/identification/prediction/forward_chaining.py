@@ -1,0 +1,323 @@
+"""Forward chaining: train on the past of a record, score on what follows, several times.
+
+The usable frames after the first half are divided into as many tests as there are splits. What is
+tested on one of them is trained on everything before it, sensor gain and noise included, so that
+all that compete on a split see the same pseudo-open-loop series and the same frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.design import Design
+from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.identification.fit.both_axes import identify
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.prediction.paired_residuals import PairedResiduals, chunk_squares
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
+from lbt_synth.linear import Controller
+from lbt_synth.loop import close_loop, filter_series
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, integer, number, require_instance
+
+_START_S = 0.5  # after the beginning of a stretch, where a controller starts from rest
+
+
+def forward_splits(
+    stretches: StretchesLike | None, frames: int, *, splits: int = 3, first_share: float = 0.5
+) -> tuple[tuple[Stretches, Stretches], ...]:
+    """Divide a record into pairs of frames to train on and later frames to test on.
+
+    Parameters
+    ----------
+    stretches : sequence of (start, stop), or None
+        Contiguous usable frames, in order; None for the whole record.
+    frames : int
+        Frames of the record.
+    splits : int, optional
+        Number of pairs.
+    first_share : float, optional
+        Part of the usable frames that the first pair trains on, in (0, 1). The rest is divided
+        into tests of equal length.
+
+    Returns
+    -------
+    tuple of (training, test)
+        Stretches ((start, stop), ...) of each; a test begins where its training ends.
+
+    Raises
+    ------
+    ProblemError
+        If the stretches do not fit the record, or a test is left without frames.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> for training, test in lbt.identification.forward_splits(
+    ...     [(0, 60), (70, 130)], 130, splits=2
+    ... ):
+    ...     print(training, test)
+    ((0, 60),) ((70, 100),)
+    ((0, 60), (70, 100)) ((100, 130),)
+    """
+    pairs = checked_stretches(stretches, integer(frames, "frames", at_least=1))
+    count = integer(splits, "splits", at_least=1)
+    share = number(first_share, "first_share", above=0, below=1)
+    usable = sum(stop - start for start, stop in pairs)
+    cuts = np.round(usable * (share + (1 - share) * np.arange(count + 1) / count)).astype(int)
+    if cuts[0] < 1 or np.any(np.diff(cuts) < 1):
+        raise ProblemError(
+            f"a record must leave frames to train on and to test on; got {usable} usable frames "
+            f"for {count} splits. Record more, or split less."
+        )
+    return tuple(
+        (_cut(pairs, 0, int(start)), _cut(pairs, int(start), int(stop)))
+        for start, stop in pairwise(cuts)
+    )
+
+
+def _cut(stretches: Stretches, first: int, last: int) -> Stretches:
+    """Return the usable frames from one count of them to another."""
+    out, before = [], 0
+    for start, stop in stretches:
+        low, high = max(first - before, 0), min(last - before, stop - start)
+        if low < high:
+            out.append((start + low, start + high))
+        before += stop - start
+    return tuple(out)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ForwardSplit:
+    """One split of a record: its past, with the model that it gives, and the frames after it.
+
+    Attributes
+    ----------
+    record : LoopRecord
+        The record.
+    training, test : tuple of (start, stop)
+        Frames to learn from; frames that count, all of them later.
+    replayed : tuple of (start, stop)
+        For each stretch of the test, the frames that a replay runs over: from where the usable
+        frames before it begin.
+    model : IdentifiedModel
+        Identified from the training.
+    open_loop : (frames, axes) ndarray
+        The pseudo-open-loop series z(k) with the sensor gains of the model [nm].
+    """
+
+    record: LoopRecord
+    training: Stretches
+    test: Stretches
+    replayed: Stretches
+    model: IdentifiedModel
+    open_loop: FloatArray
+
+    @property
+    def hardware(self) -> LoopHardware:
+        """The loop, with the sensor gains of the model."""
+        return self.model.hardware
+
+    @property
+    def noise_nm2(self) -> float:
+        """Variance of the noise in the series, summed over the axes [nm^2]."""
+        return sum((axis.noise_nm / axis.sensor_gain) ** 2 for axis in self.model.axes)
+
+    def measured(self) -> FloatArray:
+        """Return the residual that the loop measured in the test, (frames, axes) [nm]."""
+        residual = self.record.measurements / np.array(self.model.sensor_gains)
+        return np.concatenate([residual[start:stop] for start, stop in self.test])
+
+    def leave(self, residual: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Return what something leaves of the test, (frames, axes) [nm].
+
+        Parameters
+        ----------
+        residual : callable
+            From the series z(k) of contiguous frames, (k, axes), to the measured residual e(k) of
+            the same frames; e(k) may depend on z up to frame k only.
+        """
+        out = []
+        for (start, stop), (first, last) in zip(self.test, self.replayed, strict=True):
+            out.append(residual(self.open_loop[first:last])[start - first : stop - first])
+        return np.concatenate(out)
+
+    def replay(self, controller: Controller) -> FloatArray:
+        """Return the measured residual of a controller in the test, (frames, axes) [nm].
+
+        Parameters
+        ----------
+        controller : Controller
+            From y(k) to u(k). It runs from the beginning of the usable frames before the test.
+
+        Raises
+        ------
+        UnstableLoopError
+            If its loop is unstable.
+        """
+        loop = close_loop(self.hardware, controller)
+        loop.require_stable()
+        return self.leave(lambda z: filter_series(loop.rejection(), z))
+
+
+def forward_split(
+    record: LoopRecord, training: Stretches, test: Stretches, **options: Any
+) -> ForwardSplit:
+    """Identify the past of a split, and find the frames of its test that count.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record; its delay must be known.
+    training, test : tuple of (start, stop)
+        A pair of :func:`forward_splits`.
+    **options
+        Those of :func:`identify`.
+
+    Returns
+    -------
+    ForwardSplit
+        The split.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range, the delay is missing, or there are too few frames: the first
+        half second of each stretch does not count, where a controller would start from rest.
+    NumericalError
+        If the fit fails.
+    """
+    require_instance(record, LoopRecord)
+    settle = round(_START_S * record.frame_rate_hz)
+    kept, replayed = [], []
+    for start, stop in test:
+        first = max((a for a, _ in record.stretches() if a <= start), default=start)
+        begin = max(start, first + settle)
+        if begin < stop:
+            kept.append((begin, stop))
+            replayed.append((first, stop))
+    if not kept:
+        raise ProblemError(
+            f"a test needs a stretch of more than {settle} frames ({_START_S:g} s); got "
+            f"{max(stop - start for start, stop in test)}. Record more, or split less."
+        )
+    model = identify(record, stretches=training, **options)
+    return ForwardSplit(
+        record=record,
+        training=training,
+        test=tuple(kept),
+        replayed=tuple(replayed),
+        model=model,
+        open_loop=record.pseudo_open_loop(model.sensor_gains),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ForwardChain:
+    """Designs from the past of a record, compared on what followed.
+
+    Attributes
+    ----------
+    residuals : PairedResiduals
+        What the designs leave of all tests, one after the other.
+    failures : mapping of str to str
+        Why a design is not among them.
+    """
+
+    residuals: PairedResiduals
+    failures: Mapping[str, str]
+
+
+def forward_chain(
+    record: LoopRecord,
+    designs: Mapping[str, Callable[[ForwardSplit], Controller | Design]],
+    *,
+    splits: int = 3,
+    first_share: float = 0.5,
+    progress: Callable[[int], None] | None = None,
+    **options: Any,
+) -> ForwardChain:
+    """Design controllers from the past of a record, and compare them on what followed.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record; its delay must be known.
+    designs : mapping of str to callable
+        From a :class:`ForwardSplit`, of which they may use the training, to a controller. One that
+        fails on a split, or whose loop is unstable, is left out.
+    splits, first_share
+        As for :func:`forward_splits`.
+    progress : callable, optional
+        Called with 1 after each split.
+    **options
+        Those of :func:`identify`.
+
+    Returns
+    -------
+    ForwardChain
+        Their residuals on the same frames.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range, frames are too few, or no design is left.
+    NumericalError
+        If a fit fails.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=500)
+    >>> line = lbt.Vibration(frequency_hz=40, damping=0.005, rms_nm=50)
+    >>> truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500)
+    >>> ran = lbt.integrator(path, gain=0.3)
+    >>> run = lbt.simulate(ran.controller, truth, hardware=path, frames=20_000)
+    >>> record = lbt.identification.loop_record(
+    ...     run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
+    ... )
+    >>> chain = lbt.identification.forward_chain(
+    ...     record, {"ran": lambda _: ran, "filter": lambda split: lbt.kalman(split.model.plant())}
+    ... )
+    >>> difference, error = chain.residuals.above("ran", chain.residuals.best)
+    >>> chain.residuals.best, bool(difference > 2 * error)
+    ('filter', True)
+    """
+    require_instance(record, LoopRecord)
+    squares: dict[str, list[FloatArray]] = {name: [] for name in designs}
+    failures: dict[str, str] = {}
+    noise: list[tuple[float, int]] = []
+    pairs = forward_splits(
+        record.stretches(), record.frames, splits=splits, first_share=first_share
+    )
+    for training, test in pairs:
+        split = forward_split(record, training, test, **options)
+        for name, build in designs.items():
+            if name in failures:
+                continue
+            try:
+                made = build(split)
+                measured = split.replay(made.controller if isinstance(made, Design) else made)
+            except LbtSynthError as error:
+                failures[name] = str(error)
+                continue
+            squares[name].append(chunk_squares(measured, record.frame_rate_hz))
+        noise.append((split.noise_nm2, sum(stop - start for start, stop in split.test)))
+        if progress is not None:
+            progress(1)
+    left = {name: np.concatenate(squares[name]) for name in designs if name not in failures}
+    if not left:
+        reasons = "; ".join(f"{name}: {why}" for name, why in failures.items())
+        raise ProblemError(f"no design can be compared on this record: {reasons or 'none given.'}")
+    values, frames = zip(*noise, strict=True)
+    residuals = PairedResiduals(
+        squares_nm2=left, noise_nm2=float(np.average(values, weights=frames))
+    )
+    return ForwardChain(residuals=residuals, failures=failures)

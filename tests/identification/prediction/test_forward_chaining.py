@@ -1,0 +1,145 @@
+"""Trained on the past of a record, tested on what follows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.night import GAIN, simulated_night
+
+import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.prediction.forward_chaining import forward_split
+from lbt_synth.identification.prediction.paired_residuals import chunk_squares
+
+forward_splits = lbt.identification.forward_splits
+
+
+@pytest.fixture(scope="module")
+def record():
+    run, path, _ = simulated_night()
+    return lbt.identification.loop_record(
+        run.measurements[0],
+        run.commands[0],
+        frame_rate_hz=path.frame_rate_hz,
+        delay_frames=path.delay_frames,
+        unit="nm",
+    )
+
+
+@pytest.fixture(scope="module")
+def split(record):
+    training, test = forward_splits(record.stretches(), record.frames, splits=2)[0]
+    return forward_split(record, training, test, sensor_gain=GAIN, most_lines=2)
+
+
+def frames_in(stretches):
+    return np.concatenate([np.arange(start, stop) for start, stop in stretches])
+
+
+def test_tests_cover_the_rest_once_and_follow_their_training():
+    usable = [(10, 400), (450, 460), (500, 1001)]
+    pairs = forward_splits(usable, 1200, splits=4, first_share=0.4)
+    everything = frames_in(usable)
+    assert len(pairs) == 4
+    for training, test in pairs:
+        both = np.concatenate([frames_in(training), frames_in(test)])
+        assert np.array_equal(both, everything[: len(both)])
+    tests = np.concatenate([frames_in(test) for _, test in pairs])
+    assert np.array_equal(tests, everything[-len(tests) :])
+    assert len(tests) == pytest.approx(0.6 * len(everything), abs=1)
+    lengths = [len(frames_in(test)) for _, test in pairs]
+    assert max(lengths) - min(lengths) <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"splits": 0}, "splits"),
+        ({"first_share": 1.0}, "first_share"),
+        ({"splits": 7}, "10 usable frames for 7 splits"),
+    ],
+)
+def test_splits_that_a_record_cannot_have(options, words):
+    with pytest.raises(ProblemError, match=words):
+        forward_splits([(0, 10)], 10, **options)
+
+
+def test_a_replay_of_what_ran_is_what_was_measured(split):
+    _, _, ran = simulated_night()
+    # it starts from rest half a record before, and has forgotten that
+    assert np.max(np.abs(split.replay(ran.controller) - split.measured())) < 1e-6
+    assert split.measured().shape == (len(frames_in(split.test)), 2)
+    assert split.noise_nm2 == pytest.approx(2 * (8.0 / GAIN) ** 2, rel=0.05)
+
+
+def test_a_replay_is_a_loop_frame_by_frame(split):
+    design = lbt.kalman(split.model.plant())
+    running = design.controller.start()
+    gain = np.array(split.model.sensor_gains)
+    z = split.open_loop[split.replayed[0][0] : split.replayed[0][1]]
+    commands, left = np.zeros_like(z), np.zeros_like(z)
+    for k in range(len(z)):
+        left[k] = z[k] - (commands[k - 2] if k >= 2 else 0)
+        commands[k] = running.step(gain * left[k])
+    assert split.replay(design.controller) == pytest.approx(
+        left[-len(split.measured()) :], abs=1e-6
+    )
+
+
+def test_the_future_changes_nothing_before_it(record, split):
+    later = split.test[0][1] - 500
+    y = record.measurements.copy()
+    y[later:] += 1000.0
+    changed = replace(record, measurements=y)
+    again = forward_split(changed, split.training, split.test, sensor_gain=GAIN, most_lines=2)
+    assert again.noise_nm2 == split.noise_nm2
+    one, other = (each.replay(lbt.kalman(each.model.plant()).controller) for each in (split, again))
+    assert np.array_equal(one[:-500], other[:-500])
+    assert np.max(np.abs(one[-500:] - other[-500:])) > 500
+
+
+def test_frames_where_a_controller_would_start_from_rest_do_not_count(record):
+    usable = record.usable.copy()
+    usable[8000:8010] = False
+    holed = replace(record, usable=usable)
+    found = forward_split(
+        holed, ((2, 6000),), ((6000, 8000), (8010, 11_000)), sensor_gain=GAIN, most_lines=1
+    )
+    assert found.test == ((6000, 8000), (8510, 11_000))
+    assert found.replayed == ((2, 8000), (8010, 11_000))
+    with pytest.raises(ProblemError, match="more than 500 frames"):
+        forward_split(holed, ((2, 6000),), ((8010, 8300),))
+
+
+def test_designs_are_compared_on_what_follows(record, split):
+    path = split.hardware
+    steps = []
+    chain = lbt.identification.forward_chain(
+        record,
+        {
+            "ran": lambda _: lbt.integrator(lbt.LoopHardware(frame_rate_hz=1000), gain=0.4),
+            "filter": lambda each: lbt.kalman(each.model.plant()),
+            "wild": lambda _: lbt.Controller(
+                A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=path.dt_s
+            ),
+        },
+        splits=2,
+        sensor_gain=GAIN,
+        most_lines=2,
+        progress=steps.append,
+    )
+    assert steps == [1, 1]
+    assert chain.residuals.names == ("filter", "ran")
+    assert list(chain.failures) == ["wild"]
+    assert "unstable" in chain.failures["wild"]
+    exact = chunk_squares(split.replay(lbt.kalman(split.model.plant()).controller), 1000.0)
+    assert np.array_equal(chain.residuals.squares_nm2["filter"][: len(exact)], exact)
+    difference, error = chain.residuals.above("ran", "filter")
+    assert difference > 3 * error
+
+
+def test_a_comparison_without_designs(record):
+    with pytest.raises(ProblemError, match="no design can be compared on this record: none given"):
+        lbt.identification.forward_chain(record, {}, splits=1, sensor_gain=GAIN, most_lines=1)
