@@ -1,0 +1,358 @@
+"""The control law of a record: how its commands follow from its measurements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.commands.axis_matrix import AxisMatrix, classify_matrix
+from lbt_synth.identification.commands.law_search import (
+    CAUSAL_LAGS,
+    LAGS,
+    LawCoefficients,
+    LawShape,
+    Regression,
+    simplest_law,
+    simplest_short_law,
+)
+from lbt_synth.identification.commands.loop_series import LoopSeries, prepare_series
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, matrix, read_only
+
+LawKind: TypeAlias = Literal[
+    "pure integrator",
+    "leaky integrator",
+    "double integrator",
+    "proportional",
+    "higher order",
+    "none",
+]
+_LEAST_ROWS = 400
+_EXACT = 1e-6  # part of the increments' variance, below which a law is exact
+_SHORT_ORDER, _LONG_ORDER = 3, 32
+_SHORT_ROWS, _LONG_ROWS = 60_000, 16_000
+_ROWS_PER_VALUE = 8
+_LEAST_COHERENCE = 0.1
+_PASSES = 3
+_NEAR_ONE = 0.1  # distance of both poles of a double integrator
+_LEAKY = 0.5  # least pole of a leaky one
+_PURE = 1e-6
+_ROUNDING = 1e-12
+_ROUGH = 0.05  # residual beyond which a law that knows the future is doubtful
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlLaw:
+    """What computed the commands of a record.
+
+    In frames of the record, for each axis i::
+
+        u_i(k) = sum_j past[i, j-1] u_i(k-j) + sum_l taps[i, l, :] y(k - lag_frames - l)
+
+    Attributes
+    ----------
+    kind : str
+        "pure integrator", "leaky integrator", "double integrator", "proportional" (no memory),
+        "higher order", or "none": the commands do not follow from the measurements.
+    lag_frames : int
+        Lag of the first measurement: 0 if u(k) follows from measurements up to y(k), 2 if two
+        frames later than that; negative if commands know measurements of the future.
+    mean_lag_frames : float
+        Mean lag of the measurements, weighted by their share of the gain: not whole after a
+        fractional shift. Nan of a law of order 2 and more.
+    gain : (axes, axes) ndarray
+        Increment of u per unit of y at low frequencies: the gain of an integrator. Of a law
+        without memory, u per unit of y; of a double integrator, the second increment. Sign and
+        structure are those of the law at low frequencies, whatever its order; the size of one of
+        higher order depends on all of its poles. Zeros where there is no law.
+    gain_error : (axes, axes) ndarray
+        Standard errors of the gain.
+    axis_matrix : AxisMatrix
+        Signs and structure of the gain.
+    leak, leak_error : (axes,) ndarray
+        Pole nearest 1, and its standard error; nan of a law without memory.
+    poles : (axes, order) complex ndarray
+        Poles of the law of each axis.
+    order : int
+        Past commands of an axis that the law uses.
+    past : (axes, order) ndarray
+        Weights of the past commands.
+    taps : (axes, lags, axes) ndarray
+        Weights of the measurements.
+    residual : float
+        Part of the variance of the increments of u that the law leaves unexplained.
+    coherence : float
+        Part of what past commands leave of the increments that follows from measurements: 1
+        of a deterministic law, 0 of the commands of another night.
+    frames : int
+        Frames of the fit.
+    odd_frames : int
+        Frames that do not follow the law of the others, and were left out.
+    """
+
+    kind: LawKind
+    lag_frames: int
+    mean_lag_frames: float
+    gain: FloatArray
+    gain_error: FloatArray
+    axis_matrix: AxisMatrix
+    leak: FloatArray
+    leak_error: FloatArray
+    poles: ComplexArray
+    order: int
+    past: FloatArray
+    taps: FloatArray
+    residual: float
+    coherence: float
+    frames: int
+    odd_frames: int
+
+    @property
+    def exact(self) -> bool:
+        """Whether the law leaves nothing but rounding."""
+        return self.kind != "none" and self.residual < _EXACT
+
+
+def record_control_law(record: LoopRecord) -> ControlLaw:
+    """Return the control law of a closed-loop record.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record; its delay does not matter.
+
+    Returns
+    -------
+    ControlLaw
+        The law.
+
+    Raises
+    ------
+    ProblemError
+        If the record has no commands, or too few good frames.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+    >>> wind = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20, frame_rate_hz=1000)
+    >>> night = lbt.simulate(
+    ...     lbt.integrator(path, gain=0.4).controller,
+    ...     lbt.Truth(turbulence=wind, noise_nm=8),
+    ...     hardware=path,
+    ...     frames=4000,
+    ... )
+    >>> record = lbt.identification.loop_record(
+    ...     night.measurements[0], -night.commands[0], frame_rate_hz=1000, unit="nm"
+    ... )
+    >>> law = record_control_law(record)
+    >>> law.kind, law.lag_frames, law.gain.round(6).tolist()
+    ('pure integrator', 0, [[-0.4]])
+    """
+    if record.commands is None:
+        raise ProblemError(
+            "the control law needs commands; the record is of an open loop. Give the commands."
+        )
+    measured = record.usable if record.measured is None else record.measured
+    return _find_law(record.measurements, record.commands, measured, record.commanded)
+
+
+def fit_control_law(
+    measurements: ArrayLike, commands: ArrayLike, *, usable: ArrayLike | None = None
+) -> ControlLaw:
+    """Return the law with the least order that explains commands by measurements.
+
+    Frames at which a command is at a limit do not count, nor those few that do not follow the
+    law of the others.
+
+    Parameters
+    ----------
+    measurements, commands : (frames, axes) array_like
+        Measurements y(k) and commands u(k) of one or two axes, in the same unit.
+    usable : (frames,) bool array_like, optional
+        Frames whose values are good; all by default.
+
+    Returns
+    -------
+    ControlLaw
+        The law; of kind "none" if the commands do not follow from the measurements.
+
+    Raises
+    ------
+    ProblemError
+        If sizes clash, or too few frames are good.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y = np.random.default_rng(1).standard_normal((2000, 2))
+    >>> u = 0.3 * np.cumsum(y[:, ::-1], axis=0)  # axes swapped
+    >>> law = fit_control_law(y, u)
+    >>> law.kind, law.axis_matrix.kind, law.gain.round(6).tolist()
+    ('pure integrator', 'swapped', [[0.0, 0.3], [0.3, 0.0]])
+    """
+    y = matrix(measurements, "measurements")
+    why = f"to match measurements {y.shape}"
+    u = matrix(commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
+    good = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
+    if good.dtype != np.bool_ or good.shape != (len(y),):
+        raise DimensionError(
+            f"usable must be {len(y)} truth values, one per frame; got {good.dtype} {good.shape}."
+        )
+    return _find_law(y, u, good, good)
+
+
+def _find_law(
+    y: FloatArray, u: FloatArray, measured: BoolArray, commanded: BoolArray | None
+) -> ControlLaw:
+    """Fit the law, and again without the frames that do not follow it."""
+    series = prepare_series(y, u, measured, commanded)
+    for _ in range(_PASSES):
+        law = _search(series)
+        lags = range(law.lag_frames, law.lag_frames + law.taps.shape[1])
+        odd = series.odd_frames(law.past, law.taps, lags)
+        if not odd.any() or law.kind == "none":
+            break
+        series = replace(series, followed=series.followed & ~odd)
+    return replace(law, odd_frames=int(np.sum(~series.followed)))
+
+
+def _search(series: LoopSeries) -> ControlLaw:
+    """Return the shortest law that explains as much as a long one."""
+    regression = _regression(series, _SHORT_ORDER, _SHORT_ROWS)
+    if not regression.moving:
+        return _no_law(regression)
+    found = simplest_short_law(regression)
+    if found is None or regression.residual(found) > _EXACT:
+        regression = _regression(series, _LONG_ORDER, _LONG_ROWS)
+        if found is None or regression.residual(found) > regression.most_residual():
+            found = simplest_law(regression)
+    law = _describe(regression, found)
+    if law.lag_frames < 0 and law.residual > _ROUGH:
+        # the sensor's response to commands that are shaken explains more than their law may: it
+        # comes later, and has the other sign
+        causal = _describe(regression, simplest_law(regression, CAUSAL_LAGS))
+        if np.sum(causal.taps[:, 0] * law.taps[:, 0]) < 0:
+            return causal
+    return law
+
+
+def _regression(series: LoopSeries, order: int, most_rows: int) -> Regression:
+    """Return the regression of laws of an order, or of the most that the frames allow."""
+    while True:
+        lags = range(LAGS[0], LAGS[-1] + order + 1)
+        rows = series.rows(order, lags).size
+        if rows >= max(_LEAST_ROWS, _ROWS_PER_VALUE * (order + series.axes * len(lags))):
+            return Regression(series, order, lags, most_rows)
+        if order <= 1:
+            raise ProblemError(
+                f"the control law needs {_LEAST_ROWS} frames whose neighbours are good; got "
+                f"{rows} of {len(series.commands)}. Give a longer record, or one with fewer holes."
+            )
+        order //= 2
+
+
+def _describe(regression: Regression, shape: LawShape) -> ControlLaw:
+    """Return the law of a shape, in words."""
+    found = regression.coefficients(shape)
+    unexplained = regression.residual(shape)
+    used = shape.order + regression.axes * len(shape.lags)
+    before = regression.without_measurements() / (regression.rows - regression.order)
+    after = unexplained / (regression.rows - used)
+    coherence = max(0.0, 1 - after / before) if before > 0 else 0.0
+    if coherence < _LEAST_COHERENCE:
+        return _no_law(regression, residual=unexplained, coherence=coherence)
+    poles = _poles(found.past)
+    kind = _kind(shape, found, poles)
+    gain, error = _gain(found, poles[:, 2 if kind == "double integrator" else 1 :])
+    return ControlLaw(
+        kind=kind,
+        lag_frames=shape.first,
+        mean_lag_frames=_mean_lag(found.taps, shape),
+        gain=read_only(gain),
+        gain_error=read_only(error),
+        axis_matrix=classify_matrix(gain, error),
+        leak=read_only(_leak(poles)),
+        leak_error=read_only(found.past_error),
+        poles=read_only(poles),
+        order=shape.order,
+        past=read_only(found.past),
+        taps=read_only(found.taps),
+        residual=unexplained,
+        coherence=coherence,
+        frames=regression.rows,
+        odd_frames=0,
+    )
+
+
+def _poles(past: FloatArray) -> ComplexArray:
+    """Return the poles of each axis, (axes, order), the one nearest 1 first."""
+    each = [np.roots(np.append(1.0, -row)).astype(np.complex128) for row in past]
+    padded = [np.append(row, np.zeros(past.shape[1] - row.size)) for row in each]
+    return np.array([row[np.argsort(abs(row - 1), kind="stable")] for row in padded])
+
+
+def _leak(poles: ComplexArray) -> FloatArray:
+    """Return the pole nearest 1 of each axis, its size where it is complex, (axes,)."""
+    if not poles.shape[1]:
+        return np.full(len(poles), np.nan)
+    nearest = poles[:, 0]
+    return np.where(abs(nearest.imag) > 0, abs(nearest), nearest.real)
+
+
+def _mean_lag(taps: FloatArray, shape: LawShape) -> float:
+    """Return the mean lag of the measurements [frames], weighted by their share of the gain."""
+    shares = np.einsum("ilj,ij->l", taps, np.sum(taps, axis=1))
+    return float(shares @ np.array(shape.lags) / shares.sum()) if shape.order < 2 else np.nan
+
+
+def _gain(found: LawCoefficients, others: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Return the gain at low frequencies but for the poles at 1, and its errors."""
+    axes, lags, _ = found.taps.shape
+    scale = np.prod(abs(1 - others), axis=1)[:, None]
+    variance = np.einsum("iljmj->ij", found.taps_covariance.reshape(axes, lags, axes, lags, axes))
+    gain = np.sum(found.taps, axis=1) / scale
+    gain[abs(gain) < _ROUNDING * np.max(abs(gain))] = 0.0
+    return gain, np.sqrt(np.maximum(variance, 0)) / scale
+
+
+def _kind(shape: LawShape, found: LawCoefficients, poles: ComplexArray) -> LawKind:
+    """Return the word for a law."""
+    if shape.order == 0:
+        return "proportional"
+    distance = abs(poles - 1)
+    if shape.order == 1 and np.all(distance <= np.maximum(_PURE, 4 * found.past_error)[:, None]):
+        return "pure integrator"
+    if shape.order == 1 and np.all(poles.real > _LEAKY):
+        return "leaky integrator"
+    if shape.order == 2 and np.all(distance < _NEAR_ONE):
+        return "double integrator"
+    return "higher order"
+
+
+def _no_law(regression: Regression, *, residual: float = 1.0, coherence: float = 0.0) -> ControlLaw:
+    """Return the law of commands that do not follow from the measurements, or do not move."""
+    axes = regression.axes
+    zeros = np.zeros((axes, axes))
+    return ControlLaw(
+        kind="none",
+        lag_frames=0,
+        mean_lag_frames=0.0,
+        gain=read_only(zeros),
+        gain_error=read_only(zeros.copy()),
+        axis_matrix=classify_matrix(zeros),
+        leak=read_only(np.full(axes, np.nan)),
+        leak_error=read_only(np.full(axes, np.nan)),
+        poles=read_only(np.zeros((axes, 0), dtype=np.complex128)),
+        order=0,
+        past=read_only(np.zeros((axes, 0))),
+        taps=read_only(np.zeros((axes, 1, axes))),
+        residual=residual,
+        coherence=coherence,
+        frames=regression.rows,
+        odd_frames=0,
+    )

@@ -1,0 +1,214 @@
+"""Least squares of commands on past commands and measurements, by order and lag.
+
+A law of order p whose first measurement is ``first`` frames old computes, for each axis i::
+
+    u_i(k) = sum_j a_ij u_i(k-j) + sum_l B_il y(k-l),   j = 1..p,   l = first..last
+
+It is fitted to the increments u(k) - u(k-1): commands are large and smooth, and what tells the
+laws apart is in their increments.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lbt_synth.identification.commands.loop_series import LoopSeries
+from lbt_synth.validation import FloatArray
+
+LAGS = range(-4, 5)  # frames by which the first measurement may be late
+CAUSAL_LAGS = range(5)
+_CUTOFF = 1e-11  # of the largest singular value
+_BLOCK = 2048  # rows of a triangular factor
+_ALIKE = 3.0  # over the residual of the richest law, within which a simple one explains as much
+_FLOOR = 1e-10  # part of the increments' variance that rounding may leave
+_SAME = 1.05  # times the residual, within which a tap is idle
+_SPARE = 0.2  # of what the richest law explains, that a simple one may leave
+_SHORT = ((0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 3))  # order, and taps after the first
+_ORDERS = (4, 5, 6, 8, 10, 12, 16, 20, 24, 32)
+
+
+class LawShape(NamedTuple):
+    """Order of a law, and the lags of its first and last measurement [frames]."""
+
+    order: int
+    first: int
+    last: int
+
+    @property
+    def lags(self) -> range:
+        """Lags of the measurements."""
+        return range(self.first, self.last + 1)
+
+
+class LawCoefficients(NamedTuple):
+    """Coefficients of a law, with the covariance of its taps."""
+
+    past: FloatArray  # (axes, order): a_ij
+    taps: FloatArray  # (axes, lags, axes): B_il
+    past_error: FloatArray  # (axes,): error of the sum of a_ij
+    taps_covariance: FloatArray  # (axes, lags axes, lags axes)
+
+
+class Regression:
+    """Triangular factor of the increments and of all that may explain them."""
+
+    def __init__(self, series: LoopSeries, order: int, lags: range, most_rows: int) -> None:
+        """Factorise ``most_rows`` frames at most, evenly spread."""
+        rows = series.rows(order, lags)
+        if rows.size > most_rows:
+            rows = rows[np.linspace(0, rows.size - 1, most_rows).astype(np.int64)]
+        self.order, self.lags, self.axes, self.rows = order, lags, series.axes, rows.size
+        y, u = series.measurements, series.commands
+        increments = np.diff(u, axis=0, prepend=u[:1])
+        parts = [increments[rows], u[rows - 1]]
+        parts += [increments[rows - lag] for lag in range(1, order)]
+        parts += [y[rows - lag] for lag in lags]
+        table = np.concatenate(parts, axis=1)
+        table -= table.mean(axis=0)
+        self._scale = np.maximum(np.sqrt(np.mean(table**2, axis=0)), 1e-300)
+        self._factor = _triangular_factor(table / self._scale)
+        self.variance = self._scale[: self.axes] ** 2  # of the increments
+
+    def _past(self, axis: int, order: int) -> list[int]:
+        return [axis + self.axes * (1 + lag) for lag in range(order)]
+
+    def _taps(self, lags: range) -> list[int]:
+        first = self.axes * (1 + self.order + lags[0] - self.lags[0])
+        return list(range(first, first + self.axes * len(lags)))
+
+    def _target(self, axis: int, order: int) -> FloatArray:
+        """Return the increment in units of its own rms; a law without memory has the command."""
+        target = self._factor[:, axis]
+        if order:
+            return target
+        past = axis + self.axes
+        return np.asarray(target + self._factor[:, past] * self._scale[past] / self._scale[axis])
+
+    def _solve(self, axis: int, chosen: list[int], target: FloatArray) -> tuple[FloatArray, float]:
+        if not chosen:
+            return np.zeros(0), float(target @ target) / self.rows
+        table = self._factor[:, chosen]
+        found = np.linalg.lstsq(table, target, rcond=_CUTOFF)[0]
+        left = target - table @ found
+        return found * self._scale[axis] / self._scale[chosen], float(left @ left) / self.rows
+
+    def residual(self, shape: LawShape) -> float:
+        """Return the part of the increments' variance that a law leaves, the axes' mean."""
+        left = [
+            self._solve(
+                axis,
+                self._past(axis, shape.order) + self._taps(shape.lags),
+                self._target(axis, shape.order),
+            )[1]
+            for axis in self.moving
+        ]
+        return float(np.mean(left))
+
+    @property
+    def moving(self) -> list[int]:
+        """Axes whose commands move at all."""
+        return [axis for axis in range(self.axes) if self.variance[axis] > 1e-30]
+
+    def without_measurements(self) -> float:
+        """Return the part of the increments' variance that past commands leave."""
+        left = [
+            self._solve(axis, self._past(axis, self.order), self._factor[:, axis])[1]
+            for axis in self.moving
+        ]
+        return float(np.mean(left))
+
+    def most_residual(self, lags: range = LAGS) -> float:
+        """Return what a simple law may leave, to explain as much as the richest one."""
+        richest = self.residual(LawShape(self.order, lags[0], self.lags[-1]))
+        return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _FLOOR
+
+    def coefficients(self, shape: LawShape) -> LawCoefficients:
+        """Return the coefficients of a law, and their errors."""
+        count, lags = shape.order, len(shape.lags)
+        past, errors = np.zeros((self.axes, count)), np.zeros(self.axes)
+        taps = np.zeros((self.axes, lags, self.axes))
+        spread = np.zeros((self.axes, lags * self.axes, lags * self.axes))
+        for axis in self.moving:
+            chosen = self._past(axis, count) + self._taps(shape.lags)
+            found, left = self._solve(axis, chosen, self._target(axis, count))
+            taps[axis] = found[count:].reshape(lags, self.axes)
+            if count:
+                steps = np.append(found[1:count], 0.0)  # of the increments before
+                past[axis] = np.diff(steps, prepend=0.0)
+                past[axis, 0] += 1 + found[0]
+            spare = max(self.rows - len(chosen), 1)
+            inverse = np.linalg.pinv(self._factor[:, chosen], rcond=_CUTOFF)
+            scale = self._scale[axis] / self._scale[chosen]
+            half = scale[:, None] * inverse * np.sqrt(left * self.rows / spare)
+            spread[axis] = half[count:] @ half[count:].T
+            errors[axis] = float(np.linalg.norm(half[0])) if count else 0.0
+        return LawCoefficients(past, taps, errors, spread)
+
+
+def _triangular_factor(table: FloatArray) -> FloatArray:
+    """Return R of the QR factorisation of a tall table, block by block."""
+    whole = len(table) // _BLOCK * _BLOCK
+    parts = [table[whole:]]
+    if whole and table.shape[1] < _BLOCK:
+        blocks = np.asarray(np.linalg.qr(table[:whole].reshape(-1, _BLOCK, table.shape[1]), "r"))
+        parts.append(blocks.reshape(-1, table.shape[1]))
+    elif whole:
+        parts.append(table[:whole])
+    return np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
+
+
+def _lowest(regression: Regression, order: int, more: int, lags: range) -> tuple[float, LawShape]:
+    """Return the best law of an order and a number of taps, over the lags of the first."""
+    shapes = (LawShape(order, lag, lag + more) for lag in lags)
+    found = [(regression.residual(each), each) for each in shapes]
+    return min(found)
+
+
+def simplest_short_law(regression: Regression, lags: range = LAGS) -> LawShape | None:
+    """Return the shortest law of up to three states that explains as much as the richest one."""
+    most = regression.most_residual(lags)
+    for order, more in _SHORT:
+        left, shape = _lowest(regression, order, more, lags)
+        if left <= most:
+            return _without_idle_taps(regression, left, shape)
+    return None
+
+
+def simplest_law(regression: Regression, lags: range = LAGS) -> LawShape:
+    """Return the shortest law that explains as much as the richest one."""
+    if found := simplest_short_law(regression, lags):
+        return found
+    most, below = regression.most_residual(lags), _SHORT[-1][0]
+    left, shape = 1.0, LawShape(regression.order, 0, regression.order)
+    for order in (each for each in _ORDERS if each <= regression.order):
+        left, shape = _lowest(regression, order, order, lags)
+        if left <= most:
+            return _lower_order(regression, left, shape, below, most)
+        below = order
+    return _without_idle_taps(regression, left, shape)
+
+
+def _lower_order(
+    regression: Regression, left: float, shape: LawShape, below: int, most: float
+) -> LawShape:
+    """Return the law of the least order above ``below``, without idle taps."""
+    shape = _without_idle_taps(regression, left, shape)
+    for order in range(below + 1, shape.order):
+        shorter = LawShape(order, shape.first, min(shape.first + order, shape.last))
+        if regression.residual(shorter) <= most:
+            return shorter
+    return shape
+
+
+def _without_idle_taps(regression: Regression, left: float, shape: LawShape) -> LawShape:
+    """Return the law without the first and last taps that explain nothing."""
+    most = _SAME * left + _FLOOR
+    for early, late in ((1, 0), (0, -1)):
+        while shape.first < shape.last:
+            shorter = LawShape(shape.order, shape.first + early, shape.last + late)
+            if regression.residual(shorter) > most:
+                break
+            shape = shorter
+    return shape

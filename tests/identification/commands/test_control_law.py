@@ -1,0 +1,214 @@
+"""The control law of a record, on loops whose law is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.control_laws import RATE, SteppedLaw, ordinary_loop, rotation, run_law
+from support.plants import lbt_axis_plant
+from support.recorded_loops import spliced_record
+
+import lbt_synth as lbt
+from lbt_synth.identification.commands.control_law import fit_control_law, record_control_law
+
+RAN = np.diag([0.4, 0.3])
+SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("change", "structure", "signs"),
+    [
+        (np.eye(2), "diagonal", (1, 1)),
+        (-np.eye(2), "diagonal", (-1, -1)),
+        (np.diag([1.0, -1.0]), "diagonal", (1, -1)),
+        (SWAP, "swapped", (1, 1)),
+        (-SWAP, "swapped", (-1, -1)),
+        (rotation(30), "rotated", (1, 1)),
+        (1000 * np.eye(2), "diagonal", (1, 1)),
+        (0.5 * np.eye(2), "diagonal", (1, 1)),
+        (np.array([[1.0, 0.9], [0.3, 0.6]]), "general", (0, 0)),
+    ],
+)
+def test_commands_by_a_matrix(change, structure, signs):
+    y, u = ordinary_loop()
+    law = fit_control_law(y, u @ change.T)
+    assert (law.kind, law.lag_frames, law.order) == ("pure integrator", 0, 1)
+    np.testing.assert_allclose(law.gain, change @ RAN, atol=1e-9 * np.abs(change).max())
+    assert (law.axis_matrix.kind, law.axis_matrix.signs) == (structure, signs)
+    np.testing.assert_allclose(law.leak, 1.0, atol=1e-9)
+    assert law.exact
+    assert law.coherence > 1 - 1e-6
+
+
+@pytest.mark.parametrize("late", [-4, -3, -2, -1, 1, 2, 3, 4])
+def test_commands_that_are_shifted(late):
+    y, u = ordinary_loop()
+    law = fit_control_law(y[5:-5], np.roll(u, late, axis=0)[5:-5])
+    assert (law.kind, law.lag_frames) == ("pure integrator", late)
+    assert law.mean_lag_frames == pytest.approx(late)
+    np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
+
+
+def test_commands_between_two_frames():
+    y, u = ordinary_loop()
+    law = fit_control_law(y[1:], 0.7 * u[1:] + 0.3 * u[:-1])
+    assert (law.kind, law.lag_frames) == ("pure integrator", 0)
+    assert law.mean_lag_frames == pytest.approx(0.3)
+    np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
+    # a shift of the band-limited series has no law of finite order
+    phase = np.exp(-2j * np.pi * 0.5 * np.fft.rfftfreq(len(u)))
+    between = np.fft.irfft(phase[:, None] * np.fft.rfft(u, axis=0), n=len(u), axis=0)
+    law = fit_control_law(y[50:-50], between[50:-50])
+    assert law.kind == "higher order"
+    assert law.lag_frames < 0
+
+
+def test_increments_in_place_of_positions():
+    y, u = ordinary_loop()
+    law = fit_control_law(y[1:], np.diff(u, axis=0))
+    assert (law.kind, law.order, law.lag_frames) == ("proportional", 0, 0)
+    assert np.isnan(law.leak).all()
+    np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
+
+
+def test_commands_of_another_night_have_no_law():
+    y, u = ordinary_loop()
+    _, other = ordinary_loop(seed=2)
+    for law in (
+        fit_control_law(y, other),
+        fit_control_law(y[:1500], other[:1500]),
+        fit_control_law(y[:, :1], other[:, :1]),
+        fit_control_law(y[1000:], u[:-1000]),  # the same night, a second later
+        fit_control_law(y, np.zeros_like(u)),
+        fit_control_law(y, np.random.default_rng(3).standard_normal(u.shape)),
+    ):
+        assert law.kind == "none"
+        assert law.coherence < 0.02
+        assert law.axis_matrix.kind == "zero"
+        assert not law.exact
+
+
+@pytest.mark.parametrize(
+    ("controller", "kind", "poles", "gain"),
+    [
+        (
+            SteppedLaw([[0.4, 0.1], [-0.1, 0.3]]),
+            "pure integrator",
+            [1.0],
+            [[0.4, 0.1], [-0.1, 0.3]],
+        ),
+        (SteppedLaw(0.4, leak=0.99), "leaky integrator", [0.99], 0.4 * np.eye(2)),
+        (SteppedLaw(0.3, again=0.02), "double integrator", [1.0, 1.0], 0.006 * np.eye(2)),
+        (SteppedLaw(0.4, limit_nm=300), "pure integrator", [1.0], 0.4 * np.eye(2)),
+        (SteppedLaw(0.4, limit_nm=300, wind_up=True), "pure integrator", [1.0], 0.4 * np.eye(2)),
+    ],
+)
+def test_laws_of_low_order(controller, kind, poles, gain):
+    law = fit_control_law(*run_law(controller))
+    assert (law.kind, law.lag_frames) == (kind, 0)
+    np.testing.assert_allclose(law.poles, [poles, poles], atol=1e-5)
+    np.testing.assert_allclose(law.gain, gain, atol=1e-6)
+    np.testing.assert_allclose(law.leak, poles[0], atol=1e-5)
+    assert law.exact
+
+
+def response(past, taps, z):
+    """Frequency response of a law of one axis, (frequencies,)."""
+    top = sum(tap * z**-lag for lag, tap in enumerate(taps))
+    return top / (1 - sum(a * z ** -(1 + j) for j, a in enumerate(past)))
+
+
+@pytest.mark.parametrize("make", [lbt.kalman, lambda plant: lbt.hinf(plant, gamma_ratio=1.2)])
+def test_the_law_of_a_filter_is_that_of_its_design(make):
+    plant = lbt_axis_plant()
+    controller = make(plant).controller
+    truth = lbt.Truth(
+        turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5, sensor_gain=1.0
+    )
+    law = fit_control_law(*run_law(controller, truth=truth, hardware=plant.hardware))
+    assert (law.kind, law.lag_frames) == ("higher order", 0)
+    assert law.exact
+    z = np.exp(2j * np.pi * np.array([0.001, 0.01, 0.025, 0.1, 0.3]))
+    form = controller.to_statespace()
+    exact = [
+        (form.C @ np.linalg.solve(p * np.eye(len(form.A)) - form.A, form.B) + form.D)[0, 0]
+        for p in z
+    ]
+    np.testing.assert_allclose(response(law.past[0], law.taps[0, :, 0], z), exact, rtol=1e-4)
+    turned = fit_control_law(
+        *(
+            s * x
+            for s, x in zip(
+                (1, -1), run_law(controller, truth=truth, hardware=plant.hardware), strict=True
+            )
+        )
+    )
+    assert (law.axis_matrix.signs, turned.axis_matrix.signs) == ((1,), (-1,))
+
+
+def test_coarse_commands_and_those_in_single_precision():
+    y, u = ordinary_loop()
+    coarse = fit_control_law(y, 3.0 * np.round(u / 3.0))
+    assert (coarse.kind, coarse.lag_frames, coarse.axis_matrix.kind) == (
+        "pure integrator",
+        0,
+        "diagonal",
+    )
+    assert np.all(np.abs(coarse.gain - RAN) < 5 * coarse.gain_error)
+    # two roundings of variance 9/12, of the increments' variance
+    assert coarse.residual == pytest.approx(
+        np.mean(1.5 / np.var(np.diff(u, axis=0), axis=0)), rel=0.1
+    )
+    single = fit_control_law(y.astype(np.float32), (u + 1e4).astype(np.float32))
+    assert (single.kind, single.exact) == ("pure integrator", True)
+
+
+def test_errors_cover_the_gain_under_dither():
+    deviations = []
+    for seed in range(25):
+        law = fit_control_law(*run_law(SteppedLaw(0.3, dither_nm=4.0), frames=1500, seed=seed))
+        assert (law.lag_frames, law.axis_matrix.kind) == (0, "diagonal")
+        deviations.append((law.gain - 0.3 * np.eye(2)) / law.gain_error)
+    assert 0.75 < np.sqrt(np.mean(np.square(deviations))) < 1.3
+
+
+def test_a_loop_that_is_shaken_by_its_commands_is_not_read_backwards():
+    law = fit_control_law(*run_law(SteppedLaw(0.4, dither_nm=20.0)))
+    assert law.lag_frames == 0
+    assert law.residual > 0.5
+    assert np.all(np.abs(law.gain - 0.4 * np.eye(2)) < 5 * law.gain_error)
+
+
+def test_frames_that_follow_no_law():
+    y, u = (each.copy() for each in ordinary_loop())
+    usable = np.random.default_rng(0).random(len(y)) > 0.01
+    y[~usable], u[~usable] = 0.0, 1e5
+    holes = fit_control_law(y, u, usable=usable)
+    y, u = (each.copy() for each in ordinary_loop())
+    y[::500] = 0.0  # spoilt, and not said
+    u[5000:] -= 4000.0  # an offload
+    spoilt = fit_control_law(np.delete(y, 7777, axis=0), np.delete(u, 7777, axis=0))
+    assert 20 <= spoilt.odd_frames <= 25
+    for law in (holes, spoilt):
+        assert law.kind == "pure integrator"
+        np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
+
+
+def test_of_a_record():
+    record = spliced_record(frames=4000, gain=0.25)
+    law = record_control_law(record)
+    assert (law.kind, law.lag_frames) == ("pure integrator", 0)
+    assert law.gain == pytest.approx(0.25)
+    open_loop = lbt.identification.loop_record(record.measurements, frame_rate_hz=RATE, unit="nm")
+    with pytest.raises(lbt.errors.ProblemError, match="needs commands"):
+        record_control_law(open_loop)
+
+
+def test_bad_input():
+    y, u = ordinary_loop()
+    with pytest.raises(lbt.errors.ProblemError, match=r"needs 400 frames .* of 300\."):
+        fit_control_law(y[:300], u[:300])
+    with pytest.raises(lbt.errors.DimensionError, match="commands must have"):
+        fit_control_law(y, u[1:])
+    with pytest.raises(lbt.errors.DimensionError, match=r"usable must be 10000 truth values"):
+        fit_control_law(y, u, usable=np.ones(3, dtype=bool))
