@@ -33,16 +33,19 @@ class Case:
     """A loop and its record."""
 
     frozen: bool
+    drift: lbt.models.ARModel | None
     path: lbt.LoopHardware
     truth: lbt.Truth
     record: lbt.identification.LoopRecord
     total_nm: np.ndarray
 
 
-def case(seed: int, frames: int) -> Case:
-    """Draw a loop, and run it."""
+def case(
+    seed: int, frames: int, *, rate: float = RATE, drift: lbt.models.ARModel | None = None
+) -> Case:
+    """Draw a loop, perhaps with a drift on top of its turbulence, and run it."""
     rng = np.random.default_rng([seed, 1])
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2, modes=1)
+    path = lbt.LoopHardware(frame_rate_hz=rate, delay_frames=2, modes=1)
     noise = float(np.exp(rng.uniform(np.log(2), np.log(30))))
     sensor_gain = float(rng.uniform(0.4, 1.0))
     frozen = bool(seed % 2)
@@ -57,9 +60,9 @@ def case(seed: int, frames: int) -> Case:
     else:
         corner = float(np.exp(rng.uniform(np.log(0.2), np.log(3))))
         damping, rms = float(rng.uniform(0.1, 1.0)), float(rng.uniform(200, 800))
-        a1, a2, drive = coefficients(2 * np.pi * corner / RATE, damping)
+        a1, a2, drive = coefficients(2 * np.pi * corner / rate, damping)
         turbulence = lbt.models.ARModel(
-            coefficients=[a1, a2], driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=RATE
+            coefficients=[a1, a2], driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
         )
     lines = tuple(
         lbt.Vibration(
@@ -70,32 +73,46 @@ def case(seed: int, frames: int) -> Case:
         )
         for _ in range(int(rng.integers(0, 6)))
     )
-    truth = lbt.Truth(
-        turbulence=turbulence, vibrations=lines, noise_nm=noise, sensor_gain=sensor_gain
-    )
+    total = turbulence if drift is None else lbt.models.SumSpectrum(parts=[turbulence, drift])
+    truth = lbt.Truth(turbulence=total, vibrations=lines, noise_nm=noise, sensor_gain=sensor_gain)
     ran = lbt.integrator(path, gain=float(rng.uniform(0.2, 0.6)))
     run = lbt.simulate(
         ran.controller, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000
     )
     record = lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+        run.measurements[0], run.commands[0], frame_rate_hz=rate, delay_frames=2, unit="nm"
     )
-    return Case(frozen, path, truth, record, run.total_nm[0])
+    return Case(frozen, drift, path, truth, record, run.total_nm[0])
 
 
 def exact_plant(it: Case) -> lbt.models.TipTiltPlant:
     """Return the plant of the truth; frozen flow as the AR2 process fitted to its spectrum."""
-    truth, turbulence = it.truth, it.truth.turbulence
+    truth, turbulence, rate = it.truth, it.truth.turbulence, it.path.frame_rate_hz
+    lines = list(truth.vibrations)
+    if isinstance(turbulence, lbt.models.SumSpectrum):
+        turbulence = turbulence.parts[0]
     if isinstance(turbulence, lbt.Atmosphere):
         turbulence = lbt.models.ar2_turbulence(
-            turbulence, frame_rate_hz=RATE, noise_nm=truth.noise_nm / truth.sensor_gain
+            turbulence, frame_rate_hz=rate, noise_nm=truth.noise_nm / truth.sensor_gain
         )
     assert isinstance(turbulence, lbt.models.ARModel)
+    if it.drift is not None:
+        # the drift takes the place of the turbulence, which becomes a resonance
+        pole = np.log(complex(max(np.linalg.eigvals(turbulence.companion), key=np.imag)))
+        lines.append(
+            lbt.Vibration(
+                frequency_hz=abs(pole) * rate / (2 * np.pi),
+                damping=min(-pole.real / abs(pole), 1 - 1e-9),
+                rms_nm=turbulence.rms_nm,
+                direction=(1.0,),
+            )
+        )
+        turbulence = it.drift
     return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE,
+        frame_rate_hz=rate,
         delay_frames=2,
         turbulence=turbulence,
-        vibrations=list(truth.vibrations) or None,
+        vibrations=lines or None,
         noise_nm=truth.noise_nm,
         sensor_gain=truth.sensor_gain,
         modes=1,
@@ -177,7 +194,8 @@ def studied(seed: int, frames: int) -> dict:
             it.path,
             noise_nm=it.truth.noise_nm,
             sensor_gain=it.truth.sensor_gain,
-            stretches=other,
+            stretches=it.record.stretches(),
+            test=other,
         ).total_nm2
         for controller in (half_filter, predictor.controller)
     ]

@@ -58,7 +58,7 @@ def identity() -> None:
         y, u, _ = night(path, 1, 5000)
         z = open_loop(y, u, path)
         found = lbt.identification.replayed_residual(
-            z, design.controller, path, noise_nm=15.5, settle_frames=0
+            z, design.controller, path, noise_nm=15.5, from_rest=True
         )
         would = lbt.simulate(
             design.controller.start(), truth, hardware=path, frames=5000, seed=1, settle_frames=0
@@ -74,7 +74,7 @@ def show(table: lbt.identification.PredictionTable) -> None:
             f"| {name} | {tip:.1f}, {tilt:.1f} | {data:.1f} +- {error:.1f} | {model:.1f} | "
             f"{ratio:.3f} | {entry.deviations:+.1f} | {100 * seen:.1f} | {100 * promised:.1f} |"
         )
-    print(f"fit {table.fit}, test {table.test}, {table.settle_frames} frames to settle")
+    print(f"fit {table.fit}, test {table.test}, {table.warm_up_frames} frames to warm up")
 
 
 def tables() -> None:
@@ -128,7 +128,7 @@ def predictors() -> None:
         took = time.perf_counter() - start
         loop = lbt.close_loop(model.hardware, fit.controller)
         found = lbt.identification.replayed_residual(
-            z, fit.controller, model.hardware, noise_nm=15.5, stretches=[(len(z) // 2, len(z))]
+            z, fit.controller, model.hardware, noise_nm=15.5, test=[(len(z) // 2, len(z))]
         )
         print(
             f"{taps} taps: {found.rms_nm:.2f} +- {found.rms_error_nm:.2f} nm on the data, "

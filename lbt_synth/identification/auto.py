@@ -147,6 +147,7 @@ def design_from_record(
         half.plant(),
         record.pseudo_open_loop(half.sensor_gains),
         {name: _design(request, half, gamma_ratio)},
+        stretches=record.stretches(),
         fit=fit,
         test=test,
         measurements=None if record.commands is None else record.measurements,

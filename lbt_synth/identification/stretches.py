@@ -47,8 +47,7 @@ def split_halves(
         Frames of the record.
     gap_frames : int, optional
         Frames after the last one of the fit that neither half has, so that the test does not
-        know the end of the fit. A replay drops the frames in which its loop settles: they
-        are a gap already.
+        know the end of the fit.
     fit_share : float, optional
         Part of the usable frames that is fitted, in (0, 1).
 
@@ -93,11 +92,19 @@ def split_halves(
 
 
 def split_frames(
-    usable: Stretches, fit: StretchesLike | None, test: StretchesLike | None, frames: int
-) -> tuple[Stretches, Stretches]:
-    """Return the frames to fit and to test on: as given, or the halves of the usable ones."""
+    stretches: StretchesLike | None,
+    fit: StretchesLike | None,
+    test: StretchesLike | None,
+    frames: int,
+) -> tuple[Stretches, Stretches, Stretches]:
+    """Return contiguous frames, and those of them to fit and to test on.
+
+    Fit and test are as given, or the halves of the contiguous frames; without those, fit and test
+    are contiguous where they touch.
+    """
+    usable = checked_stretches(stretches, frames)
     if fit is None and test is None:
-        return split_halves(usable, frames)
+        return usable, *split_halves(usable, frames)
     if fit is None or test is None:
         raise ProblemError("fit and test must both be given, or neither; got one of them.")
     fitted, tested = checked_stretches(fit, frames), checked_stretches(test, frames)
@@ -107,16 +114,13 @@ def split_frames(
                 f"the test must have frames that the fit has not; got ({a}, {b}) to fit and "
                 f"({c}, {d}) to test."
             )
-    return fitted, tested
+    return usable if stretches is not None else _join((*fitted, *tested)), fitted, tested
 
 
-def drop_settling(stretches: Stretches, settle: int) -> Stretches:
-    """Return the stretches without the frames in which a loop settles."""
-    kept = tuple((start + settle, stop) for start, stop in stretches if stop - start > settle)
-    if not kept:
-        longest = max(stop - start for start, stop in stretches)
-        raise ProblemError(
-            f"a stretch must be longer than the {settle} frames in which the loop settles; the "
-            f"longest has {longest}. Give a longer record, or lower settle_frames."
-        )
-    return kept
+def _join(parts: Stretches) -> Stretches:
+    """Return the union of stretches that do not overlap."""
+    out: list[tuple[int, int]] = []
+    for start, stop in sorted(parts):
+        begin = out.pop()[0] if out and out[-1][1] == start else start
+        out.append((begin, stop))
+    return tuple(out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,16 +12,21 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.identification.prediction.predictor import least_squares_predictor
+from lbt_synth.identification.prediction.replay import (
+    Replay,
+    choose_warm_up,
+    measured_replay,
+    replay,
+    replay_frames,
+)
 from lbt_synth.identification.prediction.residual import (
     PredictionData,
     ResidualEstimate,
     check_series,
-    choose_settling,
     inverse_sensor,
-    predict_residual,
     prediction_data,
 )
-from lbt_synth.identification.stretches import Stretches, StretchesLike, drop_settling, split_frames
+from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
@@ -33,6 +38,7 @@ INTEGRATOR = "best integrator"
 PREDICTOR = "least-squares predictor"
 LIMIT = "limit of performance"
 _RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
+_START_SHARE = 0.01  # of a measured mean square: what a start adds above that has a note
 _AXES = ("tip", "tilt")
 _COLUMNS = {  # attribute of a row by heading
     "data_nm": "replayed_nm",
@@ -112,8 +118,9 @@ class PredictionTable:
         The rows.
     fit, test : tuple of (start, stop)
         Frames that the predictor was fitted to, and those that all rows are measured on.
-    settle_frames : int
-        Frames dropped before each stretch of the test.
+    warm_up_frames : int
+        Frames at the beginning of each contiguous stretch that are not in the test, because the
+        state before them is not known.
     notes : tuple of str
         What is left out of the table or cannot be, and why.
     """
@@ -121,7 +128,7 @@ class PredictionTable:
     entries: tuple[PredictionRow, ...]
     fit: Stretches
     test: Stretches
-    settle_frames: int
+    warm_up_frames: int
     notes: tuple[str, ...]
 
     def __getitem__(self, name: str) -> PredictionRow:
@@ -168,7 +175,6 @@ def prediction_against_data(
     noise_error_nm: ArrayLike = 0.0,
     imaging: Imaging | None = None,
     taps: int = 32,
-    settle_frames: int | None = None,
 ) -> PredictionTable:
     """Replay controllers on frames that nothing was fitted to, and compare with the model.
 
@@ -186,8 +192,8 @@ def prediction_against_data(
     controllers : mapping of str to Controller or Design
         What is compared, by name.
     stretches : sequence of (start, stop), optional
-        Contiguous usable frames; by default the whole record. They are halved by
-        :func:`split_halves`, unless ``fit`` and ``test`` are given.
+        Contiguous usable frames, over which controllers run; by default the whole record, or
+        ``fit`` and ``test``. They are halved by :func:`split_halves`, unless these are given.
     fit, test : sequence of (start, stop), optional
         Frames to fit the predictor to and frames to test on; both or neither.
     measurements : (frames, q) array_like, optional
@@ -200,9 +206,6 @@ def prediction_against_data(
         The camera, for Strehl ratios on at most two axes.
     taps : int, optional
         Coefficients of the predictor per mode.
-    settle_frames : int, optional
-        Frames dropped before each stretch of the test; by default the most of any loop
-        (:func:`replayed_residual`).
 
     Returns
     -------
@@ -240,11 +243,9 @@ def prediction_against_data(
     if imaging is not None:
         require_instance(imaging, Imaging)
     hardware = plant.hardware
-    series, usable = check_series(open_loop, hardware.modes, stretches)
-    fitted, tested = split_frames(usable, fit, test, len(series))
-    data = prediction_data(
-        series, hardware, plant.R, noise_error_nm=noise_error_nm, stretches=tested
-    )
+    series, _ = check_series(open_loop, hardware.modes, stretches)
+    runs, fitted, tested = split_frames(stretches, fit, test, len(series))
+    data = prediction_data(series, hardware, plant.R, noise_error_nm=noise_error_nm, stretches=runs)
     for name in controllers:
         if name in _RESERVED or not isinstance(name, str):
             raise ProblemError(
@@ -253,20 +254,23 @@ def prediction_against_data(
     predictor = least_squares_predictor(series, hardware, taps=taps, stretches=fitted).controller
     chosen = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
     loops = {name: _close_stable_loop(plant, name, one) for name, one in chosen.items()}
-    settle = choose_settling(settle_frames, loops.values())
+    every = replay_frames(runs, tested)
+    replays = {name: replay(loop, series, runs, from_rest=False) for name, loop in loops.items()}
+    warm_up = choose_warm_up(list(replays.values()), every)
+    frames = every.without(warm_up)
     rows = []
     if measurements is not None:
         promised = None
         if running is not None:
             promised = model_budget(_close_stable_loop(plant, RAN, running), plant).total_nm2
-        ran = _measured_residual(data, hardware, measurements, settle)
-        rows.append(_build_row(RAN, ran, promised, imaging))
+        ran = _measured_replay(data, hardware, measurements, tested)
+        rows.append(_build_row(RAN, data.estimate(ran, frames), promised, imaging))
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
     for name, loop in loops.items():
-        replayed = predict_residual(data, loop, settle)
+        replayed = data.estimate(replays[name], frames)
         rows.append(_build_row(name, replayed, model_budget(loop, plant).total_nm2, imaging))
-    notes = _note_refuted(rows)
+    notes = [*_note_starts(rows, loops), *_note_refuted(rows)]
     try:
         limit = least_model_residual(plant)
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
@@ -277,10 +281,24 @@ def prediction_against_data(
     return PredictionTable(
         entries=tuple(rows),
         fit=fitted,
-        test=drop_settling(tested, settle),
-        settle_frames=settle,
+        test=frames.test,
+        warm_up_frames=warm_up,
         notes=tuple(notes),
     )
+
+
+def _note_starts(rows: Sequence[PredictionRow], loops: Mapping[str, ClosedLoop]) -> Iterator[str]:
+    """Yield a note on each row whose start matters."""
+    for row in rows:
+        if row.replayed is None:
+            continue
+        start = float(np.trace(row.replayed.start_nm2))
+        if start > _START_SHARE * float(np.mean(np.sum(row.replayed.measured_nm**2, axis=1))):
+            yield (
+                f"the state of the {row.name} before the record is not known: slow modes (pole "
+                f"{loops[row.name].spectral_radius:.6f}) may contribute up to {start**0.5:.2g} nm "
+                "to its residual on the data, which its error holds. A longer record tells more"
+            )
 
 
 def _note_refuted(rows: Sequence[PredictionRow]) -> list[str]:
@@ -309,17 +327,16 @@ def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Desig
     return loop
 
 
-def _measured_residual(
-    data: PredictionData, hardware: LoopHardware, measurements: ArrayLike, settle: int
-) -> ResidualEstimate:
-    """Return the residual of the loop that ran, from its own measurements on the same frames."""
-    y, _ = check_series(measurements, hardware.n_measurements, data.stretches, "measurements")
+def _measured_replay(
+    data: PredictionData, hardware: LoopHardware, measurements: ArrayLike, test: Stretches
+) -> Replay:
+    """Return the residual of the loop that ran, from its own measurements."""
+    y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
     if len(y) != len(data.open_loop):
         raise ProblemError(
             f"measurements must have the {len(data.open_loop)} frames of open_loop; got {len(y)}."
         )
-    residual = y @ inverse_sensor(hardware).T
-    return data.estimate(lambda start, stop: residual[start:stop], settle)
+    return measured_replay(y @ inverse_sensor(hardware).T)
 
 
 def _build_row(

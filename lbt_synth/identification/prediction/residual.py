@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.fft import rfft
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.stretches import (
-    Stretches,
-    StretchesLike,
-    checked_stretches,
-    drop_settling,
+from lbt_synth.identification.prediction.mean_products import mean_covariance
+from lbt_synth.identification.prediction.replay import (
+    Replay,
+    ReplayFrames,
+    choose_warm_up,
+    replay,
+    replay_frames,
 )
+from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.linear import Controller
-from lbt_synth.loop import ClosedLoop, Imaging, close_loop, filter_series, jitter_strehl
-from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.loop import Imaging, close_loop, jitter_strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import (
-    ComplexArray,
     FloatArray,
     float_array,
     frozen_copy,
-    integer,
     number,
     one_or_each,
     real_array,
     require_instance,
 )
 
-_FEWEST = 100  # frames that give a standard error
 _TOO_FAR = 4.0  # standard errors below zero that chance does not explain
 
 
@@ -54,14 +51,17 @@ class ResidualEstimate:
         Covariance of the noise in e [nm^2].
     covariance_nm2 : (n, n) ndarray
         Covariance of the residual: mean of ``e e'`` less that of the noise [nm^2].
+    start_nm2 : (n, n) ndarray
+        Mean square that the unknown state of the loop before the record may add [nm^2].
     error_nm4 : (n, n) ndarray
-        Covariance of the errors of the axes' variances [nm^4].
+        Covariance of the errors of the axes' variances, that of the start included [nm^4].
     """
 
     measured_nm: FloatArray
     stretches: Stretches
     noise_nm2: FloatArray
     covariance_nm2: FloatArray
+    start_nm2: FloatArray
     error_nm4: FloatArray
 
     @property
@@ -149,7 +149,7 @@ class ResidualEstimate:
         one, two = self.measured_nm, other.measured_nm
         if self.stretches != other.stretches or one.shape != two.shape:
             raise ProblemError("two residuals can be compared on the same frames only; got others.")
-        covariance = _mean_covariance(one - two, one + two, self.stretches)
+        covariance = mean_covariance(one - two, one + two, self.stretches)
         error = float(np.sqrt(max(float(np.sum(covariance)), 0.0)))
         return self.total_nm2 - other.total_nm2, error
 
@@ -173,58 +173,23 @@ class ResidualEstimate:
 
 
 def estimate_residual(
-    measured: FloatArray, stretches: Stretches, noise_nm2: FloatArray, noise_error_nm4: FloatArray
+    measured: FloatArray,
+    stretches: Stretches,
+    noise_nm2: FloatArray,
+    noise_error_nm4: FloatArray,
+    start_nm2: FloatArray | None = None,
 ) -> ResidualEstimate:
     """Estimate a residual from the measured residual (frames, n) of some stretches."""
-    if len(measured) < _FEWEST:
-        raise ProblemError(
-            f"a residual needs at least {_FEWEST} frames after settling; got {len(measured)}. "
-            "Give longer stretches, or lower settle_frames."
-        )
+    start = np.zeros_like(noise_nm2) if start_nm2 is None else start_nm2
+    error = mean_covariance(measured, measured, stretches) + noise_error_nm4
     return ResidualEstimate(
         measured_nm=frozen_copy(measured),
         stretches=stretches,
         noise_nm2=frozen_copy(noise_nm2),
         covariance_nm2=frozen_copy(measured.T @ measured / len(measured) - noise_nm2),
-        error_nm4=frozen_copy(_mean_covariance(measured, measured, stretches) + noise_error_nm4),
+        start_nm2=frozen_copy(start),
+        error_nm4=frozen_copy(error + np.outer(np.diag(start), np.diag(start))),
     )
-
-
-def _mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) -> FloatArray:
-    """Return the covariance over the axes of mean products of two Gaussian series, (n, n).
-
-    Over K frames it is ``2 / K`` times the sum of the squared cross-covariances over all lags
-    (M. S. Bartlett, J. Roy. Stat. Soc. Suppl. 8, 27 (1946), doi:10.2307/2983611). A periodogram I
-    has ``E I^2 = 2 S^2``: no spectrum needs to be smoothed.
-
-    ``cov(x_i y_i, x_j y_j)`` over all lags is the mean over the frequencies of ``S(x_i, x_j)
-    conj S(y_i, y_j) + S(x_i, y_j) conj S(y_i, x_j)``. On the diagonal the product of the two
-    periodograms has that mean for x = y, and at least that otherwise; off it, the two factors
-    are taken at neighbouring frequencies, which are independent.
-    """
-    frames, n = one.shape
-    total, start = np.zeros((n, n)), 0
-    for begin, end in stretches:
-        length = end - begin
-        x, y = (rfft(series[start : start + length], axis=0) for series in (one, other))
-        weight = np.full(len(x), 2.0)  # a frequency and its negative
-        weight[0] = 1.0
-        weight[-1] = 2.0 if length % 2 else 1.0
-        weight /= length**2
-        part = _products(x, x) * np.roll(_products(y, y).conj(), 1, axis=0)
-        part += _products(x, y) * np.roll(_products(y, x).conj(), 1, axis=0)
-        lower = np.tril(np.tensordot(weight, part.real, 1), -1)
-        total += lower + lower.T + np.diag(weight @ (np.abs(x) ** 2 * np.abs(y) ** 2))
-        start += length
-    total /= frames**2
-    # a covariance is at most the product of the deviations
-    most = np.sqrt(np.outer(np.diag(total), np.diag(total)))
-    return np.asarray(np.clip(total, -most, most))
-
-
-def _products(x: ComplexArray, y: ComplexArray) -> ComplexArray:
-    """Return ``x_i conj(y_j)`` at each frequency, (f, n, n)."""
-    return x[:, :, None] * y.conj()[:, None, :]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -232,15 +197,19 @@ class PredictionData:
     """A recorded pseudo-open-loop series that fits a loop, and what is known of its noise."""
 
     open_loop: FloatArray  # (frames, n): the series z(k) [nm], finite in the stretches
-    stretches: Stretches  # frames that can be used
+    stretches: Stretches  # contiguous frames that can be used
     noise_nm2: FloatArray  # (n, n): covariance of the noise in z
     noise_error_nm4: FloatArray  # (n, n): covariance of the errors of the noise variances
 
-    def estimate(self, measure: Callable[[int, int], FloatArray], settle: int) -> ResidualEstimate:
-        """Return the residual of a loop that settles, given what it leaves of some frames."""
-        kept = drop_settling(self.stretches, settle)
-        measured = np.concatenate([measure(start, stop) for start, stop in kept])
-        return estimate_residual(measured, kept, self.noise_nm2, self.noise_error_nm4)
+    def estimate(self, run: Replay, frames: ReplayFrames) -> ResidualEstimate:
+        """Return the residual of a replay in the frames that count."""
+        return estimate_residual(
+            run.measured(frames),
+            frames.test,
+            self.noise_nm2,
+            self.noise_error_nm4,
+            run.left_of_start(frames),
+        )
 
 
 def replayed_residual(
@@ -252,7 +221,8 @@ def replayed_residual(
     noise_error_nm: ArrayLike = 0.0,
     sensor_gain: float = 1.0,
     stretches: StretchesLike | None = None,
-    settle_frames: int | None = None,
+    test: StretchesLike | None = None,
+    from_rest: bool = False,
 ) -> ResidualEstimate:
     """Residual that a controller would have left of a recorded disturbance.
 
@@ -261,6 +231,10 @@ def replayed_residual(
     controller computes exactly the commands of that loop under that disturbance and noise. Its
     measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + w(k) / g``. As c(k) depends on the
     noise up to frame k-1 only, white noise adds exactly its variance, which is subtracted.
+
+    The controller runs over each stretch from the equilibrium for its first frames. What the
+    error of that start can add to the mean square is part of the standard error, and as many
+    frames at the beginning of each stretch are left out of the test as make the whole error least.
 
     Parameters
     ----------
@@ -278,16 +252,19 @@ def replayed_residual(
         Sensor gain g of the recorded loop relative to the sensor matrix, as used to form z.
     stretches : sequence of (start, stop), optional
         Contiguous usable frames, in order; by default the whole record.
-    settle_frames : int, optional
-        Frames dropped at the beginning of each stretch, where the controller starts from zero; by
-        default until the slowest mode of the loop has decayed to 1e-4, and at least as many as
-        the loop has states. Shorter stretches are left out.
+    test : sequence of (start, stop), optional
+        Frames of them that count; by default all. The frames before are for the controller to
+        warm up.
+    from_rest : bool, optional
+        Start the controller, the delay and the mirror from rest, and count all frames: the
+        replay is then what such a run would have measured, frame by frame.
 
     Returns
     -------
     ResidualEstimate
         Measured residual, its variance without the noise, and standard errors. They include the
-        sampling of Gaussian series and the error of ``noise_nm``, not that of the sensor gain.
+        sampling of Gaussian series, the start and the error of ``noise_nm``, not that of the
+        sensor gain.
 
     Raises
     ------
@@ -323,7 +300,12 @@ def replayed_residual(
     )
     loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
     loop.require_stable()
-    return predict_residual(data, loop, choose_settling(settle_frames, [loop]))
+    runs = data.stretches
+    tested = runs if test is None else checked_stretches(test, len(data.open_loop))
+    frames = replay_frames(runs, tested)
+    run = replay(loop, data.open_loop, runs, from_rest=from_rest)
+    warm_up = 0 if from_rest else choose_warm_up([run], frames)
+    return data.estimate(run, frames.without(warm_up))
 
 
 def prediction_data(
@@ -384,17 +366,3 @@ def invert(square: FloatArray, need: str) -> FloatArray:
     if square.shape[0] != square.shape[1] or rank < len(square):
         raise ProblemError(f"{need} that can be inverted; got {square.shape} of rank {rank}.")
     return np.asarray(np.linalg.inv(square))
-
-
-def choose_settling(given: int | None, loops: Iterable[ClosedLoop]) -> int:
-    """Return the given frames, or those after which the slowest loop has forgotten its start."""
-    if given is not None:
-        return integer(given, "settle_frames", at_least=0)
-    return max(max(settling_frames(loop.spectral_radius), loop.system.n_states) for loop in loops)
-
-
-def predict_residual(data: PredictionData, loop: ClosedLoop, settle: int) -> ResidualEstimate:
-    """Return the residual of a stable loop replayed on recorded data."""
-    # z(k) for phi_tot(k-1), and no noise: the residual of frame k-1 is e(k)
-    path, z = loop.rejection(), data.open_loop
-    return data.estimate(lambda a, b: filter_series(path, z[a - settle : b])[settle:], settle)

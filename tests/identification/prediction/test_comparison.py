@@ -99,7 +99,7 @@ def test_the_table():
     assert np.isnan([limit.ratio, limit.deviations, limit.strehl]).all()
     # what ran: its own measurements on the same frames
     begin, end = table.test[0]
-    assert begin == 15_000 + table.settle_frames
+    assert (begin, end) == (15_000, 30_000)  # the first half is enough to warm up
     part = y[begin:end] / 0.6
     np.testing.assert_allclose(
         table["what ran"].replayed.variance_nm2,
@@ -112,8 +112,7 @@ def test_the_table():
         ran.controller,
         plant.hardware,
         noise_nm=[15.0, 10.0],
-        stretches=[(0, end)],
-        settle_frames=begin,
+        test=[(begin, end)],
     )
     np.testing.assert_allclose(again.measured_nm, part, rtol=0, atol=1e-7)
     gained, error = table["what ran"].replayed.above(table["Kalman"].replayed)
@@ -146,11 +145,11 @@ def test_a_table_of_one_axis():
         imaging=CAMERA,
         fit=[(0, 3000)],
         test=[(3000, 5000), (5100, 9000)],
-        settle_frames=500,
     )
     assert table.headings[:3] == ("controller", "tip_nm", "data_nm")
     assert table.fit == ((0, 3000),)
-    assert table.test == ((3500, 5000), (5600, 9000))
+    assert 0 < table.warm_up_frames < 1000
+    assert table.test == ((3000, 5000), (5100 + table.warm_up_frames, 9000))
     row = table["Kalman"]
     assert abs(row.deviations) < 4
     assert row.strehl == pytest.approx(
@@ -251,7 +250,7 @@ def test_more_noise_than_the_data_has_is_a_note():
         ({"measurements": SPOILT[::-1]}, "measurements, frames 1000 to 2000, must be finite"),
         ({"running": lbt.integrator(PATH, gain=0.3)}, "needs its measurements"),
         ({"imaging": 2.2}, "expected an Imaging"),
-        ({"settle_frames": 1000}, "longer than the 1000 frames"),
+        ({"stretches": [(0, 900)], "fit": [(0, 500)], "test": [(800, 950)]}, "within the usable"),
         ({"noise_error_nm": -1.0}, "noise_error_nm must be at least 0"),
         ({"taps": 300}, "at least 1200 frames to fit"),
     ],

@@ -78,7 +78,7 @@ def test_the_controller_of_the_predictor_gives_its_residual(delay, gain, mirror,
         z, path, taps=7, sensor_gain=gain, coupled=True
     )
     found = lbt.identification.replayed_residual(
-        z, fit.controller, path, noise_nm=1.0, sensor_gain=gain, settle_frames=0
+        z, fit.controller, path, noise_nm=1.0, sensor_gain=gain, from_rest=True
     )
     commands = np.zeros_like(z)
     for late in range(7):

@@ -1,0 +1,140 @@
+"""Short records of drifting loops: gain files written, residuals, tests on unseen data, times.
+
+    python benchmarks/short_records.py [--records 40] [--jobs 2] [--seconds 30 17 10]
+
+The loops are those of ``identification.py`` at 500 to 2000 Hz, with a drift on top of the
+turbulence: a first-order process of 50 to 1000 nm rms (in its logarithm) whose pole is 0.999 to
+0.99995 (in the logarithm of its distance from 1). What each design leaves is computed exactly in
+the truth, and replayed on the minute after its record.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from concurrent.futures import ProcessPoolExecutor
+
+import identification as loops
+import numpy as np
+
+import lbt_synth as lbt
+
+UNSEEN_S = 60.0
+POLES = (0.99995, 0.999)
+DRIFT_NM = (50.0, 1000.0)
+LENGTHS_S = (30.0, 17.0, 10.0)
+
+
+def drifting_case(seed: int, seconds: float) -> loops.Case:
+    """Draw a loop with a drift, and run it for so long and for a minute more."""
+    rng = np.random.default_rng([seed, 2])
+    rate = float(np.round(np.exp(rng.uniform(np.log(500), np.log(2000)))))
+    pole = 1 - float(np.exp(rng.uniform(*np.log(1 - np.array(POLES)))))
+    rms = float(np.exp(rng.uniform(*np.log(DRIFT_NM))))
+    drift = lbt.models.ARModel(
+        coefficients=[pole], driving_rms_nm=rms * np.sqrt(1 - pole**2), frame_rate_hz=rate
+    )
+    return loops.case(seed, round((seconds + UNSEEN_S) * rate), rate=rate, drift=drift)
+
+
+def left_later(it: loops.Case, controller: lbt.Controller, frames: int) -> float:
+    """Variance that a controller leaves of the truth after some frames [nm^2], by a replay."""
+    z = it.record.pseudo_open_loop(it.truth.sensor_gain)
+    known = {"noise_nm": it.truth.noise_nm, "sensor_gain": it.truth.sensor_gain}
+    later = [(frames, it.record.frames)]
+    try:
+        found = lbt.identification.replayed_residual(z, controller, it.path, test=later, **known)
+    except lbt.errors.UnstableLoopError:
+        return float("inf")
+    return found.total_nm2
+
+
+def studied(task: tuple[int, float]) -> dict:
+    """Everything that is measured of one record."""
+    seed, seconds = task
+    it = drifting_case(seed, seconds)
+    whole, frames = it.record, round(seconds * it.path.frame_rate_hz)
+    record = lbt.identification.loop_record(
+        whole.measurements[:frames],
+        whole.commands[:frames],
+        frame_rate_hz=whole.frame_rate_hz,
+        delay_frames=2,
+        unit="nm",
+    )
+    out = {"seed": seed, "seconds": seconds, "error": ""}
+    begin = time.process_time()
+    try:
+        found = lbt.design_from_record(record)
+    except lbt.errors.LbtSynthError as error:
+        return out | {"error": str(error), "time_s": time.process_time() - begin}
+    out["time_s"] = time.process_time() - begin
+    truth = it.truth
+    best = lbt.kalman(loops.exact_plant(it)).controller
+    limit = lbt.loop.least_residual(it.path, truth).rms_nm ** 2
+    later = [left_later(it, each, frames) for each in (found.design.controller, best)]
+    table = found.held_out
+    row = table[found.name]
+    half = lbt.kalman(found.half_model.plant()).controller
+    axis = found.model.axes[0]
+    told = axis.sensor_gain_error
+    return out | {
+        "ratio": loops.left(it, found.design.controller) / loops.left(it, best),
+        "limit": loops.left(it, found.design.controller) / limit,
+        "later": later[0] / later[1],
+        "gain_deviation": np.nan if told is None else (axis.sensor_gain - truth.sensor_gain) / told,
+        "half": loops.left(it, half) / loops.left(it, best),
+        "tested": (row.replayed.total_nm2, row.replayed.total_error_nm2, loops.left(it, half)),
+        "gains": (axis.sensor_gain, truth.sensor_gain),
+        "notes": [*table.notes, *found.notes],
+    }
+
+
+def show(seconds: float, results: list[dict]) -> None:
+    """Print what was found of the records of one length."""
+    written = [r for r in results if not r["error"]]
+    print(f"{seconds:g} s: {len(results)} records, gain file of {len(written)}")
+    for r in results:
+        if r["error"]:
+            print(f"  record {r['seed']}: {r['error']}")
+    if not written:
+        return
+    for key, words in (
+        ("ratio", "residual variance, exact: design / truth's filter"),
+        ("later", "the same on the minute after the record"),
+        ("limit", "the same / limit of performance"),
+        ("half", "first half's design / truth's filter"),
+    ):
+        values = np.array([r[key] for r in written])
+        print(
+            f"  {words:50s} median {np.median(values):.4f}, 90th percentile "
+            f"{np.percentile(values, 90):.4f}, largest {np.max(values):.4f}"
+        )
+    deviations = [
+        (seen * (mine / real) ** 2 - exact) / (error * (mine / real) ** 2)
+        for (seen, error, exact), (mine, real) in ((r["tested"], r["gains"]) for r in written)
+    ]
+    print(f"  test on unseen data: {np.std(deviations):.2f} standard errors rms of the exact value")
+    times = [r["time_s"] for r in results]
+    print(f"  processor time: median {np.median(times):.1f} s, largest {np.max(times):.1f} s")
+    for r in written:
+        for note in r["notes"]:
+            print(f"  record {r['seed']}: {note}")
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--records", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seconds", type=float, nargs="+", default=list(LENGTHS_S))
+    asked = parser.parse_args()
+    seeds = range(asked.first, asked.first + asked.records)
+    with ProcessPoolExecutor(asked.jobs) as pool:
+        for seconds in asked.seconds:
+            tasks = [(seed, seconds) for seed in seeds]
+            show(seconds, list(pool.map(studied, tasks)))
+
+
+if __name__ == "__main__":
+    main()
