@@ -10,6 +10,7 @@ from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, RecordedDesign, SpectrumRecord, design_from_record
+from lbt_synth.identification.auto import LEAST_SECONDS
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.storage.rows import column, fill_row, nm_column, table_row
@@ -21,7 +22,7 @@ def run(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
     gain = require_gain_name(arguments.output)
     places = loop_records.find_places(arguments, arguments.model, gain=gain)
-    record = loop_records.read_record(arguments)
+    record = loop_records.read_record(arguments, LEAST_SECONDS)
     if isinstance(record, SpectrumRecord):
         raise ProblemError(
             "auto tests its design on the recorded series; got a spectrum. Try lbt-synth identify "

@@ -28,6 +28,7 @@ from lbt_synth.identification import (
 from lbt_synth.identification.auto import RecordedDesign
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.line_priors import load_accelerations
+from lbt_synth.identification.records.record import LEAST_SECONDS
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
@@ -39,8 +40,10 @@ _FACTS = (  # that a file may not hold
 )
 
 
-def read_record(arguments: Namespace) -> LoopRecord | SpectrumRecord:
-    """Load the record of the command line, with its short gaps bridged."""
+def read_record(
+    arguments: Namespace, least_seconds: float = LEAST_SECONDS
+) -> LoopRecord | SpectrumRecord:
+    """Load the record of the command line, with its short gaps bridged; refuse a short one."""
     kind = arguments.kind
     record = load_record(
         arguments.file,
@@ -51,7 +54,7 @@ def read_record(arguments: Namespace) -> LoopRecord | SpectrumRecord:
     )
     if isinstance(record, LoopRecord):
         record = record.bridged()
-        require_length(record)
+        require_length(record, seconds=least_seconds)
     return record
 
 

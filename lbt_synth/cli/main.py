@@ -9,8 +9,9 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from lbt_synth.cli.parser import build_parser
 from lbt_synth.errors import LbtSynthError, SynthesisError
@@ -30,9 +31,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
         report = command.run(arguments)
     except LbtSynthError as error:
+        message = _name_options(str(error), vars(arguments))
         if arguments.json:
-            print(json.dumps({"error": type(error).__name__, "message": str(error)}))
-        print(f"lbt-synth: error: {error}", file=sys.stderr)
+            print(json.dumps({"error": type(error).__name__, "message": message}))
+        print(f"lbt-synth: error: {message}", file=sys.stderr)
         return FAILED if isinstance(error, SynthesisError) else WRONG
     except MemoryError:
         print("lbt-synth: error: not enough memory; ask for less.", file=sys.stderr)
@@ -42,6 +44,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     report.print(as_json=arguments.json)
     return DONE if report.passed else FAILED
+
+
+def _name_options(message: str, arguments: Mapping[str, object]) -> str:
+    """Name the command's options where a message names arguments of functions.
+
+    With a configuration, a message may name its keys instead.
+    """
+    if "config" in arguments:
+        return message
+    words = re.compile(r"(?<![\w.'\"/-])[a-z]+(?:_[a-z]+)+(?!\w|\(|\[|\.\w)")
+
+    def name(found: re.Match[str]) -> str:
+        word = found.group()
+        return "--" + word.replace("_", "-") if word in arguments else word
+
+    return words.sub(name, message)
 
 
 def entry_point() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,7 +13,11 @@ from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.prediction.comparison import PredictionTable, prediction_against_data
+from lbt_synth.identification.prediction.comparison import (
+    PredictionRow,
+    PredictionTable,
+    prediction_against_data,
+)
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
@@ -24,6 +28,8 @@ from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
 _APART = 3.0  # standard errors between gains that disagree
+LEAST_SECONDS = 8.0  # usable: half of it has to show a model
+_SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,7 +107,8 @@ def design_from_record(
     Raises
     ------
     ProblemError
-        If the record is too short, its delay is missing, or a value is out of range.
+        If less than 8 s of the record, or 4096 frames, are usable, its delay is missing, or a
+        value is out of range.
     NumericalError, CertificateError
         If a fit fails; or if a design does not pass its checks, or its loop is unstable at one
         of the sensor gains that were found.
@@ -134,7 +141,7 @@ def design_from_record(
         hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
     )
     _ = record.hardware  # refuses a record without a delay
-    require_length(record)
+    usable = require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
     fit_model = partial(identify, record, announced=announced, **gains, **options)
@@ -165,13 +172,32 @@ def design_from_record(
         half_model=half,
         held_out=held_out,
         name=name,
-        notes=_check_gains(model, half, design),
+        notes=(*_check_gains(model, half, design), *_note_short(usable, model, held_out[name])),
     )
 
 
 def _design(request: DesignRequest, model: IdentifiedModel, gamma_ratio: float) -> Design:
     defaults = {"gamma_ratio": gamma_ratio}
     return request.build(PlantInputs(plant=model.plant(), design_defaults=defaults))
+
+
+def _note_short(seconds: float, model: IdentifiedModel, row: PredictionRow) -> Iterator[str]:
+    """Yield what a short record leaves open."""
+    if seconds >= _SHORT_SECONDS:
+        return
+    open_to = [
+        ("the noise", max(axis.noise_error_nm / axis.noise_nm for axis in model.axes)),
+        ("the residual on unseen data", row.replayed_error_nm / row.replayed_nm),
+    ]
+    gains = [(axis.sensor_gain_error, axis.sensor_gain) for axis in model.axes]
+    if all(error is not None for error, _ in gains):
+        open_to.insert(0, ("the sensor gain", max((error or 0.0) / gain for error, gain in gains)))
+    yield (
+        f"the record is short ({seconds:.3g} s): it does not tell lines less than "
+        f"{max(axis.resolution_hz for axis in model.axes):.2g} Hz apart from one, and shows "
+        + " and ".join(f"{what} to {100 * share:.2g} %" for what, share in open_to)
+        + ". Half a minute shows more"
+    )
 
 
 def _check_gains(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:

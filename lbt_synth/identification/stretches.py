@@ -85,8 +85,7 @@ def split_halves(
     if not fit or not test:
         raise ProblemError(
             f"a record must leave frames to fit and to test on; got {len(fit)} stretches to fit "
-            f"and {len(test)} to test, of {frames} frames with a gap of {gap}. Record more, or "
-            "shorten gap_frames."
+            f"and {len(test)} to test, of {frames} frames with a gap of {gap}. Record for longer."
         )
     return tuple(fit), tuple(test)
 

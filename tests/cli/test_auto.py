@@ -110,7 +110,7 @@ def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
 
 def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
     for options, words in (
-        (("-o", tmp_path / "t.fits", "--gamma-ratio", 0.5), "gamma_ratio"),
+        (("-o", tmp_path / "t.fits", "--gamma-ratio", 0.5), "--gamma-ratio must be at least 1"),
         (("-o", tmp_path / "t.txt"), "must end in"),
         (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.fits"), "must end in .yaml"),
         (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.json"), "must end in .yaml"),
@@ -121,11 +121,31 @@ def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_short_record_is_refused_in_the_words_of_the_command_line(tmp_path, capsys) -> None:
+    record, file = spliced_record(frames=5000), tmp_path / "brief.npz"
+    np.savez(file, measurements=record.measurements, commands=record.commands)
+    known = ("--frame-rate-hz", 1000, "--unit", "nm", "--no-figure", "-o", tmp_path / "q.fits")
+    for options, message in (
+        (
+            ("--delay-frames", 2),
+            "the record needs 8000 usable frames (8 s at 1000 Hz) in stretches of at least 256; "
+            "got 4994 (4.99 s), the longest stretch 4994.",
+        ),
+        (("--delay-frames", 0.2), "--delay-frames must be"),
+        ((), "not known; give --delay-frames, from the middle"),
+    ):
+        status, text, error = run(capsys, "auto", file, *known, *options)
+        assert (status, text) == (2, "")
+        assert message in error
+        assert not any(name in error for name in ("_frames", "record.", "bridged", "settle"))
+    assert list(tmp_path.iterdir()) == [file]
+
+
 def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
-    record = spliced_record(frames=6000)
+    record = spliced_record(frames=9000)
     file = tmp_path / "a\x01.npz"
     np.savez(file, measurements=record.measurements, commands=record.commands)
-    status, _, error = run(
+    status, text, error = run(
         capsys,
         "auto",
         file,
@@ -141,3 +161,7 @@ def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
     )
     assert (status, error) == (0, "")
     assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()
+    assert (
+        "note: the record is short (8.99 s): it does not tell lines less than 0.11 Hz apart" in text
+    )
+    assert "Half a minute shows more" in text

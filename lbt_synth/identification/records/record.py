@@ -153,8 +153,7 @@ class LoopRecord:
         if self.delay_frames is None:
             raise ProblemError(
                 "the total delay of this loop is not known; give delay_frames, from the middle of "
-                "an exposure to the middle of the command that is computed from it. Of a record, "
-                "try record.with_delay(...)."
+                "an exposure to the middle of the command that is computed from it."
             )
         return LoopHardware(
             frame_rate_hz=self.frame_rate_hz,
@@ -332,7 +331,7 @@ def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: i
 
 
 _LEAST_FRAMES = 4096
-_LEAST_SECONDS = 4.0
+LEAST_SECONDS = 4.0
 _SHORTEST_STRETCH = 256  # frames of a stretch that counts
 
 
@@ -340,7 +339,7 @@ def require_length(
     record: LoopRecord,
     *,
     frames: int = _LEAST_FRAMES,
-    seconds: float = _LEAST_SECONDS,
+    seconds: float = LEAST_SECONDS,
     resolution_hz: float | None = None,
 ) -> int:
     """Refuse a record that is too short for a model to be found.
@@ -375,7 +374,7 @@ def require_length(
     >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
         ...
-    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s) ...
+    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s at 800 Hz) ...
     """
     rate = record.frame_rate_hz
     needed = integer(frames, "frames", at_least=1)
@@ -385,9 +384,10 @@ def require_length(
     longest = max(lengths, default=0)
     if count < needed:
         raise ProblemError(
-            f"the record needs {needed} usable frames ({needed / rate:.3g} s) in stretches of at "
-            f"least {_SHORTEST_STRETCH}; got {count}, the longest stretch {longest}. "
-            f"{record.health.summary()} Record more, or bridge short holes (record.bridged())."
+            f"the record needs {needed} usable frames ({needed / rate:.3g} s at {rate:.6g} Hz) in "
+            f"stretches of at least {_SHORTEST_STRETCH}; got {count} ({count / rate:.3g} s), the "
+            f"longest stretch {longest}. {record.health.summary()} Record for longer, or lose "
+            "fewer frames."
         )
     if resolution_hz is None:
         return count

@@ -49,7 +49,7 @@ def test_axes_share_a_sensor_gain_where_they_agree() -> None:
 def test_identify_needs_what_it_needs() -> None:
     y = np.random.default_rng(0).standard_normal((6000, 1))
     without = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
-    with pytest.raises(ProblemError, match="with_delay"):
+    with pytest.raises(ProblemError, match="give delay_frames"):
         lbt.identify(without)
     with pytest.raises(ProblemError, match="one number, or 1"):
         lbt.identify(
