@@ -24,9 +24,9 @@ endif
 # the packages of the runs in other programs come after the default check, into the same place
 $(VENV)/.ready-e2e: $(VENV)/.ready
 ifdef UV
-	$(UV) pip install --quiet --python $(BIN)/python -e ".[e2e,aot,dask,parquet]"
+	$(UV) pip install --quiet --python $(BIN)/python -e ".[e2e,aot,dask,parquet,pyrtc]"
 else
-	$(BIN)/python -m pip install --quiet -e ".[e2e,aot,dask,parquet]"
+	$(BIN)/python -m pip install --quiet -e ".[e2e,aot,dask,parquet,pyrtc]"
 endif
 	@touch $@
 
@@ -61,7 +61,7 @@ test: lint               ## the whole default check
 test-all:                ## the check on each supported Python that is found
 	PYTHON=$(PYTHON) .ci/each-python $(MAKE) test
 
-e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT, Dask, Parquet; a test that is skipped, or none at all, fails
+e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT, Dask, Parquet, pyRTC; a test that is skipped, or none at all, fails
 	$(BIN)/pytest -n 2 -m e2e --no-skips tests
 
 browser: $(VENV)/.ready-browser ## pages in headless Chromium (Debian: chromium, chromium-driver); no test may be skipped

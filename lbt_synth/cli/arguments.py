@@ -183,6 +183,26 @@ def auto(parser: ArgumentParser) -> None:
     add_output(parser, GAIN_FILE)
 
 
+def league(parser: ArgumentParser) -> None:
+    """Score controllers on records: trained on the past, tested on the future; resumes."""
+    text = "what loops recorded: files as identify takes them, all of one kind"
+    parser.add_argument("files", nargs="+", metavar="record", help=text)
+    add_output(parser, "directory to write into")
+    add_option(parser, "--splits", int, "tests of each record, in its second half", 3)
+    add_option(parser, "--entries", str, "those that compete (default: all)", nargs="+")
+    _add_engine(parser)
+    add_switch(parser, "--pdf", "write the page as a PDF, too (league.pdf)")
+    _add_missing_facts(parser)
+    _add_prior_knowledge(parser)
+
+
+def _add_engine(parser: ArgumentParser) -> None:
+    engine = parser.add_mutually_exclusive_group()
+    add_option(engine, "--jobs", int, "processes", 1)
+    text = "Dask scheduler that runs it instead, as tcp://host:8786"
+    add_option(engine, "--dask", str, text, metavar="ADDRESS")
+
+
 def _add_record(parser: ArgumentParser) -> None:
     parser.add_argument(
         "file",
@@ -293,10 +313,7 @@ def study(parser: ArgumentParser) -> None:
     """Try controllers on many samples of what the loop may meet; resumes if started again."""
     parser.add_argument("study", metavar="file", help="study file (YAML)")
     add_output(parser, "directory of the study")
-    engine = parser.add_mutually_exclusive_group()
-    add_option(engine, "--jobs", int, "processes", 1)
-    text = "Dask scheduler that runs it instead, as tcp://host:8786"
-    add_option(engine, "--dask", str, text, metavar="ADDRESS")
+    _add_engine(parser)
     add_switch(parser, "--pdf", "write the page as a PDF, too (summary.pdf)")
     instead = parser.add_mutually_exclusive_group()
     add_switch(instead, "--dry-run", "say how many samples and how long, and write nothing")

@@ -5,20 +5,17 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
-from concurrent.futures import Executor
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from lbt_synth import studies
+from lbt_synth.cli.engine import choose_engine, require_jobs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
-from lbt_synth.errors import ProblemError
 from lbt_synth.report import write_study_page
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.rows import column, fill_row, table_row
-from lbt_synth.studies.study.cluster import connect_cluster
 from lbt_synth.studies.study.run import FinishedStudy, output_paths
 from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
 from lbt_synth.studies.study.summary import worst_table
@@ -29,8 +26,7 @@ _WORST = 3  # rows of each controller that are printed; the page has more
 
 def run(arguments: Namespace) -> Report:
     """Run a study, say what it would cost, or replay one of its rows."""
-    if arguments.jobs < 1:
-        raise ProblemError(f"--jobs must be at least 1; got {arguments.jobs}.")
+    require_jobs(arguments)
     folder = Path(arguments.output)
     with show_spinner("reading the study, designing", quiet=arguments.json):
         loaded = studies.load_study(arguments.study, directory=folder)
@@ -103,7 +99,7 @@ def _compute(
                 pdf=pdf[0] if pdf else None,
             )
 
-    with _engine(arguments) as (executor, workers):
+    with choose_engine(arguments) as (executor, workers):
         make_directory(folder)
         with count_progress(
             total=loaded.samples, what="samples", quiet=arguments.json, rate=True
@@ -124,15 +120,6 @@ def _compute(
                 raise
     [(statistics, new)] = found
     return study_run, statistics, new
-
-
-def _engine(
-    arguments: Namespace,
-) -> AbstractContextManager[tuple[Executor | None, int | None]]:
-    """Provide the executor of ``--dask`` and its workers, or None for both with ``--jobs``."""
-    if arguments.dask is None:
-        return nullcontext((None, None))
-    return connect_cluster(arguments.dask)
 
 
 def _duration(seconds: float) -> str:
@@ -169,7 +156,7 @@ class StudyFacts:
 
 
 def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
-    with _engine(arguments) as (_, workers):
+    with choose_engine(arguments) as (_, workers):
         count = workers or arguments.jobs
     with show_spinner("measuring a batch", quiet=arguments.json):
         cost = studies.estimate_study(loaded, workers=count, local=workers is None)

@@ -20,6 +20,7 @@ from .prediction.predictor import LeastSquaresPredictor as LeastSquaresPredictor
 from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual
+from .prediction.spectral_design import spectral_design as spectral_design
 from .records.faults import Finding as Finding
 from .records.faults import RecordHealth as RecordHealth
 from .records.from_arrays import loop_record as loop_record

@@ -4,6 +4,7 @@ from .c.export import export_c as export_c
 from .export_checks import Exported as Exported
 from .iir.export import export_iir as export_iir
 from .matlab.export import export_mat as export_mat
+from .pyrtc import pyrtc_commands as pyrtc_commands
 from .specula.calibration import Calibration as Calibration
 from .specula.calibration import calibrate as calibrate
 from .specula.end_to_end_run import EndToEndRun as EndToEndRun

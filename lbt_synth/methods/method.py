@@ -161,6 +161,8 @@ class Method:
         ``Design.method`` of its designs, where it is not the name.
     section : type or None
         Section ``design.<name>`` of a configuration, a :class:`Section`.
+    plant_section : callable or None
+        From a plant alone to a section with defaults; None if it takes a configuration.
     exclusive : frozenset of str
         Options of which at most one is given.
     configurable : frozenset of str
@@ -191,6 +193,7 @@ class Method:
     describe: Callable[[Any], Description]
     design_names: tuple[str, ...] = ()
     section: type[Section] | None = None
+    plant_section: Callable[[TipTiltPlant], Section] | None = None
     exclusive: frozenset[str] = frozenset()
     configurable: frozenset[str] = frozenset()
     estimator: bool = True

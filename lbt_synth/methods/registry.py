@@ -160,6 +160,12 @@ def record_methods() -> list[str]:
     return [n for n, m in all_methods().items() if m.estimator and not m.needs_options]
 
 
+def plant_methods() -> list[str]:
+    """Return the names of the methods that design for a plant alone, with defaults of all else."""
+    able = {n for n, m in all_methods().items() if m.plant_section is not None}
+    return sorted(able.union(record_methods()))
+
+
 def default_method() -> str:
     """Return the name of the method that is designed unless another is named."""
     return reference_methods(estimators_only=True)[0].name

@@ -167,7 +167,9 @@ class PlantInputs:
         raise ProblemError("this method needs a truth; got a plant alone. Try a configuration.")
 
     def method_section(self, name: str) -> Any:
-        """Return None: there is no configuration."""
+        """Return the section that a method makes of a plant, None if it makes none."""
+        make = method_named(name).plant_section
+        return None if make is None else make(self.plant)
 
     def size_nm(self, entry: Any, key: str) -> float:
         """Return the size of an entry, which must give it in nm."""

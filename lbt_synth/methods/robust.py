@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import Field, model_validator
 
-from lbt_synth.errors import ConfigError, name_key
+from lbt_synth.errors import ConfigError, ProblemError, name_key
 from lbt_synth.methods.method import (
     Count,
     Description,
@@ -27,10 +27,13 @@ if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.shaping.specification import Demand
-    from lbt_synth.models import Spectrum
+    from lbt_synth.models import Spectrum, TipTiltPlant
 
 T = TypeVar("T")
 _KEY = "design.robust"
+_MOST_BANDS = 6  # around lines of a plant
+_BAND = 0.02  # half width of such a band, over its frequency
+_PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes minutes
 
 
 class BandSection(Section):
@@ -233,6 +236,31 @@ def _list_command_bounds(
     return [bound_commands(at_most_nm=bound, rate=rate) for bound, rate in bounds]
 
 
+def _plant_section(plant: TipTiltPlant) -> RobustSection:
+    """Return bands around the strongest lines of a plant, those that overlap as one."""
+    lines = sorted(plant.vibrations, key=lambda line: -line.rms_nm)
+    nyquist_hz = plant.hardware.frame_rate_hz / 2
+    bands: list[tuple[float, float, float]] = []
+    for line in sorted(lines[:_MOST_BANDS], key=lambda line: line.frequency_hz):
+        half = max(_BAND * line.frequency_hz, line.damping * line.frequency_hz)
+        low, high = max(line.frequency_hz - half, 0.0), min(line.frequency_hz + half, nyquist_hz)
+        power = line.rms_nm**2
+        if bands and low <= bands[-1][1]:
+            first, last, before = bands.pop()
+            low, high, power = min(first, low), max(last, high), power + before
+        bands.append((low, high, power))
+    if not bands:
+        raise ProblemError("a robust controller is for vibrations; the plant has none.")
+    return RobustSection(
+        bands=[
+            BandSection(low_hz=low, high_hz=high, rms_nm=float(np.sqrt(power)))
+            for low, high, power in bands
+        ],
+        functions=_PLANT_FUNCTIONS,
+        states=None,
+    )
+
+
 def _pack(design: ShapedDesign) -> DesignRecord:
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.shaping.specification import to_metadata
@@ -314,6 +342,7 @@ METHOD = Method(
     estimator=False,
     options=Section,
     section=RobustSection,
+    plant_section=_plant_section,
     build=_build,
     describe=_describe,
     pack=_pack,

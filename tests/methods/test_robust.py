@@ -1,10 +1,14 @@
 """The robust section of a configuration."""
 
+import numpy as np
 import pytest
 from support.configs import AR, OTHER, minimal_config, write_config
 from support.robust_config import SMALL, robust_writer
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.methods.registry import plant_methods
+from lbt_synth.methods.request import PlantInputs, design_request
 
 
 @pytest.fixture
@@ -70,3 +74,36 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     content["model"]["turbulence"] = [AR, OTHER]
     with pytest.raises(lbt.errors.ConfigError, match="hold under one turbulence for all axes"):
         lbt.load_config(write_config(tmp_path, content)).design("robust")
+
+
+def a_plant_with_lines(*lines):
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    shakes = [
+        lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=rms, direction=(1,)) for f, rms in lines
+    ]
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=800, turbulence=slow, vibrations=shakes or None, noise_nm=15.5, modes=1
+    )
+
+
+def test_a_plant_alone_has_a_band_around_each_line():
+    plant = a_plant_with_lines((20, 80.0), (50, 30.0), (50.5, 40.0))
+    section = PlantInputs(plant=plant).method_section("robust")
+    edges = [(band.low_hz, band.high_hz, band.rms_nm) for band in section.bands]
+    assert np.array(edges) == pytest.approx(np.array([(19.6, 20.4, 80.0), (49.0, 51.51, 50.0)]))
+    assert "robust" in plant_methods()
+    design = design_request("robust", {}).build(PlantInputs(plant=plant))
+    assert design.certificate.passed
+    lines = lbt.close_loop(plant.hardware, design.controller).rejection()
+    assert abs(lines.frequency_response([20.0])[0, 0, 0]) < 0.2
+
+
+def test_the_strongest_lines_of_a_plant_have_bands():
+    lines = [(10.0 * k, 10.0 + k) for k in range(1, 10)]
+    section = PlantInputs(plant=a_plant_with_lines(*lines)).method_section("robust")
+    assert [round(band.rms_nm) for band in section.bands] == [14, 15, 16, 17, 18, 19]
+
+
+def test_a_plant_without_lines_has_no_robust_design():
+    with pytest.raises(ProblemError, match="the plant has none"):
+        design_request("robust", {}).build(PlantInputs(plant=a_plant_with_lines()))

@@ -1,0 +1,123 @@
+"""The command league: rivals trained on the past of records and scored on what followed."""
+
+from __future__ import annotations
+
+import re
+import sys
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lbt_synth import studies
+from lbt_synth.cli import loop_records
+from lbt_synth.cli.engine import choose_engine, require_jobs
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.output_files import make_directory
+from lbt_synth.cli.progress import count_progress, show_spinner
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import LoopRecord, SpectrumRecord
+from lbt_synth.report import write_league_page
+from lbt_synth.report.league.page import standing_notes, verdict_text
+from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
+from lbt_synth.storage.rows import csv_rows
+from lbt_synth.studies.league.entries import choose_entries
+
+_TABLE, _SCORES, _PAGE, _PRINT = "standings.csv", "scores.csv", "league.html", "league.pdf"
+_ODD = re.compile(r"[^A-Za-z0-9_.+-]+")
+
+
+def run(arguments: Namespace) -> Report:
+    """Run a league of all records; write its tables and its page."""
+    require_jobs(arguments)
+    if arguments.splits < 1:
+        raise ProblemError(f"--splits must be at least 1; got {arguments.splits}.")
+    able = [entry for entry in choose_entries(arguments.entries).values() if not entry.missing]
+    folder = Path(arguments.output)
+    paths = [folder / name for name in (_TABLE, _SCORES, _PAGE)]
+    pdf = folder / _PRINT if arguments.pdf else None
+    refuse_replacing([*paths, *([pdf] if pdf else [])], arguments.files)
+    with show_spinner("reading", quiet=arguments.json):
+        records, options = _read_records(arguments)
+    make_directory(folder)
+    total = len(records) * arguments.splits * len(able)
+    with (
+        choose_engine(arguments) as (executor, _),
+        count_progress(total=total, what="entries on splits", quiet=arguments.json) as count,
+    ):
+        try:
+            found = studies.run_league(
+                records,
+                folder,
+                entries=arguments.entries,
+                splits=arguments.splits,
+                jobs=arguments.jobs,
+                executor=executor,
+                progress=count,
+                options=options,
+            )
+        except KeyboardInterrupt:
+            note = f"what is finished is kept in {folder}; start it again to continue"
+            print(f"lbt-synth: {note}", file=sys.stderr)
+            raise
+    files = [
+        write_atomically(paths[0], csv_rows(found.standings)),
+        write_atomically(paths[1], csv_rows(found.scores)),
+        *write_league_page(found, records, paths[2], sources=arguments.files, pdf=pdf),
+    ]
+    return _make_report(found, files, able=len(able))
+
+
+def _make_report(found: studies.LeagueResult, files: Sequence[Path], *, able: int) -> Report:
+    report = Report(data={"records": [scores.name for scores in found.records]})
+    splits = len(found.records[0].splits)
+    caption = f"League: {able} entries, {splits} splits of each record"
+    report.add_rows("standings", caption, found.standings, hidden=("note",))
+    report.data["failures"] = dict(found.failures)
+    report.notes += [
+        f"warning: {name} is not in the table: {why}" for name, why in found.failures.items()
+    ]
+    report.notes += [f"note: {text}" for text in standing_notes(found)]
+    report.notes.append(verdict_text(found.standings))
+    report.note_files(files)
+    return report
+
+
+def _read_records(
+    arguments: Namespace,
+) -> tuple[dict[str, LoopRecord], dict[str, dict[str, Any]]]:
+    """Return the records and the options of their identification, by name."""
+    if arguments.commands is not None and len(arguments.files) > 1:
+        raise ProblemError(
+            f"--commands goes with one record; got {len(arguments.files)}. Join each record and "
+            "its commands in one file."
+        )
+    records: dict[str, LoopRecord] = {}
+    options: dict[str, dict[str, Any]] = {}
+    for path in arguments.files:
+        own = Namespace(**(vars(arguments) | {"file": path}))
+        try:
+            record = _read_series(own)
+            settings = loop_records.identification_options(own, record)
+        except ProblemError as error:
+            text = str(error)
+            raise ProblemError(text if str(path) in text else f"{path}: {text}") from error
+        name = _name_record(path, records)
+        records[name], options[name] = record, settings
+    return records, options
+
+
+def _read_series(arguments: Namespace) -> LoopRecord:
+    """Return a record of series with a known delay."""
+    record = loop_records.read_record(arguments)
+    if isinstance(record, SpectrumRecord):
+        raise ProblemError("a league scores recorded series; got a spectrum.")
+    _ = record.hardware
+    return record
+
+
+def _name_record(path: str, taken: dict[str, LoopRecord]) -> str:
+    """Return the stem of a file as a name that no other record has."""
+    stem = _ODD.sub("-", Path(path).stem).lstrip("_.+-") or "record"
+    names = [stem, *(f"{stem}-{i}" for i in range(2, len(taken) + 2))]
+    return next(name for name in names if name not in taken)

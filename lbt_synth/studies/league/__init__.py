@@ -1,0 +1,1 @@
+"""The league: rivals trained on the past of records and scored on what followed."""
