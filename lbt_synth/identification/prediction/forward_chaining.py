@@ -19,14 +19,16 @@ from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.paired_residuals import PairedResiduals, chunk_squares
+from lbt_synth.identification.prediction.replay import replay
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.linear import Controller
-from lbt_synth.loop import close_loop, filter_series
+from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray, integer, number, require_instance
 
-_START_S = 0.5  # after the beginning of a stretch, where a controller starts from rest
+_LEAST_TEST_S = 1.0
+_START_S = 0.5  # after the beginning of a stretch, where a controller has just started
 
 
 def forward_splits(
@@ -91,6 +93,24 @@ def _cut(stretches: Stretches, first: int, last: int) -> Stretches:
             out.append((start + low, start + high))
         before += stop - start
     return tuple(out)
+
+
+def record_splits(
+    record: LoopRecord, splits: int, *, first_share: float = 0.5
+) -> tuple[tuple[Stretches, Stretches], ...]:
+    """Return the :func:`forward_splits` of a record; refuse tests of less than a second."""
+    require_instance(record, LoopRecord)
+    pairs = forward_splits(
+        record.stretches(), record.frames, splits=splits, first_share=first_share
+    )
+    least = round(_LEAST_TEST_S * record.frame_rate_hz)
+    shortest = min(sum(stop - start for start, stop in test) for _, test in pairs)
+    if shortest < least:
+        raise ProblemError(
+            f"each test needs {least} usable frames ({_LEAST_TEST_S:g} s); with {splits} splits "
+            f"the shortest has {shortest}. Record more, or split less."
+        )
+    return pairs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,7 +179,8 @@ class ForwardSplit:
         Parameters
         ----------
         controller : Controller
-            From y(k) to u(k). It runs from the beginning of the usable frames before the test.
+            From y(k) to u(k). It runs from the equilibrium for the first of the usable frames
+            before the test.
 
         Raises
         ------
@@ -168,7 +189,8 @@ class ForwardSplit:
         """
         loop = close_loop(self.hardware, controller)
         loop.require_stable()
-        return self.leave(lambda z: filter_series(loop.rejection(), z))
+        run = replay(loop, self.open_loop, self.replayed, from_rest=False)
+        return np.concatenate([run.residual[start:stop] for start, stop in self.test])
 
 
 def forward_split(
@@ -194,7 +216,7 @@ def forward_split(
     ------
     ProblemError
         If a value is out of range, the delay is missing, or there are too few frames: the first
-        half second of each stretch does not count, where a controller would start from rest.
+        half second of each stretch does not count, where a controller has just started.
     NumericalError
         If the fit fails.
     """
@@ -295,14 +317,10 @@ def forward_chain(
     >>> chain.residuals.best, bool(difference > 2 * error)
     ('filter', True)
     """
-    require_instance(record, LoopRecord)
     squares: dict[str, list[FloatArray]] = {name: [] for name in designs}
     failures: dict[str, str] = {}
     noise: list[tuple[float, int]] = []
-    pairs = forward_splits(
-        record.stretches(), record.frames, splits=splits, first_share=first_share
-    )
-    for training, test in pairs:
+    for training, test in record_splits(record, splits, first_share=first_share):
         split = forward_split(record, training, test, **options)
         for name, build in designs.items():
             if name in failures:

@@ -11,7 +11,6 @@ from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
 from lbt_synth.identification import ForwardSplit
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.linear import Controller
-from lbt_synth.loop import close_loop, filter_series
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
@@ -49,9 +48,8 @@ def hindsight_integrators(split: ForwardSplit) -> Controller:
     for axis in range(split.hardware.modes):
 
         def left(gain: float, axis: int = axis) -> float:
-            path = close_loop(single, _integrators(single, [gain])).rejection()
-            residual = split.leave(lambda z: filter_series(path, z[:, axis : axis + 1]))
-            return float(np.mean(residual**2))
+            controller = _integrators(split.hardware, [gain] * split.hardware.modes)
+            return float(np.mean(split.replay(controller)[:, axis] ** 2))
 
         gains.append(_best_gain(left, single))
     return _integrators(split.hardware, gains)

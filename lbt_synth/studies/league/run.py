@@ -16,7 +16,7 @@ import numpy as np
 import lbt_synth
 from lbt_synth.errors import LbtSynthError, OutputError, ProblemError
 from lbt_synth.identification import ForwardSplit, LinePrior, LoopRecord, PairedResiduals
-from lbt_synth.identification.prediction.forward_chaining import forward_split, forward_splits
+from lbt_synth.identification.prediction.forward_chaining import forward_split, record_splits
 from lbt_synth.identification.prediction.paired_residuals import chunk_squares
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.array_file import digest
@@ -29,7 +29,7 @@ from lbt_synth.studies.league.standings import (
     score_rows,
     standings,
 )
-from lbt_synth.validation import integer, require_instance
+from lbt_synth.validation import integer
 
 CASES = "cases"  # the folder of the results of cases
 _latest: dict[str, ForwardSplit] = {}  # the split of this process' last case
@@ -137,8 +137,12 @@ def run_league(
         raise OutputError(f"cannot make {folder}: {error.strerror}.", path=folder) from error
     scores, failures = [], {}
     for name, record in records.items():
-        require_instance(record, LoopRecord)
         own = dict((options or {}).get(name, {}))
+        try:
+            record_splits(record, count)
+        except ProblemError as error:
+            failures[name] = str(error)
+            continue
         results = run_cases(
             partial(run_entry, record, own),
             record_cases(name, record, own, able, count),
@@ -197,11 +201,12 @@ def run_entry(record: LoopRecord, options: Mapping[str, Any], case: Case) -> dic
     """Run one entry on one split of a record; an error is a result too."""
     try:
         split = _split_of(record, options, case)
-        left = all_entries()[case["entry"]].residual(split)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a loop that is unstable
+            left = all_entries()[case["entry"]].residual(split)
     except (LbtSynthError, np.linalg.LinAlgError) as error:
         return {"error": str(error)}
     if not np.all(np.isfinite(left)):
-        return {"error": "what it leaves is not finite"}
+        return {"error": "its loop is unstable: what it leaves is not finite"}
     chunks = chunk_squares(left, record.frame_rate_hz)
     return {"squares_nm2": chunks.tolist(), "noise_nm2": split.noise_nm2}
 
@@ -211,8 +216,8 @@ def _split_of(record: LoopRecord, options: Mapping[str, Any], case: Case) -> For
     key = json.dumps({k: v for k, v in case.items() if k != "entry"}, sort_keys=True)
     found = _latest.get(key)
     if found is None:
-        pairs = forward_splits(record.stretches(), record.frames, splits=case["splits"])
-        found = forward_split(record, *pairs[case["split"]], **options)
+        training, test = record_splits(record, case["splits"])[case["split"]]
+        found = forward_split(record, training, test, **options)
         _latest.clear()
         _latest[key] = found
     return found

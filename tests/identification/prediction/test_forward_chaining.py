@@ -68,7 +68,7 @@ def test_splits_that_a_record_cannot_have(options, words):
 
 def test_a_replay_of_what_ran_is_what_was_measured(split):
     _, _, ran = simulated_night()
-    # it starts from rest half a record before, and has forgotten that
+    # it starts half a record before, and has forgotten how
     assert np.max(np.abs(split.replay(ran.controller) - split.measured())) < 1e-6
     assert split.measured().shape == (len(frames_in(split.test)), 2)
     assert split.noise_nm2 == pytest.approx(2 * (8.0 / GAIN) ** 2, rel=0.05)
@@ -100,7 +100,7 @@ def test_the_future_changes_nothing_before_it(record, split):
     assert np.max(np.abs(one[-500:] - other[-500:])) > 500
 
 
-def test_frames_where_a_controller_would_start_from_rest_do_not_count(record):
+def test_frames_where_a_controller_has_just_started_do_not_count(record):
     usable = record.usable.copy()
     usable[8000:8010] = False
     holed = replace(record, usable=usable)
@@ -143,3 +143,8 @@ def test_designs_are_compared_on_what_follows(record, split):
 def test_a_comparison_without_designs(record):
     with pytest.raises(ProblemError, match="no design can be compared on this record: none given"):
         lbt.identification.forward_chain(record, {}, splits=1, sensor_gain=GAIN, most_lines=1)
+
+
+def test_a_test_is_at_least_a_second(record):
+    with pytest.raises(ProblemError, match="1000 usable frames .* the shortest has 599"):
+        lbt.identification.forward_chain(record, {}, splits=10)

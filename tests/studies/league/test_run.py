@@ -137,7 +137,7 @@ def test_an_entry_that_leaves_nan_has_failed(monkeypatch):
     )  # fmt: skip
     case = {"record": "-", "options": {}, "splits": 2, "version": "-", "split": 0, "entry": "ran"}
     found = league_run.run_entry(short_record(), OPTIONS, case)
-    assert found == {"error": "what it leaves is not finite"}
+    assert found == {"error": "its loop is unstable: what it leaves is not finite"}
 
 
 def test_a_case_depends_on_the_record_and_the_options():
