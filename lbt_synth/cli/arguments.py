@@ -203,7 +203,15 @@ def _add_engine(parser: ArgumentParser) -> None:
     add_option(engine, "--dask", str, text, metavar="ADDRESS")
 
 
-def _add_record(parser: ArgumentParser) -> None:
+def diagnose(parser: ArgumentParser) -> None:
+    """Say what ran in a record, what is wrong, what it costs, and what to change first."""
+    _add_series(parser)
+    parser.add_argument("gain", nargs="?", help=f"{GAIN_FILE} to try on the record")
+    add_output(parser, "page to write, one file that opens offline (.html)", required=False)
+    add_option(parser, "--pdf", str, "write the same as a PDF, too (.pdf)", metavar="FILE")
+
+
+def _add_series(parser: ArgumentParser) -> None:
     parser.add_argument(
         "file",
         help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
@@ -212,6 +220,10 @@ def _add_record(parser: ArgumentParser) -> None:
     _add_missing_facts(parser)
     _add_prior_knowledge(parser)
     add_option(parser, "--wavelength-um", float, "of Strehl ratios", 2.2)
+
+
+def _add_record(parser: ArgumentParser) -> None:
+    _add_series(parser)
     add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
     add_switch(parser, "--no-figure", "write no figure")
 

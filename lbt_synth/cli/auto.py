@@ -12,8 +12,9 @@ from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, RecordedDesign, SpectrumRecord, design_from_record
 from lbt_synth.identification.auto import LEAST_SECONDS
 from lbt_synth.identification.prediction.comparison import RAN
-from lbt_synth.loop import Imaging, close_loop, loop_margins
-from lbt_synth.storage.rows import column, fill_row, nm_column, table_row
+from lbt_synth.identification.prediction.residual_row import ResidualRow
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.storage.rows import fill_row
 
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
 
@@ -33,11 +34,7 @@ def run(arguments: Namespace) -> Report:
             record,
             method=arguments.method,
             gamma_ratio=arguments.gamma_ratio,
-            imaging=Imaging(
-                diameter_m=record.diameter_m,
-                obstruction=0.0 if record.obstruction is None else record.obstruction,
-                wavelength_um=arguments.wavelength_um,
-            ),
+            imaging=loop_records.record_imaging(arguments, record),
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
@@ -55,26 +52,13 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-@table_row
-class HeldOutRow:
-    """One controller on frames that nothing was fitted to, beside what the model promises."""
-
-    name: str = column("controller")
-    replayed_nm: float = nm_column("data", format=".2f", key="data_nm")
-    replayed_error_nm: float = nm_column("+-", format=".2f", key="data_error_nm")
-    model_nm: float = nm_column("model", format=".2f")
-    ratio: float = column("data/model", format=".3f")
-    strehl: float = column("Strehl, data", format=".3f")
-    model_strehl: float = column("Strehl, model", format=".3f")
-
-
 def _add_comparison(report: Report, found: RecordedDesign, record: LoopRecord) -> None:
     """Add what the second half of the data says of a design from the first."""
     table = found.held_out
     report.add_rows(
         "held_out",
         "Residual on the second half of the record, by models of the first",
-        [fill_row(HeldOutRow, entry) for entry in table.entries],
+        [fill_row(ResidualRow, entry) for entry in table.entries],
     )
     report.notes += [f"note: {note}" for note in table.notes]
     best = table[found.name]

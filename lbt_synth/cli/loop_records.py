@@ -29,6 +29,7 @@ from lbt_synth.identification.auto import RecordedDesign
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.line_priors import load_accelerations
 from lbt_synth.identification.records.record import LEAST_SECONDS
+from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
@@ -44,18 +45,37 @@ def read_record(
     arguments: Namespace, least_seconds: float = LEAST_SECONDS
 ) -> LoopRecord | SpectrumRecord:
     """Load the record of the command line, with its short gaps bridged; refuse a short one."""
-    kind = arguments.kind
-    record = load_record(
-        arguments.file,
-        kind=None if kind is None else kind.replace("-", "_"),
-        frame_rate_hz=None if kind == "spectrum" else arguments.frame_rate_hz,
-        columns=_parse_columns(arguments.columns),
-        **{name: getattr(arguments, name) for name in _FACTS},
-    )
+    record = load_series(arguments)
     if isinstance(record, LoopRecord):
         record = record.bridged()
         require_length(record, seconds=least_seconds)
     return record
+
+
+def load_series(
+    arguments: Namespace, axes: Sequence[int] | None = None
+) -> LoopRecord | SpectrumRecord:
+    """Load the record of the command line, or some of its axes, whatever its length."""
+    kind, facts = arguments.kind, {name: getattr(arguments, name) for name in _FACTS}
+    if axes is not None:
+        chosen = facts["axes"]
+        facts["axes"] = list(axes) if chosen is None else [chosen[axis] for axis in axes]
+    return load_record(
+        arguments.file,
+        kind=None if kind is None else kind.replace("-", "_"),
+        frame_rate_hz=None if kind == "spectrum" else arguments.frame_rate_hz,
+        columns=_parse_columns(arguments.columns),
+        **facts,
+    )
+
+
+def record_imaging(arguments: Namespace, record: LoopRecord) -> Imaging:
+    """Return the camera of the command line and the telescope of the record."""
+    return Imaging(
+        diameter_m=record.diameter_m,
+        obstruction=0.0 if record.obstruction is None else record.obstruction,
+        wavelength_um=arguments.wavelength_um,
+    )
 
 
 def _parse_columns(given: Sequence[str] | None) -> dict[str, list[str | int]] | None:
@@ -199,17 +219,8 @@ def _add_spectra(report: Report, record: SpectrumRecord) -> None:
 
 def _add_series(report: Report, record: LoopRecord) -> None:
     health, names = record.health, _axis_names(record.axes)
-    kind = "open loop" if record.commands is None else "closed loop"
-    report.data["record"] = {
-        "kind": kind,
-        "frames": record.frames,
-        "usable": health.usable,
-        "frame_rate_hz": record.frame_rate_hz,
-        "delay_frames": record.delay_frames,
-        "findings": [asdict(found) for found in health.findings],
-        "notes": health.notes,
-    }
-    text = f"{record.duration_s:.4g} s, {kind}, {_axes_text(record.axes)}"
+    report.data["record"] = record_data(record)
+    text = f"{record.duration_s:.4g} s, {_loop_kind(record)}, {_axes_text(record.axes)}"
     rows = [
         (fault, series, "both" if axis is None else names[axis], *rest)
         for fault, series, axis, *rest in health.rows()
@@ -219,6 +230,24 @@ def _add_series(report: Report, record: LoopRecord) -> None:
     else:
         report.notes.append(f"record: {text}; {health.summary()}")
     report.notes += [f"note: {note}" for note in health.notes]
+
+
+def record_data(record: LoopRecord) -> dict[str, Any]:
+    """Return what JSON says of a record."""
+    health = record.health
+    return {
+        "kind": _loop_kind(record),
+        "frames": record.frames,
+        "usable": health.usable,
+        "frame_rate_hz": record.frame_rate_hz,
+        "delay_frames": record.delay_frames,
+        "findings": [asdict(found) for found in health.findings],
+        "notes": health.notes,
+    }
+
+
+def _loop_kind(record: LoopRecord) -> str:
+    return "open loop" if record.commands is None else "closed loop"
 
 
 def _axes_text(count: int) -> str:

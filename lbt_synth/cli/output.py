@@ -28,6 +28,7 @@ class Report:
     """What a command reports, for programs and for people."""
 
     data: dict[str, Any] = field(default_factory=dict)  # for ``--json``; nan and inf become null
+    opening: list[str] = field(default_factory=list)  # lines above the tables
     tables: list[Table] = field(default_factory=list)  # what people see
     notes: list[str] = field(default_factory=list)  # lines below the tables
     passed: bool = True  # False makes the exit status 1
@@ -89,10 +90,12 @@ class Report:
             print(json.dumps(json_value(self.data), allow_nan=False))
             return
         console = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
+        for line in self.opening:
+            console.print(line, markup=False, soft_wrap=True)
         for table in self.tables:
             console.print(_printable(table))
-        for note in self.notes:
-            console.print(note, markup=False, soft_wrap=True)
+        for line in self.notes:
+            console.print(line, markup=False, soft_wrap=True)
 
 
 def _printable(table: Table) -> rich_table.Table:

@@ -14,7 +14,7 @@ COMMANDS = {
     for add_arguments in (
         *(arguments.design, arguments.show, arguments.verify, arguments.export, arguments.sigma),
         *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
-        arguments.league,
+        *(arguments.diagnose, arguments.league),
         *(arguments.robustness, arguments.tradeoff, arguments.limits, arguments.report),
         *(arguments.end_to_end, arguments.end_to_end_table),
         *(arguments.mirror, arguments.modal, arguments.study, arguments.paper),

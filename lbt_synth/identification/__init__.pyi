@@ -1,5 +1,13 @@
 from .auto import RecordedDesign as RecordedDesign
 from .auto import design_from_record as design_from_record
+from .commands.axis_matrix import AxisMatrix as AxisMatrix
+from .commands.control_law import ControlLaw as ControlLaw
+from .commands.control_law import fit_control_law as fit_control_law
+from .commands.control_law import record_control_law as record_control_law
+from .commands.law_controller import law_controller as law_controller
+from .diagnosis.diagnosis import Diagnosis as Diagnosis
+from .diagnosis.diagnosis import diagnose as diagnose
+from .diagnosis.verdict import diagnosis_verdict as diagnosis_verdict
 from .fit.axis import identify_axis as identify_axis
 from .fit.axis import identify_spectrum as identify_spectrum
 from .fit.both_axes import identify as identify

@@ -42,6 +42,7 @@ _NEAR_ONE = 0.1  # distance of both poles of a double integrator
 _LEAKY = 0.5  # least pole of a leaky one
 _PURE = 1e-6
 _ROUNDING = 1e-12
+_AS_GOOD = 0.9
 _ROUGH = 0.05  # residual beyond which a law that knows the future is doubtful
 
 
@@ -87,7 +88,9 @@ class ControlLaw:
         Part of the variance of the increments of u that the law leaves unexplained.
     coherence : float
         Part of what past commands leave of the increments that follows from measurements: 1
-        of a deterministic law, 0 of the commands of another night.
+        of a deterministic law, 0 of the commands of another night; the mean of the axes.
+    axis_coherence : (axes,) ndarray
+        The same of each axis; there is a law if any of them is not 0.
     frames : int
         Frames of the fit.
     odd_frames : int
@@ -108,6 +111,7 @@ class ControlLaw:
     taps: FloatArray
     residual: float
     coherence: float
+    axis_coherence: FloatArray
     frames: int
     odd_frames: int
 
@@ -234,9 +238,10 @@ def _search(series: LoopSeries) -> ControlLaw:
     law = _describe(regression, found)
     if law.lag_frames < 0 and law.residual > _ROUGH:
         # the sensor's response to commands that are shaken explains more than their law may: it
-        # comes later, and has the other sign
+        # comes later, and has the other sign; or it is only that of an axis without a law
         causal = _describe(regression, simplest_law(regression, CAUSAL_LAGS))
-        if np.sum(causal.taps[:, 0] * law.taps[:, 0]) < 0:
+        as_good = np.max(causal.axis_coherence) > _AS_GOOD * np.max(law.axis_coherence)
+        if as_good or np.sum(causal.taps[:, 0] * law.taps[:, 0]) < 0:
             return causal
     return law
 
@@ -260,11 +265,8 @@ def _describe(regression: Regression, shape: LawShape) -> ControlLaw:
     """Return the law of a shape, in words."""
     found = regression.coefficients(shape)
     unexplained = regression.residual(shape)
-    used = shape.order + regression.axes * len(shape.lags)
-    before = regression.without_measurements() / (regression.rows - regression.order)
-    after = unexplained / (regression.rows - used)
-    coherence = max(0.0, 1 - after / before) if before > 0 else 0.0
-    if coherence < _LEAST_COHERENCE:
+    coherence = regression.coherence(shape)
+    if np.max(coherence) < _LEAST_COHERENCE:
         return _no_law(regression, residual=unexplained, coherence=coherence)
     poles = _poles(found.past)
     kind = _kind(shape, found, poles)
@@ -283,7 +285,8 @@ def _describe(regression: Regression, shape: LawShape) -> ControlLaw:
         past=read_only(found.past),
         taps=read_only(found.taps),
         residual=unexplained,
-        coherence=coherence,
+        coherence=float(np.mean(coherence)),
+        axis_coherence=read_only(coherence),
         frames=regression.rows,
         odd_frames=0,
     )
@@ -334,9 +337,12 @@ def _kind(shape: LawShape, found: LawCoefficients, poles: ComplexArray) -> LawKi
     return "higher order"
 
 
-def _no_law(regression: Regression, *, residual: float = 1.0, coherence: float = 0.0) -> ControlLaw:
+def _no_law(
+    regression: Regression, *, residual: float = 1.0, coherence: FloatArray | None = None
+) -> ControlLaw:
     """Return the law of commands that do not follow from the measurements, or do not move."""
     axes = regression.axes
+    known = np.zeros(axes) if coherence is None else coherence
     zeros = np.zeros((axes, axes))
     return ControlLaw(
         kind="none",
@@ -352,7 +358,8 @@ def _no_law(regression: Regression, *, residual: float = 1.0, coherence: float =
         past=read_only(np.zeros((axes, 0))),
         taps=read_only(np.zeros((axes, 1, axes))),
         residual=residual,
-        coherence=coherence,
+        coherence=float(np.mean(known)),
+        axis_coherence=read_only(known),
         frames=regression.rows,
         odd_frames=0,
     )

@@ -94,8 +94,8 @@ class Regression:
         left = target - table @ found
         return found * self._scale[axis] / self._scale[chosen], float(left @ left) / self.rows
 
-    def residual(self, shape: LawShape) -> float:
-        """Return the part of the increments' variance that a law leaves, the axes' mean."""
+    def residuals(self, shape: LawShape) -> FloatArray:
+        """Return the part of the increments' variance that a law leaves of each moving axis."""
         left = [
             self._solve(
                 axis,
@@ -104,20 +104,30 @@ class Regression:
             )[1]
             for axis in self.moving
         ]
-        return float(np.mean(left))
+        return np.array(left)
+
+    def residual(self, shape: LawShape) -> float:
+        """Return the mean of that over the axes."""
+        return float(np.mean(self.residuals(shape)))
 
     @property
     def moving(self) -> list[int]:
         """Axes whose commands move at all."""
         return [axis for axis in range(self.axes) if self.variance[axis] > 1e-30]
 
-    def without_measurements(self) -> float:
-        """Return the part of the increments' variance that past commands leave."""
-        left = [
-            self._solve(axis, self._past(axis, self.order), self._factor[:, axis])[1]
-            for axis in self.moving
-        ]
-        return float(np.mean(left))
+    def coherence(self, shape: LawShape) -> FloatArray:
+        """Return the part of what past commands leave that a law explains, of each axis (axes,).
+
+        Corrected for the number of coefficients; zero where commands do not move.
+        """
+        out = np.zeros(self.axes)
+        used = shape.order + self.axes * len(shape.lags)
+        for axis, after in zip(self.moving, self.residuals(shape), strict=True):
+            _, before = self._solve(axis, self._past(axis, self.order), self._factor[:, axis])
+            if before > 0:
+                ratio = after / before * (self.rows - self.order) / (self.rows - used)
+                out[axis] = max(0.0, 1 - float(ratio))
+        return out
 
     def most_residual(self, lags: range = LAGS) -> float:
         """Return what a simple law may leave, to explain as much as the richest one."""

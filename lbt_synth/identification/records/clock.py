@@ -36,6 +36,7 @@ class Clock(NamedTuple):
     frame_rate_hz: float
     frame_of_row: IntArray  # (rows,), from 0, never falling; equal for rows of the same time
     notes: list[str]
+    jitter_frames: float | None = None  # rms distance of the times from the grid; None without any
 
 
 def build_clock(
@@ -70,7 +71,16 @@ def build_clock(
             notes += _compare_rates(rate, found, times, frame)
     if rate is None:
         raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
-    return Clock(rate, frame, notes)
+    return Clock(rate, frame, notes, None if times is None else _jitter(times, frame))
+
+
+def _jitter(times: FloatArray, frame: IntArray) -> float | None:
+    """Return the rms distance of times from the closest grid of their frames [frames]."""
+    if len(times) < 3 or frame[-1] == 0:
+        return None
+    t, n = times - times.mean(), frame - frame.mean()
+    slope = float(n @ t) / float(n @ n)
+    return float(np.sqrt(np.mean((t / slope - n) ** 2))) if slope > 0 else None
 
 
 def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:

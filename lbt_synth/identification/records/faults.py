@@ -233,6 +233,8 @@ class RecordHealth:
         How a file was read, what was repaired, what changes with time.
     bridged : int
         Frames that were interpolated.
+    jitter_frames : float or None
+        Rms distance of the rows' times from the regular grid [frames]; None without times.
 
     Examples
     --------
@@ -250,6 +252,7 @@ class RecordHealth:
     findings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     bridged: int = 0
+    jitter_frames: float | None = None
 
     @property
     def clean(self) -> bool:

@@ -136,6 +136,7 @@ def loop_record(
             usable=int(np.sum(measured)),
             findings=tuple(findings),
             notes=merge_notes(said),
+            jitter_frames=clock.jitter_frames,
         ),
         diameter_m=diameter_m,
         obstruction=obstruction,

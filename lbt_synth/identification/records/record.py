@@ -28,7 +28,7 @@ from lbt_synth.validation import (
 
 _BRIDGED_FRAMES = 3
 _BRIDGED_FRACTION = 0.01
-_NOT_KNOWN = "correction not known"
+NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 
 
@@ -237,14 +237,14 @@ class LoopRecord:
             frame_rate_hz=self.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
         )
         measured = self.usable if self.measured is None else self.measured
-        findings = tuple(found for found in self.health.findings if found.kind != _NOT_KNOWN)
+        findings = tuple(found for found in self.health.findings if found.kind != NOT_KNOWN)
         usable = measured
         if self.commands is not None:
             spoilt = [False] * self.frames if self.commanded is None else ~self.commanded
             unknown = np.convolve(spoilt, [0, *(path.mirror_taps != 0)])[: self.frames] > 0
             unknown[: len(path.mirror_taps)] = True  # commands before the record
             usable = measured & ~unknown
-            findings += findings_in(unknown, _NOT_KNOWN, "frames")
+            findings += findings_in(unknown, NOT_KNOWN, "frames")
         health = replace(self.health, usable=int(np.sum(usable)), findings=findings, bridged=0)
         return replace(
             self,

@@ -66,7 +66,15 @@ def identification_figure(
     3
     """
     require_instance(model, IdentifiedModel)
-    residuals = _predicted_residuals(model, designs or {})
+    panels = identification_panels(model, designs or {})
+    return draw_figure(panels, columns=len(model.axes), axes=axes)
+
+
+def identification_panels(
+    model: IdentifiedModel, designs: Mapping[str, Controller | Design]
+) -> list[Panel]:
+    """Return the panels of the figure, row by row."""
+    residuals = _predicted_residuals(model, designs)
     cumulative = [
         _cumulative_curves(axis, {name: densities[i] for name, densities in residuals.items()})
         for i, axis in enumerate(model.axes)
@@ -83,8 +91,7 @@ def identification_figure(
         ],
         [_innovations_panel(axis) for axis in model.axes],
     )
-    panels = [panel for row in rows for panel in row]
-    return draw_figure(panels, columns=len(model.axes), axes=axes)
+    return [panel for row in rows for panel in row]
 
 
 def _predicted_residuals(

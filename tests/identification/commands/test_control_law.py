@@ -194,6 +194,15 @@ def test_frames_that_follow_no_law():
         np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
 
 
+def test_one_axis_without_a_law():
+    y, u = (each.copy() for each in ordinary_loop())
+    y[:, 1] += 100 * np.random.default_rng(0).standard_normal(len(y))
+    law = fit_control_law(y, u)
+    assert law.lag_frames == 0
+    assert law.axis_coherence[0] > 0.999 > 0.1 > law.axis_coherence[1]
+    assert law.gain[0, 0] == pytest.approx(0.4)
+
+
 def test_of_a_record():
     record = spliced_record(frames=4000, gain=0.25)
     law = record_control_law(record)

@@ -1,0 +1,94 @@
+"""The command diagnose: the autopsy of a record."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import asdict
+from typing import Any
+
+from lbt_synth.cli import loop_records
+from lbt_synth.cli.loop_inputs import given_options, load_designs
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.progress import count_progress
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import (
+    Diagnosis,
+    LoopRecord,
+    SpectrumRecord,
+    diagnose,
+    diagnosis_verdict,
+)
+from lbt_synth.identification.commands.control_law import ControlLaw
+from lbt_synth.identification.diagnosis.channels import live_axes
+from lbt_synth.report.diagnosis.page import write_diagnosis
+from lbt_synth.report.diagnosis.tables import diagnosis_tables
+from lbt_synth.report.page.page_files import require_page_names
+from lbt_synth.storage.rows import json_record
+
+_STEPS = 4
+
+
+def run(arguments: Namespace) -> Report:
+    """Diagnose a record, with a design to try on it if one is given, and write the page."""
+    if arguments.output is not None:
+        named = given_options(arguments, "file", "gain", "commands", "lines_file", "accelerometers")
+        require_page_names(arguments.output, arguments.pdf, inputs=tuple(named.values()))
+    elif arguments.pdf is not None:
+        raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
+    given = {} if arguments.gain is None else load_designs([arguments.gain])
+    whole = _load(arguments)
+    live = live_axes(whole)
+    record = whole if len(live) in (0, whole.axes) else _load(arguments, live)
+    with count_progress(total=_STEPS, what="diagnosing", quiet=arguments.json) as count:
+        found = diagnose(
+            record.bridged(),
+            given=given,
+            whole=whole,
+            imaging=loop_records.record_imaging(arguments, record),
+            progress=count,
+            **loop_records.identification_options(arguments, record),
+        )
+    verdict = diagnosis_verdict(found)
+    report = Report(
+        data={"source": str(arguments.file), "verdict": verdict, **_diagnosis_data(found)},
+        opening=list(verdict),
+        tables=list(diagnosis_tables(found)),
+        notes=[loop_records.marked_note(note) for note in found.notes],
+    )
+    if arguments.output is not None:
+        files = (arguments.file, *([arguments.gain] if arguments.gain else []))
+        report.note_files(write_diagnosis(found, arguments.output, pdf=arguments.pdf, files=files))
+    return report
+
+
+def _load(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
+    """Load the record, or some of its axes."""
+    record = loop_records.load_series(arguments, axes)
+    if isinstance(record, SpectrumRecord):
+        raise ProblemError(
+            "diagnose examines recorded series; got a spectrum. Try lbt-synth identify."
+        )
+    return record
+
+
+def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:
+    """Return a diagnosis for JSON; what could not be said is null or empty."""
+    record = found.record
+    return {
+        "doubt": found.doubt or None,
+        "record": loop_records.record_data(record),
+        "channels": [json_record(row) for row in found.channels],
+        "control_law": None if found.law is None else _law_data(found.law),
+        "loop": None if found.loop is None else json_record(found.loop),
+        "lines": [json_record(line.row) for line in found.lines],
+        "costs": [json_record(row) for row in found.costs],
+        "residuals": [json_record(row) for row in found.residuals],
+        "best": found.best or None,
+        "given": None if found.given is None else json_record(found.given),
+        "notes": found.notes,
+    }
+
+
+def _law_data(law: ControlLaw) -> dict[str, Any]:
+    values = asdict(law)
+    return values | {"poles": [[abs(pole) for pole in row] for row in law.poles]}

@@ -1,0 +1,333 @@
+"""The autopsy of a record: all that it tells of its loop, in rows and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from lbt_synth.design import Design
+from lbt_synth.errors import LbtSynthError
+from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
+from lbt_synth.identification.diagnosis.candidates import candidate_designs, stable_designs
+from lbt_synth.identification.diagnosis.channels import ChannelRow, judge_channels
+from lbt_synth.identification.diagnosis.costs import CostRow, disturbance_costs
+from lbt_synth.identification.diagnosis.given_design import (
+    GivenDesignRow,
+    design_differences,
+    given_controller,
+    given_design_row,
+)
+from lbt_synth.identification.diagnosis.line_origins import LineOrigin, line_origins
+from lbt_synth.identification.diagnosis.running_loop import (
+    LoopRow,
+    count_frames,
+    loop_row,
+    running_controller,
+)
+from lbt_synth.identification.fit.both_axes import identify
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.prediction.comparison import (
+    INTEGRATOR,
+    PredictionRow,
+    PredictionTable,
+    prediction_against_data,
+)
+from lbt_synth.identification.prediction.residual_row import ResidualRow
+from lbt_synth.identification.records.record import LoopRecord, require_length
+from lbt_synth.identification.stretches import split_halves
+from lbt_synth.linear import Controller
+from lbt_synth.loop import Imaging, close_loop
+from lbt_synth.storage.rows import fill_row
+from lbt_synth.validation import require_instance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Diagnosis:
+    """What a record tells of its loop.
+
+    Attributes
+    ----------
+    record : LoopRecord
+        The record.
+    imaging : Imaging
+        The camera of Strehl ratios.
+    doubt : str
+        Why the commands are not those of this loop; empty if they are.
+    repair : str
+        What to do about that.
+    channels : tuple of ChannelRow
+        Measurements and commands, one by one.
+    law : ControlLaw or None
+        The law that computed the commands; None of an open loop.
+    model : IdentifiedModel or None
+        The model of the whole record, and why there is none in ``notes``.
+    loop : LoopRow or None
+        The loop that ran, by law and model.
+    lines : tuple of LineOrigin
+        Vibrations, and where they come from.
+    costs : tuple of CostRow
+        What each part of the disturbance costs, the most costly first; the last row is all.
+    comparison : PredictionTable or None
+        Residuals on the second half of the record, by models of the first.
+    best : str
+        Row of the comparison that leaves least, of the designs.
+    best_design : Design or None
+        The same design, for the model of the whole record.
+    given : GivenDesignRow or None
+        A given design on this record.
+    notes : tuple of str
+        What could not be said and why, and what else should be known.
+    """
+
+    record: LoopRecord
+    imaging: Imaging
+    doubt: str = ""
+    repair: str = ""
+    channels: tuple[ChannelRow, ...] = ()
+    law: ControlLaw | None = None
+    model: IdentifiedModel | None = None
+    loop: LoopRow | None = None
+    lines: tuple[LineOrigin, ...] = ()
+    costs: tuple[CostRow, ...] = ()
+    comparison: PredictionTable | None = None
+    best: str = ""
+    best_design: Design | None = None
+    given: GivenDesignRow | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def residuals(self) -> tuple[ResidualRow, ...]:
+        """Rows of the comparison, for tables."""
+        entries = () if self.comparison is None else self.comparison.entries
+        return tuple(fill_row(ResidualRow, entry) for entry in entries)
+
+    def row(self, name: str) -> PredictionRow | None:
+        """Return a row of the comparison, None where there is none."""
+        entries = () if self.comparison is None else self.comparison.entries
+        return next((entry for entry in entries if entry.name == name), None)
+
+
+def diagnose(
+    record: LoopRecord,
+    *,
+    given: Mapping[str, Design] | None = None,
+    whole: LoopRecord | None = None,
+    imaging: Imaging | None = None,
+    progress: Callable[[int], object] | None = None,
+    **options: Any,
+) -> Diagnosis:
+    """Find what ran in a record, what is wrong with it, what it costs, and what would be better.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        What the loop recorded; the delay of a closed loop must be known.
+    given : mapping of str to Design, optional
+        One design to try on the record, by its name.
+    whole : LoopRecord, optional
+        The record with those axes, too, that are left out of ``record`` because they are dead.
+    imaging : Imaging, optional
+        The camera, for Strehl ratios; 2.2 um by default.
+    progress : callable, optional
+        Called with 1 after each of 4 steps.
+    **options
+        As :func:`identify` takes them.
+
+    Returns
+    -------
+    Diagnosis
+        Rows for tables; :func:`diagnosis_verdict` makes sentences of them.
+
+    Raises
+    ------
+    ProblemError
+        If a given design is of another kind of loop, or an option is out of range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    >>> run = lbt.simulate(
+    ...     lbt.integrator(path, gain=0.1).controller,
+    ...     lbt.Truth(turbulence=slow, noise_nm=5.0),
+    ...     hardware=path,
+    ...     frames=10_000,
+    ... )
+    >>> record = lbt.identification.loop_record(
+    ...     run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
+    ... )
+    >>> found = lbt.identification.diagnose(record)
+    >>> found.law.kind, [row.part for row in found.costs]
+    ('pure integrator', ['turbulence', 'measurement noise', 'all'])
+    """
+    require_instance(record, LoopRecord)
+    step = progress or (lambda _: None)
+    notes: list[str] = []
+    law = None
+    if record.commands is not None:
+        law = _attempt(lambda: record_control_law(record), "control law", notes)
+    doubt, repair = doubt_commands(law)
+    camera = Imaging() if imaging is None else imaging
+    found = Diagnosis(
+        record=record,
+        imaging=camera,
+        doubt=doubt,
+        repair=repair,
+        channels=judge_channels(record if whole is None else whole),
+        law=law,
+    )
+    step(1)
+    if whole is not None and whole.axes > record.axes:
+        notes.append("the rest is of the axis that lives: the other one is dead")
+    if not found.doubt:
+        found = _examine_loop(found, dict(given or {}), options, notes, step)
+    elif given:
+        notes.append("the given design was not tried: the commands are not those of this loop")
+    return replace(found, notes=tuple(notes))
+
+
+def doubt_commands(law: ControlLaw | None) -> tuple[str, str]:
+    """Say why commands are not those of the loop, and what to do; empty if nothing is wrong."""
+    if law is None:
+        return "", ""
+    matrix = law.axis_matrix
+    if law.kind == "none":
+        return (
+            "the commands do not follow from the measurements",
+            "find the commands that belong to these measurements",
+        )
+    if matrix.kind == "diagonal" and min(matrix.signs) < 0:
+        return "the commands have the opposite sign", "turn the sign of the commands"
+    if matrix.kind == "swapped":
+        return "the axes of the commands are swapped", "exchange the columns of the commands"
+    if law.lag_frames < 0:
+        return (
+            f"the commands are {count_frames(-law.lag_frames)} early, and know the future",
+            f"shift the commands by {count_frames(-law.lag_frames)}",
+        )
+    if law.kind == "proportional":
+        return (
+            "the commands are increments, not positions",
+            "record the positions, or add the increments up",
+        )
+    return "", ""
+
+
+def _examine_loop(
+    found: Diagnosis,
+    given: dict[str, Design],
+    options: dict[str, Any],
+    notes: list[str],
+    step: Callable[[int], object],
+) -> Diagnosis:
+    """Add what a model of the record tells."""
+    record, law = found.record, found.law
+    model = _attempt(lambda: _identify(record, options), "model", notes)
+    step(1)
+    if model is None:
+        return found
+    notes += model.notes
+    running = running_controller(law, record.frame_rate_hz)
+    series = record.pseudo_open_loop(model.sensor_gains)
+    lines = line_origins(model, series, record.stretches())
+    given_controllers = {name: given_controller(one, model) for name, one in given.items()}
+    compared = _attempt(
+        lambda: _compare(found, model, running, given_controllers, options, notes, step),
+        "comparison on unseen data",
+        notes,
+    )
+    comparison, best = compared if compared is not None else (None, "")
+    build = candidate_designs(model).get(best)
+    best_design = None if build is None else _attempt(build, best, notes)
+    costs = _attempt(
+        lambda: disturbance_costs(
+            model.plant(),
+            lines,
+            running,
+            None if best_design is None else best_design.controller,
+            found.imaging,
+        ),
+        "costs",
+        notes,
+    )
+    found = replace(
+        found,
+        model=model,
+        loop=loop_row(model, running),
+        lines=lines,
+        costs=costs or (),
+        comparison=comparison,
+        best=best,
+        best_design=best_design,
+    )
+    step(1)
+    for name, design in given.items():
+        notes += design_differences(design, model)
+        found = replace(found, given=given_design_row(name, design, model, found.row(name)))
+    return found
+
+
+def _identify(record: LoopRecord, options: dict[str, Any]) -> IdentifiedModel:
+    require_length(record)
+    return identify(record, **options)
+
+
+def _compare(
+    found: Diagnosis,
+    model: IdentifiedModel,
+    running: Controller | None,
+    given: Mapping[str, Controller],
+    options: dict[str, Any],
+    notes: list[str],
+    step: Callable[[int], object],
+) -> tuple[PredictionTable, str]:
+    """Return residuals on the second half, by models of the first, and the best design there."""
+    record = found.record
+    fit, test = split_halves(record.stretches(), record.frames)
+    half = identify(record, stretches=fit, start=model, **options)
+    step(1)
+    plant = half.plant()
+    series = record.pseudo_open_loop(half.sensor_gains)
+    builders = candidate_designs(half)
+    builders.pop(INTEGRATOR)  # the comparison has it
+    designs, missing = stable_designs(builders, plant)
+    notes += missing
+    stable = {}
+    for name, controller in given.items():
+        if close_loop(plant.hardware, controller).is_stable:
+            stable[name] = controller
+        else:
+            notes.append(f"{name} is unstable in the loop of this record")
+    ran = running
+    if ran is not None and not close_loop(plant.hardware, ran).is_stable:
+        notes.append("the law of the commands is unstable at the sensor gain of the model")
+        ran = None
+    table = prediction_against_data(
+        plant,
+        series,
+        {**designs, **stable},
+        fit=fit,
+        test=test,
+        measurements=None if record.commands is None else record.measurements,
+        running=ran,
+        noise_error_nm=[axis.noise_error_nm for axis in half.axes],
+        imaging=found.imaging,
+    )
+    notes += table.notes
+    left = {
+        entry.name: entry.replayed.total_nm2
+        for entry in table.entries
+        if entry.replayed is not None and entry.name in (INTEGRATOR, *designs)
+    }
+    return table, min(left, key=lambda name: left[name])
+
+
+def _attempt(compute: Callable[[], Any], what: str, notes: list[str]) -> Any:
+    """Return what is computed; None, and a note, where it cannot be."""
+    try:
+        return compute()
+    except LbtSynthError as error:
+        notes.append(f"no {what}: {error}")
+        return None

@@ -1,0 +1,162 @@
+"""Where the lines of a record come from: one axis, a diagonal, or both axes without relation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import detrend
+
+from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.stretches import Stretches
+from lbt_synth.models import Vibration
+from lbt_synth.storage.rows import column, nm_column, table_row
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_SAME = 3.0  # standard errors between frequencies of one line
+_SEGMENTS = 16
+_LEAST_SEGMENT = 64  # frames
+_LINEAR = 0.1  # of the power, that a line along a direction may have across it
+_RELATED = 0.5  # coherence of axes that move together
+_NEAR_AXIS_DEG = 6.0
+_SIGMAS = 3.0
+
+
+@table_row
+class LineRow:
+    """A vibration, on all axes."""
+
+    frequency_hz: float = column("f", unit="Hz", format=".3f", help="Frequency")
+    frequency_error_hz: float = column("+-", unit="Hz", format=".2g", help="Its standard error")
+    damping: str = column("damping", help="Damping ratio, a bound where it is not resolved")
+    rms_nm: float = nm_column("rms", help="Rms over all axes")
+    direction_deg: float = column(
+        "direction", unit="deg", format=".1f", help="From tip (0) towards tilt (90)"
+    )
+    direction_error_deg: float = column("+-", unit="deg", format=".2g", help="Its error")
+    origin: str = column("origin", help="Where it is from")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LineOrigin:
+    """A line of all axes, and the vibrations of the plant that it is made of."""
+
+    row: LineRow
+    vibrations: tuple[Vibration, ...]
+
+    @property
+    def name(self) -> str:
+        """What tables of costs call it."""
+        return f"line at {self.row.frequency_hz:.4g} Hz"
+
+
+def line_origins(
+    model: IdentifiedModel, series: FloatArray, stretches: Stretches
+) -> tuple[LineOrigin, ...]:
+    """Return the lines of a model by frequency, with their origin in a series (frames, axes)."""
+    found = [(i, part) for i, axis in enumerate(model.axes) for part in axis.parts]
+    groups: list[list[tuple[int, IdentifiedLine]]] = []
+    for i, part in sorted(found, key=lambda each: each[1].frequency_hz):
+        if part.kind == "turbulence":
+            continue
+        last = groups[-1] if groups else []
+        if last and all(j != i for j, _ in last) and _is_same(last[-1][1], part, model):
+            last.append((i, part))
+        else:
+            groups.append([(i, part)])
+    return tuple(_describe(group, model, series, stretches) for group in groups)
+
+
+def _is_same(one: IdentifiedLine, other: IdentifiedLine, model: IdentifiedModel) -> bool:
+    """Whether lines of two axes are one: their frequencies agree."""
+    error = float(np.hypot(one.frequency_error_hz, other.frequency_error_hz))
+    width = max(one.damping * one.frequency_hz, other.damping * other.frequency_hz)
+    near = max(_SAME * error, min(width, model.axes[0].resolution_hz * 2))
+    return abs(one.frequency_hz - other.frequency_hz) <= near
+
+
+def _describe(
+    group: Sequence[tuple[int, IdentifiedLine]],
+    model: IdentifiedModel,
+    series: FloatArray,
+    stretches: Stretches,
+) -> LineOrigin:
+    """Return a line of one or two axes."""
+    axes = len(model.axes)
+    parts = [part for _, part in group]
+    first = max(parts, key=lambda part: part.rms_nm)
+    weights = np.array([1 / max(part.frequency_error_hz, 1e-12) ** 2 for part in parts])
+    frequency = float(weights @ [part.frequency_hz for part in parts] / weights.sum())
+    angle, error, origin = np.nan, np.nan, "one axis" if axes == 1 else ""
+    if axes == 2:
+        angle, error, origin = _origin(frequency, first.damping, model, series, stretches)
+    each = np.eye(axes).tolist()
+    return LineOrigin(
+        row=LineRow(
+            frequency_hz=frequency,
+            frequency_error_hz=float(1 / np.sqrt(weights.sum())),
+            damping=f"{first.damping:.3g}" if first.resolved else f"< {first.damping:.2g}",
+            rms_nm=float(np.sqrt(sum(part.rms_nm**2 for part in parts))),
+            direction_deg=angle,
+            direction_error_deg=error,
+            origin=origin if first.kind == "line" else f"{origin}, broad",
+        ),
+        vibrations=tuple(part.vibration(tuple(each[i])) for i, part in group),
+    )
+
+
+def _origin(
+    frequency_hz: float,
+    damping: float,
+    model: IdentifiedModel,
+    series: FloatArray,
+    stretches: Stretches,
+) -> tuple[float, float, str]:
+    """Return direction [deg], its error, and words, from the cross-spectrum at a line."""
+    power, rest, averages = _power_at(frequency_hz, damping, model.frame_rate_hz, series, stretches)
+    values, vectors = np.linalg.eigh(power.real)
+    if not values[1] > 0:
+        return np.nan, np.nan, "not seen"
+    along, beside = vectors[:, 1], vectors[:, 0]
+    angle = (float(np.degrees(np.arctan2(along[1], along[0]))) + 90) % 180 - 90
+    across = max(float(values[0]), 0.0) / float(values[1])
+    # the rest of the spectrum across the line turns it from segment to segment
+    noise = max(float(beside @ rest @ beside), 0.0) / float(values[1])
+    error = float(np.degrees(np.sqrt((across + noise) / (2 * averages))))
+    if across < _LINEAR:
+        near = max(_NEAR_AXIS_DEG, _SIGMAS * error)
+        if abs(angle) < near:
+            return angle, error, "tip"
+        if abs(angle) > 90 - near:
+            return angle % 180, error, "tilt"
+        return angle, error, "a diagonal"
+    both = float(power[0, 0].real * power[1, 1].real)
+    coherence = float(abs(power[0, 1]) ** 2 / both) if both > 0 else 0.0
+    if coherence > _RELATED:
+        return np.nan, np.nan, "both axes, out of phase"
+    return np.nan, np.nan, "both axes, unrelated"
+
+
+def _power_at(
+    frequency_hz: float, damping: float, rate_hz: float, series: FloatArray, stretches: Stretches
+) -> tuple[ComplexArray, FloatArray, float]:
+    """Return the cross-power (2, 2) of a line, that of its surroundings, and averages of both."""
+    start, stop = max(stretches, key=lambda pair: pair[1] - pair[0])
+    z = series[start:stop]
+    size = 2 ** int(np.log2(max(2 * len(z) / _SEGMENTS, _LEAST_SEGMENT)))
+    size = min(size, len(z))
+    window = np.hanning(size)
+    starts = range(0, len(z) - size + 1, max(size // 2, 1))
+    parts = np.fft.rfft(
+        [window[:, None] * detrend(z[a : a + size], axis=0) for a in starts], axis=1
+    )
+    density = np.einsum("sfi,sfj->fij", parts, parts.conj())
+    f, step = np.fft.rfftfreq(size, 1 / rate_hz), rate_hz / size
+    half = max(2 * step, 2 * damping * frequency_hz)
+    away = np.abs(f - frequency_hz)
+    near, beside = away <= half, (away > half + 2 * step) & (away <= 3 * half + 4 * step)
+    level = density[beside].mean(axis=0) if beside.any() else np.zeros((2, 2))
+    rest = np.count_nonzero(near) * level
+    widths = 1 + np.pi * damping * frequency_hz / step  # independent values of a wide line
+    return density[near].sum(axis=0) - rest, rest.real, max(len(starts) * 0.6 * widths, 1.0)

@@ -1,0 +1,1 @@
+"""The page about the autopsy of a record."""

@@ -1,0 +1,87 @@
+"""The page of a diagnosis: it has what is known, and says loudly what is wrong."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from support.diagnoses import line_diagnosis, short_record
+from support.pages import Reader
+
+import lbt_synth as lbt
+from lbt_synth.report.charts.description import Bars, Curve
+from lbt_synth.report.diagnosis.page import diagnosis_page, write_diagnosis
+from lbt_synth.storage.tables import Table
+
+
+@pytest.fixture(scope="module")
+def page():
+    return diagnosis_page(line_diagnosis())
+
+
+def test_sections_and_charts(page):
+    assert [section.key for section in page.sections] == [
+        "verdict",
+        "record",
+        "loop",
+        "disturbance",
+        "sources",
+    ]
+    assert [chart.key for chart in page.charts] == ["residuals", "costs", "identification"]
+    residuals, costs, spectra = page.charts
+    (bars, promised) = residuals.panels[0].select(Bars)
+    rows = line_diagnosis().residuals
+    np.testing.assert_allclose(bars.values, [row.replayed_nm for row in rows])
+    np.testing.assert_allclose(promised.values, [row.model_nm for row in rows])
+    assert costs.panels[0].categories[-1] == "all"
+    assert len(spectra.panels) == 3
+
+
+def test_long_curves_are_thinned_and_keep_their_peaks(page):
+    spectrum = page.charts[2].panels[0]
+    axis = line_diagnosis().model.axes[0]
+    (fit,) = (curve for curve in spectrum.select(Curve) if curve.name == "fit")
+    assert fit.x.size <= 1600 < axis.frequency_hz.size
+    assert np.max(fit.y) == np.max(axis.fitted_nm2_hz)
+    near = np.abs(fit.x - 31) < 3
+    assert np.max(fit.y[near]) == np.max(axis.fitted_nm2_hz[np.abs(axis.frequency_hz - 31) < 3])
+
+
+def test_words_have_the_signs_of_print(page):
+    tables = [block for s in page.sections for block in s.blocks if isinstance(block, Table)]
+    words = [str(cell) for table in tables for row in table.rows for cell in row]
+    words += [heading for table in tables for heading in table.headings]
+    assert "± [nm]" in words
+    assert not [word for word in words if "+-" in word]
+
+
+def test_files(tmp_path):
+    source = tmp_path / "night.npz"
+    source.write_bytes(b"what was recorded")
+    (path,) = write_diagnosis(line_diagnosis(), tmp_path / "page.html", files=[source])
+    text = path.read_text(encoding="utf-8")
+    reader = Reader(text)
+    assert reader.texts["h1"] == ["Diagnosis of night.npz"]
+    assert hashlib.sha256(b"what was recorded").hexdigest() in text
+    (notice,) = (a for a in reader.named("p") if "good" in (a.get("class") or ""))
+    assert notice["class"] == "notice good"
+
+
+def test_what_is_wrong_comes_first_and_loudly(tmp_path):
+    found = lbt.identification.diagnose(short_record(-1.0))
+    page = diagnosis_page(found)
+    first = page.sections[0].blocks[0]
+    assert (first.tone, first.text) == (
+        "bad",
+        "Do not use this record as it is: the commands have the opposite sign.",
+    )
+    assert page.charts == []
+    assert [section.key for section in page.sections][:3] == ["verdict", "record", "loop"]
+
+
+def test_names(tmp_path):
+    with pytest.raises(lbt.errors.OutputError, match=r"\.html"):
+        write_diagnosis(line_diagnosis(), tmp_path / "page.txt")
+    with pytest.raises(lbt.errors.FileError, match="cannot read"):
+        write_diagnosis(line_diagnosis(), tmp_path / "a.html", files=[tmp_path / "nowhere"])
