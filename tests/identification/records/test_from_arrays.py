@@ -50,7 +50,7 @@ def test_a_dead_axis_leaves_nothing():
     assert not seen.usable.any()
     assert kinds(seen) == {("stuck", "measurements", 1)}
     with pytest.raises(
-        lbt.errors.ProblemError, match="got 0, the longest stretch 0. 0 of 5000 frames"
+        lbt.errors.ProblemError, match=r"got 0 \(0 s\), the longest stretch 0. 0 of 5000 frames"
     ):
         lbt.identification.require_length(seen)
 
