@@ -8,7 +8,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray
 
-_AXES = ("tip", "tilt")
+AXES = ("tip", "tilt")
 _DEAD = 0.5  # of the frames, on one value
 _NOISIER = 3.0  # times the other axis
 _CHANGED = 2.0  # ratio of the scatter at the ends of the record
@@ -54,7 +54,7 @@ def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
     >>> [(row.channel, row.state) for row in judge_channels(record)]
     [('tip measurement', 'good'), ('tilt measurement', 'noisy')]
     """
-    names = _AXES if record.axes == len(_AXES) else ("",)
+    names = AXES if record.axes == len(AXES) else ("",)
     measured = record.usable if record.measured is None else record.measured
     everything = np.ones(record.frames, dtype=np.bool_)
     commanded = everything if record.commanded is None else record.commanded

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import detrend
 
+from lbt_synth.identification.diagnosis.channels import AXES
 from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models import Vibration
@@ -127,9 +128,9 @@ def _origin(
     if across < _LINEAR:
         near = max(_NEAR_AXIS_DEG, _SIGMAS * error)
         if abs(angle) < near:
-            return angle, error, "tip"
+            return angle, error, AXES[0]
         if abs(angle) > 90 - near:
-            return angle % 180, error, "tilt"
+            return angle % 180, error, AXES[1]
         return angle, error, "a diagonal"
     both = float(power[0, 0].real * power[1, 1].real)
     coherence = float(abs(power[0, 1]) ** 2 / both) if both > 0 else 0.0

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.design import model_integrator
+from lbt_synth.identification.diagnosis.channels import AXES
 from lbt_synth.identification.diagnosis.diagnosis import Diagnosis
+from lbt_synth.identification.diagnosis.line_origins import LineRow
 from lbt_synth.identification.diagnosis.running_loop import count_frames, law_row
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, LIMIT, RAN
 
@@ -97,8 +99,11 @@ def _residual_sentence(found: Diagnosis) -> str:
     by_running = np.isfinite(total.running_nm)
     of = [(row.part, row.running_nm if by_running else row.best_nm) for row in parts]
     whole = total.running_nm if by_running else total.best_nm
+    where = {line.name: _direction_text(line.row) for line in found.lines}
     named = [
-        f"{nm:.3g} nm of the {part}" for part, nm in of[:_PARTS] if nm**2 >= _LEAST_PART * whole**2
+        f"{nm:.3g} nm of the {part}{where.get(part, '')}"
+        for part, nm in of[:_PARTS]
+        if nm**2 >= _LEAST_PART * whole**2
     ]
     if not by_running:
         return f"By the model the {found.best} would leave {whole:.3g} nm: {_join(named)}."
@@ -109,6 +114,13 @@ def _residual_sentence(found: Diagnosis) -> str:
             f"(Strehl ratio {ran.strehl:.3f}), by the model "
         )
     return f"{measured or 'By the model it leaves '}{whole:.3g} nm: {_join(named)}."
+
+
+def _direction_text(row: LineRow) -> str:
+    """Say along what a line shakes."""
+    if row.origin in AXES:
+        return f" in {row.origin}"
+    return "" if np.isnan(row.direction_deg) else f" along {row.direction_deg:.0f} deg"
 
 
 def _join(items: list[str]) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from lbt_synth.identification import Diagnosis
+from lbt_synth.identification.diagnosis.channels import AXES
 from lbt_synth.identification.diagnosis.running_loop import law_row
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.storage.rows import cell_text, fact_table, row_table
 from lbt_synth.storage.tables import Table
-
-_AXES = ("tip", "tilt")
 
 
 def diagnosis_tables(found: Diagnosis) -> tuple[Table, ...]:
@@ -26,7 +25,7 @@ def record_tables(found: Diagnosis) -> list[Table]:
         text += f", clock jitter {health.jitter_frames:.2g} frames rms"
     tables = [row_table(f"Record: {text}. {health.summary()}", found.channels)]
     rows = [
-        (kind, series, "-" if axis is None else _AXES[axis], *rest)
+        (kind, series, "-" if axis is None else AXES[axis], *rest)
         for kind, series, axis, *rest in health.rows()
         if kind != NOT_KNOWN  # a consequence of other faults, and of the beginning
     ]

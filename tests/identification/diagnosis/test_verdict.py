@@ -92,3 +92,12 @@ def test_of_a_loop_near_its_limit():
     assert diagnosis_verdict(near)[0].endswith(" but with a modulus margin of 0.12 only.")
     wild = replace(found, loop=replace(found.loop, spectral_radius=1.02))
     assert "which is UNSTABLE at the sensor gain of" in diagnosis_verdict(wild)[0]
+
+
+def test_along_what_a_line_shakes():
+    found = line_diagnosis()
+    (line,) = found.lines
+    for origin, angle, words in (("a diagonal", 30.0, "along 30 deg"), ("tilt", 90.0, "in tilt")):
+        row = replace(line.row, origin=origin, direction_deg=angle)
+        turned = replace(found, lines=(replace(line, row=row),))
+        assert f"nm of the {line.name} {words}" in diagnosis_verdict(turned)[1]
