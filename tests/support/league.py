@@ -17,9 +17,9 @@ QUICK = ("ran", "best-integrator", "least-squares-32", "kalman")
 
 @cache
 def short_record(seed: int = 0, *, closed: bool = True) -> lbt.identification.LoopRecord:
-    """One axis for 16 s, in the loop of an integrator or as an open loop."""
+    """One axis for 18 s, in the loop of an integrator or as an open loop."""
     ran = lbt.integrator(PATH, gain=0.3).controller
-    run = lbt.simulate(ran, TRUTH, hardware=PATH, frames=8000, seed=seed)
+    run = lbt.simulate(ran, TRUTH, hardware=PATH, frames=9000, seed=seed)
     series = (run.measurements[0], run.commands[0]) if closed else (run.total_nm[0],)
     return lbt.identification.loop_record(
         *series, frame_rate_hz=RATE, delay_frames=2 if closed else None, unit="nm"

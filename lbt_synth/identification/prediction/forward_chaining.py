@@ -8,7 +8,7 @@ all that compete on a split see the same pseudo-open-loop series and the same fr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -130,6 +130,8 @@ class ForwardSplit:
         Identified from the training.
     open_loop : (frames, axes) ndarray
         The pseudo-open-loop series z(k) with the sensor gains of the model [nm].
+    options : mapping
+        Options of :func:`identify` that the model was identified with.
     """
 
     record: LoopRecord
@@ -138,11 +140,22 @@ class ForwardSplit:
     replayed: Stretches
     model: IdentifiedModel
     open_loop: FloatArray
+    options: Mapping[str, Any]
 
     @property
     def hardware(self) -> LoopHardware:
         """The loop, with the sensor gains of the model."""
         return self.model.hardware
+
+    @property
+    def past(self) -> LoopRecord:
+        """The record as it was when the training ended."""
+        stop, record = self.training[-1][1], self.record
+        names = ("measurements", "commands", "usable", "measured", "commanded")
+        series = {name: getattr(record, name) for name in names}
+        return replace(
+            record, **{name: given[:stop] for name, given in series.items() if given is not None}
+        )
 
     @property
     def noise_nm2(self) -> float:
@@ -242,6 +255,7 @@ def forward_split(
         replayed=tuple(replayed),
         model=model,
         open_loop=record.pseudo_open_loop(model.sensor_gains),
+        options=options,
     )
 
 

@@ -16,6 +16,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import (
     ForwardSplit,
     TrackingController,
+    design_from_record,
     least_squares_predictor,
     spectral_design,
 )
@@ -90,8 +91,11 @@ def all_entries() -> dict[str, Entry]:
         )
         for name in plant_methods()
     ]
-    tracking = Entry(name="tracking", title="tracking controller", residual=_residual_of_tracking)
-    return {entry.name: entry for entry in (*rivals, *ours, tracking)}
+    ours += [
+        Entry(name="tracking", title="tracking controller", residual=_residual_of_tracking),
+        Entry(name="auto", title="automatic design", residual=_residual_of_auto),
+    ]
+    return {entry.name: entry for entry in (*rivals, *ours)}
 
 
 def choose_entries(names: Sequence[str] | None) -> dict[str, Entry]:
@@ -126,6 +130,15 @@ def _residual_of_order(split: ForwardSplit, *, order: int) -> FloatArray:
 def _residual_of_method(split: ForwardSplit, *, name: str) -> FloatArray:
     design = design_request(name, {}).build(PlantInputs(plant=split.model.plant()))
     return split.replay(design.controller)
+
+
+def _residual_of_auto(split: ForwardSplit) -> FloatArray:
+    """Return what the controller leaves that ``auto`` would have designed when the training ended.
+
+    It chooses its method, and refuses what it would not write.
+    """
+    made = design_from_record(split.past, **split.options)
+    return split.replay(made.design.controller)
 
 
 def _residual_of_pyrtc(split: ForwardSplit, *, kind: str) -> FloatArray:

@@ -148,3 +148,12 @@ def test_a_comparison_without_designs(record):
 def test_a_test_is_at_least_a_second(record):
     with pytest.raises(ProblemError, match="1000 usable frames .* the shortest has 599"):
         lbt.identification.forward_chain(record, {}, splits=10)
+
+
+def test_the_past_is_the_record_as_it_was(record, split):
+    stop = split.training[-1][1]
+    assert split.past.frames == stop < record.frames
+    assert np.array_equal(split.past.commands, record.commands[:stop])
+    assert split.past.stretches() == split.training
+    again = lbt.identify(split.past, **split.options)
+    assert again.sensor_gains == split.model.sensor_gains

@@ -89,7 +89,7 @@ def test_what_fails_is_left_out_and_says_why(tmp_path):
     records = {
         "night": short_record(),
         "open": replace(short_record(closed=False), delay_frames=2.0),
-        "brief": replace(short_record(), usable=np.arange(8000) < 600),
+        "brief": replace(short_record(), usable=np.arange(9000) < 600),
     }
     options = {name: OPTIONS if name != "open" else {"most_lines": 2} for name in records}
     found = lbt.studies.run_league(
